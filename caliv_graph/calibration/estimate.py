@@ -1,0 +1,593 @@
+"""The estimator: registration, graph solve, and the loop around both.
+
+`estimate` is the one place that goes round. The paper's pipeline is its first half: register all
+clouds to the latent target, then solve the graph with one pose factor per cloud, robustly. `staged`
+stops there, in the paper's two stages. `joint` and `auto` go on: expectation-maximisation whose
+M-step is the graph solve, the clouds' quadratic (component means eliminated, all clouds coupled) in
+the place of the pose factors.
+
+Gauge: the target frames are free, the map is held by the given poses, the extrinsics by the data or
+the guesses (SPEC 3, `auto`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import (
+    CloudLinearisation,
+    add_shape,
+    cloud_graph,
+    dense_system,
+    initial_values,
+    linearise_clouds,
+    merged,
+    optimise,
+    pose_graph,
+    prior_graph,
+    retract,
+    with_given_poses,
+)
+from caliv_graph.calibration.noise import TYPICAL_SCALE, first_pose_noise, fit_pose_noise
+from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.calibration.robust import RobustWeights
+from caliv_graph.config import Config, RobustConfig
+from caliv_graph.conventions import key_mounting, key_target, key_vehicle
+from caliv_graph.errors import SolveError
+from caliv_graph.geometry.se3 import stack, vehicle_axes_difference
+from caliv_graph.products import (
+    Array,
+    PoseNoise,
+    Registration,
+    Solution,
+    TargetObservation,
+    Trajectory,
+)
+from caliv_graph.progress import Progress
+from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.register import JointRegistration, left_step, register_jointly
+from caliv_graph.uncertainty.observability import (
+    respectful_covariance,
+    respectful_step,
+    spectrum,
+)
+
+REWEIGHTINGS = 12
+"""Rounds of reweighting at most; graduated non-convexity needs more and may take twice this."""
+
+WEIGHT_TOLERANCE = 0.02
+"""Largest change of a weight at which reweighting stops."""
+
+GROSS = 30.0
+"""A cloud whose squared residual is this many times the median's has no say in the noise levels."""
+
+REFINEMENTS = 25
+"""Iterations of the joint loop at most."""
+
+DECIDED_AFTER = 6
+"""Iterations after which the number of undetermined directions is no longer changed, so that one
+at the threshold does not make the estimate jump for ever."""
+
+REHEATED_SIGMA_M = 0.02
+"""Width that the mixture goes back to when the graph takes over: the poses move by millimetres."""
+
+STEP_TOLERANCE = (5e-5, 3e-4)
+"""Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
+what 100 clouds of a chair can tell."""
+
+HELD_SIGMAS = np.full(6, 1e-6)
+"""Stiffness with which the staged solve holds what it does not estimate, rad and m."""
+
+
+@dataclass
+class _State:
+    """What the solve carries along."""
+
+    problem: Problem
+    config: Config
+    values: gtsam.Values
+    noise: PoseNoise
+    scale: float
+    weights: RobustWeights
+    graph_seconds: float = 0.0
+
+
+def estimate(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[Trajectory],
+    config: Config,
+    progress: Progress,
+) -> Solution:
+    """Registers, solves and refines, as `solve.mode` says.
+
+    Args:
+        observations: clouds of each target placement.
+        trajectories: one per drive.
+        config: modes, kernels, priors.
+        progress: told of every stage.
+
+    Raises:
+        RegistrationError, SolveError: it could not be done.
+    """
+    used = [o for o in observations if len(o.clouds) >= 2]
+    used = [replace(o, placement=m) for m, o in enumerate(used)]
+    problem = pose_problem(used, trajectories, config)
+    times: dict[str, float] = {}
+
+    begun = time.perf_counter()
+    states, registrations = [], []
+    with progress.stage("registering the clouds", len(used)) as advance:
+        for m, observation in enumerate(used):
+            state = JointRegistration(observation, config)
+            registrations.append(
+                register_jointly(
+                    state, _prealigned(problem, m), config.registration.max_iterations
+                )
+            )
+            states.append(state)
+            advance()
+    times["registration"] = time.perf_counter() - begun
+
+    begun = time.perf_counter()
+    with progress.stage("solving the graph", None):
+        solve = _solve_registered(problem, registrations, config)
+    if config.solve.mode == "staged":
+        solution = _staged(solve, registrations)
+    else:
+        with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
+            solution = _refine(solve, states, registrations, advance)
+    times["graph"] = solve.graph_seconds
+    times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
+    return replace(solution, stage_times_s=times)
+
+
+def _prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
+    """T_map_vehicle T_vehicle_lidar of the clouds of a placement, at the guesses."""
+    out = []
+    for j in np.flatnonzero(problem.cloud_placement == placement):
+        guess = problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
+        out.append(problem.T_map_vehicle[problem.cloud_pose[j]].compose(guess))
+    return out
+
+
+def _measured(registrations: Sequence[Registration]) -> tuple[list[gtsam.Pose3], Array]:
+    """Registered poses and informations of all placements, in order."""
+    poses = [T for r in registrations for T in r.T_target_lidar]
+    return poses, np.concatenate([r.information for r in registrations])
+
+
+def _residuals(
+    lines: CloudLinearisation, measured: Sequence[gtsam.Pose3], information: Array
+) -> tuple[Array, Array]:
+    """Whitened residuals (J, 6) of the pose factors and their squares (J,)."""
+    r = np.array(
+        [
+            gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
+            for j, Z in enumerate(lines.predicted)
+        ]
+    )
+    white = np.einsum("jba,jb->ja", np.linalg.cholesky(information), r)
+    return white, np.sum(white**2, axis=1)
+
+
+def _solve_registered(
+    problem: Problem, registrations: Sequence[Registration], config: Config
+) -> _State:
+    """The paper's minimisation on the graph: pose factors, robust, noise levels from the data."""
+    begun = time.perf_counter()
+    measured, information = _measured(registrations)
+    state = _State(
+        problem=problem,
+        config=config,
+        values=initial_values(problem, measured),
+        noise=first_pose_noise(config.noise),
+        scale=TYPICAL_SCALE,
+        weights=RobustWeights(config.robust, problem.clouds),
+    )
+    # Before the noise is known, weights would take the slow error of the poses for outliers, and
+    # the variances would then find none of it: solve plainly, and leave out what is far off.
+    plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
+    state.weights, kernel = plain, state.weights
+    _reweight(state, measured, information, 1)
+    lines = linearise_clouds(problem, state.values)
+    squared = _residuals(lines, measured, information)[1]
+    sound = squared < GROSS * np.median(squared)
+    given = with_given_poses(problem, state.values)
+    state.noise, state.scale = fit_pose_noise(
+        problem, measured, information, sound, given, config.noise
+    )
+    state.weights = kernel
+    rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
+    _reweight(state, measured, information, rounds)
+    state.graph_seconds += time.perf_counter() - begun
+    return state
+
+
+def _reweight(
+    state: _State, measured: Sequence[gtsam.Pose3], information: Array, rounds: int
+) -> None:
+    """Alternates graph solves and robust weights until the weights stay."""
+    problem = state.problem
+    steady = merged(
+        pose_graph(problem, state.noise), prior_graph(problem, problem.lidars)
+    )
+    scaled = information / state.scale**2
+    for _ in range(rounds):
+        clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
+        state.values = optimise(merged(steady, clouds), state.values, 10)
+        lines = linearise_clouds(problem, state.values)
+        change = state.weights.update(_residuals(lines, measured, scaled)[1])
+        if change < WEIGHT_TOLERANCE and state.weights.settled:
+            break
+
+
+# ---------------------------------------------------------------- staged
+
+
+def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
+    """The paper's second stage: S_a fixed, the reference's translation held, its rotation free."""
+    begun = time.perf_counter()
+    problem = state.problem
+    measured, information = _measured(registrations)
+    scaled = information / state.scale**2 * state.weights.values[:, None, None]
+    clouds = cloud_graph(problem, measured, scaled)
+    poses = pose_graph(problem, state.noise)
+    fixed = prior_graph(problem, sorted(problem.fixed))
+    priors = prior_graph(problem, problem.lidars)
+    information_data = _reduce(problem, state.values, merged(poses, fixed, clouds)).D
+    first = state.values
+    holds = gtsam.NonlinearFactorGraph()
+    stiff = gtsam.noiseModel.Diagonal.Sigmas(HELD_SIGMAS)
+    for key in problem.extrinsic_keys()[1:]:
+        holds.add(gtsam.PriorFactorPose3(key, first.atPose3(key), stiff))
+    guess = problem.guesses[problem.reference]
+    holds.add(
+        gtsam.PoseTranslationPrior3D(
+            key_mounting(), guess, gtsam.noiseModel.Isotropic.Sigma(3, HELD_SIGMAS[3])
+        )
+    )
+    start = gtsam.Values(first)
+    E = first.atPose3(key_mounting())
+    start.update(key_mounting(), gtsam.Pose3(E.rotation(), guess.translation()))
+    # The prior has no say in the rotation: the paper's second stage minimises the data's error.
+    state.values = optimise(merged(poses, fixed, holds, clouds), start, 30)
+    prior = _prior_information(problem)
+    cov = _staged_covariance(state, information_data, prior, first)
+    state.graph_seconds += time.perf_counter() - begun
+    return _solution(
+        state,
+        registrations,
+        merged(poses, priors, clouds),
+        measured,
+        information / state.scale**2,
+        information_data,
+        cov,
+        held=("x", "y", "z"),
+        iterations=1,
+        converged=True,
+    )
+
+
+def _staged_covariance(
+    state: _State, information_data: Array, prior: Array, first: gtsam.Values
+) -> Array:
+    """Covariance of the staged result, vehicle axes.
+
+    S_a has the covariance of stage 1. The held translation has the guess's. The rotation has what
+    the data leave, and moves with both: a translation that is wrong by 0.1 m turns the yaw by
+    0.1 m over the turning radius (SPEC 4).
+    """
+    problem = state.problem
+    n = len(problem.lidars)
+    Q = problem.to_vehicle_axes(first)
+    D = Q.T @ information_data @ Q  # tangents of E (rotation, translation), S_a
+    stage_one = np.linalg.inv(D + Q.T @ prior @ Q)
+    R = first.atPose3(key_mounting()).rotation().matrix()
+    others = np.zeros((6 * n - 3, 6 * n - 3))
+    sigma = problem.prior_sigmas[problem.reference][3:]
+    others[:3, :3] = R.T @ np.diag(sigma**2) @ R
+    others[3:, 3:] = stage_one[6:, 6:]
+    inner = np.linalg.inv(D[:3, :3])
+    pull = -inner @ D[:3, 3:]
+    cov = np.zeros((6 * n, 6 * n))
+    cov[3:, 3:] = others
+    cov[:3, 3:] = pull @ others
+    cov[3:, :3] = cov[:3, 3:].T
+    cov[:3, :3] = inner + pull @ others @ pull.T
+    Q = problem.to_vehicle_axes(state.values)
+    cov = Q @ cov @ Q.T
+    return np.asarray(0.5 * (cov + cov.T))
+
+
+# ---------------------------------------------------------------- joint and auto
+
+
+@dataclass
+class _Shapes:
+    """The clouds' quadratic over all placements at one set of poses."""
+
+    poses: list[tuple[Array, Array]]
+    quadratics: list[ShapeQuadratic]
+
+    def joint(self, scale: float) -> tuple[Array, Array]:
+        """(6 J, 6 J) and (6 J,) of all placements."""
+        blocks = [q.joint() for q in self.quadratics]
+        size = sum(len(b) for b in blocks)
+        H, start = np.zeros((size, size)), 0
+        for block in blocks:
+            H[start : start + len(block), start : start + len(block)] = block
+            start += len(block)
+        return H / scale**2, np.concatenate([q.gradient.ravel() for q in self.quadratics]) / (
+            scale**2
+        )
+
+
+def _expect(
+    states: Sequence[JointRegistration], lines: CloudLinearisation
+) -> _Shapes:
+    """E-step of every placement at the poses that the graph predicts."""
+    poses = _per_placement(states, lines)
+    quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
+    return _Shapes(poses, quadratics)
+
+
+def _per_placement(
+    states: Sequence[JointRegistration], lines: CloudLinearisation
+) -> list[tuple[Array, Array]]:
+    """The predicted poses of the clouds, (R, t) per placement."""
+    out, start = [], 0
+    for state in states:
+        out.append(stack(lines.predicted[start : start + state.clouds.count]))
+        start += state.clouds.count
+    return out
+
+
+def _hand_weights(state: _State, states: Sequence[JointRegistration]) -> None:
+    """Gives every placement the robust weights of its clouds."""
+    start = 0
+    for shape in states:
+        shape.weights = state.weights.values[start : start + shape.clouds.count]
+        start += shape.clouds.count
+
+
+@dataclass
+class _ShapeMeasurements:
+    """What each cloud by itself, given the shape, would have its pose be.
+
+    Attributes:
+        pull: (J, 6) left perturbations that lead there from the predicted poses.
+        information: (J, 6, 6) without robust weights.
+        white: (J, 6) whitened residuals.
+        squared: (J,) their squares.
+    """
+
+    pull: Array
+    information: Array
+    white: Array
+    squared: Array
+
+
+def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
+    """The pose factors that the quadratic stands for, one per cloud."""
+    weights = state.weights.values
+    blocks = np.concatenate([q.blocks for q in shapes.quadratics])
+    gradient = np.concatenate([q.gradient for q in shapes.quadratics])
+    information = blocks / weights[:, None, None] / state.scale**2
+    # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
+    ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
+    information = information + ridge[:, None, None] * np.eye(6)
+    force = gradient / weights[:, None] / state.scale**2
+    pull = -np.linalg.solve(information, force[..., None])[..., 0]
+    white = np.einsum("jba,jb->ja", np.linalg.cholesky(information), -pull)
+    return _ShapeMeasurements(pull, information, white, np.sum(white**2, axis=1))
+
+
+def _refine(
+    state: _State,
+    states: Sequence[JointRegistration],
+    registrations: Sequence[Registration],
+    advance: Callable[..., None],
+) -> Solution:
+    """Expectation-maximisation whose M-step is the graph solve."""
+    problem, config = state.problem, state.config
+    prior = _prior_information(problem)
+    steady = merged(
+        pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed))
+    )
+    for shape in states:
+        shape.reheat(REHEATED_SIGMA_M)
+    _hand_weights(state, states)
+    undetermined: int | None = None
+    converged, iteration = False, 0
+    while iteration < REFINEMENTS and not converged:
+        iteration += 1
+        lines = linearise_clouds(problem, state.values)
+        shapes = _expect(states, lines)
+        begun = time.perf_counter()
+        reduced = _reduce(problem, state.values, steady, shapes, lines, state.scale)
+        if config.solve.mode == "auto":
+            split = spectrum(reduced.D, prior, undetermined)
+            if iteration >= DECIDED_AFTER:
+                undetermined = int(split.undetermined.sum())
+            step = respectful_step(reduced.D, reduced.c, prior, _offset(state), split)
+        else:
+            step = np.linalg.solve(reduced.D + prior, reduced.c - prior @ _offset(state))
+        state.values = reduced.move(step)
+        state.graph_seconds += time.perf_counter() - begun
+        new = linearise_clouds(problem, state.values)
+        for shape, (R, t) in zip(states, _per_placement(states, new), strict=True):
+            shape.maximise(R, t)
+        change = state.weights.update(_shape_measurements(state, shapes).squared)
+        _hand_weights(state, states)
+        size = np.abs(step.reshape(-1, 6))
+        converged = (
+            all(s.finest for s in states)
+            and size[:, :3].max() < STEP_TOLERANCE[0]
+            and size[:, 3:].max() < STEP_TOLERANCE[1]
+            and change < 10.0 * WEIGHT_TOLERANCE
+        )
+        advance()
+    return _refined_solution(state, states, steady, prior, undetermined, iteration, converged)
+
+
+def _refined_solution(
+    state: _State,
+    states: Sequence[JointRegistration],
+    steady: gtsam.NonlinearFactorGraph,
+    prior: Array,
+    undetermined: int | None,
+    iterations: int,
+    converged: bool,
+) -> Solution:
+    """Reads covariance, residuals and registrations off the last estimate."""
+    problem = state.problem
+    lines = linearise_clouds(problem, state.values)
+    shapes = _expect(states, lines)
+    begun = time.perf_counter()
+    reduced = _reduce(problem, state.values, steady, shapes, lines, state.scale)
+    if state.config.solve.mode == "auto":
+        split = spectrum(reduced.D, prior, undetermined)
+        cov = respectful_covariance(prior, split)
+    else:
+        cov = np.linalg.inv(reduced.D + prior)
+    pulls = _shape_measurements(state, shapes)
+    registrations, measured, start = [], [], 0
+    for shape, (R, t), quadratic in zip(states, shapes.poses, shapes.quadratics, strict=True):
+        part = slice(start, start + shape.clouds.count)
+        start = part.stop
+        R, t = left_step(R, t, pulls.pull[part])
+        quadratic = replace(quadratic, blocks=pulls.information[part] * state.scale**2)
+        result = shape.result(R, t, quadratic, iterations, converged, (0.0, 0.0))
+        registrations.append(result)
+        measured += list(result.T_target_lidar)
+    weighted = pulls.information * state.weights.values[:, None, None]
+    graph = merged(
+        steady,
+        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
+        cloud_graph(problem, measured, weighted),
+    )
+    state.graph_seconds += time.perf_counter() - begun
+    return _solution(
+        state,
+        registrations,
+        graph,
+        measured,
+        pulls.information,
+        reduced.D,
+        cov,
+        held=(),
+        iterations=iterations,
+        converged=converged,
+    )
+
+
+# ---------------------------------------------------------------- shared
+
+
+@dataclass
+class _Reduced:
+    """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
+
+    `D` and `c`: the quadratic `e^T D e / 2 - c^T e` of the data in a step e of the extrinsics.
+    """
+
+    D: Array
+    c: Array
+    _to_axes: Array
+    _keys: tuple[int, ...]
+    _G: Array
+    _g: Array
+    _values: gtsam.Values
+
+    def move(self, step: Array) -> gtsam.Values:
+        """All values after a step (6n,) of the extrinsics, the rest following."""
+        tangent = np.linalg.solve(self._to_axes, step)
+        rest = self._g - self._G @ tangent
+        return retract(self._values, self._keys, np.concatenate([rest, tangent]))
+
+
+def _reduce(
+    problem: Problem,
+    values: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph,
+    shapes: _Shapes | None = None,
+    lines: CloudLinearisation | None = None,
+    scale: float = 1.0,
+) -> _Reduced:
+    """Linearises a graph (and the clouds' quadratic, if given) and eliminates the rest."""
+    system = dense_system(problem, graph, values)
+    if shapes is not None and lines is not None:
+        H, gradient = shapes.joint(scale)
+        system = add_shape(system, lines, H, gradient)
+    D, c, G, g = system.schur()
+    Q = problem.to_vehicle_axes(values)
+    inverse = np.linalg.inv(Q)
+    D = inverse.T @ D @ inverse
+    return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values)
+
+
+def _prior_information(problem: Problem) -> Array:
+    """(6n, 6n) information of the guesses, vehicle axes."""
+    return np.diag(np.concatenate([problem.prior_sigmas[n] for n in problem.lidars]) ** -2.0)
+
+
+def _offset(state: _State) -> Array:
+    """(6n,) where the estimate is from the guesses, vehicle axes."""
+    problem = state.problem
+    return np.concatenate(
+        [
+            vehicle_axes_difference(problem.mounting(state.values, n), problem.guesses[n])
+            for n in problem.lidars
+        ]
+    )
+
+
+def _solution(
+    state: _State,
+    registrations: Sequence[Registration],
+    graph: gtsam.NonlinearFactorGraph,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    information_data: Array,
+    cov: Array,
+    held: tuple[str, ...],
+    iterations: int,
+    converged: bool,
+) -> Solution:
+    """Packs the result."""
+    problem = state.problem
+    if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
+        raise SolveError("the covariance of the extrinsics is not finite")
+    lines = linearise_clouds(problem, state.values)
+    white, _ = _residuals(lines, measured, information)
+    cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
+    return Solution(
+        mode=state.config.solve.mode,
+        lidars=problem.lidars,
+        reference=problem.reference,
+        T_vehicle_lidar={n: problem.mounting(state.values, n) for n in problem.lidars},
+        T_map_vehicle={
+            pose: state.values.atPose3(key_vehicle(i)) for i, pose in enumerate(problem.poses)
+        },
+        T_target_map=tuple(
+            state.values.atPose3(key_target(m)) for m in range(problem.placements)
+        ),
+        registrations=tuple(registrations),
+        cloud_weights=tuple(np.split(state.weights.values, cuts)),
+        residuals=tuple(np.split(white, cuts)),
+        pose_noise=state.noise,
+        registration_scale=state.scale,
+        information_data=information_data,
+        information_prior=_prior_information(problem),
+        cov=cov,
+        held=held,
+        iterations=iterations,
+        converged=converged,
+        graph=graph,
+        values=state.values,
+    )

@@ -1,0 +1,154 @@
+"""The factors of the calibration graph, one function per kind.
+
+Variables (keys in `conventions`): X_i = T_map_vehicle, E = T_vehicle_ref, S_a = T_ref_a for every
+LiDAR but the reference, C = T_target_map, and per pose a slow error b_i (6: rotation in vehicle
+axes, position in map axes). All Jacobians are analytic; the tests check them numerically.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.geometry.se3 import (
+    left_jacobian_inverse,
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
+from caliv_graph.products import Array
+
+ErrorFunction = Callable[[gtsam.CustomFactor, gtsam.Values, list[Array] | None], Array]
+
+
+def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Array]]:
+    """The product of poses, and how it moves with each of them.
+
+    Args:
+        chain: T_0 ... T_n.
+
+    Returns:
+        The product Z, and per pose the (6, 6) derivative of a *left* perturbation of Z by a right
+        perturbation of that pose: `Z = Exp(J d) Z`, J the adjoint of the product up to it.
+    """
+    product = chain[0]
+    jacobians = [product.AdjointMap()]
+    for pose in chain[1:]:
+        product = product.compose(pose)
+        jacobians.append(product.AdjointMap())
+    return product, jacobians
+
+
+def target_pose_factor(
+    keys: Sequence[int], T_target_lidar: gtsam.Pose3, information: Array
+) -> gtsam.CustomFactor:
+    """A registered cloud: `r = Log(C X E S_a Z^-1)`, at the target (SPEC 3).
+
+    Args:
+        keys: of C, X_i, E and, unless the LiDAR is the reference, S_a.
+        T_target_lidar: the registered pose Z of the cloud.
+        information: (6, 6) of the left perturbation of Z (target frame), rad and m.
+    """
+    Z_inverse = T_target_lidar.inverse()
+    order = list(keys)
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        predicted, moves = chain_jacobians([values.atPose3(key) for key in order])
+        r = gtsam.Pose3.Logmap(predicted.compose(Z_inverse))
+        if jacobians is not None:
+            J_left = left_jacobian_inverse(r)
+            for i, move in enumerate(moves):
+                jacobians[i] = J_left @ move
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Information(information), order, error)
+
+
+def given_pose_factor(
+    key_pose: int,
+    key_drift: int,
+    T_map_vehicle: gtsam.Pose3,
+    sigma_rotation_rad: float,
+    sigma_position_m: float,
+) -> gtsam.CustomFactor:
+    """A given pose with a white error and the slow error b_i of its drive.
+
+    `r = [Log(R_given^T R) - b_rotation, t - t_given - b_position]`: rotation in vehicle axes,
+    position in map axes, since a position filter's error does not turn with the vehicle.
+    """
+    R_given = T_map_vehicle.rotation()
+    t_given = T_map_vehicle.translation()
+    sigmas = np.array([sigma_rotation_rad] * 3 + [sigma_position_m] * 3)
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        T = values.atPose3(key_pose)
+        w = gtsam.Rot3.Logmap(R_given.between(T.rotation()))
+        if jacobians is not None:
+            J = np.zeros((6, 6))
+            J[:3, :3] = gtsam.Rot3.LogmapDerivative(w)
+            J[3:, 3:] = T.rotation().matrix()
+            jacobians[0] = J
+            jacobians[1] = -np.eye(6)
+        return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_drift)
+
+    return gtsam.CustomFactor(
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas), [key_pose, key_drift], error
+    )
+
+
+def drift_factor(
+    key_before: int, key_after: int, decay: float, sigmas: Array
+) -> gtsam.LinearContainerFactor:
+    """A step of the slow error, `b_after = decay * b_before + noise` (first-order Gauss-Markov).
+
+    Args:
+        key_before, key_after: keys of the slow errors.
+        decay: exp(-dt / correlation time).
+        sigmas: (6,) of the step.
+    """
+    linear = gtsam.JacobianFactor(
+        key_before,
+        -decay * np.eye(6),
+        key_after,
+        np.eye(6),
+        np.zeros(6),
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas),
+    )
+    zero = gtsam.Values()
+    zero.insert(key_before, np.zeros(6))
+    zero.insert(key_after, np.zeros(6))
+    return gtsam.LinearContainerFactor(linear, zero)
+
+
+def mounting_prior(
+    keys: Sequence[int], T_vehicle_lidar: gtsam.Pose3, sigmas: Array
+) -> gtsam.CustomFactor:
+    """The initial guess of one LiDAR's mounting, on `T_vehicle_a = E S_a`, in vehicle axes.
+
+    Args:
+        keys: of E and, unless the LiDAR is the reference, S_a.
+        T_vehicle_lidar: the guess.
+        sigmas: (6,), rotation about and shift along the vehicle's axes, rad and m.
+    """
+    order = list(keys)
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        T, moves = chain_jacobians([values.atPose3(key) for key in order])
+        r = vehicle_axes_difference(T, T_vehicle_lidar)
+        if jacobians is not None:
+            # Left rotation and shift of the LiDAR's origin from a right perturbation of T.
+            J = right_to_vehicle_axes(T)
+            J[:3, :3] = gtsam.Rot3.LogmapDerivative(-r[:3]) @ J[:3, :3]
+            to_right = T.inverse().AdjointMap()
+            for i, move in enumerate(moves):
+                jacobians[i] = J @ to_right @ move
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), order, error)

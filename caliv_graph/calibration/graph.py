@@ -1,0 +1,293 @@
+"""The factor graph: assembling, solving, and reading its information on the extrinsics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.calibration.factors import (
+    chain_jacobians,
+    drift_factor,
+    given_pose_factor,
+    mounting_prior,
+    target_pose_factor,
+)
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.conventions import key_drift, key_mounting, key_target, key_vehicle
+from caliv_graph.errors import SolveError
+from caliv_graph.products import Array, PoseNoise
+
+GAUGE = 1e-9
+"""Relative ridge under which a dense system is solved: directions that nothing says anything
+about (the clouds' poses when all weights vanish) stay where they are."""
+
+
+def drift_sigmas(noise: PoseNoise) -> Array:
+    """(6,) stationary sigmas of the slow error."""
+    return np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
+
+
+def pose_graph(problem: Problem, noise: PoseNoise) -> gtsam.NonlinearFactorGraph:
+    """The given poses with their white and slow errors."""
+    graph = gtsam.NonlinearFactorGraph()
+    times, drives = problem.times_s(), problem.drives()
+    stationary = drift_sigmas(noise)
+    for i, T in enumerate(problem.T_map_vehicle):
+        graph.add(
+            given_pose_factor(
+                key_vehicle(i),
+                key_drift(i),
+                T,
+                noise.white_rotation_rad,
+                noise.white_position_m,
+            )
+        )
+        if i == 0 or drives[i] != drives[i - 1]:
+            graph.add(
+                gtsam.PriorFactorVector(
+                    key_drift(i), np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(stationary)
+                )
+            )
+        else:
+            decay = float(np.exp(-(times[i] - times[i - 1]) / noise.drift_time_s))
+            step = stationary * np.sqrt(1.0 - decay**2)
+            graph.add(drift_factor(key_drift(i - 1), key_drift(i), decay, step))
+    return graph
+
+
+def prior_graph(problem: Problem, lidars: Sequence[str]) -> gtsam.NonlinearFactorGraph:
+    """The initial guesses of the named LiDARs."""
+    graph = gtsam.NonlinearFactorGraph()
+    for name in lidars:
+        graph.add(
+            mounting_prior(
+                problem.mounting_keys(name), problem.guesses[name], problem.prior_sigmas[name]
+            )
+        )
+    return graph
+
+
+def cloud_graph(
+    problem: Problem, measured: Sequence[gtsam.Pose3], information: Array
+) -> gtsam.NonlinearFactorGraph:
+    """One pose factor per registered cloud; `information` (J, 6, 6) has the weights in it."""
+    graph = gtsam.NonlinearFactorGraph()
+    for j, Z in enumerate(measured):
+        graph.add(target_pose_factor(problem.cloud_keys(j), Z, information[j]))
+    return graph
+
+
+def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.Values:
+    """The guesses, the given poses, and the target frames that fit the median cloud."""
+    values = gtsam.Values()
+    for i, T in enumerate(problem.T_map_vehicle):
+        values.insert(key_vehicle(i), T)
+        values.insert(key_drift(i), np.zeros(6))
+    E = problem.guesses[problem.reference]
+    values.insert(key_mounting(), E)
+    for name in problem.lidars:
+        for key in problem.mounting_keys(name)[1:]:
+            values.insert(key, E.between(problem.guesses[name]))
+    for m in range(problem.placements):
+        candidates = []
+        for j in np.flatnonzero(problem.cloud_placement == m):
+            X = problem.T_map_vehicle[problem.cloud_pose[j]]
+            guess = problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
+            candidates.append(measured[j].compose(X.compose(guess).inverse()))
+        values.insert(key_target(m), _median_pose(candidates))
+    return values
+
+
+def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
+    """The same extrinsics and targets, with the poses as they were given."""
+    out = gtsam.Values(values)
+    for i, T in enumerate(problem.T_map_vehicle):
+        out.update(key_vehicle(i), T)
+        out.update(key_drift(i), np.zeros(6))
+    return out
+
+
+def _median_pose(poses: Sequence[gtsam.Pose3]) -> gtsam.Pose3:
+    """The pose of the list that has the smallest sum of distances to the others.
+
+    Distances are taken where the poses put the origin of their inverse: at the target.
+    """
+    if not poses:
+        return gtsam.Pose3()
+    centres = np.array([p.inverse().translation() for p in poses])
+    total = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
+    return poses[int(total.argmin())]
+
+
+def merged(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """All factors of several graphs in one."""
+    out = gtsam.NonlinearFactorGraph()
+    for graph in graphs:
+        out.push_back(graph)
+    return out
+
+
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int
+) -> gtsam.Values:
+    """Levenberg-Marquardt from `values`.
+
+    Raises:
+        SolveError: the graph is singular or its error is not finite.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-6)
+    parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    try:
+        result = optimiser.optimizeSafely()
+    except RuntimeError as e:
+        raise SolveError(f"the graph could not be solved: {str(e).splitlines()[0]}") from None
+    if not np.isfinite(optimiser.error()):
+        raise SolveError("the graph could not be solved: its error is not a number")
+    return result
+
+
+@dataclass(frozen=True)
+class CloudLinearisation:
+    """How the predicted pose of every cloud moves with the variables it depends on.
+
+    Attributes:
+        predicted: T_target_lidar of each cloud.
+        keys: per cloud, in order of the product.
+        jacobians: per cloud and key, (6, 6): left perturbation of the prediction by a right
+            perturbation of the variable.
+    """
+
+    predicted: tuple[gtsam.Pose3, ...]
+    keys: tuple[tuple[int, ...], ...]
+    jacobians: tuple[tuple[Array, ...], ...]
+
+
+def linearise_clouds(problem: Problem, values: gtsam.Values) -> CloudLinearisation:
+    """Predictions and their Jacobians at `values`."""
+    predicted, keys, jacobians = [], [], []
+    for j in range(problem.clouds):
+        chain = problem.cloud_keys(j)
+        Z, moves = chain_jacobians([values.atPose3(key) for key in chain])
+        predicted.append(Z)
+        keys.append(chain)
+        jacobians.append(tuple(moves))
+    return CloudLinearisation(tuple(predicted), tuple(keys), tuple(jacobians))
+
+
+@dataclass(frozen=True)
+class DenseSystem:
+    """A linearised graph as one quadratic, `d^T H d / 2 - b^T d`, the extrinsics last.
+
+    Attributes:
+        keys: every variable, each with six coordinates, the extrinsics at the end.
+        H: (6 N, 6 N).
+        b: (6 N,).
+        extrinsics: how many of `keys` are extrinsics.
+    """
+
+    keys: tuple[int, ...]
+    H: Array
+    b: Array
+    extrinsics: int
+
+    def offset(self, key: int) -> int:
+        """First coordinate of a variable."""
+        return 6 * self.keys.index(key)
+
+    def schur(self) -> tuple[Array, Array, Array, Array]:
+        """Eliminates everything but the extrinsics.
+
+        Returns:
+            D (6n, 6n) and c (6n,) of the reduced quadratic; and G, g with which the eliminated
+            variables follow: `d_rest = g - G d_extrinsics`.
+
+        Raises:
+            SolveError: the rest is singular.
+        """
+        split = len(self.b) - 6 * self.extrinsics
+        rest = self.H[:split, :split].copy()
+        diagonal = np.arange(split)
+        rest[diagonal, diagonal] *= 1.0 + GAUGE
+        try:
+            factor = scipy.linalg.cho_factor(rest, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            raise SolveError(
+                "the graph without extrinsics is singular: a pose or a target is tied to nothing"
+            ) from None
+        both = scipy.linalg.cho_solve(
+            factor, np.column_stack([self.H[:split, split:], self.b[:split]]), check_finite=False
+        )
+        G, g = both[:, :-1], both[:, -1]
+        D = self.H[split:, split:] - self.H[split:, :split] @ G
+        c = self.b[split:] - self.H[split:, :split] @ g
+        return 0.5 * (D + D.T), c, G, g
+
+
+def dense_system(
+    problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> DenseSystem:
+    """Linearises `graph` at `values`; variables that it does not touch get zero rows."""
+    extrinsics = problem.extrinsic_keys()
+    keys = (
+        *problem.drift_keys(),
+        *problem.pose_keys(),
+        *problem.target_keys(),
+        *extrinsics,
+    )
+    size = 6 * len(keys)
+    H, b = np.zeros((size, size)), np.zeros(size)
+    touched = set(graph.keyVector())
+    order = [key for key in keys if key in touched]
+    if order:
+        ordering = gtsam.Ordering()
+        for key in order:
+            ordering.push_back(key)
+        H_part, b_part = graph.linearize(values).hessian(ordering)
+        where = np.concatenate(
+            [np.arange(6 * i, 6 * i + 6) for i, key in enumerate(keys) if key in touched]
+        )
+        H[np.ix_(where, where)] = H_part
+        b[where] = np.asarray(b_part).ravel()
+    return DenseSystem(keys, H, b, len(extrinsics))
+
+
+def add_shape(
+    system: DenseSystem, lines: CloudLinearisation, H_clouds: Array, gradient: Array
+) -> DenseSystem:
+    """Adds a quadratic on the poses of all clouds, `d^T H d / 2 + g^T d` (left perturbations).
+
+    Args:
+        system: the rest of the graph.
+        lines: how the clouds' poses move with the variables.
+        H_clouds: (6 J, 6 J).
+        gradient: (6 J,).
+    """
+    where = {key: i for i, key in enumerate(system.keys)}
+    J = np.zeros((len(gradient), len(system.b)))
+    for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
+        for key, jacobian in zip(keys, jacobians, strict=True):
+            column = 6 * where[key]
+            J[6 * j : 6 * j + 6, column : column + 6] = jacobian
+    # Slow errors come first and are not touched by clouds: skip their zero columns.
+    used = 6 * min(where[key] for keys in lines.keys for key in keys)
+    J = J[:, used:]
+    H = system.H.copy()
+    H[used:, used:] += J.T @ (H_clouds @ J)
+    b = system.b.copy()
+    b[used:] -= J.T @ gradient
+    return DenseSystem(system.keys, H, b, system.extrinsics)
+
+
+def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:
+    """Moves the variables `keys` by the tangent d (6 N,)."""
+    delta = gtsam.VectorValues()
+    for i, key in enumerate(keys):
+        delta.insert(key, d[6 * i : 6 * i + 6])
+    return values.retract(delta)

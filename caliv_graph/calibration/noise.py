@@ -1,0 +1,208 @@
+"""How good the given poses are, read off the data themselves.
+
+Filtered poses come without a usable covariance, and their errors are correlated in time; a wrong
+guess of either costs accuracy and makes every sigma a lie. The variances (white and slow, rotation
+and position) and one scale on the registration's sigmas are estimated by restricted maximum
+likelihood: the extrinsics and the targets are integrated out, so that what they absorb is not
+taken for precision (Patterson & Thompson 1971).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+from scipy.optimize import minimize
+
+from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.config import NoiseConfig
+from caliv_graph.products import Array, IntArray, PoseNoise
+
+TYPICAL = PoseNoise(
+    white_rotation_rad=2e-4,
+    white_position_m=2e-3,
+    drift_rotation_rad=1e-3,
+    drift_position_m=1e-2,
+    drift_time_s=4.0,
+)
+"""What is assumed before the data speak: a filter of a good GNSS/INS."""
+
+TYPICAL_SCALE = 1.5
+"""Sigmas of a registration against what its mixture claims, before the data speak."""
+
+LOG_SPREAD = math.log(10.0)
+"""One sigma of how far the truth may be from `TYPICAL`: a factor of ten."""
+
+FLOORS = np.array([2e-5, 2e-4, 1e-5, 1e-4, 0.5])
+"""Smallest values: rotation rad, position m (white, slow), scale. Below them nothing changes."""
+
+CEILINGS = np.array([0.05, 1.0, 0.1, 2.0, 10.0])
+
+CLOUDS_USED = 50
+"""Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
+
+
+def _names(noise: NoiseConfig) -> list[float | None]:
+    """What the user gave, in SI units, in the order of the parameters."""
+    rad = [
+        None if v is None else math.radians(v)
+        for v in (noise.pose_rotation_deg, noise.pose_drift_rotation_deg)
+    ]
+    return [
+        rad[0],
+        noise.pose_position_m,
+        rad[1],
+        noise.pose_drift_position_m,
+        None,
+    ]
+
+
+def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
+    """What the config says, and `TYPICAL` where it is silent."""
+    given = _names(noise)
+    typical = [
+        TYPICAL.white_rotation_rad,
+        TYPICAL.white_position_m,
+        TYPICAL.drift_rotation_rad,
+        TYPICAL.drift_position_m,
+    ]
+    values = [t if g is None else g for g, t in zip(given, typical, strict=False)]
+    return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
+
+
+def fit_pose_noise(
+    problem: Problem,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    sound: npt.NDArray[np.bool_],
+    values: gtsam.Values,
+    config: NoiseConfig,
+) -> tuple[PoseNoise, float]:
+    """Variances of the given poses and the scale of the registration's sigmas.
+
+    Args:
+        problem: the clouds and poses.
+        measured: registered pose of each cloud.
+        information: (J, 6, 6), without robust weights.
+        sound: (J,) the clouds to go by.
+        values: the current extrinsics and targets, and the poses *as given*: estimated poses
+            have taken up the errors that are to be measured.
+        config: what is given there is kept.
+    """
+    first = first_pose_noise(config)
+    given = _names(config)
+    chosen = _spread(sound)
+    lines = linearise_clouds(problem, values)
+    r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
+    times = problem.times_s()[problem.cloud_pose[chosen]]
+    drives = problem.drives()[problem.cloud_pose[chosen]]
+    apart = np.abs(times[:, None] - times[None])
+    together = drives[:, None] == drives[None]
+    same = ((apart < 1e-9) & together).astype(np.float64)
+    slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
+    # Rotation and position parts of what a pose error does to the clouds' residuals.
+    effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
+    spread = [e @ e.T for e in effect]
+    ones = np.ones((6, 6))
+    parts = [
+        spread[0] * np.kron(same, ones),
+        spread[1] * np.kron(same, ones),
+        spread[0] * np.kron(slow, ones),
+        spread[1] * np.kron(slow, ones),
+        scipy.linalg.block_diag(*R),
+    ]
+    ridge = _ridge(problem, A.shape[1])
+    start = np.log(
+        [
+            first.white_rotation_rad,
+            first.white_position_m,
+            first.drift_rotation_rad,
+            first.drift_position_m,
+            TYPICAL_SCALE,
+        ]
+    )
+    free = np.array([g is None for g in given])
+
+    def cost(x: Array) -> float:
+        full = start.copy()
+        full[free] = x
+        scale = np.exp(2.0 * np.clip(full, np.log(FLOORS), np.log(CEILINGS)))
+        V = sum(s * p for s, p in zip(scale, parts, strict=True))
+        try:
+            L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            return 1e12
+        white = scipy.linalg.solve_triangular(
+            L, np.column_stack([A, r]), lower=True, check_finite=False
+        )
+        N = white[:, :-1].T @ white[:, :-1] + ridge
+        LN = scipy.linalg.cholesky(N, lower=True, check_finite=False)
+        y = scipy.linalg.solve_triangular(LN, white[:, :-1].T @ white[:, -1], lower=True)
+        misfit = white[:, -1] @ white[:, -1] - y @ y
+        surprise = np.sum(((full - start) / LOG_SPREAD) ** 2)
+        return float(
+            np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)
+        )
+
+    found = minimize(
+        cost,
+        start[free],
+        method="Nelder-Mead",
+        options={"maxfev": 160, "xatol": 0.05, "fatol": 0.1},
+    )
+    full = start.copy()
+    full[free] = found.x
+    value = np.exp(np.clip(full, np.log(FLOORS), np.log(CEILINGS)))
+    noise = PoseNoise(
+        float(value[0]), float(value[1]), float(value[2]), float(value[3]), first.drift_time_s
+    )
+    return noise, float(value[4])
+
+
+def _spread(sound: npt.NDArray[np.bool_]) -> IntArray:
+    """Indices of at most CLOUDS_USED of the sound clouds, evenly over each LiDAR's."""
+    usable = np.flatnonzero(sound)
+    return usable[:: max(1, math.ceil(len(usable) / CLOUDS_USED))]
+
+
+def _stacked(
+    problem: Problem,
+    lines: CloudLinearisation,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    values: gtsam.Values,
+    chosen: IntArray,
+) -> tuple[Array, Array, Array, Array]:
+    """Residuals (6m,), Jacobians by extrinsics and targets (6m, p), by pose errors (m, 6, 6)
+    (rotation in vehicle axes, position in map axes), and registration covariances (m, 6, 6)."""
+    columns = {
+        key: 6 * i for i, key in enumerate((*problem.extrinsic_keys(), *problem.target_keys()))
+    }
+    r = np.zeros(6 * len(chosen))
+    A = np.zeros((6 * len(chosen), 6 * len(columns)))
+    B = np.zeros((len(chosen), 6, 6))
+    for row, j in enumerate(chosen):
+        block = slice(6 * row, 6 * row + 6)
+        r[block] = gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse()))
+        for key, jacobian in zip(lines.keys[j], lines.jacobians[j], strict=True):
+            if key in columns:
+                A[block, columns[key] : columns[key] + 6] = jacobian
+            else:
+                R_map_vehicle = values.atPose3(key).rotation().matrix()
+                B[row, :, :3] = jacobian[:, :3]
+                B[row, :, 3:] = jacobian[:, 3:] @ R_map_vehicle.T
+    return r, A, B, np.linalg.inv(information[chosen])
+
+
+def _ridge(problem: Problem, size: int) -> Array:
+    """Information that keeps undetermined directions finite: the weakest of the guesses."""
+    sigmas = np.max([problem.prior_sigmas[n] for n in problem.lidars], axis=0)
+    count = 6 * len(problem.lidars)
+    ridge = np.full(size, 1e-2)
+    ridge[:count] = np.tile(sigmas**-2.0, len(problem.lidars))
+    return np.diag(ridge)

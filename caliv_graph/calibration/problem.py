@@ -1,0 +1,169 @@
+"""What is to be solved: LiDARs, poses, registered clouds, and their indices in the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config import Config
+from caliv_graph.conventions import (
+    NANOSECONDS_PER_SECOND,
+    key_drift,
+    key_mounting,
+    key_sensor,
+    key_target,
+    key_vehicle,
+)
+from caliv_graph.errors import SolveError
+from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes
+from caliv_graph.products import Array, IntArray, TargetObservation, Trajectory
+
+TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
+"""Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
+0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The bookkeeping of one calibration; arrays over clouds are in order of placement, cloud.
+
+    Attributes:
+        lidars: names of the LiDARs that take part, in the config's order.
+        reference: name of the reference LiDAR, one of `lidars`.
+        guesses: initial guess of T_vehicle_lidar per LiDAR.
+        prior_sigmas: (6,) per LiDAR, vehicle axes.
+        fixed: names of the LiDARs whose guess is trusted.
+        poses: (drive, stamp_ns) of every pose used, ascending.
+        T_map_vehicle: the given pose of each.
+        cloud_lidar: (J,) index into `lidars`.
+        cloud_pose: (J,) index into `poses`.
+        cloud_placement: (J,) index of the placement.
+        placements: number of placements.
+    """
+
+    lidars: tuple[str, ...]
+    reference: str
+    guesses: Mapping[str, gtsam.Pose3]
+    prior_sigmas: Mapping[str, Array]
+    fixed: frozenset[str]
+    poses: tuple[tuple[int, int], ...]
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+    cloud_lidar: IntArray
+    cloud_pose: IntArray
+    cloud_placement: IntArray
+    placements: int
+
+    @property
+    def clouds(self) -> int:
+        """Number of clouds."""
+        return len(self.cloud_lidar)
+
+    def mounting_keys(self, lidar: str) -> tuple[int, ...]:
+        """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""
+        if lidar == self.reference:
+            return (key_mounting(),)
+        return (key_mounting(), key_sensor(self.lidars.index(lidar)))
+
+    def extrinsic_keys(self) -> tuple[int, ...]:
+        """E, then S_a of every other LiDAR in order."""
+        others = [self.mounting_keys(n)[1] for n in self.lidars if n != self.reference]
+        return (key_mounting(), *others)
+
+    def pose_keys(self) -> tuple[int, ...]:
+        """X_i of every pose used."""
+        return tuple(key_vehicle(i) for i in range(len(self.poses)))
+
+    def drift_keys(self) -> tuple[int, ...]:
+        """b_i of every pose used."""
+        return tuple(key_drift(i) for i in range(len(self.poses)))
+
+    def target_keys(self) -> tuple[int, ...]:
+        """C of every placement."""
+        return tuple(key_target(m) for m in range(self.placements))
+
+    def cloud_keys(self, j: int) -> tuple[int, ...]:
+        """Keys of C, X_i, E and S_a of cloud j, in the order of their product."""
+        lidar = self.lidars[self.cloud_lidar[j]]
+        return (
+            key_target(int(self.cloud_placement[j])),
+            key_vehicle(int(self.cloud_pose[j])),
+            *self.mounting_keys(lidar),
+        )
+
+    def times_s(self) -> Array:
+        """(n,) times of the poses in seconds; drives are infinitely far apart."""
+        first = self.poses[0][1]
+        return np.array([(stamp - first) / NANOSECONDS_PER_SECOND for _, stamp in self.poses])
+
+    def drives(self) -> IntArray:
+        """(n,) drive of each pose."""
+        return np.array([drive for drive, _ in self.poses], dtype=np.int64)
+
+    def mounting(self, values: gtsam.Values, lidar: str) -> gtsam.Pose3:
+        """T_vehicle_lidar at given values."""
+        pose = values.atPose3(key_mounting())
+        for key in self.mounting_keys(lidar)[1:]:
+            pose = pose.compose(values.atPose3(key))
+        return pose
+
+    def to_vehicle_axes(self, values: gtsam.Values) -> Array:
+        """Turns tangents of (E, S_a, ...) into vehicle axes of every LiDAR; (6n, 6n).
+
+        Rows are in the order of `lidars`, columns in that of `extrinsic_keys`.
+        """
+        keys = self.extrinsic_keys()
+        out = np.zeros((6 * len(self.lidars), 6 * len(keys)))
+        for i, name in enumerate(self.lidars):
+            axes = right_to_vehicle_axes(self.mounting(values, name))
+            for key in self.mounting_keys(name):
+                block = axes
+                if key == key_mounting() and name != self.reference:
+                    S = values.atPose3(self.mounting_keys(name)[1])
+                    block = axes @ S.inverse().AdjointMap()
+                column = 6 * keys.index(key)
+                out[6 * i : 6 * i + 6, column : column + 6] = block
+        return out
+
+
+def pose_problem(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[Trajectory],
+    config: Config,
+) -> Problem:
+    """Lists what takes part.
+
+    Raises:
+        SolveError: nothing does.
+    """
+    clouds = [(o.placement, c) for o in observations for c in o.clouds]
+    if not clouds:
+        raise SolveError("no cloud of a target to calibrate with")
+    seen = {c.lidar for _, c in clouds}
+    lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
+    # If the configured reference saw nothing, another LiDAR has to carry the mounting.
+    reference = config.reference if config.reference in lidars else lidars[0]
+    poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds}))
+    index = {pose: i for i, pose in enumerate(poses)}
+    fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
+    sigmas = {}
+    for name in lidars:
+        sigma = config.lidars[name].sigma
+        sigmas[name] = (
+            TRUSTED_SIGMAS if name in fixed else np.array([*sigma.rpy_rad(), *sigma.xyz_m()])
+        )
+    return Problem(
+        lidars=lidars,
+        reference=reference,
+        guesses={n: pose_from_mounting(config.lidars[n].initial) for n in lidars},
+        prior_sigmas=sigmas,
+        fixed=fixed,
+        poses=poses,
+        T_map_vehicle=tuple(trajectories[d].pose_at(stamp) for d, stamp in poses),
+        cloud_lidar=np.array([lidars.index(c.lidar) for _, c in clouds]),
+        cloud_pose=np.array([index[c.drive, c.stamp_ns] for _, c in clouds]),
+        cloud_placement=np.array([m for m, _ in clouds]),
+        placements=len(observations),
+    )

@@ -1,0 +1,77 @@
+"""Robust weights: what stands in for the paper's percentile filter.
+
+`CustomFactor` cannot be cloned by GTSAM's `GncOptimizer`, and a hard trim is no M-estimator of
+GTSAM's. So all kernels are one scheme here, iteratively reweighted least squares: solve, weigh
+every cloud by its whitened residual, solve again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from caliv_graph.config import RobustConfig
+from caliv_graph.products import Array
+
+DOF = 6
+"""Degrees of freedom of a cloud's residual."""
+
+GNC_FACTOR = 1.4
+"""Growth of the convexity parameter of graduated non-convexity (Yang et al. 2020)."""
+
+MIN_WEIGHT = 1e-6
+"""A dropped cloud keeps this weight, so that its information stays invertible."""
+
+
+class RobustWeights:
+    """Weights of the clouds under one kernel, round by round."""
+
+    def __init__(self, config: RobustConfig, clouds: int) -> None:
+        """Starts with full weights for `clouds` clouds."""
+        self._config = config
+        self._mu: float | None = None
+        self._annealed = False
+        self.values: Array = np.ones(clouds)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the kernel has reached its final shape (only `tls` is graduated)."""
+        return self._config.kernel != "tls" or self._annealed
+
+    def update(self, squared: Array) -> float:
+        """New weights from squared whitened residuals (J,); returns the largest change."""
+        before = self.values
+        self.values = np.maximum(self._weights(squared), MIN_WEIGHT)
+        return float(np.abs(self.values - before).max())
+
+    def _weights(self, squared: Array) -> Array:
+        kernel = self._config.kernel
+        if kernel == "none":
+            return np.ones_like(squared)
+        if kernel == "huber":
+            bend = self._config.huber_k * np.sqrt(DOF)
+            return np.asarray(np.minimum(1.0, bend / np.sqrt(np.maximum(squared, 1e-12))))
+        if kernel == "trimmed":
+            dropped = int(len(squared) * self._config.trim_percent / 100.0)
+            weights = np.ones_like(squared)
+            if dropped:
+                weights[np.argsort(squared, kind="stable")[-dropped:]] = 0.0
+            return weights
+        return self._graduated(squared)
+
+    def _graduated(self, squared: Array) -> Array:
+        """Truncated least squares by graduated non-convexity (Yang et al. 2020, eq. 14)."""
+        c2 = float(chi2.isf(self._config.tls_p_value, DOF))
+        if self._annealed:
+            return np.where(squared < c2, 1.0, 0.0)
+        if self._mu is None:
+            worst = float(squared.max())
+            if 2.0 * worst <= c2:
+                self._annealed = True
+                return np.ones_like(squared)
+            self._mu = c2 / (2.0 * worst - c2)
+        mu = self._mu
+        middle = np.sqrt(c2 * mu * (mu + 1.0) / np.maximum(squared, 1e-12)) - mu
+        self._mu = mu * GNC_FACTOR
+        self._annealed = self._mu > 1e3
+        return np.clip(middle, 0.0, 1.0)

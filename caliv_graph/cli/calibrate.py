@@ -1,0 +1,147 @@
+"""`caliv-graph calibrate`: from drives to mountings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from caliv_graph.cli import streams
+from caliv_graph.cli.exits import UNMET
+
+if TYPE_CHECKING:
+    from caliv_graph.config import Config
+    from caliv_graph.products import Calibration, Recording
+
+
+def calibrate(
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' drafts one.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the result.")],
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--data",
+            metavar="PATH",
+            help="The drive, instead of data.path of the config. Several drives of one vehicle "
+            "are solved together: repeat the option.",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older result.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json", help="Print one JSON document, calibration.yaml's content and more."
+        ),
+    ] = False,
+) -> None:
+    """Calibrate the LiDARs of a vehicle from one or more drives past a target.
+
+    DIR gets calibration.yaml (mountings, covariance, what was not determined), config.yaml (the
+    effective one), target.ply (the reconstructed target) and log.jsonl.
+
+    Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
+    for was not reached, or a LiDAR never saw the target.
+
+    Example: caliv-graph calibrate config.yaml --out result/
+    """
+    from caliv_graph.config import load_config
+    from caliv_graph.files import check_output_folder, output_folder
+    from caliv_graph.pipeline import calibrate as run_pipeline
+    from caliv_graph.report.tables import calibration_table
+    from caliv_graph.results import (
+        RESULT_FILES,
+        calibration_document,
+        stage_documents,
+        without_infinities,
+        write_result,
+    )
+
+    start = time.monotonic()
+    settings = load_config(config)
+    _check_guesses(settings, config)
+    # Nobody should wait for a result that then has no place to go.
+    check_output_folder(out, RESULT_FILES, force)
+    recordings = _open_recordings(settings, data)
+    with streams.progress_on_stdout(as_json) as progress:
+        calibration, solution, found = run_pipeline(recordings, settings, progress)
+    read = [line for recording in recordings for line in recording.warnings()]
+    warnings = list(dict.fromkeys([*_unused_keys(settings), *found, *read, *_misses(calibration)]))
+    effective = _with_data(settings, recordings)
+    with output_folder(out, RESULT_FILES, force) as folder:
+        write_result(folder, calibration, solution, effective, progress.stages, warnings)
+    if as_json:
+        extra = {
+            "out": str(out),
+            "stages": stage_documents(progress.stages),
+            "warnings": warnings,
+        }
+        document = calibration_document(calibration)
+        streams.show_json(without_infinities({**document, **extra}))
+    else:
+        streams.show(calibration_table(calibration, progress.stages, time.monotonic() - start))
+        streams.say(f"Written to {out}")
+    streams.warn(warnings)
+    if calibration.unmet or not all(lidar.saw_target for lidar in calibration.lidars.values()):
+        raise typer.Exit(UNMET)
+
+
+def _open_recordings(config: Config, data: Sequence[Path] | None) -> list[Recording]:
+    from caliv_graph.errors import ConfigError
+    from caliv_graph.readers import open_recording
+
+    seen: set[Path] = set()
+    for path in data or ():
+        if path.resolve() in seen:
+            raise ConfigError(f"--data {path}: given twice; a drive counts once")
+        seen.add(path.resolve())
+    return [open_recording(config, path) for path in data or (None,)]
+
+
+def _check_guesses(config: Config, path: Path) -> None:
+    """Raises if two LiDARs still have the zeros that `init` writes where it knows no better."""
+    from caliv_graph.config import Mounting
+    from caliv_graph.errors import ConfigError
+
+    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == Mounting()]
+    if len(zeros) > 1:
+        fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
+        raise ConfigError(
+            f"{path}: {fields} are all zeros, but two LiDARs are not in one place. Measure where "
+            "they are, or read it off a drawing"
+        )
+
+
+def _unused_keys(config: Config) -> list[str]:
+    """A line for each key that is set and has no effect, or not yet."""
+    lines = []
+    if "ground" in config.model_fields_set and config.ground.use:
+        lines.append("ground: has no effect yet; 'use: false' says that you know")
+    if config.solve.time_offset:
+        lines.append("solve.time_offset: has no effect yet; no time offsets are estimated")
+    sections = {"topics": config.topics, "imu": config.imu, "gnss": config.gnss}
+    return lines + [
+        f"{name}: has no effect on a CaLiV folder, which brings its poses"
+        for name, section in sections.items()
+        if section != type(section)()
+    ]
+
+
+def _misses(calibration: Calibration) -> list[str]:
+    """A line for each reason to leave with exit code 3."""
+    unseen = [
+        f"LiDAR '{name}' never saw a target; it stays at its initial guess"
+        for name, lidar in calibration.lidars.items()
+        if not lidar.saw_target
+    ]
+    return [*unseen, *calibration.unmet]
+
+
+def _with_data(config: Config, recordings: Sequence[Recording]) -> Config:
+    """The config as it was used: with the (first) drive's path, whole, so that it can move."""
+    path = Path(recordings[0].name).resolve()
+    return config.model_copy(update={"data": config.data.model_copy(update={"path": path})})

@@ -1,0 +1,7 @@
+"""Exit codes (SPEC 5)."""
+
+DONE = 0
+DEFECT = 1
+USAGE = 2
+UNMET = 3
+INTERRUPTED = 130

@@ -1,0 +1,53 @@
+"""`caliv-graph inspect`: what a recording holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caliv_graph.cli import streams
+
+
+def inspect(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="The drive: a CaLiV folder.")],
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="CONFIG", help="Also look for the target with this config."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Show what a recording holds: clouds, gaps, points, the drive.
+
+    With a config, also which LiDAR sees the target when.
+
+    Example: caliv-graph inspect drive/ --config config.yaml
+    """
+    from caliv_graph.config import load_config
+    from caliv_graph.readers import open_recording
+    from caliv_graph.readers.discover import open_all
+    from caliv_graph.report.inspection import add_targets, inspect_recording
+    from caliv_graph.report.tables import inspection_table
+
+    settings = None if config is None else load_config(config)
+    recording = open_all(data) if settings is None else open_recording(settings, data)
+    with streams.progress_on_stdout(as_json) as progress:
+        inspection = inspect_recording(recording, progress)
+        warnings = list(recording.warnings())
+        if settings is not None:
+            from caliv_graph.products import Trajectory
+            from caliv_graph.targets import extract_targets
+
+            given = recording.given_poses()
+            trajectory = Trajectory(given.stamps_ns, given.T_map_vehicle)
+            observations = extract_targets([recording], [trajectory], settings, progress)
+            inspection = add_targets(inspection, observations)
+            warnings += [line for seen in observations for line in seen.warnings]
+    if as_json:
+        streams.show_json(inspection.document())
+    else:
+        streams.show(inspection_table(inspection))
+    streams.warn(warnings)

@@ -1,0 +1,150 @@
+"""The command line: commands, exit codes, interrupts.
+
+Whatever imports gtsam, open3d or pydantic is imported inside the commands, for `--help` is to
+answer at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from types import FrameType
+from typing import Annotated, Any, Self
+
+import typer
+
+from caliv_graph import __version__
+from caliv_graph.cli import streams
+from caliv_graph.cli.calibrate import calibrate
+from caliv_graph.cli.evaluate import evaluate
+from caliv_graph.cli.exits import DEFECT, DONE, INTERRUPTED, USAGE
+from caliv_graph.cli.init import init
+from caliv_graph.cli.inspect import inspect
+from caliv_graph.errors import CalivError
+
+_PROGRAM = "caliv-graph"
+
+_UsageError: Any = typer.BadParameter.__mro__[1]
+"""Base of what typer raises on a wrong command line; it has no public name for it."""
+
+app = typer.Typer(
+    name=_PROGRAM,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Calibrates LiDARs to each other and to the vehicle from one drive past a target, with "
+    "covariance and a statement of what the drive could not determine.",
+    epilog="Exit codes: 0 done; 2 bad usage or input; 3 finished, but something required was not "
+    "determined; 130 interrupted; 1 a defect of the program.",
+)
+
+
+def _paragraphs(docstring: str) -> str:
+    """A docstring without the line breaks inside its paragraphs: the terminal makes its own."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
+
+
+for _command in (init, inspect, calibrate, evaluate):
+    app.command(help=_paragraphs(_command.__doc__ or ""))(_command)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        streams.say(f"{_PROGRAM} {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+class _Interrupts:
+    """Turns SIGINT and SIGTERM into KeyboardInterrupt, and remembers that it did.
+
+    Native code between here and there may turn the exception into another one.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+
+    def __enter__(self) -> Self:
+        # SIGINT too: a shell without job control has it ignored in what it starts with '&'.
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        self._before = {number: signal.signal(number, self._on_signal) for number in numbers}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.came = True
+        raise KeyboardInterrupt
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Runs a command line and turns whatever escapes from it into messages.
+
+    Args:
+        arguments: without the program's name.
+
+    Returns:
+        The exit code (SPEC 5).
+    """
+    with _Interrupts() as interrupts, warnings.catch_warnings():
+        if not sys.warnoptions:
+            # They are for developers; on stderr they would be lines that nobody can act upon.
+            warnings.simplefilter("ignore")
+        try:
+            code = typer.main.get_command(app).main(
+                list(arguments), prog_name=_PROGRAM, standalone_mode=False
+            )
+        except BaseException as e:
+            code = INTERRUPTED if interrupts.came else _explain(e)
+        if code == INTERRUPTED:
+            streams.error("interrupted")
+        return code if isinstance(code, int) else DONE
+
+
+def _explain(problem: BaseException) -> int:
+    """Says what went wrong, and with which exit code to leave."""
+    if isinstance(problem, KeyboardInterrupt | typer.Abort):
+        return INTERRUPTED
+    if isinstance(problem, CalivError):
+        return _fail(str(problem))
+    if isinstance(problem, _UsageError):
+        return _fail(_usage_message(problem))
+    if not isinstance(problem, Exception):
+        raise problem
+    traceback.print_exception(problem)
+    streams.error(
+        f"this is a defect of {_PROGRAM} {__version__}: please report it with the lines above and "
+        "the command"
+    )
+    return DEFECT
+
+
+def _fail(message: str) -> int:
+    streams.error(message)
+    return USAGE
+
+
+def _usage_message(problem: Any) -> str:
+    command = problem.ctx.command_path if problem.ctx else _PROGRAM
+    return f"{problem.format_message().rstrip('.')}. See '{command} --help'"
+
+
+def main() -> None:
+    """Entry point of `caliv-graph`."""
+    sys.exit(run(sys.argv[1:]))

@@ -1,0 +1,448 @@
+"""The configuration: frozen, validated on load, dumped beside every result.
+
+Units are in the `Field` descriptions. An unknown key is an error that names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from caliv_graph.errors import ConfigError
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite)]
+NonNegative = Annotated[float, Field(ge=0.0), AfterValidator(_finite)]
+Triple = tuple[Finite, Finite, Finite]
+PositiveTriple = tuple[Positive, Positive, Positive]
+
+SolveMode = Literal["auto", "staged", "joint"]
+RobustKernel = Literal["huber", "tls", "trimmed", "none"]
+Requirement = Literal["s2s", "s2v_rotation", "s2v"]
+
+LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Mounting(_Section):
+    """A pose as people measure it: `T_parent_child`."""
+
+    xyz: Triple = Field((0.0, 0.0, 0.0), description="metres, in the parent frame")
+    rpy_deg: Triple = Field(
+        (0.0, 0.0, 0.0), description="roll, pitch, yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll)"
+    )
+
+
+class MountingSigma(_Section):
+    """How far off the initial guess may be, 1 sigma, per vehicle axis."""
+
+    xyz: Positive | PositiveTriple = Field(
+        0.058, description="metres; 0.058 is a uniform +-0.1 m"
+    )
+    rpy_deg: Positive | PositiveTriple = Field(
+        1.73, description="degrees; 1.73 is a uniform +-3 degrees"
+    )
+
+    def xyz_m(self) -> tuple[float, float, float]:
+        """Sigma of x, y, z in metres."""
+        return self.xyz if isinstance(self.xyz, tuple) else (self.xyz,) * 3
+
+    def rpy_rad(self) -> tuple[float, float, float]:
+        """Sigma of the rotation about the vehicle's x, y, z axes in radians."""
+        deg = self.rpy_deg if isinstance(self.rpy_deg, tuple) else (self.rpy_deg,) * 3
+        return (math.radians(deg[0]), math.radians(deg[1]), math.radians(deg[2]))
+
+
+class LidarConfig(_Section):
+    """One LiDAR, by the user's name for it."""
+
+    topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
+    initial: Mounting = Field(description="initial guess of T_vehicle_lidar")
+    sigma: MountingSigma = MountingSigma()
+    fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
+    min_range: NonNegative = Field(
+        1.0, description="metres; nearer returns are dropped (the vehicle's own body)"
+    )
+    max_range: Positive = Field(200.0, description="metres; farther returns are dropped")
+
+    @model_validator(mode="after")
+    def _ranges_in_order(self) -> LidarConfig:
+        if self.min_range >= self.max_range:
+            raise ValueError(
+                f"min_range ({self.min_range} m) must be below max_range ({self.max_range} m)"
+            )
+        return self
+
+
+class DataConfig(_Section):
+    """Where the recording is."""
+
+    format: Literal["rosbag", "caliv"] = "rosbag"
+    path: Path | None = Field(None, description="folder or file, relative to the config")
+
+
+class TopicsConfig(_Section):
+    """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
+
+    imu: str | None = None
+    gnss: str | None = None
+    twist: str | None = None
+    pose: str | None = None
+
+
+class TargetRegion(_Section):
+    """An axis-aligned box in which the target, and nothing else above the ground, stands."""
+
+    min: Triple = Field(description="metres, lower corner")
+    max: Triple = Field(description="metres, upper corner")
+    frame: Literal["map", "start"] = Field(
+        "map", description="map, or start: the vehicle's first pose"
+    )
+
+    @model_validator(mode="after")
+    def _corners_in_order(self) -> TargetRegion:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low >= high:
+                raise ValueError(f"min {axis} ({low} m) must be below max {axis} ({high} m)")
+        return self
+
+
+class GroundConfig(_Section):
+    """The ground as a source of roll, pitch and height."""
+
+    use: bool = True
+    vehicle_height: Finite | None = Field(
+        None, description="metres, height of the vehicle frame above ground; absent: unknown"
+    )
+    sigma: Positive = Field(0.005, description="metres, sigma of vehicle_height over the drive")
+    parallel_sigma_deg: Positive | None = Field(
+        None, description="degrees; given: the vehicle stands parallel to the ground to this sigma"
+    )
+
+
+class ImuConfig(_Section):
+    """Mounting of the IMU."""
+
+    T_vehicle_imu: Mounting = Mounting()
+
+
+class GnssConfig(_Section):
+    """Mounting of the GNSS antenna."""
+
+    lever_arm: Triple = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
+
+
+class NoiseConfig(_Section):
+    """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
+
+    lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
+    pose_position_m: Positive | None = Field(
+        None, description="metres, white error of each given pose; absent: from the poses"
+    )
+    pose_rotation_deg: Positive | None = Field(
+        None, description="degrees, white error of each given pose; absent: from the poses"
+    )
+    pose_drift_position_m: Positive | None = Field(
+        None, description="metres, slowly varying error of the given poses over the drive"
+    )
+    pose_drift_rotation_deg: Positive | None = Field(
+        None, description="degrees, slowly varying error of the given poses over the drive"
+    )
+    pose_drift_time_s: Positive = Field(
+        4.0, description="seconds, correlation time of the slowly varying error of given poses"
+    )
+    accelerometer_density_m_s2_sqrthz: Positive | None = None
+    gyroscope_density_rad_s_sqrthz: Positive | None = None
+    accelerometer_bias_walk_m_s3_sqrthz: Positive | None = None
+    gyroscope_bias_walk_rad_s2_sqrthz: Positive | None = None
+    gnss_horizontal_m: Positive | None = None
+    gnss_vertical_m: Positive | None = None
+    velocity_m_s: Positive | None = None
+    orientation_deg: Positive | None = None
+
+
+class SolveConfig(_Section):
+    """How the graph is solved."""
+
+    mode: SolveMode = Field(
+        "auto",
+        description="staged: the paper's two stages; joint: everything free under its prior; "
+        "auto: the prior decides only along what the drive does not determine",
+    )
+    time_offset: bool = Field(False, description="estimate a constant time offset per LiDAR")
+
+
+class RobustConfig(_Section):
+    """What stands in for the paper's percentile filter."""
+
+    kernel: RobustKernel = "huber"
+    huber_k: Positive = Field(1.5, description="whitened residual per sqrt(dof) where Huber bends")
+    tls_p_value: Annotated[float, Field(gt=0.0, lt=0.5)] = Field(
+        0.001, description="chi-square tail probability beyond which TLS drops a cloud"
+    )
+    trim_percent: Annotated[float, Field(ge=0.0, lt=50.0)] = Field(
+        10.0, description="percent of the clouds that `trimmed` drops: the worst"
+    )
+
+
+class ExtractionConfig(_Section):
+    """How target points are cut out of the clouds."""
+
+    ground_distance: Positive = Field(
+        0.05, description="metres; points nearer to the ground plane are ground"
+    )
+    voxel: NonNegative = Field(
+        0.0, description="metres; at most one point per voxel of this size is kept; 0: all points"
+    )
+    outlier_neighbours: Annotated[int, Field(ge=0)] = Field(
+        6, description="neighbours of the statistical outlier filter; 0: no filter"
+    )
+    outlier_ratio: Positive = Field(
+        3.0, description="a point this many standard deviations lonelier than the rest is dropped"
+    )
+    min_points: Annotated[int, Field(ge=10)] = Field(
+        50, description="a scan with fewer target points does not see the target"
+    )
+    min_scans: Annotated[int, Field(ge=2)] = Field(
+        8, description="a LiDAR with fewer scans of the target does not see it"
+    )
+
+
+class RegistrationConfig(_Section):
+    """The mixture that all clouds of a target are registered to."""
+
+    components: Annotated[int, Field(ge=20)] = Field(
+        600, description="number of Gaussian components of the reconstructed target"
+    )
+    outlier_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        0.05, description="assumed ratio of outliers to inliers (gamma)"
+    )
+    max_iterations: Annotated[int, Field(ge=5)] = Field(100, description="EM iterations at most")
+    max_points: Annotated[int, Field(ge=20)] = Field(
+        1500, description="points of one cloud used at most; a larger cloud is thinned evenly"
+    )
+
+
+class Config(_Section):
+    """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
+
+    data: DataConfig = DataConfig()
+    topics: TopicsConfig = TopicsConfig()
+    lidars: dict[str, LidarConfig] = Field(min_length=1)
+    reference: str = Field("", description="reference LiDAR; empty: the first")
+    target: tuple[TargetRegion, ...] | None = Field(
+        None, description="one region or a list of them; absent: the target is searched for"
+    )
+    ground: GroundConfig = GroundConfig()
+    imu: ImuConfig = ImuConfig()
+    gnss: GnssConfig = GnssConfig()
+    noise: NoiseConfig = NoiseConfig()
+    solve: SolveConfig = SolveConfig()
+    robust: RobustConfig = RobustConfig()
+    extraction: ExtractionConfig = ExtractionConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    require: tuple[Requirement, ...] = Field(
+        ("s2s",), description="what exit code 0 promises to have determined"
+    )
+    limits: dict[str, Positive] = Field(
+        {}, description="largest sigma that exit code 0 allows, such as s2v_yaw_deg: 0.1"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_inside_require(cls, raw: Any) -> Any:
+        """`require` may carry the limits: `{limits: {...}}`, alone or as an item of the list."""
+        if not isinstance(raw, Mapping):
+            return raw
+        raw = dict(raw)
+        items = raw.get("require")
+        if items is None:
+            return raw
+        items = [items] if isinstance(items, str | Mapping) else items
+        if not isinstance(items, list | tuple):
+            return raw
+        names = []
+        limits = dict(raw.get("limits") or {})
+        for item in items:
+            if isinstance(item, Mapping):
+                # A bare {s2v_yaw_deg: 0.1} can only mean a limit as well.
+                limits.update(item.get("limits", item) or {})
+            else:
+                names.append(item)
+        if names or not limits:
+            raw["require"] = names
+        else:
+            raw["require"] = []
+        raw["limits"] = limits
+        return raw
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _one_region_or_many(cls, raw: Any) -> Any:
+        return [raw] if isinstance(raw, Mapping) else raw
+
+    @field_validator("limits")
+    @classmethod
+    def _known_limits(cls, limits: dict[str, float]) -> dict[str, float]:
+        for key in limits:
+            if not LIMIT_KEY.match(key):
+                raise ValueError(
+                    f"unknown limit '{key}': write s2s_ or s2v_, then roll_deg, pitch_deg, "
+                    "yaw_deg, x_m, y_m or z_m"
+                )
+        return limits
+
+    @model_validator(mode="after")
+    def _reference_is_a_lidar(self) -> Config:
+        if self.reference and self.reference not in self.lidars:
+            raise ValueError(
+                f"reference '{self.reference}' is not a LiDAR of this config: "
+                f"{', '.join(self.lidars)}"
+            )
+        if not self.reference:
+            object.__setattr__(self, "reference", next(iter(self.lidars)))
+        topics = [lidar.topic for lidar in self.lidars.values()]
+        for topic in topics:
+            if topics.count(topic) > 1:
+                raise ValueError(f"topic '{topic}' belongs to more than one LiDAR")
+        return self
+
+    def lidar_order(self) -> tuple[str, ...]:
+        """LiDAR names in the order of the file."""
+        return tuple(self.lidars)
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
+    return hint
+
+
+def _section_at(location: tuple[int | str, ...]) -> type[BaseModel] | None:
+    """The model that owns the key at `location` (its last item is the key itself)."""
+    model: Any = Config
+    for item in location[:-1]:
+        if isinstance(item, int):
+            continue
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            return None
+        field = model.model_fields.get(item)
+        if field is None:
+            # A LiDAR's name: the dictionary's value model was already selected.
+            continue
+        annotation = field.annotation
+        while not isinstance(annotation, type) or get_args(annotation):
+            inner = [a for a in get_args(annotation) if a not in (type(None), Ellipsis)]
+            if not inner:
+                return None
+            annotation = inner[-1]
+        model = annotation
+    return model if isinstance(model, type) and issubclass(model, BaseModel) else None
+
+
+def _one_line(error: ValidationError) -> str:
+    """The first thing wrong, as one line a person can act upon."""
+    first = error.errors(include_url=False)[0]
+    location = tuple(first["loc"])
+    where = ".".join(str(item) for item in location) or "the file"
+    more = error.error_count() - 1
+    rest = f" (and {more} more)" if more else ""
+    if first["type"] == "extra_forbidden":
+        section = _section_at(location)
+        known = list(section.model_fields) if section else list(Config.model_fields)
+        return f"unknown key '{where}': {_nearest(str(location[-1]), known)}{rest}"
+    if first["type"] == "missing":
+        return f"'{where}' is missing{rest}"
+    message = first["msg"].removeprefix("Value error, ")
+    given = first["input"]
+    shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:60]!r})"
+    return f"'{where}': {message}{shown}{rest}"
+
+
+def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
+    """Reads a YAML file with the safe loader.
+
+    Raises:
+        error: the file is missing, unreadable, or not YAML; names the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise error(f"{path}: is a folder, expected a YAML file") from None
+    except UnicodeDecodeError:
+        raise error(f"{path}: is not text in UTF-8") from None
+    except OSError as e:
+        raise error(f"{path}: {e.strerror}") from None
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        return yaml.load(text, Loader=loader)  # noqa: S506 (both are safe loaders)
+    except yaml.MarkedYAMLError as e:
+        line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
+        raise error(f"{path}: not valid YAML{line}: {e.problem}") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as e:
+        raise error(f"{path}: not valid YAML: {str(e).splitlines()[0]}") from None
+
+
+def parse_config(raw: Any, source: str, base: Path) -> Config:
+    """Validates a configuration.
+
+    Args:
+        raw: what the YAML file held.
+        source: what to call it in messages.
+        base: folder that its paths are relative to.
+
+    Raises:
+        ConfigError: with the first thing wrong, in one line.
+    """
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{source}: holds no configuration: expected keys such as 'lidars'")
+    try:
+        config = Config.model_validate(raw)
+    except ValidationError as e:
+        raise ConfigError(f"{source}: {_one_line(e)}") from None
+    if config.data.path is None:
+        return config
+    data = config.data.model_copy(update={"path": base / config.data.path})
+    return config.model_copy(update={"data": data})
+
+
+def load_config(path: Path) -> Config:
+    """Reads and validates a configuration file.
+
+    Raises:
+        ConfigError: the file is missing, not YAML, or not valid.
+    """
+    return parse_config(read_yaml(path), str(path), path.parent)
+
+
+def dump_config(config: Config) -> str:
+    """The effective configuration as YAML that `load_config` reads back to the same values."""
+    data = config.model_dump(mode="json", exclude_none=True)
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

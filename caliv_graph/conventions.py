@@ -1,0 +1,59 @@
+"""Frames, transforms, tangent order, units and key letters, on one page.
+
+Transforms
+    `T_a_b` maps points of frame b into frame a: `p_a = T_a_b * p_b`. In code `T_a_b` is a
+    `gtsam.Pose3`, `R_a_b` a 3x3 array, `t_a_b` a (3,) array, `points_b` an (N, 3) array.
+
+Frames
+    `map`      ENU axes, gravity-aligned, or the frame of the given poses (R in the paper)
+    `vehicle`  base_link, x forward, y left, z up (V)
+    `lidar`    the frame of a LiDAR's cloud (L_a)
+    `target`   the latent calibration frame, origin at the target's centre, axes of the map (C)
+    `ref`      the reference LiDAR's frame
+
+Tangent space
+    GTSAM's `Pose3`: rotation (3) before translation (3), right perturbation
+    `T.retract(d) = T * Exp(d)`. A covariance names its pose, its order and its side:
+    `cov_*` is a covariance, `info_*` its inverse, `sigma_*` a standard deviation.
+    *Vehicle axes*: the perturbation of `T_vehicle_lidar` by a small rotation about, and a shift
+    along, the vehicle's axes with the LiDAR's own origin as the centre:
+    `t' = t + dt`, `R' = Exp(dw) R`. It is the right perturbation rotated by `R_vehicle_lidar`.
+
+Units
+    Metres, radians, seconds; stamps are `int` nanoseconds (`stamp_ns`), durations float seconds
+    (`_s`). Degrees and millimetres exist at the edges only (config, tables) and say so in the
+    name (`rpy_deg`). Roll, pitch, yaw: `R = Rz(yaw) Ry(pitch) Rx(roll)`, as in URDF and in
+    `gtsam.Rot3.RzRyRx(roll, pitch, yaw)`. Quaternions in files are x y z w.
+"""
+
+import gtsam
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+
+AXES = ("roll", "pitch", "yaw", "x", "y", "z")
+"""Names of the six tangent coordinates, in the order of GTSAM's Pose3."""
+
+
+def key_vehicle(index: int) -> int:
+    """Key of X_i = T_map_vehicle at the i-th stamp used (counted over all drives)."""
+    return int(gtsam.symbol("x", index))
+
+
+def key_drift(index: int) -> int:
+    """Key of the slow error of the given pose at the i-th stamp used."""
+    return int(gtsam.symbol("b", index))
+
+
+def key_mounting() -> int:
+    """Key of E = T_vehicle_ref, the mounting of the reference LiDAR."""
+    return int(gtsam.symbol("e", 0))
+
+
+def key_sensor(index: int) -> int:
+    """Key of S_a = T_ref_a of the LiDAR at `index` in the order of the problem."""
+    return int(gtsam.symbol("s", index))
+
+
+def key_target(index: int) -> int:
+    """Key of T_target_map of the target placement at `index`."""
+    return int(gtsam.symbol("c", index))

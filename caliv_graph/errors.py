@@ -1,0 +1,41 @@
+"""One tree of errors. Every message says what, where, the numbers with units, and the next step.
+
+The command line turns a `CalivError` into one line on stderr and exit code 2; anything else that
+escapes is a defect of the program (exit code 1).
+"""
+
+
+class CalivError(Exception):
+    """Base of everything a user can cause and mend."""
+
+
+class ConfigError(CalivError):
+    """The configuration, or a result file given as input, is not what its schema says."""
+
+
+class RecordingError(CalivError):
+    """A recording (folder, bag, cloud, pose file) is missing, damaged or incomplete."""
+
+
+class TrajectoryError(CalivError):
+    """The vehicle's motion cannot be had from what was recorded."""
+
+
+class TargetError(CalivError):
+    """The target was not found in the clouds."""
+
+
+class RegistrationError(CalivError):
+    """The clouds of a target could not be registered to one shape."""
+
+
+class SolveError(CalivError):
+    """The factor graph could not be solved."""
+
+
+class ExportError(CalivError):
+    """A result could not be written in the form that was asked for."""
+
+
+class OutputError(CalivError):
+    """A result could not be written where it was asked for."""

@@ -1,0 +1,225 @@
+"""Output that is there whole or not at all, and never in the place of what is not ours."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import secrets
+import shutil
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from caliv_graph.errors import OutputError
+
+
+def atomic_write(path: Path, text: str, force: bool = False) -> None:
+    """Writes a text file in one step: a reader sees the old one or the new one.
+
+    Args:
+        path: the file; folders that it needs are made.
+        text: its content, written as UTF-8.
+        force: replace an older one.
+
+    Raises:
+        OutputError: it exists and `force` is not set, or it cannot be written.
+    """
+    check_output_file(path, force)
+    target = path.resolve()
+    with _errors_named(path), _new_parents(target):
+        scratch = _beside(target)
+        try:
+            with scratch.open("x", encoding="utf-8") as file:
+                file.write(text)
+                _flush_to_disk(file)
+            scratch.replace(target)
+        finally:
+            with _uninterrupted():
+                scratch.unlink(missing_ok=True)
+
+
+def check_output_file(path: Path, force: bool = False) -> None:
+    """Says before long work what `atomic_write` would say after it.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    with _errors_named(path):
+        target = path.resolve()
+        if target.is_dir():
+            raise OutputError(f"{path}: is a folder. Give --out the name of a file")
+        if target.exists() and not force:
+            raise OutputError(f"{path}: exists already. Give --force to replace it")
+        _check_parent_writable(path, target)
+
+
+@contextmanager
+def output_folder(path: Path, content: Sequence[str], force: bool = False) -> Iterator[Path]:
+    """A folder that appears with all its content, or not at all.
+
+    Args:
+        path: the folder. An empty one that exists is filled.
+        content: patterns (`fnmatch`) of the names that a result of this kind consists of. The
+            first is the name of its main file: a folder without it is none of our results. With
+            `force` only a result is replaced, and only if all its names are known: what somebody
+            else has put there is never deleted.
+        force: replace an older result.
+
+    Yields:
+        An empty folder beside `path` to write to. It takes the place of `path` at the end, and is
+        removed if anything goes wrong; the older result then stays.
+
+    Raises:
+        OutputError: `path` exists and is not to be replaced, or something cannot be written.
+    """
+    check_output_folder(path, content, force)
+    target = path.resolve()
+    with _errors_named(path), _new_parents(target):
+        scratch = _beside(target)
+        fresh, old = scratch / "new", scratch / "old"
+        try:
+            fresh.mkdir(parents=True)
+            yield fresh
+            for file in fresh.iterdir():
+                with file.open("rb") as opened:
+                    _flush_to_disk(opened)
+            with _uninterrupted():
+                _swap(fresh, target, old)
+        finally:
+            with _uninterrupted():
+                shutil.rmtree(scratch, ignore_errors=True)
+
+
+def check_output_folder(path: Path, content: Sequence[str], force: bool = False) -> None:
+    """Says before long work what `output_folder` would say after it.
+
+    Args:
+        path: see `output_folder`.
+        content: see `output_folder`.
+        force: see `output_folder`.
+
+    Raises:
+        OutputError: `path` exists and is not to be replaced, or cannot be written.
+    """
+    with _errors_named(path):
+        target = path.resolve()
+        _check_parent_writable(path, target)
+        if not target.exists():
+            return
+        if not target.is_dir():
+            raise OutputError(f"{path}: is a file. Give --out the name of a folder")
+        if os.path.ismount(target) or Path.cwd().is_relative_to(target):
+            kind = "a mount point" if os.path.ismount(target) else "the current folder"
+            raise OutputError(
+                f"{path}: is {kind}, which cannot be replaced in one step. Give --out a folder "
+                f"in it, such as {path / 'result'}"
+            )
+        names = sorted(entry.name for entry in target.iterdir())
+        if not names:
+            return
+        if not force:
+            raise OutputError(
+                f"{path}: exists already. Give --force to replace it, or another --out"
+            )
+        if not fnmatch.filter(names, content[0]):
+            raise OutputError(
+                f"{path}: is not replaced, for it holds no {content[0]} and is none of our "
+                "results. Give another --out"
+            )
+        foreign = [name for name in names if not any(fnmatch.fnmatch(name, p) for p in content)]
+        if foreign:
+            raise OutputError(
+                f"{path}: is not replaced, for it also holds '{foreign[0]}', which is not part of "
+                "a result and would be lost. Move it elsewhere, or give another --out"
+            )
+
+
+def _swap(fresh: Path, target: Path, old: Path) -> None:
+    """Puts `fresh` in the place of `target`, which goes to `old` unless it is empty."""
+    # A folder can be renamed onto an empty one, but not onto one with content.
+    occupied = target.is_dir() and any(target.iterdir())
+    if occupied:
+        target.rename(old)
+    try:
+        fresh.rename(target)
+    except OSError:
+        if occupied:
+            old.rename(target)
+        raise
+
+
+def _beside(target: Path) -> Path:
+    """A new name in the same folder, hence on the same disk: only there is a rename one step."""
+    return target.with_name(f".{target.name[:200]}.{secrets.token_hex(6)}")
+
+
+def _check_parent_writable(path: Path, target: Path) -> None:
+    parent = _nearest_folder(target)
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(
+            f"{path}: cannot be written: no permission to write in {parent}. Give another --out"
+        )
+
+
+def _nearest_folder(target: Path) -> Path:
+    return next(folder for folder in target.parents if folder.is_dir())
+
+
+@contextmanager
+def _new_parents(target: Path) -> Iterator[None]:
+    """Makes the folders that `target` needs, and takes them away again if nothing came of it."""
+    made = []
+    for folder in reversed(target.parents):
+        if not folder.exists():
+            folder.mkdir()
+            made.append(folder)
+    try:
+        yield
+    except BaseException:
+        with _uninterrupted():
+            for folder in reversed(made):
+                # Somebody else may have put something there meanwhile.
+                if not any(folder.iterdir()):
+                    folder.rmdir()
+        raise
+
+
+@contextmanager
+def _errors_named(path: Path) -> Iterator[None]:
+    """Turns what the system refuses (a full or read-only disk, no permission) into one line."""
+    try:
+        yield
+    except OSError as e:
+        where = f" ({e.filename})" if e.filename and str(e.filename) != str(path) else ""
+        raise OutputError(
+            f"{path}: cannot be written: {e.strerror or e}{where}. Nothing was changed; give "
+            "another --out"
+        ) from None
+
+
+def _flush_to_disk(file: Any) -> None:
+    """Some file systems find out only here that they are full."""
+    file.flush()
+    os.fsync(file.fileno())
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Lets a swap or a clean-up, milliseconds each, end before an interrupt counts.
+
+    One that comes here comes too late: what follows is done, or already fails.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            # None: it was not set from Python, and cannot be set back from here.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

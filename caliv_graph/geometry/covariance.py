@@ -1,0 +1,57 @@
+"""Covariance of the pose between two LiDARs, from the joint covariance of their mountings."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
+from caliv_graph.products import Array
+
+
+def relative_jacobian(T_vehicle_a: gtsam.Pose3, T_vehicle_b: gtsam.Pose3) -> Array:
+    """How `T_b_a = T_vehicle_b^-1 T_vehicle_a` moves with the two mountings.
+
+    From `(T_vehicle_b Exp(d_b))^-1 T_vehicle_a Exp(d_a) = T_b_a Exp(-Ad(T_b_a^-1) d_b) Exp(d_a)`.
+
+    Returns:
+        (6, 12): right perturbation of `T_b_a` (frame of a) by those of `T_vehicle_a` and
+        `T_vehicle_b`, in this order.
+    """
+    T_a_b = T_vehicle_a.between(T_vehicle_b)
+    return np.hstack([np.eye(6), -np.asarray(T_a_b.AdjointMap(), dtype=np.float64)])
+
+
+def relative_covariance(
+    T_vehicle_a: gtsam.Pose3, T_vehicle_b: gtsam.Pose3, cov_joint: Array
+) -> Array:
+    """Covariance of `T_b_a` to first order.
+
+    Args:
+        T_vehicle_a: mounting of LiDAR a.
+        T_vehicle_b: mounting of LiDAR b.
+        cov_joint: (12, 12) of `T_vehicle_a`, then `T_vehicle_b`; right perturbations, rotation
+            then translation, rad and m.
+
+    Returns:
+        (6, 6) of `T_b_a`, right perturbation (frame of a), same order and units.
+    """
+    J = relative_jacobian(T_vehicle_a, T_vehicle_b)
+    cov = J @ cov_joint @ J.T
+    return np.asarray((cov + cov.T) / 2.0)
+
+
+def parent_axes_covariance(T_parent_child: gtsam.Pose3, cov: Array) -> Array:
+    """Turns a covariance from the child's axes into the parent's, at the child's origin.
+
+    For a mounting the parent is the vehicle, and these are *vehicle axes* (see `conventions`).
+
+    Args:
+        T_parent_child: the pose.
+        cov: (6, 6) of it, right perturbation.
+
+    Returns:
+        (6, 6), rotation about and shift along the parent's axes.
+    """
+    J = right_to_vehicle_axes(T_parent_child)
+    return np.asarray(J @ cov @ J.T)

@@ -1,0 +1,188 @@
+"""From recordings to a calibration: one statement per stage, as in the paper's figure."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+import caliv_graph
+from caliv_graph.calibration.estimate import estimate
+from caliv_graph.calibration.problem import TRUSTED_SIGMAS
+from caliv_graph.config import Config, dump_config
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    LidarResult,
+    Recording,
+    Solution,
+    TargetObservation,
+    Uncertainty,
+)
+from caliv_graph.progress import Progress
+from caliv_graph.requirements import unmet_requirements
+from caliv_graph.targets import extract_targets
+from caliv_graph.trajectory.given import given_trajectories
+from caliv_graph.uncertainty.observability import assess
+
+
+@dataclass(frozen=True)
+class CalibrationRun:
+    """What a run leaves: the result, and what it was made from.
+
+    Attributes:
+        calibration: the result to write.
+        solution: the solved graph.
+        observations: the target's clouds.
+        warnings: what a person should know, a line each.
+    """
+
+    calibration: Calibration
+    solution: Solution
+    observations: tuple[TargetObservation, ...]
+    warnings: tuple[str, ...]
+
+
+def calibrate(
+    recordings: Sequence[Recording], config: Config, progress: Progress
+) -> CalibrationRun:
+    """Calibrates all LiDARs of one vehicle from one or several drives.
+
+    Args:
+        recordings: opened drives (`readers.open_recording`).
+        config: the configuration.
+        progress: told of every stage.
+
+    Raises:
+        CalivError: something is wrong with the input; the message says what to do.
+    """
+    trajectories = given_trajectories(recordings)
+    observations = extract_targets(recordings, trajectories, config, progress)
+    solution = estimate(observations, trajectories, config, progress)
+    uncertainty = assess(
+        solution.information_data,
+        solution.information_prior,
+        solution.T_vehicle_lidar,
+        solution.held,
+    )
+    calibration = assemble(solution, uncertainty, config, recordings)
+    return CalibrationRun(
+        calibration, solution, observations, _warnings(recordings, observations, solution)
+    )
+
+
+def _warnings(
+    recordings: Sequence[Recording],
+    observations: Sequence[TargetObservation],
+    solution: Solution,
+) -> tuple[str, ...]:
+    out = [w for r in recordings for w in r.warnings()]
+    out += [w for o in observations for w in o.warnings]
+    for registration in solution.registrations:
+        if not registration.converged:
+            out.append(
+                f"{registration.observation.name}: the registration was still moving after "
+                f"{registration.iterations} iterations: treat the result with care, or raise "
+                "registration.max_iterations"
+            )
+    return tuple(out)
+
+
+def assemble(
+    solution: Solution,
+    uncertainty: Uncertainty,
+    config: Config,
+    recordings: Sequence[Recording],
+) -> Calibration:
+    """The reported result: every LiDAR of the config, in its order, in right perturbations."""
+    names = config.lidar_order()
+    index = {name: i for i, name in enumerate(solution.lidars)}
+    used = _scans_used(solution)
+    size = 6 * len(names)
+    to_right = np.zeros((size, 6 * len(solution.lidars)))
+    cov_joint, information = np.zeros((size, size)), np.zeros((size, size))
+    poses: dict[str, gtsam.Pose3] = {}
+    for row, name in enumerate(names):
+        block = slice(6 * row, 6 * row + 6)
+        if name in index:
+            poses[name] = solution.T_vehicle_lidar[name]
+            column = slice(6 * index[name], 6 * index[name] + 6)
+            to_right[block, column] = right_to_vehicle_axes(poses[name]).T
+        else:
+            poses[name] = pose_from_mounting(config.lidars[name].initial)
+            cov_joint[block, block] = _prior_covariance(config, name, poses[name])
+    cov_joint += to_right @ solution.cov @ to_right.T
+    information += to_right @ solution.information_data @ to_right.T
+    lidars = {}
+    for row, name in enumerate(names):
+        block = slice(6 * row, 6 * row + 6)
+        lidars[name] = LidarResult(
+            T_vehicle_lidar=poses[name],
+            cov=cov_joint[block, block],
+            determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
+            scans_used=used.get(name, 0),
+            saw_target=used.get(name, 0) > 0,
+        )
+    complete = not uncertainty.undetermined and all(
+        all(lidar.determined.values()) for lidar in lidars.values()
+    )
+    draft = Calibration(
+        status="ok" if complete else "partial",
+        reference=solution.reference,
+        lidars=lidars,
+        cov_joint=0.5 * (cov_joint + cov_joint.T),
+        information_data=0.5 * (information + information.T),
+        undetermined=uncertainty.undetermined,
+        weak=uncertainty.weak,
+        unmet=(),
+        provenance=_provenance(config, recordings, solution),
+    )
+    return unmet_requirements(draft, config)
+
+
+def _prior_covariance(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Array:
+    """Covariance of a guess, right perturbation."""
+    lidar = config.lidars[name]
+    sigmas = np.array([*lidar.sigma.rpy_rad(), *lidar.sigma.xyz_m()])
+    if lidar.fixed:
+        sigmas = TRUSTED_SIGMAS
+    axes = right_to_vehicle_axes(T_vehicle_lidar)
+    return np.asarray(axes.T @ np.diag(sigmas**2) @ axes)
+
+
+def _scans_used(solution: Solution) -> dict[str, int]:
+    """Per LiDAR, the scans whose clouds carry at least half their weight."""
+    out: dict[str, int] = {}
+    for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
+        for cloud, weight in zip(registration.observation.clouds, weights, strict=True):
+            out[cloud.lidar] = out.get(cloud.lidar, 0) + int(weight >= 0.5)
+    return out
+
+
+def _provenance(
+    config: Config, recordings: Sequence[Recording], solution: Solution
+) -> dict[str, object]:
+    """Versions, what was asked, and what the solve found out about its input."""
+    noise = solution.pose_noise
+    return {
+        "caliv_graph": caliv_graph.__version__,
+        "config_sha256": hashlib.sha256(dump_config(config).encode()).hexdigest(),
+        "mode": solution.mode,
+        "robust_kernel": config.robust.kernel,
+        "recordings": [r.name for r in recordings],
+        "pose_noise": {
+            "white_rotation_rad": noise.white_rotation_rad,
+            "white_position_m": noise.white_position_m,
+            "drift_rotation_rad": noise.drift_rotation_rad,
+            "drift_position_m": noise.drift_position_m,
+            "drift_time_s": noise.drift_time_s,
+        },
+        "registration_scale": solution.registration_scale,
+        "iterations": solution.iterations,
+        "converged": solution.converged,
+    }

@@ -1,0 +1,338 @@
+"""What passes from stage to stage: frozen dataclasses, in the order in which they arise.
+
+A new reader starts here: LidarScan -> Trajectory -> TargetObservation -> Registration ->
+Solution -> Uncertainty -> Calibration. Frames and tangent order are in `conventions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LidarScan:
+    """One cloud of one LiDAR.
+
+    Attributes:
+        lidar: the user's name of the LiDAR.
+        stamp_ns: stamp of the cloud in nanoseconds.
+        points_lidar: (N, 3) float64, metres, lidar frame; every value finite.
+        source: what to call it in messages: a file, or a topic and stamp.
+    """
+
+    lidar: str
+    stamp_ns: int
+    points_lidar: Array
+    source: str
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """Vehicle poses that came with the recording.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        T_map_vehicle: n poses.
+    """
+
+    stamps_ns: IntArray
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+
+
+class Recording(Protocol):
+    """A drive that can be read, one cloud at a time. Readers implement this."""
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages: the path."""
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """LiDARs of the config, in the config's order."""
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """Stamps of the clouds of one LiDAR, ascending, without reading a cloud."""
+
+    def scans(self, lidar: str) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in order of their stamps; never more than one in memory."""
+
+    def given_poses(self) -> GivenPoses:
+        """The vehicle poses that came with the recording."""
+
+    def warnings(self) -> Sequence[str]:
+        """What was left out so far, and why, a line each."""
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Error model of given poses: white errors on each, and slow errors correlated in time.
+
+    The slow part is a first-order Gauss-Markov process (exponential correlation), which is what a
+    filter's estimate does: it wanders. Position errors are in map axes, rotation errors in vehicle
+    axes; all axes alike. See SPEC 3 on why white noise alone is the wrong model.
+
+    Attributes:
+        white_rotation_rad: 1 sigma of the white part, per axis.
+        white_position_m: 1 sigma of the white part, per axis.
+        drift_rotation_rad: stationary 1 sigma of the slow part, per axis.
+        drift_position_m: stationary 1 sigma of the slow part, per axis.
+        drift_time_s: correlation time of the slow part.
+    """
+
+    white_rotation_rad: float
+    white_position_m: float
+    drift_rotation_rad: float
+    drift_position_m: float
+    drift_time_s: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The vehicle's poses at the stamps of the clouds of one drive.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        T_map_vehicle: n poses.
+    """
+
+    stamps_ns: IntArray
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+
+    def pose_at(self, stamp_ns: int) -> gtsam.Pose3:
+        """The pose at a stamp of the trajectory.
+
+        Raises:
+            KeyError: the trajectory has no such stamp.
+        """
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        if index == len(self.stamps_ns) or self.stamps_ns[index] != stamp_ns:
+            raise KeyError(stamp_ns)
+        return self.T_map_vehicle[index]
+
+
+@dataclass(frozen=True)
+class TargetCloud:
+    """The points of one target in one scan.
+
+    Attributes:
+        lidar: name of the LiDAR.
+        drive: index of the drive.
+        stamp_ns: stamp of the scan.
+        points_lidar: (N, 3) float64, metres, lidar frame.
+        source: what to call the scan in messages.
+        cut: True if the edge of the field of view may cut the target off: its points tell less
+            about position than they seem to.
+    """
+
+    lidar: str
+    drive: int
+    stamp_ns: int
+    points_lidar: Array
+    source: str
+    cut: bool = False
+
+
+@dataclass(frozen=True)
+class TargetObservation:
+    """All clouds of one target placement (one target in one drive).
+
+    Attributes:
+        placement: index of the placement; one latent target frame belongs to each.
+        name: what to call it in messages.
+        centre_map: (3,) metres, rough centre in the map of its drive.
+        clouds: in order of LiDAR, then stamp.
+        warnings: what was left out, and why, a line each.
+    """
+
+    placement: int
+    name: str
+    centre_map: Array
+    clouds: tuple[TargetCloud, ...]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """The reconstructed target: oriented, anisotropic Gaussian components in the target frame.
+
+    Attributes:
+        means_target: (K, 3) metres.
+        normals_target: (K, 3) unit vectors, towards the side the surface was seen from.
+        var_normal: (K,) m^2, variance along the normal.
+        var_tangent: (K,) m^2, variance along each tangent.
+        weights: (K,) priors of the components; with the outlier class they add up to one.
+    """
+
+    means_target: Array
+    normals_target: Array
+    var_normal: Array
+    var_tangent: Array
+    weights: Array
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Every cloud of a placement registered to the latent target frame (SPEC 3, GMMCalib).
+
+    Attributes:
+        observation: what was registered.
+        T_target_lidar: a pose per cloud.
+        information: (J, 6, 6) of each pose given the shape, rotation then translation, rad and m,
+            left perturbation (target frame): `Exp(d) T_target_lidar`.
+        mixture: the reconstructed target.
+        inlier_ratio: (J,) part of each cloud's points that the mixture explains.
+        iterations: EM iterations done.
+        converged: whether the last step was below the tolerance.
+        last_step: (rotation rad, translation m), largest over the clouds, of the last iteration.
+    """
+
+    observation: TargetObservation
+    T_target_lidar: tuple[gtsam.Pose3, ...]
+    information: Array
+    mixture: Mixture
+    inlier_ratio: Array
+    iterations: int
+    converged: bool
+    last_step: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The solved factor graph.
+
+    Matrices over the extrinsics are in *vehicle axes* (see `conventions`), LiDARs in the order of
+    `lidars`, six coordinates each, rotation before translation.
+
+    Attributes:
+        mode: staged, joint or auto.
+        lidars: names of the LiDARs that take part (they saw a target, or are fixed).
+        reference: name of the reference LiDAR.
+        T_vehicle_lidar: estimate per LiDAR.
+        T_map_vehicle: estimated vehicle pose per (drive, stamp_ns).
+        T_target_map: estimate per placement.
+        registrations: what the graph was built from, a registration per placement.
+        cloud_weights: robust weight of each cloud, per placement, 1 full and 0 dropped.
+        residuals: whitened pose-factor residuals, (J, 6) per placement.
+        pose_noise: error model of the given poses that was used.
+        registration_scale: factor on the sigmas of the registration that the data called for.
+        information_data: (6n, 6n) what the data alone say, no prior on the extrinsics.
+        information_prior: (6n, 6n) of the initial guesses.
+        cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
+        held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
+        iterations: iterations of the outer loop.
+        converged: whether the outer loop's last step was below its tolerance.
+        graph: the factor graph.
+        values: its values.
+        stage_times_s: seconds per stage.
+    """
+
+    mode: str
+    lidars: tuple[str, ...]
+    reference: str
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+    T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3]
+    T_target_map: tuple[gtsam.Pose3, ...]
+    registrations: tuple[Registration, ...]
+    cloud_weights: tuple[Array, ...]
+    residuals: tuple[Array, ...]
+    pose_noise: PoseNoise
+    registration_scale: float
+    information_data: Array
+    information_prior: Array
+    cov: Array
+    held: tuple[str, ...]
+    iterations: int
+    converged: bool
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    stage_times_s: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A direction in the space of all extrinsics.
+
+    Attributes:
+        vector: per LiDAR (6,), vehicle axes, rotation (rad) then translation (m).
+        sigma_data: 1 sigma of the data along it; inf if they say nothing. In units of `vector`.
+        sigma_prior: 1 sigma of the prior along it, same units.
+        text: how a person says it.
+    """
+
+    vector: Mapping[str, Array]
+    sigma_data: float
+    sigma_prior: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the drive could and could not tell (SPEC 4).
+
+    Attributes:
+        undetermined: directions along which the prior decides.
+        weak: directions that the data determine no better than ten times the prior.
+        determined: per LiDAR and axis of `conventions.AXES`.
+        spectrum: sigma of the data, scaled so that 1 mrad and 10 mm compare, ascending, in mrad.
+    """
+
+    undetermined: tuple[Direction, ...]
+    weak: tuple[Direction, ...]
+    determined: Mapping[str, Mapping[str, bool]]
+    spectrum: Array
+
+
+@dataclass(frozen=True)
+class LidarResult:
+    """One LiDAR's mounting as it is reported.
+
+    Attributes:
+        T_vehicle_lidar: the estimate, or the initial guess if the LiDAR saw no target.
+        cov: (6, 6) right perturbation (lidar frame), rotation then translation, rad and m.
+        determined: per axis of `conventions.AXES`, vehicle axes.
+        scans_used: scans of a target that carried weight.
+        saw_target: False if it took no part.
+    """
+
+    T_vehicle_lidar: gtsam.Pose3
+    cov: Array
+    determined: Mapping[str, bool]
+    scans_used: int
+    saw_target: bool
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The result, as written to calibration.yaml (SPEC 6).
+
+    Attributes:
+        status: ok, partial or inconsistent.
+        reference: name of the reference LiDAR.
+        lidars: in the config's order.
+        cov_joint: (6n, 6n) over the LiDARs in that order, right perturbations.
+        information_data: (6n, 6n) in the same coordinates, without any prior; zero rows and
+            columns for a LiDAR that saw no target.
+        undetermined: directions, vehicle axes.
+        weak: directions, vehicle axes.
+        unmet: what `require` or `limits` asked for and did not get, a sentence each.
+        provenance: versions, configuration digest, inputs; plain values only.
+    """
+
+    status: str
+    reference: str
+    lidars: Mapping[str, LidarResult]
+    cov_joint: Array
+    information_data: Array
+    undetermined: tuple[Direction, ...]
+    weak: tuple[Direction, ...]
+    unmet: tuple[str, ...]
+    provenance: Mapping[str, object]

@@ -1,0 +1,204 @@
+"""What long work says of itself while it runs, and how long each stage took.
+
+A stage is a context manager that yields `advance(n, note)`:
+
+    with progress.stage("registration", total=len(clouds)) as advance:
+        for cloud in clouds:
+            ...
+            advance()
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+SIGN_OF_LIFE_S = 10.0
+"""Seconds between two lines of a stage that goes on, where there is no bar."""
+
+
+class Advance(Protocol):
+    """Says that work was done."""
+
+    def __call__(self, n: int = 1, note: str = "") -> None:
+        """Adds to the count.
+
+        Args:
+            n: steps done since the last call.
+            note: what a person may want to know now; stays until the next one.
+        """
+
+
+class Progress(Protocol):
+    """Where long work reports its stages."""
+
+    def stage(self, name: str, total: int | None = None) -> AbstractContextManager[Advance]:
+        """A stage of the work.
+
+        Args:
+            name: what is being done, in a word or two.
+            total: steps there will be; None if that is not known.
+        """
+
+
+@dataclass
+class StageRecord:
+    """One stage.
+
+    Attributes:
+        name: what was done.
+        total: steps expected; None if unknown.
+        depth: 0, or one more than that of the stage around it.
+        done: steps done.
+        note: the last note.
+        seconds: how long it took; None while it runs, or if it was left by an exception.
+    """
+
+    name: str
+    total: int | None
+    depth: int
+    done: int = 0
+    note: str = ""
+    seconds: float | None = None
+
+
+class SilentProgress:
+    """Keeps the records and shows nothing.
+
+    Attributes:
+        stages: in the order in which they started.
+    """
+
+    def __init__(self) -> None:
+        self.stages: list[StageRecord] = []
+        self._depth = 0
+
+    @contextmanager
+    def stage(self, name: str, total: int | None = None) -> Iterator[Advance]:
+        """A stage of the work (see `Progress`)."""
+        record = StageRecord(name, total, self._depth)
+        self.stages.append(record)
+
+        def advance(n: int = 1, note: str = "") -> None:
+            record.done += n
+            record.note = note or record.note
+            self._show(record)
+
+        start = time.monotonic()
+        self._depth += 1
+        self._show_start(record)
+        try:
+            yield advance
+        finally:
+            self._depth -= 1
+        record.seconds = time.monotonic() - start
+        self._show_end(record)
+
+    def _show_start(self, record: StageRecord) -> None:
+        """A stage has started."""
+
+    def _show(self, record: StageRecord) -> None:
+        """A stage goes on."""
+
+    def _show_end(self, record: StageRecord) -> None:
+        """A stage has ended well."""
+
+
+class PlainProgress(SilentProgress):
+    """A line where a stage starts and ends, and now and then in between."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        """Makes it.
+
+        Args:
+            write: takes a line, without its end.
+        """
+        super().__init__()
+        self._write = write
+        self._last_line = 0.0
+
+    def _line(self, record: StageRecord, text: str) -> None:
+        self._last_line = time.monotonic()
+        note = f" ({record.note})" if record.note else ""
+        self._write(f"{'  ' * record.depth}{record.name}: {text}{note}")
+
+    def _show_start(self, record: StageRecord) -> None:
+        self._line(record, "started")
+
+    def _show(self, record: StageRecord) -> None:
+        if time.monotonic() - self._last_line >= SIGN_OF_LIFE_S:
+            self._line(record, count_text(record) or "still going")
+
+    def _show_end(self, record: StageRecord) -> None:
+        count = count_text(record)
+        self._line(record, f"{f'{count} ' if count else ''}in {record.seconds:.1f} s")
+
+
+class BarProgress(SilentProgress):
+    """A bar per stage on a terminal. A context manager: the terminal is its own inside."""
+
+    def __init__(self, console: Console) -> None:
+        """Makes it.
+
+        Args:
+            console: the terminal.
+        """
+        # Rich takes a tenth of a second; whoever works in silence does without.
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            SpinnerColumn,
+            TextColumn,
+            TimeElapsedColumn,
+        )
+        from rich.progress import Progress as RichProgress
+
+        super().__init__()
+        self._bars = RichProgress(
+            SpinnerColumn(finished_text=" "),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
+            console=console,
+        )
+        self._tasks: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bars.stop()
+
+    def _show_start(self, record: StageRecord) -> None:
+        description = f"{'  ' * record.depth}{record.name}"
+        self._tasks[id(record)] = self._bars.add_task(description, total=record.total, note="")
+
+    def _show(self, record: StageRecord) -> None:
+        self._bars.update(self._tasks[id(record)], completed=record.done, note=record.note)
+
+    def _show_end(self, record: StageRecord) -> None:
+        # A bar that ends short of its total would go on spinning.
+        total = max(record.done, 1)
+        self._bars.update(self._tasks[id(record)], total=total, completed=total, note=record.note)
+
+
+def count_text(record: StageRecord) -> str:
+    """Steps done, of how many: '12/136', '12', or nothing if none were counted."""
+    if record.total is not None:
+        return f"{record.done}/{record.total}"
+    return str(record.done) if record.done else ""

@@ -1,0 +1,34 @@
+"""Reading recordings: one reader per format, all of them a `products.Recording`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from caliv_graph.config import Config
+from caliv_graph.errors import ConfigError, RecordingError
+from caliv_graph.products import Recording
+from caliv_graph.readers.caliv_folder import CalivFolder
+
+__all__ = ["open_recording"]
+
+
+def open_recording(config: Config, path: Path | None = None) -> Recording:
+    """Opens a drive with the reader that `config.data.format` names.
+
+    Args:
+        config: the configuration.
+        path: the drive; absent: `config.data.path`.
+
+    Raises:
+        ConfigError: there is no path.
+        RecordingError: the recording is missing, incomplete or contradicts itself.
+    """
+    path = config.data.path if path is None else path
+    if path is None:
+        raise ConfigError("no recording given: set data.path in the config, or give --data")
+    if config.data.format == "rosbag":
+        raise RecordingError(
+            f"{path}: rosbags cannot be read yet. Export the drive as a CaLiV folder and set "
+            "data.format: caliv"
+        )
+    return CalivFolder(path, config.lidars)

@@ -1,0 +1,329 @@
+"""Reading PCD clouds: ascii, binary and binary_compressed.
+
+The header is read and held against the file's size here, because the libraries that read PCD do
+not do so: Open3D 0.20 makes up points for a cut-off ascii file, warns on stdout, and its legacy
+reader returns zeros for float64 coordinates; pypcd4 1.5 wants columns one space apart and a COUNT
+line. The bodies are left to numpy and liblzf.
+
+The format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import lzf  # type: ignore[import-not-found]
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.errors import RecordingError
+from caliv_graph.products import Array
+
+_ENCODINGS = ("ascii", "binary", "binary_compressed")
+_HEADER_KEYS = (
+    *("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT"),
+    *("WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"),
+)
+
+_SCALAR_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+"""Bytes that a number of each TYPE may have."""
+
+_COMPRESSED_SIZES = struct.Struct("<II")
+"""What stands before a compressed body: its size and that of what it unpacks to, in bytes."""
+
+_ADVICE_EMPTY = "Record the cloud again, or remove the file"
+
+_PADDING = b"\0\t\n\r "
+"""What may follow the last point: writers end with a newline or fill up a page."""
+
+
+class _Unreadable(Exception):
+    """What is wrong with a cloud, without its name, and what to do about it."""
+
+    def __init__(self, what: str, advice: str = "Copy or export the cloud again") -> None:
+        super().__init__(f"{what}. {advice}")
+
+
+@dataclass(frozen=True)
+class _Field:
+    """One field of a point.
+
+    Attributes:
+        name: x, y, z, rgb, ...
+        kind: F, I or U: float, signed, unsigned.
+        size: bytes of one number.
+        count: numbers in the field.
+        offset: bytes of the fields before it in a point.
+        column: numbers in the fields before it in a point.
+    """
+
+    name: str
+    kind: str
+    size: int
+    count: int
+    offset: int
+    column: int
+
+    @property
+    def dtype(self) -> np.dtype[np.floating]:
+        """Of a coordinate. PCD has no mark for byte order: that of the machine, so little."""
+        return np.dtype(f"<f{self.size}")
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the body must hold.
+
+    Attributes:
+        xyz: the three coordinates.
+        points: number of points, at least 1.
+        point_size: bytes of one point.
+        columns: numbers of one point.
+        encoding: ascii, binary or binary_compressed.
+        size: bytes of the header itself.
+    """
+
+    xyz: tuple[_Field, _Field, _Field]
+    points: int
+    point_size: int
+    columns: int
+    encoding: str
+    size: int
+
+
+def read_pcd(path: Path) -> Array:
+    """Reads the points of a PCD file as they stand in it, NaN and zero returns included.
+
+    VIEWPOINT is not applied: as in PCL and Open3D, it tells where the sensor stood and the points
+    are the sensor's.
+
+    Args:
+        path: the file, with float x, y, z among its fields, in any order, organised or not.
+
+    Returns:
+        (N, 3) float64, metres, frame of the cloud, N >= 1.
+
+    Raises:
+        RecordingError: the file is missing, empty, cut off or damaged, or has no x, y, z.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from None
+    try:
+        header = _read_header(data)
+        if header.encoding == "ascii":
+            return _read_ascii(data, header)
+        if header.encoding == "binary":
+            return _read_binary(data, header)
+        return _read_compressed(data, header)
+    except _Unreadable as e:
+        raise RecordingError(f"{path}: {e}") from None
+
+
+def _read_header(data: bytes) -> _Header:
+    if not data:
+        raise _Unreadable("is empty (0 bytes)", _ADVICE_EMPTY)
+    entries, size = _header_entries(data)
+    encoding = " ".join(entries["DATA"])
+    if encoding not in _ENCODINGS:
+        raise _Unreadable(f"DATA is {encoding[:40]!r}, expected one of {', '.join(_ENCODINGS)}")
+    fields = _fields(entries)
+    width = _whole_number(entries, "WIDTH")
+    height = _whole_number(entries, "HEIGHT") if "HEIGHT" in entries else 1
+    points = _whole_number(entries, "POINTS") if "POINTS" in entries else width * height
+    if points != width * height:
+        raise _Unreadable(
+            f"the header is damaged: POINTS is {points}, but WIDTH {width} x HEIGHT {height} is "
+            f"{width * height}"
+        )
+    xyz = _coordinates(fields)
+    if points == 0:
+        raise _Unreadable("holds no points (POINTS 0)", _ADVICE_EMPTY)
+    last = fields[-1]
+    return _Header(
+        xyz=xyz,
+        points=points,
+        point_size=last.offset + last.size * last.count,
+        columns=last.column + last.count,
+        encoding=encoding,
+        size=size,
+    )
+
+
+def _header_entries(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """The values of each header line, and where the body starts."""
+    entries: dict[str, list[str]] = {}
+    end = 0
+    number = 0
+    while "DATA" not in entries:
+        start, end = end, data.find(b"\n", end) + 1
+        number += 1
+        if end == 0:
+            raise _Unreadable(
+                f"the header has no complete DATA line in {len(data)} bytes: "
+                "the file is cut off, or no PCD file"
+            )
+        line = data[start:end].decode("ascii", errors="replace").strip()
+        if not line or line.startswith("#"):
+            continue
+        key, *values = line.split()
+        if key not in _HEADER_KEYS or key in entries:
+            what = "repeats an entry" if key in entries else "is no entry of a PCD header"
+            raise _Unreadable(f"line {number} {what}: {line[:40]!r}")
+        entries[key] = values
+    return entries, end
+
+
+def _fields(entries: dict[str, list[str]]) -> list[_Field]:
+    names = _values(entries, "FIELDS")
+    kinds = _values(entries, "TYPE")
+    sizes = _values(entries, "SIZE")
+    # Old writers leave COUNT out where every field is one number.
+    counts = _values(entries, "COUNT") if "COUNT" in entries else ["1"] * len(names)
+    for key, values in (("TYPE", kinds), ("SIZE", sizes), ("COUNT", counts)):
+        if len(values) != len(names):
+            raise _Unreadable(
+                f"the header is damaged: {key} has {len(values)} values for {len(names)} FIELDS"
+            )
+    fields: list[_Field] = []
+    offset = column = 0
+    for name, kind, size_text, count_text in zip(names, kinds, sizes, counts, strict=True):
+        size = _parse_whole_number(size_text, "SIZE")
+        count = _parse_whole_number(count_text, "COUNT")
+        if size not in _SCALAR_SIZES.get(kind, ()) or count < 1:
+            raise _Unreadable(
+                f"the header is damaged: field {name[:40]!r} has TYPE {kind[:40]!r}, SIZE {size}, "
+                f"COUNT {count}"
+            )
+        fields.append(_Field(name, kind, size, count, offset, column))
+        offset += size * count
+        column += count
+    return fields
+
+
+def _coordinates(fields: list[_Field]) -> tuple[_Field, _Field, _Field]:
+    names = [field.name for field in fields]
+    for axis in "xyz":
+        if names.count(axis) != 1:
+            what = "has no field" if axis not in names else "has more than one field"
+            raise _Unreadable(
+                f"{what} '{axis}': its FIELDS are {' '.join(names)[:200]!r}",
+                "Export the cloud with x, y and z in metres",
+            )
+        field = fields[names.index(axis)]
+        if field.kind != "F" or field.count != 1:
+            raise _Unreadable(
+                f"field '{axis}' has TYPE {field.kind}, SIZE {field.size}, COUNT {field.count}",
+                "Export x, y and z as one float (TYPE F) each, in metres",
+            )
+    x, y, z = (fields[names.index(axis)] for axis in "xyz")
+    return x, y, z
+
+
+def _values(entries: dict[str, list[str]], key: str) -> list[str]:
+    values = entries.get(key)
+    if not values:
+        raise _Unreadable(f"the header is damaged: {key} is missing")
+    return values
+
+
+def _whole_number(entries: dict[str, list[str]], key: str) -> int:
+    return _parse_whole_number(" ".join(_values(entries, key)), key)
+
+
+def _parse_whole_number(text: str, key: str) -> int:
+    # Nineteen digits hold any size a file can have; int() of thousands of digits raises.
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise _Unreadable(
+            f"the header is damaged: {key} is {text[:40]!r}, expected a whole number, 0 or more"
+        )
+    return int(text)
+
+
+def _check_end(data: bytes, end: int, declared: str) -> None:
+    """Refuses a file whose body is not `end - header` bytes: its points would be made up."""
+    if len(data) < end:
+        raise _Unreadable(f"is cut off: {end} bytes expected ({declared}), {len(data)} found")
+    if data[end:].strip(_PADDING):
+        raise _Unreadable(
+            f"has {len(data) - end} bytes too many: {end} bytes expected ({declared}), "
+            f"{len(data)} found; the header does not belong to these data"
+        )
+
+
+def _read_binary(data: bytes, header: _Header) -> Array:
+    _check_end(
+        data,
+        header.size + header.points * header.point_size,
+        f"{header.points} points of {header.point_size} bytes",
+    )
+    record = np.dtype(
+        {
+            "names": [field.name for field in header.xyz],
+            "formats": [field.dtype for field in header.xyz],
+            "offsets": [field.offset for field in header.xyz],
+            "itemsize": header.point_size,
+        }
+    )
+    points = np.frombuffer(data, record, count=header.points, offset=header.size)
+    return _stack([points[field.name] for field in header.xyz])
+
+
+def _read_compressed(data: bytes, header: _Header) -> Array:
+    """Reads fields that were stored one after another, all points of each, and LZF-compressed."""
+    body = header.size + _COMPRESSED_SIZES.size
+    _check_end(data[:body], body, "header and the sizes of the compressed data")
+    packed_size, size = _COMPRESSED_SIZES.unpack_from(data, header.size)
+    _check_end(data, body + packed_size, f"{packed_size} of them compressed")
+    if size != header.points * header.point_size:
+        raise _Unreadable(
+            f"the header is damaged: {header.points} points of {header.point_size} bytes are "
+            f"{header.points * header.point_size} bytes, but the data unpack to {size}"
+        )
+    try:
+        unpacked: bytes | None = lzf.decompress(data[body : body + packed_size], size)
+    except (ValueError, MemoryError):
+        unpacked = None
+    if unpacked is None or len(unpacked) != size:
+        raise _Unreadable(
+            f"the compressed data are damaged: {packed_size} bytes do not unpack to {size}"
+        )
+    return _stack(
+        [
+            np.frombuffer(unpacked, field.dtype, header.points, header.points * field.offset)
+            for field in header.xyz
+        ]
+    )
+
+
+def _read_ascii(data: bytes, header: _Header) -> Array:
+    try:
+        text = data[header.size :].decode("ascii")
+        # An empty body is a warning to loadtxt, and an error here.
+        rows = np.loadtxt(io.StringIO(text), comments=None, ndmin=2) if text.strip() else None
+    except ValueError as e:
+        # Without numpy's advice on its own arguments.
+        what = str(e).split("; use")[0].rstrip(".")
+        raise _Unreadable(f"the points are damaged: {what}") from None
+    found = 0 if rows is None else len(rows)
+    if rows is None or found != header.points:
+        raise _Unreadable(
+            f"{header.points} points expected (POINTS), {found} found in {len(data)} bytes"
+        )
+    if rows.shape[1] != header.columns:
+        raise _Unreadable(
+            f"{header.columns} numbers expected per point (FIELDS, COUNT), {rows.shape[1]} found; "
+            "the header does not belong to these data"
+        )
+    return _stack([rows[:, field.column] for field in header.xyz])
+
+
+def _stack(coordinates: list[npt.NDArray[np.floating]]) -> Array:
+    points = np.empty((len(coordinates[0]), 3))
+    for axis, values in enumerate(coordinates):
+        points[:, axis] = values
+    return points

@@ -1,0 +1,287 @@
+"""The mixture that a target is reconstructed as: E-step, and the quadratic that it puts on poses.
+
+GMMCalib (Evangelidis & Horaud 2018 behind it) has isotropic components. A chair is seen from its
+front by one LiDAR and from its back by another, 2 to 3 cm apart; isotropic components pull the two
+skins together, which on the CaLiV authors' drive is 36 mrad of roll between the LiDARs. So a
+component here has a normal, a variance along it and one across it, and explains only points whose
+beam came from the side that its normal points to. With equal variances and no normals the formulas
+are those of SPEC 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas
+from scipy.spatial import cKDTree
+
+from caliv_graph.geometry.se3 import skew
+from caliv_graph.products import Array, IntArray, Mixture
+from caliv_graph.registration.clouds import CloudStack
+
+NEIGHBOURS = 6
+"""Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
+
+NORMAL_METRES = 0.1
+"""In the search for near components, normals that are opposite count as 2 x 0.1 m apart."""
+
+NORMAL_CONCENTRATION = 4.0
+"""Exponent of the agreement of normals: 60 degrees cost a factor of e^2."""
+
+GRAZING = 0.05
+"""Cosine between beam and surface at which visibility fades."""
+
+PRIOR_COUNT = 1e-3
+"""Points' worth of weight that keeps an abandoned component defined."""
+
+
+@dataclass(frozen=True)
+class Responsibilities:
+    """Which components explain which points.
+
+    Attributes:
+        component: (N, k) indices of components.
+        alpha: (N, k) responsibilities times the weight of the point's cloud; the rest of each row
+            belongs to the outlier class.
+        inlier_ratio: (J,) part of each cloud's points that components explain.
+    """
+
+    component: IntArray
+    alpha: Array
+    inlier_ratio: Array
+
+
+@dataclass(frozen=True)
+class ShapeQuadratic:
+    """What the points say about the poses of all clouds, with the shape estimated from them.
+
+    As a function of left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then
+    translation) the negative log-likelihood is `d^T H d / 2 + g^T d`, where H is `blocks` on the
+    diagonal minus `coupling^T coupling`: the means of the components are eliminated, since they
+    come from the same points. `blocks` alone, per-cloud information given the shape, claims more.
+
+    Attributes:
+        blocks: (J, 6, 6).
+        gradient: (J, 6).
+        coupling: (3 K, 6 J).
+    """
+
+    blocks: Array
+    gradient: Array
+    coupling: Array
+
+    def joint(self) -> Array:
+        """H, (6 J, 6 J), symmetric positive semidefinite."""
+        size = self.coupling.shape[1]
+        upper = blas.dsyrk(-1.0, self.coupling, trans=1)
+        H = np.triu(upper) + np.triu(upper, 1).T
+        H4 = H.reshape(size // 6, 6, size // 6, 6)
+        j = np.arange(size // 6)
+        H4[j, :, j, :] += self.blocks
+        return np.asarray(H)
+
+
+def seed_mixture(
+    stack: CloudStack, R: Array, t: Array, components: int, sigma_m: float
+) -> Mixture:
+    """A first mixture: components on points drawn where normals can be trusted.
+
+    Points are drawn with equal chance from every cell of a coarse grid over positions and
+    normals, so that a near cloud with many points does not take all components.
+
+    Args:
+        stack: the clouds.
+        R, t: (J, 3, 3), (J, 3) current `T_target_lidar`.
+        components: how many; fewer if there are fewer points.
+        sigma_m: first standard deviation along and across the normal.
+    """
+    rng = np.random.default_rng(components)
+    points = stack.moved(R, t)
+    normals = stack.rotated(R, stack.normals)
+    usable = np.flatnonzero(stack.flatness > 0.5)
+    if len(usable) < 2 * components:
+        usable = np.arange(len(points))
+    cells = np.column_stack(
+        [np.floor(points[usable] / 0.03), np.floor(normals[usable] * 1.5)]
+    ).astype(np.int64)
+    order = rng.permutation(len(usable))
+    _, first, inverse = np.unique(cells[order], axis=0, return_index=True, return_inverse=True)
+    # The rank of each point inside its cell: all first ones, then all second ones, ...
+    by_cell = np.argsort(inverse.ravel(), kind="stable")
+    starts = np.searchsorted(inverse.ravel()[by_cell], np.arange(len(first)))
+    rank = np.empty(len(usable), dtype=np.int64)
+    rank[by_cell] = np.arange(len(usable)) - starts[inverse.ravel()[by_cell]]
+    chosen = usable[order[np.argsort(rank, kind="stable")[:components]]]
+    count = len(chosen)
+    return Mixture(
+        means_target=points[chosen].copy(),
+        normals_target=normals[chosen].copy(),
+        var_normal=np.full(count, sigma_m**2),
+        var_tangent=np.full(count, sigma_m**2),
+        weights=np.full(count, 1.0 / count),
+    )
+
+
+def expect(
+    stack: CloudStack,
+    R: Array,
+    t: Array,
+    mixture: Mixture,
+    outlier_density: float,
+    cloud_weights: Array,
+) -> Responsibilities:
+    """E-step: the responsibilities of SPEC 3, of the nearest components only.
+
+    Args:
+        stack: the clouds.
+        R, t: (J, 3, 3), (J, 3) current `T_target_lidar`.
+        mixture: the current components.
+        outlier_density: gamma / (h (gamma + 1)), per cubic metre.
+        cloud_weights: (J,) robust weight of each cloud.
+    """
+    points = stack.moved(R, t)
+    normals = stack.rotated(R, stack.normals)
+    beams = stack.rotated(R, stack.beams)
+    k = min(NEIGHBOURS, len(mixture.weights))
+    tree = cKDTree(
+        np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target])
+    )
+    # One worker: the trees are small, and threads that wait for each other cost more here.
+    _, near = tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
+    near = near.reshape(len(points), k)
+    n_k = mixture.normals_target[near]
+    offset = points[:, None] - mixture.means_target[near]
+    along = np.einsum("nki,nki->nk", offset, n_k)
+    across2 = np.maximum(np.einsum("nki,nki->nk", offset, offset) - along**2, 0.0)
+    var_n, var_t = mixture.var_normal[near], mixture.var_tangent[near]
+    agreement = np.einsum("nki,ni->nk", n_k, normals)
+    facing = -np.einsum("nki,ni->nk", n_k, beams)
+    log_alpha = (
+        np.log(mixture.weights[near])
+        - 1.5 * np.log(2.0 * np.pi)
+        - 0.5 * np.log(var_n)
+        - np.log(var_t)
+        - 0.5 * along**2 / var_n
+        - 0.5 * across2 / var_t
+        + NORMAL_CONCENTRATION * stack.flatness[:, None] * (agreement - 1.0)
+    )
+    visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 1e-3, 1.0)
+    alpha = np.exp(log_alpha) * visible
+    alpha /= alpha.sum(axis=1, keepdims=True) + outlier_density
+    inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
+        np.append(stack.starts, len(stack.points))
+    )
+    return Responsibilities(near, alpha * cloud_weights[stack.cloud][:, None], inlier)
+
+
+def component_means(points: Array, who: Responsibilities, components: int) -> tuple[Array, Array]:
+    """Weighted means of the points of each component (K, 3), and their weights (K,)."""
+    flat = who.component.ravel()
+    mass = np.bincount(flat, who.alpha.ravel(), components) + PRIOR_COUNT
+    sums = [
+        np.bincount(flat, (who.alpha * points[:, None, axis]).ravel(), components)
+        for axis in range(3)
+    ]
+    return np.stack(sums, axis=1) / mass[:, None], mass
+
+
+def shape_quadratic(
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, who: Responsibilities
+) -> ShapeQuadratic:
+    """The quadratic of `ShapeQuadratic` at the current poses, means eliminated.
+
+    A point y of cloud j contributes `alpha (y - mu)^T W (y - mu)` with W the component's inverse
+    covariance and `dy = [-skew(y), I] d_j`.
+    """
+    count, K = stack.count, len(mixture.weights)
+    points = stack.moved(R, t)
+    means, mass = component_means(points, who, K)
+    near, alpha = who.component, who.alpha
+    n_k = mixture.normals_target[near]
+    w_n, w_t = alpha / mixture.var_normal[near], alpha / mixture.var_tangent[near]
+    W = np.einsum("nk,nki,nkj->nij", w_n - w_t, n_k, n_k, optimize=True)
+    diagonal = np.arange(3)
+    W[:, diagonal, diagonal] += w_t.sum(axis=1)[:, None]
+    S = skew(points)
+    WS = W @ S
+    per_point = np.empty((len(points), 6, 6))
+    per_point[:, :3, :3] = -S @ WS
+    per_point[:, 3:, 3:] = W
+    per_point[:, 3:, :3] = -WS
+    per_point[:, :3, 3:] = -np.swapaxes(WS, 1, 2)
+    blocks = stack.sum_per_cloud(per_point)
+
+    offset = points[:, None] - means[near]
+    along = np.einsum("nki,nki->nk", offset, n_k)
+    pull = np.einsum("nk,nki->ni", (w_n - w_t) * along, n_k)
+    pull += np.einsum("nk,nki->ni", w_t, offset)
+    gradient = stack.sum_per_cloud(np.concatenate([np.cross(points, pull), pull], axis=1))
+
+    # Sums of alpha and alpha * y per cloud and component: what the component means depend on.
+    cell = (stack.cloud[:, None] * K + near).ravel()
+    mass_jk = np.bincount(cell, alpha.ravel(), count * K).reshape(count, K)
+    sum_jk = np.stack(
+        [
+            np.bincount(cell, (alpha * points[:, None, axis]).ravel(), count * K)
+            for axis in range(3)
+        ],
+        axis=-1,
+    ).reshape(count, K, 3)
+    lever = np.zeros((count, K, 3, 6))
+    lever[..., :3] = -skew(sum_jk)
+    lever[..., diagonal, diagonal + 3] = mass_jk[..., None]
+    n = mixture.normals_target
+    root = (mixture.var_normal**-0.5 - mixture.var_tangent**-0.5)[:, None, None] * (
+        n[:, :, None] * n[:, None, :]
+    )
+    root[:, diagonal, diagonal] += (mixture.var_tangent**-0.5)[:, None]
+    root /= np.sqrt(mass)[:, None, None]
+    coupling = np.matmul(root[None], lever).transpose(1, 2, 0, 3).reshape(3 * K, 6 * count)
+    return ShapeQuadratic(blocks, gradient, coupling)
+
+
+def maximise_shape(
+    stack: CloudStack,
+    R: Array,
+    t: Array,
+    mixture: Mixture,
+    who: Responsibilities,
+    sigma_floor_m: float,
+) -> Mixture:
+    """M-step of the components at new poses: means, normals, variances, priors.
+
+    Args:
+        stack: the clouds.
+        R, t: (J, 3, 3), (J, 3) the new `T_target_lidar`.
+        mixture: the components of the E-step.
+        who: its responsibilities.
+        sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
+    """
+    K = len(mixture.weights)
+    points = stack.moved(R, t)
+    means, mass = component_means(points, who, K)
+    flat = who.component.ravel()
+    trusted = who.alpha * stack.flatness[:, None]
+    rotated = stack.rotated(R, stack.normals)
+    normals = PRIOR_COUNT * mixture.normals_target + np.stack(
+        [
+            np.bincount(flat, (trusted * rotated[:, None, axis]).ravel(), K)
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    offset = points[:, None] - means[who.component]
+    along2 = np.einsum("nki,nki->nk", offset, normals[who.component]) ** 2
+    all2 = np.einsum("nki,nki->nk", offset, offset)
+    floor = sigma_floor_m**2
+    var_n = np.bincount(flat, (who.alpha * along2).ravel(), K) / mass
+    var_t = np.bincount(flat, (who.alpha * (all2 - along2)).ravel(), K) / (2.0 * mass)
+    return Mixture(
+        means_target=means,
+        normals_target=normals,
+        var_normal=np.maximum(var_n, floor),
+        var_tangent=np.maximum(var_t, floor),
+        weights=mass / mass.sum(),
+    )

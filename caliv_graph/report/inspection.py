@@ -1,0 +1,242 @@
+"""What a recording holds: clouds, frames, gaps, the drive, and which LiDAR sees the target when."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import Recording, TargetObservation
+from caliv_graph.progress import Progress
+from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
+
+Run = tuple[int, int]
+"""First and last frame number, or the frames before and after a gap."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points per cloud, without NaN and zero returns and those outside the ranges of the config.
+
+    Attributes:
+        min: of the emptiest cloud.
+        median: over the clouds.
+        max: of the fullest cloud.
+    """
+
+    min: int
+    median: int
+    max: int
+
+
+@dataclass(frozen=True)
+class LidarSummary:
+    """The clouds of one LiDAR.
+
+    Attributes:
+        clouds: how many there are.
+        frames: first and last frame number.
+        step: frame numbers from one cloud to the next, mostly.
+        gaps: frames before and after each place where clouds are missing from that rhythm.
+        rate_hz: nominal, for the files carry no time; None if there is but one cloud.
+        points: points per cloud.
+    """
+
+    clouds: int
+    frames: Run
+    step: int
+    gaps: tuple[Run, ...]
+    rate_hz: float | None
+    points: Points
+
+
+@dataclass(frozen=True)
+class DriveSummary:
+    """The vehicle's motion by the given poses.
+
+    Attributes:
+        poses: how many there are.
+        duration_s: nominal, from the first to the last.
+        path_length_m: sum of the distances between poses.
+        climb_m: from the lowest to the highest.
+        heading_change_deg: sum of all turns, positive to the left.
+        turned_deg: the same without regard to the sign.
+    """
+
+    poses: int
+    duration_s: float
+    path_length_m: float
+    climb_m: float
+    heading_change_deg: float
+    turned_deg: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """How one LiDAR sees one target.
+
+    Attributes:
+        scans: scans with enough points on the target.
+        frames: runs of frames, in the LiDAR's rhythm, from first to last.
+        points: points on the target per scan; None if it is never seen.
+        range_m: nearest and farthest distance of the target from the LiDAR; None if never seen.
+    """
+
+    scans: int
+    frames: tuple[Run, ...]
+    points: Points | None
+    range_m: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class TargetSummary:
+    """One target placement.
+
+    Attributes:
+        name: what to call it.
+        centre_map_m: rough centre in the map.
+        lidars: sightings per LiDAR, also of those that never see it.
+    """
+
+    name: str
+    centre_map_m: tuple[float, float, float]
+    lidars: dict[str, Sighting]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a recording holds.
+
+    Attributes:
+        data: the recording.
+        lidars: per LiDAR.
+        drive: the vehicle's motion.
+        targets: who sees what when; None if nobody was asked to look.
+    """
+
+    data: str
+    lidars: dict[str, LidarSummary]
+    drive: DriveSummary
+    targets: tuple[TargetSummary, ...] | None = None
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        return asdict(self)
+
+
+def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
+    """Reads all of a recording once, a cloud at a time.
+
+    Raises:
+        RecordingError: a cloud is missing, empty, cut off or damaged.
+    """
+    lidars = {}
+    total = sum(len(recording.scan_stamps_ns(lidar)) for lidar in recording.lidars)
+    with progress.stage("reading the clouds", total) as advance:
+        for lidar in recording.lidars:
+            counts = []
+            for scan in recording.scans(lidar):
+                counts.append(len(scan.points_lidar))
+                advance()
+            lidars[lidar] = _summarise_lidar(_frames(recording, lidar), counts)
+    return Inspection(data=recording.name, lidars=lidars, drive=_summarise_drive(recording))
+
+
+def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
+    """Adds which LiDAR sees the target when.
+
+    Args:
+        inspection: of the recording.
+        observations: the targets found in it.
+    """
+    targets = tuple(
+        TargetSummary(
+            name=observation.name,
+            centre_map_m=_triple(observation.centre_map),
+            lidars={
+                lidar: _summarise_sighting(observation, lidar, summary.step)
+                for lidar, summary in inspection.lidars.items()
+            },
+        )
+        for observation in observations
+    )
+    return replace(inspection, targets=targets)
+
+
+def _frames(recording: Recording, lidar: str) -> list[int]:
+    return [stamp_ns // FRAME_PERIOD_NS for stamp_ns in recording.scan_stamps_ns(lidar)]
+
+
+def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSummary:
+    steps = np.diff(frames)
+    # The lower median: a step that occurs, where the mean of two would not.
+    step = int(np.sort(steps)[(len(steps) - 1) // 2]) if len(steps) else 1
+    gaps = [
+        (before, after) for before, after in itertools.pairwise(frames) if after - before > step
+    ]
+    rate_hz = NANOSECONDS_PER_SECOND / (step * FRAME_PERIOD_NS) if len(steps) else None
+    return LidarSummary(
+        clouds=len(frames),
+        frames=(frames[0], frames[-1]),
+        step=step,
+        gaps=tuple(gaps),
+        rate_hz=rate_hz,
+        points=_points(counts),
+    )
+
+
+def _summarise_drive(recording: Recording) -> DriveSummary:
+    given = recording.given_poses()
+    poses = given.T_map_vehicle
+    positions_map = np.array([pose.translation() for pose in poses])
+    turns = [
+        gtsam.Rot3.rpy(before.rotation().between(after.rotation()))[2]
+        for before, after in itertools.pairwise(poses)
+    ]
+    steps_m = np.linalg.norm(np.diff(positions_map, axis=0), axis=1)
+    return DriveSummary(
+        poses=len(poses),
+        duration_s=float(given.stamps_ns[-1] - given.stamps_ns[0]) / NANOSECONDS_PER_SECOND,
+        path_length_m=float(steps_m.sum()),
+        climb_m=float(np.ptp(positions_map[:, 2])),
+        heading_change_deg=math.degrees(float(np.sum(turns))),
+        turned_deg=math.degrees(float(np.sum(np.abs(turns)))),
+    )
+
+
+def _summarise_sighting(observation: TargetObservation, lidar: str, step: int) -> Sighting:
+    clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
+    if not clouds:
+        return Sighting(scans=0, frames=(), points=None, range_m=None)
+    ranges_m = [float(np.linalg.norm(cloud.points_lidar.mean(axis=0))) for cloud in clouds]
+    return Sighting(
+        scans=len(clouds),
+        frames=_runs([cloud.stamp_ns // FRAME_PERIOD_NS for cloud in clouds], step),
+        points=_points([len(cloud.points_lidar) for cloud in clouds]),
+        range_m=(min(ranges_m), max(ranges_m)),
+    )
+
+
+def _runs(frames: Sequence[int], step: int) -> tuple[Run, ...]:
+    runs: list[Run] = []
+    for frame in frames:
+        if runs and frame - runs[-1][1] <= step:
+            runs[-1] = (runs[-1][0], frame)
+        else:
+            runs.append((frame, frame))
+    return tuple(runs)
+
+
+def _points(counts: Sequence[int]) -> Points:
+    return Points(min=min(counts), median=int(np.median(counts)), max=max(counts))
+
+
+def _triple(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

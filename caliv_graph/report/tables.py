@@ -1,0 +1,288 @@
+"""Results as tables for a terminal. Degrees and millimetres exist here only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.covariance import parent_axes_covariance
+from caliv_graph.products import Array, Calibration, LidarResult
+from caliv_graph.progress import StageRecord, count_text
+from caliv_graph.report.inspection import Inspection, Run, Sighting
+from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
+
+_SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Order in tables: as people write a mounting down."""
+
+_MOST_DECIMALS = 6
+
+_HELD = "held"
+
+_STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
+
+
+def calibration_table(
+    calibration: Calibration, stages: Sequence[StageRecord], seconds: float
+) -> RenderableType:
+    """The closing words of `calibrate`.
+
+    An axis that the drive does not determine is marked as held, and its value, in brackets, is
+    only as precise as what decided it.
+
+    Args:
+        calibration: the result.
+        stages: what was done.
+        seconds: how long all of it took.
+    """
+    parts: list[RenderableType] = [_status_line(calibration), "", _mountings(calibration)]
+    if len(calibration.lidars) > 1:
+        parts += ["", _sensor_to_sensor(calibration)]
+    if not _all_determined(calibration):
+        parts.append(
+            Text(
+                f"{_HELD}: the drive does not determine this axis; the value in brackets is "
+                "decided by the initial guess.",
+                style="yellow",
+            )
+        )
+    parts += _sentences("What the drive could not tell:", _undetermined_texts(calibration))
+    weak = [direction.text for direction in calibration.weak]
+    parts += _sentences("What it told only weakly:", weak)
+    parts += _sentences("Asked for in the config, but not reached:", calibration.unmet)
+    parts += ["", _times(stages, seconds)]
+    return Group(*parts)
+
+
+def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) -> RenderableType:
+    """Errors against the truth.
+
+    Args:
+        evaluation: what `uncertainty.evaluation.evaluate` returned.
+        calibration: what was evaluated; tells which axes were held.
+    """
+    table = _table("Errors in vehicle axes (estimate against truth)", "", *_headings("mm", "mrad"))
+    table.add_column("NEES\n6 dof", justify="right")
+    any_held = False
+    for name, errors in evaluation["lidars"].items():
+        determined = calibration.lidars[name].determined
+        any_held |= not all(determined.values())
+        table.add_row(Text(f"S2V {name}"), *_error_cells(errors["s2v"], determined))
+    for errors in evaluation["pairs"]:
+        # The verdict on a pair's axes is about those of `to`, and these errors are not.
+        seen = all(calibration.lidars[errors[end]].saw_target for end in ("from", "to"))
+        name = f"S2S {errors['from']} to {errors['to']}"
+        table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
+    if not any_held:
+        return table
+    note = "In brackets: the drive did not determine this axis; its error is that of the guess."
+    return Group(table, Text(note, style="yellow"))
+
+
+def inspection_table(inspection: Inspection) -> RenderableType:
+    """What a recording holds."""
+    drive = inspection.drive
+    table = _table(
+        "Clouds (frame numbers; rates are nominal, at 10 frames per second)",
+        "LiDAR",
+        "clouds",
+        "frames",
+        "step",
+        "rate\nHz",
+        "points per cloud\nmin / median / max",
+    )
+    for name, lidar in inspection.lidars.items():
+        points = lidar.points
+        table.add_row(
+            Text(name),
+            str(lidar.clouds),
+            f"{lidar.frames[0]} to {lidar.frames[1]}",
+            str(lidar.step),
+            "-" if lidar.rate_hz is None else f"{lidar.rate_hz:.3g}",
+            f"{points.min} / {points.median} / {points.max}",
+        )
+    parts: list[RenderableType] = [Text(inspection.data, style="bold"), "", table]
+    parts += [
+        Text(f"{name}: clouds are missing between the frames {_runs(lidar.gaps, ' and ')}")
+        for name, lidar in inspection.lidars.items()
+        if lidar.gaps
+    ]
+    parts += [
+        "",
+        Text(
+            f"Drive: {drive.poses} poses, {drive.path_length_m:.1f} m in {drive.duration_s:.1f} s "
+            f"(nominal), {drive.climb_m:.2f} m up and down; heading changes by "
+            f"{drive.heading_change_deg:+.1f} degrees (positive: left), turns add up to "
+            f"{drive.turned_deg:.1f} degrees."
+        ),
+    ]
+    for target in inspection.targets or ():
+        x, y, z = target.centre_map_m
+        seen = _table(
+            f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map",
+            "LiDAR",
+            "scans",
+            "range\nm",
+            "points per scan\nmin / median / max",
+            "frames",
+        )
+        for name, sighting in target.lidars.items():
+            seen.add_row(Text(name), *_sighting_cells(sighting))
+        parts += ["", seen]
+    return Group(*parts)
+
+
+def _status_line(calibration: Calibration) -> Text:
+    names = ", ".join(calibration.lidars)
+    status = Text(calibration.status, style=_STATUS_STYLES.get(calibration.status, "bold"))
+    return Text.assemble(
+        "Status: ", status, f". LiDARs: {names}; reference {calibration.reference}."
+    )
+
+
+def _mountings(calibration: Calibration) -> Table:
+    table = _table(
+        "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes",
+        "LiDAR",
+        *_headings("m", "deg"),
+        "scans\nused",
+    )
+    for name, result in calibration.lidars.items():
+        cells = _pose_cells(result.T_vehicle_lidar, result.cov, result.determined)
+        table.add_row(Text(name), *cells, _scans_cell(result))
+    return table
+
+
+def _scans_cell(result: LidarResult) -> Text:
+    if result.saw_target:
+        return Text(str(result.scans_used))
+    return Text("no\ntarget", style="bold yellow")
+
+
+def _sensor_to_sensor(calibration: Calibration) -> Table:
+    table = _table(
+        "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
+        "from\nto",
+        *_headings("m", "deg"),
+    )
+    for source, to in sensor_pairs(calibration.lidars, calibration.reference):
+        T_vehicle_from = calibration.lidars[source].T_vehicle_lidar
+        T_to_from = calibration.lidars[to].T_vehicle_lidar.between(T_vehicle_from)
+        cov = pair_covariance(calibration, source, to)
+        determined = pair_determined(calibration, source, to)
+        table.add_row(Text(f"{source}\n{to}"), *_pose_cells(T_to_from, cov, determined))
+    return table
+
+
+def _all_determined(calibration: Calibration) -> bool:
+    return all(all(result.determined.values()) for result in calibration.lidars.values())
+
+
+def _undetermined_texts(calibration: Calibration) -> list[str]:
+    texts = [direction.text for direction in calibration.undetermined]
+    return texts + [
+        f"LiDAR '{name}' never saw a target: its mounting is the initial guess"
+        for name, result in calibration.lidars.items()
+        if not result.saw_target
+    ]
+
+
+def _sentences(heading: str, texts: Iterable[str]) -> list[RenderableType]:
+    lines: list[RenderableType] = [Text(f"  - {text}") for text in texts]
+    return ["", Text(heading, style="bold"), *lines] if lines else []
+
+
+def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
+    table = _table("Time", "stage", "seconds", "done")
+    for stage in stages:
+        taken = "-" if stage.seconds is None else f"{stage.seconds:.2f}"
+        table.add_row(Text(f"{'  ' * stage.depth}{stage.name}"), taken, count_text(stage))
+    table.add_row("all", f"{seconds:.2f}", "", style="bold")
+    return table
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+        show_edge=False,
+    )
+    for number, column in enumerate(columns):
+        last_of_text = column == "frames" and number == len(columns) - 1
+        left = number == 0 or last_of_text
+        table.add_column(
+            column, justify="left" if left else "right", no_wrap=not last_of_text, overflow="fold"
+        )
+    return table
+
+
+def _headings(length: str, angle: str) -> list[str]:
+    return [f"{axis}\n{length if axis in 'xyz' else angle}" for axis in _SHOWN_AXES]
+
+
+def _pose_cells(T_parent_child: Any, cov: Array, determined: Mapping[str, bool]) -> list[Text]:
+    """A cell per axis of `_SHOWN_AXES`: the value and, below it, its sigma in the parent's axes."""
+    sigma = np.sqrt(np.diag(parent_axes_covariance(T_parent_child, cov)))
+    values = np.concatenate([T_parent_child.rotation().rpy(), T_parent_child.translation()])
+    values[:3], sigma[:3] = np.degrees(values[:3]), np.degrees(sigma[:3])
+    cells = dict(zip(AXES, zip(values, sigma, strict=True), strict=True))
+    return [_value_cell(*cells[axis], determined[axis]) for axis in _SHOWN_AXES]
+
+
+def _value_cell(value: float, sigma: float, determined: bool) -> Text:
+    """A value to two digits of its sigma; or, held, to one and in brackets."""
+    if not determined:
+        return Text(f"({_fixed(value, _decimals(sigma, 1))})\n{_HELD}", style="yellow")
+    decimals = _decimals(sigma, 2)
+    return Text(f"{_fixed(value, decimals)}\n±{sigma:.{decimals}f}")
+
+
+def _decimals(sigma: float, digits: int) -> int:
+    """Decimals that show so many digits of a sigma."""
+    if not sigma > 0.0:
+        return 3
+    return min(max(digits - 1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS)
+
+
+def _fixed(value: float, decimals: int) -> str:
+    # Rounded first: a minus before zeros says nothing.
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+
+
+def _error_cells(errors: Mapping[str, Any], determined: Mapping[str, bool]) -> list[Text]:
+    values = dict(zip(AXES, [*errors["rotation_rad"], *errors["translation_m"]], strict=True))
+    cells = []
+    for axis in _SHOWN_AXES:
+        text = _fixed(1e3 * values[axis], 2)
+        cells.append(Text(text) if determined[axis] else Text(f"({text})", style="yellow"))
+    nees = errors["nees"]
+    return [*cells, Text("-" if nees is None else f"{nees:.2f}")]
+
+
+def _sighting_cells(sighting: Sighting) -> list[str]:
+    if sighting.points is None or sighting.range_m is None:
+        return ["0", "-", "-", "never"]
+    points, (near, far) = sighting.points, sighting.range_m
+    return [
+        str(sighting.scans),
+        f"{near:.1f} to {far:.1f}",
+        f"{points.min} / {points.median} / {points.max}",
+        _runs(sighting.frames, " to "),
+    ]
+
+
+def _runs(runs: Iterable[Run], between: str) -> str:
+    return ", ".join(
+        str(first) if first == last else f"{first}{between}{last}" for first, last in runs
+    )

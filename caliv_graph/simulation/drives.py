@@ -1,0 +1,264 @@
+"""Drives: where the vehicle is at any time, analytic in time and in path length.
+
+The vehicle steers its front axle (Ackermann, single-track model) and its frame is on the ground at
+the rear axle: it moves along its own x axis, and its heading changes by the curvature per metre.
+Speed is a function of time, curvature one of path length, so that the path does not depend on the
+speed. Distance and heading are closed-form; the position is their integral by quadrature, to
+better than a micrometre.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import assert_never
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import Array, IntArray
+from caliv_graph.simulation.scenario import (
+    ArcDrive,
+    DriveModel,
+    FigureEightDrive,
+    SCurveDrive,
+    StandstillDrive,
+    StraightDrive,
+)
+
+PANEL_M = 0.25
+"""Length of one quadrature panel. With 8 nodes the rule is exact to rounding at driving radii."""
+
+GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+def smoothstep(u: npt.ArrayLike) -> Array:
+    """0 below 0, 1 above 1, between them 10 u^3 - 15 u^4 + 6 u^5: two continuous derivatives."""
+    v = np.clip(np.asarray(u, dtype=np.float64), 0.0, 1.0)
+    return v**3 * (10.0 + v * (6.0 * v - 15.0))
+
+
+def smoothstep_rate(u: npt.ArrayLike) -> Array:
+    """The derivative of `smoothstep`."""
+    v = np.clip(np.asarray(u, dtype=np.float64), 0.0, 1.0)
+    return 30.0 * (v * (1.0 - v)) ** 2
+
+
+def smoothstep_integral(u: npt.ArrayLike) -> Array:
+    """The integral of `smoothstep` from 0."""
+    w = np.asarray(u, dtype=np.float64)
+    v = np.clip(w, 0.0, 1.0)
+    return v**4 * (2.5 + v * (v - 3.0)) + np.maximum(w - 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class SpeedProfile:
+    """Speed over time: standing, a smooth start, constant speed, a smooth stop.
+
+    Attributes:
+        speed_m_s: the constant speed; 0 is a vehicle that never moves.
+        standstill_s: time before it starts.
+        ramp_s: duration of the start, and of the stop.
+        duration_s: time at which it stands again.
+    """
+
+    speed_m_s: float
+    standstill_s: float
+    ramp_s: float
+    duration_s: float
+
+    def _progress(self, time_s: Array) -> tuple[Array, Array]:
+        stop_s = self.duration_s - self.ramp_s
+        return (time_s - self.standstill_s) / self.ramp_s, (time_s - stop_s) / self.ramp_s
+
+    def distance_m(self, time_s: Array) -> Array:
+        """Path length since the start, any shape."""
+        start, stop = self._progress(time_s)
+        ramps = smoothstep_integral(start) - smoothstep_integral(stop)
+        return self.speed_m_s * self.ramp_s * ramps
+
+    def speed(self, time_s: Array) -> Array:
+        """Speed in m/s, any shape."""
+        start, stop = self._progress(time_s)
+        return self.speed_m_s * (smoothstep(start) - smoothstep(stop))
+
+    def acceleration(self, time_s: Array) -> Array:
+        """Acceleration along the path in m/s^2, any shape."""
+        start, stop = self._progress(time_s)
+        rate = smoothstep_rate(start) - smoothstep_rate(stop)
+        return self.speed_m_s / self.ramp_s * rate
+
+
+@dataclass(frozen=True)
+class CurvatureProfile:
+    """Curvature over path length: constant pieces with smooth transitions.
+
+    Attributes:
+        initial_1_m: curvature at the start in 1/m, positive to the left.
+        changes: per change the path length of its middle (m), the length over which it happens (m)
+            and the change of curvature (1/m).
+    """
+
+    initial_1_m: float
+    changes: tuple[tuple[float, float, float], ...] = ()
+
+    def curvature(self, distance_m: Array) -> Array:
+        """Curvature in 1/m, any shape."""
+        value = np.full_like(distance_m, self.initial_1_m)
+        for middle, length, change in self.changes:
+            value += change * smoothstep((distance_m - middle) / length + 0.5)
+        return value
+
+    def heading(self, distance_m: Array) -> Array:
+        """The integral of the curvature: heading gained since the start in radians, any shape."""
+        value = self.initial_1_m * distance_m
+        for middle, length, change in self.changes:
+            value += change * length * smoothstep_integral((distance_m - middle) / length + 0.5)
+        return value
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The vehicle's state at n times.
+
+    Attributes:
+        stamps_ns: (n,) since the start of the drive.
+        xy_map: (n, 2) position of the rear axle in metres.
+        heading_rad: (n,) from map +x, not wrapped.
+        speed_m_s: (n,) along the vehicle's x axis.
+        acceleration_m_s2: (n,) rate of the speed.
+        curvature_1_m: (n,) of the path of the rear axle, positive to the left.
+        steering_rad: (n,) angle of the front wheels, positive to the left.
+    """
+
+    stamps_ns: IntArray
+    xy_map: Array
+    heading_rad: Array
+    speed_m_s: Array
+    acceleration_m_s2: Array
+    curvature_1_m: Array
+    steering_rad: Array
+
+    @property
+    def yaw_rate_rad_s(self) -> Array:
+        """(n,) heading's rate: speed times curvature."""
+        return self.speed_m_s * self.curvature_1_m
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive on flat ground.
+
+    Attributes:
+        speed: speed over time.
+        curvature: curvature over path length.
+        wheelbase_m: distance of the axles.
+        start_xy_m: start in the map.
+        start_yaw_rad: heading at the start.
+    """
+
+    speed: SpeedProfile
+    curvature: CurvatureProfile
+    wheelbase_m: float
+    start_xy_m: tuple[float, float] = (0.0, 0.0)
+    start_yaw_rad: float = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Time at which the vehicle stands again."""
+        return self.speed.duration_s
+
+    def _displacement(self, begin_m: Array, end_m: Array) -> Array:
+        """(n, 2) integral of the direction of travel between path lengths (n,) and (n,)."""
+        half = 0.5 * (end_m - begin_m)
+        nodes_m = (0.5 * (end_m + begin_m))[:, None] + half[:, None] * GAUSS_NODES
+        heading = self.start_yaw_rad + self.curvature.heading(nodes_m)
+        direction = np.stack([np.cos(heading), np.sin(heading)])
+        displacement: Array = (half * (direction @ GAUSS_WEIGHTS)).T
+        return displacement
+
+    @cached_property
+    def _panel_starts_xy(self) -> Array:
+        """(p, 2) position at the start of each quadrature panel."""
+        length_m = float(self.speed.distance_m(np.array(self.duration_s)))
+        begin_m = PANEL_M * np.arange(math.floor(length_m / PANEL_M), dtype=np.float64)
+        steps = self._displacement(begin_m, begin_m + PANEL_M)
+        start: Array = np.array(self.start_xy_m, dtype=np.float64)
+        return start + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+    def motion(self, stamps_ns: IntArray) -> Motion:
+        """The state at any times; before the start and after the end the vehicle stands.
+
+        Args:
+            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
+        """
+        time_s = np.asarray(stamps_ns, dtype=np.int64) / NANOSECONDS_PER_SECOND
+        distance_m = self.speed.distance_m(time_s)
+        starts = self._panel_starts_xy
+        panel = np.clip((distance_m / PANEL_M).astype(np.int64), 0, len(starts) - 1)
+        panel_m: Array = PANEL_M * panel.astype(np.float64)
+        curvature = self.curvature.curvature(distance_m)
+        return Motion(
+            stamps_ns=np.asarray(stamps_ns, dtype=np.int64),
+            xy_map=starts[panel] + self._displacement(panel_m, distance_m),
+            heading_rad=self.start_yaw_rad + self.curvature.heading(distance_m),
+            speed_m_s=self.speed.speed(time_s),
+            acceleration_m_s2=self.speed.acceleration(time_s),
+            curvature_1_m=curvature,
+            steering_rad=np.arctan(self.wheelbase_m * curvature),
+        )
+
+    def poses(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> tuple[gtsam.Pose3, ...]:
+        """T_map_vehicle at any times.
+
+        Args:
+            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
+            z_map: height of the vehicle frame in the map in metres, a number or (n,).
+        """
+        motion = self.motion(stamps_ns)
+        heights = np.broadcast_to(np.asarray(z_map, dtype=np.float64), motion.heading_rad.shape)
+        return tuple(
+            gtsam.Pose3(gtsam.Rot3.Yaw(float(yaw)), np.array([x, y, z]))
+            for (x, y), yaw, z in zip(motion.xy_map, motion.heading_rad, heights, strict=True)
+        )
+
+
+def _figure_eight(model: FigureEightDrive) -> tuple[SpeedProfile, float]:
+    """Speed profile, and path length of the change, for which each loop turns by 360 degrees."""
+    # The first half of the change turns less than the arc would: the loop is longer by as much.
+    longer_m = 2.0 * float(smoothstep_integral(0.5)) * model.transition_m
+    middle_m = 2.0 * math.pi * model.radius_m + longer_m
+    rolling_s = 2.0 * middle_m / model.speed_m_s + model.ramp_s
+    duration_s = model.standstill_s + rolling_s
+    return (
+        SpeedProfile(model.speed_m_s, model.standstill_s, model.ramp_s, duration_s),
+        middle_m,
+    )
+
+
+def make_drive(model: DriveModel) -> Drive:
+    """The drive that a scenario describes."""
+    start_yaw_rad = math.radians(model.start_yaw_deg)
+    if isinstance(model, StandstillDrive):
+        speed = SpeedProfile(0.0, 0.0, 1.0, model.duration_s)
+        return Drive(speed, CurvatureProfile(0.0), 1.0, model.start_xy_m, start_yaw_rad)
+    if isinstance(model, FigureEightDrive):
+        speed, middle_m = _figure_eight(model)
+    else:
+        speed = SpeedProfile(model.speed_m_s, model.standstill_s, model.ramp_s, model.duration_s)
+        middle_m = 0.5 * float(speed.distance_m(np.array(model.duration_s)))
+    if isinstance(model, StraightDrive):
+        curvature = CurvatureProfile(0.0)
+    else:
+        first = (1.0 if model.turn == "left" else -1.0) / model.radius_m
+        if isinstance(model, ArcDrive):
+            curvature = CurvatureProfile(first)
+        elif isinstance(model, SCurveDrive | FigureEightDrive):
+            change = (middle_m, model.transition_m, -2.0 * first)
+            curvature = CurvatureProfile(first, (change,))
+        else:
+            assert_never(model)
+    return Drive(speed, curvature, model.wheelbase_m, model.start_xy_m, start_yaw_rad)

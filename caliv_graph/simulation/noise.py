@@ -1,0 +1,113 @@
+"""What a simulation draws besides the LiDARs' noise; each from a random stream of its own.
+
+Streams are separate so that a change in one place (another LiDAR, other pose errors) leaves all
+other draws of the same seed as they were.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config import Mounting
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import ConfigError
+from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.products import Array, IntArray
+from caliv_graph.simulation.scenario import InitialGuessModel, PoseNoiseModel, SuspensionModel
+
+
+class Stream(enum.IntEnum):
+    """What is drawn. The numbers are part of what a seed means: append, never renumber."""
+
+    POSES = 0
+    SUSPENSION = 1
+    INITIAL_GUESS = 2
+    LIDAR = 3
+
+
+def random_stream(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
+    """The generator of one stream; `index` tells LiDARs apart.
+
+    Raises:
+        ConfigError: the seed is negative.
+    """
+    if seed < 0:
+        raise ConfigError(f"seed: must be 0 or a positive whole number, not {seed}")
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, index)))
+
+
+def vehicle_heights(model: SuspensionModel, count: int, rng: np.random.Generator) -> Array:
+    """(count,) heights of the vehicle frame above the ground in metres, one per frame.
+
+    White from frame to frame: frames are 0.1 s apart, and a body on its springs forgets as fast.
+    """
+    common_m = model.height_sigma_m * rng.standard_normal()
+    heights_m: Array = common_m + model.heave_sigma_m * rng.standard_normal(count)
+    return heights_m
+
+
+def noisy_poses(
+    stamps_ns: IntArray,
+    T_map_vehicle: Sequence[gtsam.Pose3],
+    model: PoseNoiseModel,
+    rng: np.random.Generator,
+) -> tuple[gtsam.Pose3, ...]:
+    """Poses as a filter would give them: the true ones with white errors and a random walk.
+
+    Args:
+        stamps_ns: (n,) strictly increasing.
+        T_map_vehicle: n true poses.
+        model: sizes of the errors.
+        rng: their source.
+
+    Returns:
+        n poses. Position errors are along map axes. The white rotation error is a right
+        perturbation (vehicle axes); the walk is one of the map (left), where a filter's heading
+        drifts.
+    """
+    n = len(stamps_ns)
+    white = rng.standard_normal((n, 6)) * np.repeat(
+        [model.rotation_sigma_rad, model.position_sigma_m], 3
+    )
+    root_dt = np.sqrt(np.diff(stamps_ns, prepend=stamps_ns[:1]) / NANOSECONDS_PER_SECOND)
+    walk = np.cumsum(rng.standard_normal((n, 6)) * root_dt[:, None], axis=0) * np.repeat(
+        [model.rotation_walk_rad_sqrts, model.position_walk_m_sqrts], 3
+    )
+    return tuple(
+        gtsam.Pose3(
+            gtsam.Rot3.Expmap(w[:3]).compose(true.rotation()).compose(gtsam.Rot3.Expmap(e[:3])),
+            true.translation() + w[3:] + e[3:],
+        )
+        for true, e, w in zip(T_map_vehicle, white, walk, strict=True)
+    )
+
+
+def perturbed_mounting(
+    mounting: Mounting, model: InitialGuessModel, rng: np.random.Generator
+) -> Mounting:
+    """An initial guess: uniform errors of position per vehicle axis, and of rotation.
+
+    The rotation is R_true Rxyz, with roll, pitch and yaw of Rxyz drawn uniformly (CaLiV, section
+    IV, Evaluation).
+
+    Returns:
+        The guess, to a micrometre and a microdegree.
+    """
+    shift_m = rng.uniform(-1.0, 1.0, 3) * model.translation_m
+    turn_rad = rng.uniform(-1.0, 1.0, 3) * math.radians(model.rotation_deg)
+    T_vehicle_lidar = pose_from_mounting(mounting)
+    rotation = T_vehicle_lidar.rotation().compose(gtsam.Rot3.RzRyRx(*turn_rad))
+    return Mounting(
+        xyz=_rounded(T_vehicle_lidar.translation() + shift_m),
+        rpy_deg=_rounded(np.degrees(rotation.rpy())),
+    )
+
+
+def _rounded(values: Array) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 6) for value in values)
+    return (x, y, z)

@@ -1,0 +1,1 @@
+"""Covariance, observability and consistency: on matrices, without the graph."""

@@ -1,0 +1,86 @@
+"""Pairs of LiDARs: which there are, their covariance, and what the drive told about them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.covariance import relative_covariance, relative_jacobian
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
+from caliv_graph.products import Array, Calibration
+
+_SCALE = np.array([1e3, 1e3, 1e3, 1e2, 1e2, 1e2])
+"""Makes 1 mrad and 10 mm compare (SPEC 4)."""
+
+_LEAST_SHARE = 0.01
+_LEAST_SHARE_OF_AXIS = 0.05
+"""SPEC 4: what counts as a part of the undetermined subspace, and which axes it is seen on."""
+
+
+def sensor_pairs(lidars: Iterable[str], reference: str) -> tuple[tuple[str, str], ...]:
+    """Every pair of LiDARs once, as (from, to).
+
+    `to` is the reference if it belongs to the pair (the paper's L2), else the later of the two.
+    """
+    return tuple(
+        (second, first) if first == reference else (first, second)
+        for first, second in itertools.combinations(lidars, 2)
+    )
+
+
+def pair_covariance(calibration: Calibration, source: str, to: str) -> Array:
+    """Covariance of `T_to_from`, (6, 6), right perturbation (frame of `from`), priors included."""
+    a, b = (calibration.lidars[name].T_vehicle_lidar for name in (source, to))
+    return relative_covariance(a, b, _block(calibration, calibration.cov_joint, source, to))
+
+
+def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
+    """Which axes of `T_to_from` the drive determined, by the rule of SPEC 4 for a LiDAR's axes.
+
+    The undetermined subspace is projected onto the pair: a direction in which both LiDARs move
+    together, such as the rotation about the turn centre, leaves the pair alone.
+
+    Returns:
+        Per axis of `conventions.AXES`: rotation about, shift along the axes of `to`.
+    """
+    results = [calibration.lidars[name] for name in (source, to)]
+    if not all(result.saw_target for result in results):
+        return dict.fromkeys(AXES, False)
+    if not calibration.undetermined:
+        return dict.fromkeys(AXES, True)
+    names = list(calibration.lidars)
+    scale = np.tile(_SCALE, len(names))
+    directions = np.array(
+        [
+            np.concatenate([direction.vector.get(name, np.zeros(6)) for name in names])
+            for direction in calibration.undetermined
+        ]
+    )
+    basis, _ = np.linalg.qr((directions * scale).T)
+    T_from, T_to = (result.T_vehicle_lidar for result in results)
+    J = relative_jacobian(T_from, T_to)
+    J[:, :6] @= right_to_vehicle_axes(T_from).T
+    J[:, 6:] @= right_to_vehicle_axes(T_to).T
+    J = right_to_vehicle_axes(T_to.between(T_from)) @ J
+    rows = _rows(calibration, source, to)
+    seen = (_SCALE[:, None] * J / scale[rows]) @ basis[rows]
+    shares = np.sum(seen**2, axis=1)
+    total = float(shares.sum())
+    return {
+        axis: bool(total <= _LEAST_SHARE or share <= _LEAST_SHARE_OF_AXIS * total)
+        for axis, share in zip(AXES, shares, strict=True)
+    }
+
+
+def _rows(calibration: Calibration, *lidars: str) -> list[int]:
+    """Rows of the joint matrices that belong to these LiDARs, in the order of the arguments."""
+    names = list(calibration.lidars)
+    return [6 * names.index(lidar) + axis for lidar in lidars for axis in range(6)]
+
+
+def _block(calibration: Calibration, matrix: Array, *lidars: str) -> Array:
+    rows = _rows(calibration, *lidars)
+    return np.asarray(matrix[np.ix_(rows, rows)])

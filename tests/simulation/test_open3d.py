@@ -1,0 +1,73 @@
+"""Importing open3d: what is missing is named together with the package that brings it."""
+
+import importlib
+import sys
+from types import ModuleType
+
+import pytest
+
+from caliv_graph import _open3d
+from caliv_graph._open3d import import_open3d
+from caliv_graph.errors import CalivError
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """`import_open3d` without its cache, and open3d itself refusing to load."""
+    monkeypatch.setattr(_open3d, "import_open3d", import_open3d.__wrapped__)
+    monkeypatch.setattr(sys, "platform", "linux")
+    return monkeypatch
+
+
+def refuse(error: Exception, *names: str) -> object:
+    real = importlib.import_module
+
+    def import_module(name: str) -> ModuleType:
+        if name in names:
+            raise error
+        return real(name)
+
+    return import_module
+
+
+def test_open3d_comes_with_its_ray_caster() -> None:
+    assert hasattr(import_open3d().t.geometry, "RaycastingScene")
+    assert import_open3d() is import_open3d()
+
+
+def test_missing_system_libraries_are_named_with_their_packages(
+    fresh: pytest.MonkeyPatch,
+) -> None:
+    error = ImportError("libGL.so.1: cannot open shared object file")
+    fresh.setattr(importlib, "import_module", refuse(error, "open3d"))
+    fresh.setattr(_open3d, "_loads", lambda library: "lib" not in library or "gomp" in library)
+    with pytest.raises(CalivError) as caught:
+        _open3d.import_open3d()
+    assert str(caught.value) == (
+        "open3d cannot be loaded: libGL.so.1, libEGL.so.1, libX11.so.6 missing: "
+        "install them with 'apt-get install libgl1 libegl1 libx11-6'"
+    )
+
+
+def test_missing_libusb_is_named_with_its_package(fresh: pytest.MonkeyPatch) -> None:
+    error = ImportError("libusb-1.0.so.0: cannot open shared object file")
+    fresh.setattr(importlib, "import_module", refuse(error, "open3d", "libusb_package"))
+    fresh.setattr(_open3d, "_loads", lambda library: "usb" not in library)
+    with pytest.raises(CalivError, match="'pip install libusb-package'"):
+        _open3d.import_open3d()
+
+
+def test_missing_open3d_is_named(fresh: pytest.MonkeyPatch) -> None:
+    error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
+    fresh.setattr(importlib, "import_module", refuse(error, "open3d"))
+    with pytest.raises(CalivError, match="'open3d' is not installed: 'pip install open3d'"):
+        _open3d.import_open3d()
+
+
+def test_any_other_failure_is_told_in_one_line(fresh: pytest.MonkeyPatch) -> None:
+    error = ImportError("undefined symbol: abc\nmore")
+    fresh.setattr(importlib, "import_module", refuse(error, "open3d"))
+    fresh.setattr(_open3d, "_loads", lambda _library: True)
+    with pytest.raises(CalivError) as caught:
+        _open3d.import_open3d()
+    assert str(caught.value) == "open3d cannot be loaded: undefined symbol: abc"

@@ -78,7 +78,7 @@ def make_calibration(*lidars: str, **changes: Any) -> Calibration:
             for i, (name, T) in enumerate(poses.items())
         },
         cov_joint=cov,
-        information_data=np.linalg.inv(cov),
+        information_data=np.asarray(np.linalg.inv(cov), dtype=np.float64),
         undetermined=(turn_about_centre(poses),),
         weak=(),
         unmet=(),

@@ -14,7 +14,7 @@ from caliv_graph.cli.exits import UNMET
 
 if TYPE_CHECKING:
     from caliv_graph.config import Config
-    from caliv_graph.products import Calibration, Recording
+    from caliv_graph.products import Recording
 
 
 def calibrate(
@@ -68,12 +68,12 @@ def calibrate(
     check_output_folder(out, RESULT_FILES, force)
     recordings = _open_recordings(settings, data)
     with streams.progress_on_stdout(as_json) as progress:
-        calibration, solution, found = run_pipeline(recordings, settings, progress)
-    read = [line for recording in recordings for line in recording.warnings()]
-    warnings = list(dict.fromkeys([*_unused_keys(settings), *found, *read, *_misses(calibration)]))
+        run = run_pipeline(recordings, settings, progress)
+    calibration = run.calibration
+    warnings = [*_unused_keys(settings), *run.warnings, *calibration.unmet]
     effective = _with_data(settings, recordings)
     with output_folder(out, RESULT_FILES, force) as folder:
-        write_result(folder, calibration, solution, effective, progress.stages, warnings)
+        write_result(folder, calibration, run.solution, effective, progress.stages, warnings)
     if as_json:
         extra = {
             "out": str(out),
@@ -86,7 +86,7 @@ def calibrate(
         streams.show(calibration_table(calibration, progress.stages, time.monotonic() - start))
         streams.say(f"Written to {out}")
     streams.warn(warnings)
-    if calibration.unmet or not all(lidar.saw_target for lidar in calibration.lidars.values()):
+    if calibration.unmet:
         raise typer.Exit(UNMET)
 
 
@@ -129,16 +129,6 @@ def _unused_keys(config: Config) -> list[str]:
         for name, section in sections.items()
         if section != type(section)()
     ]
-
-
-def _misses(calibration: Calibration) -> list[str]:
-    """A line for each reason to leave with exit code 3."""
-    unseen = [
-        f"LiDAR '{name}' never saw a target; it stays at its initial guess"
-        for name, lidar in calibration.lidars.items()
-        if not lidar.saw_target
-    ]
-    return [*unseen, *calibration.unmet]
 
 
 def _with_data(config: Config, recordings: Sequence[Recording]) -> Config:

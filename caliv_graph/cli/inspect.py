@@ -38,12 +38,11 @@ def inspect(
         inspection = inspect_recording(recording, progress)
         warnings = list(recording.warnings())
         if settings is not None:
-            from caliv_graph.products import Trajectory
             from caliv_graph.targets import extract_targets
+            from caliv_graph.trajectory.given import given_trajectories
 
-            given = recording.given_poses()
-            trajectory = Trajectory(given.stamps_ns, given.T_map_vehicle)
-            observations = extract_targets([recording], [trajectory], settings, progress)
+            trajectories = given_trajectories([recording])
+            observations = extract_targets([recording], trajectories, settings, progress)
             inspection = add_targets(inspection, observations)
             warnings += [line for seen in observations for line in seen.warnings]
     if as_json:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray, TargetObservation
 
 NORMAL_NEIGHBOURS = 9
 """Points of a local plane fit: a ring of eight and the point itself."""
-
-SAMPLING_SEED = 20250401
-"""Thinning draws points at random, since a stride would alias with the scan lines; the same
-points every time, since the same input has to give the same result."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +53,24 @@ class CloudStack:
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
 
+def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
+    """A pseudo-random priority of each point, (N,), by which points are drawn.
+
+    A stride would alias with the scan lines. The priority depends on the point's own coordinates
+    in its own LiDAR's frame and on nothing else, so that another initial guess, or a point more
+    at the edge of the region, draws the same points: the result shall not depend on them.
+    """
+    bits = np.ascontiguousarray(points, dtype=np.float64).view(np.uint64)
+    state = np.zeros(len(points), dtype=np.uint64)
+    for axis in range(3):
+        # The finaliser of SplitMix64 (Steele et al. 2014), one round per coordinate.
+        state = (state ^ bits[:, axis]) + np.uint64(0x9E3779B97F4A7C15)
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return state
+
+
 def surface_normals(points: Array, sigma_range_m: float) -> tuple[Array, Array]:
     """Surface normals of one cloud by local principal components, towards the sensor.
 
@@ -86,16 +101,15 @@ def stack_clouds(
 
     Args:
         observation: the clouds, none of them empty.
-        max_points: a larger cloud is thinned at random, the same way every time.
+        max_points: a larger cloud is thinned (`sampling_order`).
         sigma_range_m: noise along the beam, metres.
     """
-    rng = np.random.default_rng(SAMPLING_SEED)
     points, normals, flatness = [], [], []
     for cloud in observation.clouds:
         n, flat = surface_normals(cloud.points_lidar, sigma_range_m)
         keep: slice | IntArray = slice(None)
         if len(cloud.points_lidar) > max_points:
-            keep = np.sort(rng.permutation(len(cloud.points_lidar))[:max_points])
+            keep = np.sort(np.argsort(sampling_order(cloud.points_lidar))[:max_points])
         points.append(cloud.points_lidar[keep])
         normals.append(n[keep])
         flatness.append(flat[keep])

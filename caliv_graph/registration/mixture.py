@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
-from caliv_graph.registration.clouds import CloudStack
+from caliv_graph.registration.clouds import CloudStack, sampling_order
 
 NEIGHBOURS = 6
 """Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
@@ -87,8 +87,8 @@ def seed_mixture(
 ) -> Mixture:
     """A first mixture: components on points drawn where normals can be trusted.
 
-    Points are drawn with equal chance from every cell of a coarse grid over positions and
-    normals, so that a near cloud with many points does not take all components.
+    Every cloud gives the same number of points, so that a near cloud with many does not take all
+    components. Which points are drawn does not depend on the poses (`sampling_order`).
 
     Args:
         stack: the clouds.
@@ -96,23 +96,19 @@ def seed_mixture(
         components: how many; fewer if there are fewer points.
         sigma_m: first standard deviation along and across the normal.
     """
-    rng = np.random.default_rng(components)
     points = stack.moved(R, t)
     normals = stack.rotated(R, stack.normals)
     usable = np.flatnonzero(stack.flatness > 0.5)
     if len(usable) < 2 * components:
         usable = np.arange(len(points))
-    cells = np.column_stack(
-        [np.floor(points[usable] / 0.03), np.floor(normals[usable] * 1.5)]
-    ).astype(np.int64)
-    order = rng.permutation(len(usable))
-    _, first, inverse = np.unique(cells[order], axis=0, return_index=True, return_inverse=True)
-    # The rank of each point inside its cell: all first ones, then all second ones, ...
-    by_cell = np.argsort(inverse.ravel(), kind="stable")
-    starts = np.searchsorted(inverse.ravel()[by_cell], np.arange(len(first)))
-    rank = np.empty(len(usable), dtype=np.int64)
-    rank[by_cell] = np.arange(len(usable)) - starts[inverse.ravel()[by_cell]]
-    chosen = usable[order[np.argsort(rank, kind="stable")[:components]]]
+    order = usable[np.argsort(sampling_order(stack.points[usable]))]
+    # The rank of each point in its own cloud: all first ones, then all second ones, ...
+    cloud = stack.cloud[order]
+    by_cloud = np.argsort(cloud, kind="stable")
+    starts = np.searchsorted(cloud[by_cloud], cloud[by_cloud], side="left")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[by_cloud] = np.arange(len(order)) - starts
+    chosen = order[np.argsort(rank, kind="stable")[:components]]
     count = len(chosen)
     return Mixture(
         means_target=points[chosen].copy(),

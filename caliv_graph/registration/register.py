@@ -104,10 +104,6 @@ class JointRegistration:
         self._floor = max(sigma_m, self._floor_end)
         self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor)
 
-    def reheat(self, sigma_m: float) -> None:
-        """Widens the annealing floor to `sigma_m` again, keeping the components."""
-        self._floor = max(self._floor, sigma_m)
-
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at (R, t), and the quadratic that it puts on the poses."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)

@@ -1,0 +1,245 @@
+"""Exit codes and streams of SPEC 5, as a shell sees them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from caliv_graph import __version__
+from tests.cli.commands import ROOT, run, start, write_config, write_drive
+
+SUCCEEDS = """
+def calibrate(recordings, config, progress):
+    with progress.stage("solving", 2) as advance:
+        advance(2)
+    return run_of(make_calibration())
+"""
+
+FAILS = """
+def calibrate(recordings, config, progress):
+    import warnings
+    from caliv_graph.errors import TargetError
+    warnings.warn("of a library")
+    with progress.stage("solving", 2) as advance:
+        raise TargetError("target: no cloud enters the region;\\n  it came as near as 3.2 m")
+"""
+
+BREAKS = """
+def calibrate(recordings, config, progress):
+    raise ZeroDivisionError("nobody thought of this")
+"""
+
+WAITS = """
+def calibrate(recordings, config, progress):
+    import time
+    with progress.stage("solving", 2) as advance:
+        time.sleep(60)
+"""
+
+LOSES_THE_INTERRUPT = """
+def calibrate(recordings, config, progress):
+    import time
+    with progress.stage("solving", 2) as advance:
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            raise RuntimeError("what native code makes of it")
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    write_drive(tmp_path / "drive")
+    return write_config(tmp_path / "config.yaml")
+
+
+def test_help_is_quick_and_names_only_what_there_is() -> None:
+    starts = []
+    for _ in range(3):
+        start_s = time.monotonic()
+        result = run("--help")
+        starts.append(time.monotonic() - start_s)
+
+    assert result.returncode == 0
+    assert result.stderr == ""
+    for command in ("init", "inspect", "calibrate", "evaluate"):
+        assert f"│ {command} " in result.stdout
+    assert "simulate" not in result.stdout
+    # 0.4 s on a quiet machine (SPEC 5); the quickest of three, on one that may not be.
+    assert min(starts) < 0.8
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from caliv_graph.cli.main import run\n"
+        "run(['calibrate', '--help'])\n"
+        "heavy = {'gtsam', 'open3d', 'numpy', 'scipy', 'caliv_graph.config'} & set(sys.modules)\n"
+        "sys.exit(f'imported: {heavy}' if heavy else 0)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("command", ["init", "inspect", "calibrate", "evaluate"])
+def test_every_command_explains_itself_with_an_example(command: str) -> None:
+    result = run(command, "--help")
+
+    assert result.returncode == 0
+    assert f"Example: caliv-graph {command} " in result.stdout
+    if command != "init":
+        assert "--json" in result.stdout
+    if command in ("init", "calibrate"):
+        assert "--out" in result.stdout
+        assert "--force" in result.stdout
+
+
+def test_version() -> None:
+    result = run("--version")
+
+    assert (result.returncode, result.stdout, result.stderr) == (
+        0,
+        f"caliv-graph {__version__}\n",
+        "",
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "error: Missing command. See 'caliv-graph --help'\n"),
+        (["calibrat"], "error: No such command 'calibrat'"),
+        (["--verbose"], "error: No such option: --verbose"),
+        (["calibrate"], "error: Missing argument 'CONFIG.yaml'"),
+        (["calibrate", "a.yaml"], "error: Missing option '--out'"),
+        (["calibrate", "a.yaml", "--out"], "error: Option '--out' requires an argument"),
+        (["evaluate", "a", "b", "c"], "error: Got unexpected extra argument"),
+        (["evaluate", "nowhere.yaml", "b"], "error: nowhere.yaml: no such file\n"),
+        (["inspect", "nowhere"], "error: nowhere: no such folder"),
+        (["inspect", "drive.mcap"], "error: drive.mcap: rosbags cannot be read yet"),
+        (["init", "nowhere", "--out", "c.yaml"], "error: nowhere: no such folder"),
+        (["calibrate", "nowhere.yaml", "--out", "o"], "error: nowhere.yaml: no such file\n"),
+    ],
+)
+def test_bad_usage_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+    result = run(*arguments, cwd=tmp_path)
+
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith(message)
+    assert result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_bad_input_is_one_line_and_no_output(config: Path, form: list[str]) -> None:
+    out = config.parent / "a/out"
+    # The warning about 'ground' must not join the error.
+    write_config(config, ground={"use": True})
+
+    result = run("calibrate", config, "--out", out, *form, pipeline=FAILS)
+
+    assert result.returncode == 2
+    assert result.stderr == (
+        "error: target: no cloud enters the region; it came as near as 3.2 m\n"
+    )
+    assert result.stdout == ("" if form else "solving: started\n")
+    assert not out.parent.exists()
+
+
+def test_a_defect_of_the_program(config: Path) -> None:
+    result = run("calibrate", config, "--out", config.parent / "out", pipeline=BREAKS)
+
+    assert result.returncode == 1
+    lines = result.stderr.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert "ZeroDivisionError: nobody thought of this" in lines
+    assert lines[-1].startswith(f"error: this is a defect of caliv-graph {__version__}: please")
+    assert not (config.parent / "out").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("pipeline", [WAITS, LOSES_THE_INTERRUPT])
+def test_an_interrupt_leaves_nothing(config: Path, number: int, pipeline: str) -> None:
+    before = sorted(config.parent.iterdir())
+    process = start("calibrate", config, "--out", config.parent / "out", pipeline=pipeline)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "solving: started\n"
+
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+
+    assert process.returncode == 130
+    assert err == "error: interrupted\n"
+    assert sorted(config.parent.iterdir()) == before
+
+
+def test_an_interrupt_counts_where_the_shell_had_it_ignored(config: Path) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = start("calibrate", config, "--out", config.parent / "out", pipeline=WAITS)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert process.stdout is not None
+    process.stdout.readline()
+
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+
+    assert process.returncode == 130
+
+
+def test_json_is_one_document_and_nothing_else(config: Path) -> None:
+    result = run("calibrate", config, "--out", config.parent / "out", "--json", pipeline=SUCCEEDS)
+
+    assert result.returncode == 0
+    assert result.stderr == ""
+    assert json.loads(result.stdout)["status"] == "partial"
+
+
+def test_progress_is_lines_where_stdout_is_no_terminal(config: Path) -> None:
+    result = run("calibrate", config, "--out", config.parent / "out", pipeline=SUCCEEDS)
+
+    lines = result.stdout.splitlines()
+    assert lines[0] == "solving: started"
+    assert lines[1].startswith("solving: 2/2 in ")
+    assert lines[-1] == f"Written to {config.parent / 'out'}"
+    assert "\x1b" not in result.stdout
+
+
+def test_a_closed_pipe_is_one_line(config: Path) -> None:
+    process = start("inspect", config.parent / "drive")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+
+    err = process.stderr.read()
+
+    assert process.wait(timeout=30) == 2
+    assert err == "error: standard output: cannot be written: Broken pipe\n"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_one_line(config: Path) -> None:
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "caliv_graph", "inspect", str(config.parent / "drive")],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            check=False,
+        )
+
+    assert result.returncode == 2
+    assert result.stderr == "error: standard output: cannot be written: No space left on device\n"

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from rich.console import Console, RenderableType
+
+from caliv_graph.progress import SilentProgress
+from caliv_graph.report.inspection import (
+    DriveSummary,
+    Inspection,
+    LidarSummary,
+    Points,
+    Sighting,
+    TargetSummary,
+)
+from caliv_graph.report.tables import calibration_table, evaluation_table, inspection_table
+from caliv_graph.uncertainty.evaluation import evaluate
+from tests.samples import make_calibration, unseen
+
+
+def rendered(table: RenderableType, width: int = 80) -> list[str]:
+    console = Console(width=width, color_system=None)
+    with console.capture() as captured:
+        console.print(table, highlight=False)
+    return [line.rstrip() for line in captured.get().splitlines()]
+
+
+def cells(lines: list[str], name: str, after: str = "") -> list[str]:
+    """The row that begins with a name, behind a heading."""
+    start = next(i for i, line in enumerate(lines) if line.startswith(after))
+    row = next(line for line in lines[start:] if line.startswith(name))
+    return row.removeprefix(name).split()
+
+
+def cells_below(lines: list[str], name: str) -> list[str]:
+    index = next(i for i, line in enumerate(lines) if line.startswith(name))
+    return lines[index + 1].split()
+
+
+def with_sigma(sigma_rad: float, sigma_m: float) -> np.ndarray:
+    return np.diag([sigma_rad] * 3 + [sigma_m] * 3) ** 2
+
+
+def test_values_are_shown_to_two_digits_of_their_sigma_in_metres_and_degrees() -> None:
+    calibration = make_calibration("rear", undetermined=())
+    cov = with_sigma(np.radians(0.031), 0.0093)
+    result = replace(
+        calibration.lidars["rear"],
+        T_vehicle_lidar=gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(*np.radians([-1.23456, 10.0, 91.0])), np.array([1.23456, 0, -2.5])
+        ),
+        cov=cov,
+        determined=dict.fromkeys(calibration.lidars["rear"].determined, True),
+    )
+    calibration = replace(calibration, lidars={"rear": result}, cov_joint=cov)
+
+    lines = rendered(calibration_table(calibration, [], 1.0))
+
+    assert cells(lines, "rear") == [
+        "1.2346", "0.0000", "-2.5000", "-1.235", "10.000", "91.000", "60"
+    ]  # fmt: skip
+    assert cells_below(lines, "rear") == ["±0.0093"] * 3 + ["±0.031"] * 3
+    assert not any("held" in line or "could not tell" in line for line in lines)
+
+
+def test_an_undetermined_axis_is_held_and_says_why() -> None:
+    lines = rendered(calibration_table(make_calibration(), [], 1.0))
+
+    row = cells(lines, "front")
+    assert row[0] == "(2.000)"
+    assert row[5] == "(0.00)"
+    assert re.fullmatch(r"0\.0+", row[1])
+    below = cells_below(lines, "front")
+    assert (below[0], below[5]) == ("held", "held")
+    assert below[1].startswith("±")
+    assert any(line.startswith("held: the drive does not determine") for line in lines)
+    index = lines.index("What the drive could not tell:")
+    assert lines[index + 1] == "  - rotation of all LiDARs about the turn centre"
+
+
+def test_the_turn_of_all_lidars_leaves_their_pair_determined() -> None:
+    lines = rendered(calibration_table(make_calibration(), [], 1.0))
+
+    start = next(i for i, line in enumerate(lines) if line.startswith("Sensor to sensor"))
+    end = next(i for i, line in enumerate(lines) if line.startswith("held:"))
+    assert "held" not in " ".join(lines[start:end])
+    assert cells(lines, "front", after="Sensor to sensor")[0].startswith("-2.36")
+
+
+def test_a_lidar_that_never_saw_the_target_pretends_nothing() -> None:
+    calibration = unseen(make_calibration("front", "left", "rear"), "left")
+
+    lines = rendered(calibration_table(calibration, [], 1.0))
+
+    row, below = cells(lines, "left"), cells_below(lines, "left")
+    assert all(cell.startswith("(") for cell in row[:6])
+    assert row[6:] == ["no"]
+    assert below == ["held"] * 6 + ["target"]
+    assert "  - LiDAR 'left' never saw a target: its mounting is the initial guess" in lines
+    assert all(cell.startswith("(") for cell in cells(lines, "front", after="Sensor to sensor")[:6])
+
+
+def test_what_was_asked_for_and_not_reached_is_said() -> None:
+    calibration = make_calibration(unmet=("s2v: yaw of front is not determined",))
+
+    lines = rendered(calibration_table(calibration, [], 1.0))
+
+    index = lines.index("Asked for in the config, but not reached:")
+    assert lines[index + 1] == "  - s2v: yaw of front is not determined"
+
+
+def test_times_of_the_stages() -> None:
+    progress = SilentProgress()
+    with progress.stage("reading", 3) as advance:
+        advance(3)
+
+    lines = rendered(calibration_table(make_calibration(), progress.stages, 12.5))
+
+    assert cells(lines, "reading") == ["0.00", "3/3"]
+    assert cells(lines, "all") == ["12.50"]
+
+
+def test_names_are_no_markup() -> None:
+    calibration = make_calibration("rear", undetermined=())
+    renamed = replace(
+        calibration,
+        reference="[red]rear",
+        lidars={"[red]rear": calibration.lidars["rear"]},
+        unmet=("[bold]s2v",),
+    )
+
+    text = "\n".join(rendered(calibration_table(renamed, [], 1.0)))
+
+    assert "reference [red]rear" in text
+    assert "[bold]s2v" in text
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_tables_fit_a_terminal(width: int) -> None:
+    calibration = unseen(make_calibration("front", "left", "rear"), "left")
+    truth = {name: gtsam.Pose3() for name in calibration.lidars}
+
+    for table in (
+        calibration_table(calibration, [], 1.0),
+        evaluation_table(evaluate(calibration, truth), calibration),
+    ):
+        assert not any("…" in line for line in rendered(table, width))
+
+
+def test_errors_in_millimetres_and_milliradians() -> None:
+    calibration = make_calibration()
+    truth = {name: result.T_vehicle_lidar for name, result in calibration.lidars.items()}
+    evaluation = evaluate(calibration, truth)
+    evaluation["lidars"]["front"]["s2v"] |= {
+        "translation_m": [0.0123456, -0.001, -1e-9],
+        "rotation_rad": [0.001, -0.0005, 0.0043],
+        "nees": 5.4321,
+    }
+    evaluation["pairs"][0]["nees"] = None
+
+    lines = rendered(evaluation_table(evaluation, calibration))
+
+    # x and yaw were not determined.
+    assert cells(lines, "S2V front") == [
+        "(12.35)", "-1.00", "0.00", "1.00", "-0.50", "(4.30)", "5.43"
+    ]  # fmt: skip
+    assert cells(lines, "S2S front to rear") == ["0.00"] * 6 + ["-"]
+    assert lines[-2].startswith("In brackets: the drive did not determine this axis")
+
+
+def test_what_a_recording_holds() -> None:
+    points = Points(10, 20, 30)
+    inspection = Inspection(
+        data="drive",
+        lidars={
+            "front": LidarSummary(5, (3, 15), 2, ((5, 11),), 5.0, points),
+            "rear": LidarSummary(1, (7, 7), 1, (), None, points),
+        },
+        drive=DriveSummary(6, 1.2, 3.456, 0.02, -90.0, 95.0),
+        targets=(
+            TargetSummary(
+                "target 1",
+                (15.0, -9.0, 0.5),
+                {
+                    "front": Sighting(3, ((3, 5), (11, 11)), points, (4.0, 9.5)),
+                    "rear": Sighting(0, (), None, None),
+                },
+            ),
+        ),
+    )
+
+    lines = rendered(inspection_table(inspection))
+
+    assert " ".join(cells(lines, "front")) == "5 3 to 15 2 5 10 / 20 / 30"
+    assert " ".join(cells(lines, "rear")) == "1 7 to 7 1 - 10 / 20 / 30"
+    assert "front: clouds are missing between the frames 5 and 11" in lines
+    assert "heading changes by -90.0 degrees" in " ".join(lines)
+    seen = "target 1 near (15.0, -9.0, 0.5) m in the map"
+    assert " ".join(cells(lines, "front", after=seen)) == "3 4.0 to 9.5 10 / 20 / 30 3 to 5, 11"
+    assert cells(lines, "rear", after=seen) == ["0", "-", "-", "never"]

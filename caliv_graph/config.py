@@ -61,9 +61,7 @@ class Mounting(_Section):
 class MountingSigma(_Section):
     """How far off the initial guess may be, 1 sigma, per vehicle axis."""
 
-    xyz: Positive | PositiveTriple = Field(
-        0.058, description="metres; 0.058 is a uniform +-0.1 m"
-    )
+    xyz: Positive | PositiveTriple = Field(0.058, description="metres; 0.058 is a uniform +-0.1 m")
     rpy_deg: Positive | PositiveTriple = Field(
         1.73, description="degrees; 1.73 is a uniform +-3 degrees"
     )
@@ -402,7 +400,7 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
         raise error(f"{path}: {e.strerror}") from None
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        return yaml.load(text, Loader=loader)  # noqa: S506 (both are safe loaders)
+        return yaml.load(text, Loader=loader)
     except yaml.MarkedYAMLError as e:
         line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
         raise error(f"{path}: not valid YAML{line}: {e.problem}") from None

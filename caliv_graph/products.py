@@ -188,6 +188,8 @@ class Registration:
         T_target_lidar: a pose per cloud.
         information: (J, 6, 6) of each pose given the shape, rotation then translation, rad and m,
             left perturbation (target frame): `Exp(d) T_target_lidar`.
+        information_joint: (6 J, 6 J) of all poses together, the shape estimated from the same
+            points: what `information` claims, less what the shape took of it.
         mixture: the reconstructed target.
         inlier_ratio: (J,) part of each cloud's points that the mixture explains.
         iterations: EM iterations done.
@@ -198,6 +200,7 @@ class Registration:
     observation: TargetObservation
     T_target_lidar: tuple[gtsam.Pose3, ...]
     information: Array
+    information_joint: Array
     mixture: Mixture
     inlier_ratio: Array
     iterations: int
@@ -266,12 +269,14 @@ class Direction:
         sigma_data: 1 sigma of the data along it; inf if they say nothing. In units of `vector`.
         sigma_prior: 1 sigma of the prior along it, same units.
         text: how a person says it.
+        together: whether all LiDARs move as one, so that sensor-to-sensor is left alone.
     """
 
     vector: Mapping[str, Array]
     sigma_data: float
     sigma_prior: float
     text: str
+    together: bool = True
 
 
 @dataclass(frozen=True)

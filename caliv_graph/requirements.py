@@ -31,7 +31,8 @@ def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
 def _unmet(calibration: Calibration, requirement: str) -> list[str]:
     seen = {n: r for n, r in calibration.lidars.items() if r.saw_target}
     if requirement == "s2s":
-        apart = _undetermined_apart(calibration)
+        # What moves all LiDARs as one rigid body leaves sensor-to-sensor alone.
+        apart = [d.text for d in calibration.undetermined if not d.together]
         return [f"require s2s: not determined: {text}" for text in apart]
     axes = AXES[:3] if requirement == "s2v_rotation" else AXES
     out = []
@@ -40,14 +41,6 @@ def _unmet(calibration: Calibration, requirement: str) -> list[str]:
         if lost:
             out.append(f"require {requirement}: {', '.join(lost)} of '{name}' not determined")
     return out
-
-
-def _undetermined_apart(calibration: Calibration) -> list[str]:
-    """Undetermined directions that move LiDARs against each other.
-
-    One that moves all of them as one rigid body leaves sensor-to-sensor alone.
-    """
-    return [d.text for d in calibration.undetermined if "against each other" in d.text]
 
 
 def sigmas_s2v(calibration: Calibration, name: str) -> Array:
@@ -80,8 +73,7 @@ def _over_limit(calibration: Calibration, key: str, limit: float) -> list[str]:
         sigmas = {f"'{n}'": sigmas_s2v(calibration, n)[axis] for n in seen}
     else:
         sigmas = {
-            f"'{a}' to '{b}'": sigmas_s2s(calibration, a, b)[axis]
-            for a, b in permutations(seen, 2)
+            f"'{a}' to '{b}'": sigmas_s2s(calibration, a, b)[axis] for a, b in permutations(seen, 2)
         }
     for what, sigma in sigmas.items():
         if sigma * unit > limit:

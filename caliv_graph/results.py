@@ -1,8 +1,8 @@
 """What `calibrate` leaves behind, and reading it back: calibration.yaml, truth.yaml, target.ply.
 
 The keys of calibration.yaml are those of SPEC 6 and, as own ones, `unmet`, `scans_used`,
-`saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `sigma_data`, `sigma_prior` and
-`provenance`. `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived from the rest.
+`saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `together`, `sigma_data`, `sigma_prior`
+and `provenance`. `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived from the rest.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from caliv_graph.files import atomic_write
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, Direction, LidarResult, Mixture, Solution
 from caliv_graph.progress import StageRecord
+from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
 SCHEMA = "caliv-graph/calibration/1"
@@ -245,6 +246,7 @@ def read_calibration_file(path: Path) -> CalibrationFile:
         name: _read_lidar(lidars[name], bool(np.any(information[6 * i : 6 * i + 6])))
         for i, name in enumerate(names)
     }
+    poses = {name: result.T_vehicle_lidar for name, result in results.items()}
     observability = root.child("observability")
     calibration = Calibration(
         status=root.child("status").one_of(STATUSES),
@@ -252,8 +254,8 @@ def read_calibration_file(path: Path) -> CalibrationFile:
         lidars=results,
         cov_joint=root.child("joint").child("covariance").symmetric(size),
         information_data=information,
-        undetermined=_read_directions(observability.child("undetermined"), names),
-        weak=_read_directions(observability.child("weak"), names),
+        undetermined=_read_directions(observability.child("undetermined"), poses),
+        weak=_read_directions(observability.child("weak"), poses),
         unmet=tuple(str(item.value) for item in root.get("unmet", []).items()),
         provenance={name: node.value for name, node in root.get("provenance", {}).names().items()},
     )
@@ -331,6 +333,7 @@ def _direction_document(direction: Direction) -> dict[str, Any]:
             name: np.asarray(vector).tolist() for name, vector in direction.vector.items()
         },
         "text": direction.text,
+        "together": bool(direction.together),
         "sigma_data": float(direction.sigma_data),
         "sigma_prior": float(direction.sigma_prior),
     }
@@ -388,19 +391,28 @@ def _read_lidar(node: Field, has_data: bool) -> LidarResult:
     )
 
 
-def _read_directions(node: Field, lidars: Sequence[str]) -> tuple[Direction, ...]:
+def _read_directions(
+    node: Field, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> tuple[Direction, ...]:
     directions = []
     for item in node.items():
-        vectors = item.child("direction").names()
-        for name, vector in vectors.items():
-            if name not in lidars:
-                vector.fail(f"'{name}' is not a LiDAR of the file, {list(lidars)}")
+        fields = item.child("direction").names()
+        for name, field in fields.items():
+            if name not in T_vehicle_lidar:
+                field.fail(f"'{name}' is not a LiDAR of the file, {list(T_vehicle_lidar)}")
+        vector = {name: field.vector(6) for name, field in fields.items()}
+        together = item.get("together", None)
         directions.append(
             Direction(
-                vector={name: vector.vector(6) for name, vector in vectors.items()},
-                # Not in every writer's file: unknown, and said so.
+                vector=vector,
+                # Not in every writer's file: unknown, and said so, or found out.
                 sigma_data=item.get("sigma_data", math.nan).number(),
                 sigma_prior=item.get("sigma_prior", math.nan).number(),
+                together=(
+                    rigid_twist(vector, T_vehicle_lidar) is not None
+                    if together.value is None
+                    else together.flag()
+                ),
                 text=str(item.child("text").value),
             )
         )

@@ -55,7 +55,7 @@ def turn_about_centre(lidars: Mapping[str, gtsam.Pose3]) -> Direction:
         name: np.concatenate([up, np.cross(up, T.translation() - centre)])
         for name, T in lidars.items()
     }
-    return Direction(vector, math.inf, 4.3e-3, "rotation of all LiDARs about the turn centre")
+    return Direction(vector, math.inf, 4.3e-3, True, "rotation of all LiDARs about the turn centre")
 
 
 def make_calibration(*lidars: str, **changes: Any) -> Calibration:
@@ -113,6 +113,7 @@ def make_solution(placements: int = 1) -> Solution:
             observation=TargetObservation(i, f"target {i + 1}", np.zeros(3), (cloud,)),
             T_target_lidar=(gtsam.Pose3(),),
             information=np.eye(6)[None],
+            information_joint=np.eye(6),
             mixture=mixture,
             inlier_ratio=np.ones(1),
             iterations=7,

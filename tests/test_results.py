@@ -72,7 +72,9 @@ def delete_at(*keys: Any) -> Callable[[Any], None]:
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    weak = Direction({"front": np.arange(6.0), "rear": np.ones(6)}, 0.2, 1.0, "front's z: weakly")
+    weak = Direction(
+        {"front": np.arange(6.0), "rear": np.ones(6)}, 0.2, 1.0, False, "front's z: weakly"
+    )
     calibration = unseen(
         make_calibration("front", "left", "rear", status="ok", unmet=("s2v: yaw",), weak=(weak,)),
         "left",
@@ -97,11 +99,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         (*calibration.undetermined, *calibration.weak),
         strict=True,
     ):
-        assert (ours.text, ours.sigma_data, ours.sigma_prior) == (
-            theirs.text,
-            theirs.sigma_data,
-            theirs.sigma_prior,
-        )
+        for field in ("text", "together", "sigma_data", "sigma_prior"):
+            assert getattr(ours, field) == getattr(theirs, field)
         for name, vector in theirs.vector.items():
             assert ours.vector[name] == pytest.approx(vector)
 
@@ -326,7 +325,8 @@ def test_the_smallest_file_of_the_specification_is_read(written: Path) -> None:
             for key in ("scans_used", "saw_target", "sigma_vehicle_axes"):
                 del lidar[key]
             lidar["time_offset"] = {"value": 0.01, "sigma": 0.001}
-        del document["observability"]["undetermined"][0]["sigma_data"]
+        for key in ("sigma_data", "together"):
+            del document["observability"]["undetermined"][0][key]
         document["lidars"]["front"]["T_vehicle_lidar"]["translation"][1] = "1e-05"
         document["comment"] = "nothing we know"
 
@@ -336,6 +336,7 @@ def test_the_smallest_file_of_the_specification_is_read(written: Path) -> None:
     assert front.T_vehicle_lidar.translation()[1] == 1e-05
     assert front.saw_target
     assert math.isnan(file.calibration.undetermined[0].sigma_data)
+    assert file.calibration.undetermined[0].together
     assert list(file.cov_pairs) == [("front", "rear")]
 
 

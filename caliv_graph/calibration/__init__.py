@@ -1,0 +1,1 @@
+"""The calibration graph and its estimator."""

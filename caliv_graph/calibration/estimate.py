@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
+from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.graph import (
     CloudLinearisation,
@@ -80,6 +82,9 @@ STEP_TOLERANCE = (5e-5, 3e-4)
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
 what 100 clouds of a chair can tell."""
 
+COUPLED_STEPS = 4
+"""Gauss-Newton steps with the joint information: the problem is nearly linear there."""
+
 HELD_SIGMAS = np.full(6, 1e-6)
 """Stiffness with which the staged solve holds what it does not estimate, rad and m."""
 
@@ -117,17 +122,27 @@ def estimate(
     used = [o for o in observations if len(o.clouds) >= 2]
     used = [replace(o, placement=m) for m, o in enumerate(used)]
     problem = pose_problem(used, trajectories, config)
-    times: dict[str, float] = {}
+    # The matrices are small: threads of a linear algebra library would mostly wait for each other,
+    # for seconds where the machine has other work.
+    with threadpool_limits(limits=1):
+        return _estimate(problem, used, config, progress)
 
+
+def _estimate(
+    problem: Problem,
+    observations: Sequence[TargetObservation],
+    config: Config,
+    progress: Progress,
+) -> Solution:
+    """The stages of `estimate`, timed."""
+    times: dict[str, float] = {}
     begun = time.perf_counter()
     states, registrations = [], []
-    with progress.stage("registering the clouds", len(used)) as advance:
-        for m, observation in enumerate(used):
+    with progress.stage("registering the clouds", len(observations)) as advance:
+        for m, observation in enumerate(observations):
             state = JointRegistration(observation, config)
             registrations.append(
-                register_jointly(
-                    state, _prealigned(problem, m), config.registration.max_iterations
-                )
+                register_jointly(state, _prealigned(problem, m), config.registration.max_iterations)
             )
             states.append(state)
             advance()
@@ -213,9 +228,7 @@ def _reweight(
 ) -> None:
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
-    steady = merged(
-        pose_graph(problem, state.noise), prior_graph(problem, problem.lidars)
-    )
+    steady = merged(pose_graph(problem, state.noise), prior_graph(problem, problem.lidars))
     scaled = information / state.scale**2
     for _ in range(rounds):
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
@@ -244,8 +257,8 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     clouds = cloud_graph(problem, measured, scaled)
     poses = pose_graph(problem, state.noise)
     fixed = prior_graph(problem, sorted(problem.fixed))
+    information_data = _couple(state, registrations, merged(poses, fixed))
     first = state.values
-    information_data = _reduce(problem, first, merged(poses, fixed, clouds)).D
     holds = gtsam.NonlinearFactorGraph()
     stiff = gtsam.noiseModel.Diagonal.Sigmas(HELD_SIGMAS)
     for key in problem.extrinsic_keys()[1:]:
@@ -279,6 +292,42 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
         iterations=1,
         converged=True,
     )
+
+
+def _couple(
+    state: _State, registrations: Sequence[Registration], steady: gtsam.NonlinearFactorGraph
+) -> Array:
+    """Stage 1 once more, with the registration's joint information in place of the blocks.
+
+    Pose factors alone say twice what the clouds share: the shape was estimated from them. Where
+    two LiDARs saw different skins of the target, the blocks tie them together and the joint
+    information does not.
+
+    Args:
+        state: solved with pose factors; its values are moved.
+        registrations: the clouds' poses.
+        steady: given poses and trusted mountings.
+
+    Returns:
+        (6n, 6n) data information, vehicle axes.
+    """
+    problem = state.problem
+    measured, _ = _measured(registrations)
+    root = np.repeat(np.sqrt(state.weights.values), 6)
+    H = block_diag(*[r.information_joint for r in registrations])
+    H *= np.outer(root, root) / state.scale**2
+    prior = _prior_information(problem)
+    for _ in range(COUPLED_STEPS):
+        lines = linearise_clouds(problem, state.values)
+        r = np.concatenate(
+            [
+                gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
+                for j, Z in enumerate(lines.predicted)
+            ]
+        )
+        reduced = _reduce(problem, state.values, steady, (H, H @ r), lines)
+        state.values = reduced.move(reduced.step_with(prior, _offset(state)))
+    return reduced.D
 
 
 def _staged_covariance(
@@ -341,9 +390,7 @@ class _Shapes:
         )
 
 
-def _expect(
-    states: Sequence[JointRegistration], lines: CloudLinearisation
-) -> _Shapes:
+def _expect(states: Sequence[JointRegistration], lines: CloudLinearisation) -> _Shapes:
     """E-step of every placement at the poses that the graph predicts."""
     poses = _per_placement(states, lines)
     quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
@@ -410,9 +457,7 @@ def _refine(
     """Expectation-maximisation whose M-step is the graph solve."""
     problem, config = state.problem, state.config
     prior = _prior_information(problem)
-    steady = merged(
-        pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed))
-    )
+    steady = merged(pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed)))
     # A new mixture, where the graph puts the clouds: what is found shall not depend on the way the
     # registration took from the initial guess.
     first = linearise_clouds(problem, state.values)
@@ -425,15 +470,16 @@ def _refine(
         iteration += 1
         lines = linearise_clouds(problem, state.values)
         shapes = _expect(states, lines)
+        clouds = shapes.joint(state.scale)
         begun = time.perf_counter()
-        reduced = _reduce(problem, state.values, steady, shapes, lines, state.scale)
+        reduced = _reduce(problem, state.values, steady, clouds, lines)
         if config.solve.mode == "auto":
             split = spectrum(reduced.D, prior, undetermined)
             if iteration >= DECIDED_AFTER:
                 undetermined = int(split.undetermined.sum())
             step = respectful_step(reduced.D, reduced.c, prior, _offset(state), split)
         else:
-            step = np.linalg.solve(reduced.D + prior, reduced.c - prior @ _offset(state))
+            step = reduced.step_with(prior, _offset(state))
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
         new = linearise_clouds(problem, state.values)
@@ -465,13 +511,14 @@ def _refined_solution(
     problem = state.problem
     lines = linearise_clouds(problem, state.values)
     shapes = _expect(states, lines)
+    clouds = shapes.joint(state.scale)
     begun = time.perf_counter()
-    reduced = _reduce(problem, state.values, steady, shapes, lines, state.scale)
+    reduced = _reduce(problem, state.values, steady, clouds, lines)
     if state.config.solve.mode == "auto":
         split = spectrum(reduced.D, prior, undetermined)
         cov = respectful_covariance(prior, split)
     else:
-        cov = np.linalg.inv(reduced.D + prior)
+        cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
     pulls = _shape_measurements(state, shapes)
     registrations, measured, start = [], [], 0
     for shape, (R, t), quadratic in zip(states, shapes.poses, shapes.quadratics, strict=True):
@@ -521,6 +568,15 @@ class _Reduced:
     _g: Array
     _values: gtsam.Values
 
+    def step_with(self, prior: Array, offset: Array) -> Array:
+        """The step (6n,) that data and guesses together call for.
+
+        Args:
+            prior: (6n, 6n) information of the guesses.
+            offset: (6n,) where the estimate is from them.
+        """
+        return np.asarray(np.linalg.solve(self.D + prior, self.c - prior @ offset), np.float64)
+
     def move(self, step: Array) -> gtsam.Values:
         """All values after a step (6n,) of the extrinsics, the rest following."""
         tangent = np.linalg.solve(self._to_axes, step)
@@ -532,15 +588,11 @@ def _reduce(
     problem: Problem,
     values: gtsam.Values,
     graph: gtsam.NonlinearFactorGraph,
-    shapes: _Shapes | None = None,
-    lines: CloudLinearisation | None = None,
-    scale: float = 1.0,
+    clouds: tuple[Array, Array],
+    lines: CloudLinearisation,
 ) -> _Reduced:
-    """Linearises a graph (and the clouds' quadratic, if given) and eliminates the rest."""
-    system = dense_system(problem, graph, values)
-    if shapes is not None and lines is not None:
-        H, gradient = shapes.joint(scale)
-        system = add_shape(system, lines, H, gradient)
+    """Linearises a graph and the clouds' quadratic (H, gradient), and eliminates the rest."""
+    system = add_shape(dense_system(problem, graph, values), lines, *clouds)
     D, c, G, g = system.schur()
     Q = problem.to_vehicle_axes(values)
     inverse = np.linalg.inv(Q)
@@ -591,9 +643,7 @@ def _solution(
         T_map_vehicle={
             pose: state.values.atPose3(key_vehicle(i)) for i, pose in enumerate(problem.poses)
         },
-        T_target_map=tuple(
-            state.values.atPose3(key_target(m)) for m in range(problem.placements)
-        ),
+        T_target_map=tuple(state.values.atPose3(key_target(m)) for m in range(problem.placements)),
         registrations=tuple(registrations),
         cloud_weights=tuple(np.split(state.weights.values, cuts)),
         residuals=tuple(np.split(white, cuts)),

@@ -53,9 +53,7 @@ def target_pose_factor(
     Z_inverse = T_target_lidar.inverse()
     order = list(keys)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         predicted, moves = chain_jacobians([values.atPose3(key) for key in order])
         r = gtsam.Pose3.Logmap(predicted.compose(Z_inverse))
         if jacobians is not None:
@@ -83,9 +81,7 @@ def given_pose_factor(
     t_given = T_map_vehicle.translation()
     sigmas = np.array([sigma_rotation_rad] * 3 + [sigma_position_m] * 3)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T = values.atPose3(key_pose)
         w = gtsam.Rot3.Logmap(R_given.between(T.rotation()))
         if jacobians is not None:
@@ -107,7 +103,8 @@ def drift_factor(
     """A step of the slow error, `b_after = decay * b_before + noise` (first-order Gauss-Markov).
 
     Args:
-        key_before, key_after: keys of the slow errors.
+        key_before: key of the slow error before the step.
+        key_after: key of the one after it.
         decay: exp(-dt / correlation time).
         sigmas: (6,) of the step.
     """
@@ -137,9 +134,7 @@ def mounting_prior(
     """
     order = list(keys)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = chain_jacobians([values.atPose3(key) for key in order])
         r = vehicle_axes_difference(T, T_vehicle_lidar)
         if jacobians is not None:

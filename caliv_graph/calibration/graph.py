@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from caliv_graph.calibration.factors import (
     chain_jacobians,
@@ -94,7 +95,7 @@ def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.V
             values.insert(key, E.between(problem.guesses[name]))
     for m in range(problem.placements):
         candidates = []
-        for j in np.flatnonzero(problem.cloud_placement == m):
+        for j in np.flatnonzero(problem.cloud_placement == m).tolist():
             X = problem.T_map_vehicle[problem.cloud_pose[j]]
             guess = problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
             candidates.append(measured[j].compose(X.compose(guess).inverse()))
@@ -186,7 +187,7 @@ class DenseSystem:
     """A linearised graph as one quadratic, `d^T H d / 2 - b^T d`, the extrinsics last.
 
     Attributes:
-        keys: every variable, each with six coordinates, the extrinsics at the end.
+        keys: poses, targets and extrinsics, each with six coordinates, the extrinsics at the end.
         H: (6 N, 6 N).
         b: (6 N,).
         extrinsics: how many of `keys` are extrinsics.
@@ -233,25 +234,33 @@ class DenseSystem:
 def dense_system(
     problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 ) -> DenseSystem:
-    """Linearises `graph` at `values`; variables that it does not touch get zero rows."""
+    """Linearises `graph` at `values`, with the slow errors of the poses eliminated.
+
+    They form chains, which GTSAM eliminates sparsely, and are linear: their values do not matter.
+    Variables that the graph does not touch get zero rows.
+    """
     extrinsics = problem.extrinsic_keys()
-    keys = (
-        *problem.drift_keys(),
-        *problem.pose_keys(),
-        *problem.target_keys(),
-        *extrinsics,
-    )
+    keys = (*problem.pose_keys(), *problem.target_keys(), *extrinsics)
+    drifts = set(problem.drift_keys())
+    linear = graph.linearize(values)
+    touched = set(graph.keyVector())
+    chains = [key for key in problem.drift_keys() if key in touched]
+    if chains:
+        try:
+            _, linear = linear.eliminatePartialMultifrontal(chains)
+        except RuntimeError as e:
+            raise SolveError(f"the given poses: {str(e).splitlines()[0]}") from None
     size = 6 * len(keys)
     H, b = np.zeros((size, size)), np.zeros(size)
-    touched = set(graph.keyVector())
-    order = [key for key in keys if key in touched]
+    order = [key for key in keys if key in touched and key not in drifts]
     if order:
         ordering = gtsam.Ordering()
         for key in order:
             ordering.push_back(key)
-        H_part, b_part = graph.linearize(values).hessian(ordering)
+        H_part, b_part = linear.hessian(ordering)
+        present = set(order)
         where = np.concatenate(
-            [np.arange(6 * i, 6 * i + 6) for i, key in enumerate(keys) if key in touched]
+            [np.arange(6 * i, 6 * i + 6) for i, key in enumerate(keys) if key in present]
         )
         H[np.ix_(where, where)] = H_part
         b[where] = np.asarray(b_part).ravel()
@@ -270,19 +279,24 @@ def add_shape(
         gradient: (6 J,).
     """
     where = {key: i for i, key in enumerate(system.keys)}
-    J = np.zeros((len(gradient), len(system.b)))
+    rows, columns, blocks = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
-            column = 6 * where[key]
-            J[6 * j : 6 * j + 6, column : column + 6] = jacobian
-    # Slow errors come first and are not touched by clouds: skip their zero columns.
-    used = 6 * min(where[key] for keys in lines.keys for key in keys)
-    J = J[:, used:]
-    H = system.H.copy()
-    H[used:, used:] += J.T @ (H_clouds @ J)
-    b = system.b.copy()
-    b[used:] -= J.T @ gradient
-    return DenseSystem(system.keys, H, b, system.extrinsics)
+            rows.append(j)
+            columns.append(where[key])
+            blocks.append(jacobian)
+    six = np.arange(6)
+    row = (6 * np.array(rows)[:, None, None] + six[None, :, None]).repeat(6, axis=2)
+    column = (6 * np.array(columns)[:, None, None] + six[None, None, :]).repeat(6, axis=1)
+    # Every cloud depends on four variables of hundreds.
+    J = scipy.sparse.csr_array(
+        (np.array(blocks).ravel(), (row.ravel(), column.ravel())),
+        shape=(len(gradient), len(system.b)),
+    )
+    half = J.T @ H_clouds
+    return DenseSystem(
+        system.keys, system.H + (J.T @ half.T), system.b - J.T @ gradient, system.extrinsics
+    )
 
 
 def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:

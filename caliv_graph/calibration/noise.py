@@ -179,7 +179,8 @@ def _stacked(
     chosen: IntArray,
 ) -> tuple[Array, Array, Array, Array]:
     """Residuals (6m,), Jacobians by extrinsics and targets (6m, p), by pose errors (m, 6, 6)
-    (rotation in vehicle axes, position in map axes), and registration covariances (m, 6, 6)."""
+    (rotation in vehicle axes, position in map axes), and registration covariances (m, 6, 6).
+    """
     columns = {
         key: 6 * i for i, key in enumerate((*problem.extrinsic_keys(), *problem.target_keys()))
     }
@@ -196,7 +197,7 @@ def _stacked(
                 R_map_vehicle = values.atPose3(key).rotation().matrix()
                 B[row, :, :3] = jacobian[:, :3]
                 B[row, :, 3:] = jacobian[:, 3:] @ R_map_vehicle.T
-    return r, A, B, np.linalg.inv(information[chosen])
+    return r, A, B, np.asarray(np.linalg.inv(information[chosen]), dtype=np.float64)
 
 
 def _ridge(problem: Problem, size: int) -> Array:

@@ -1,0 +1,1 @@
+"""Poses, their tangents and their covariances."""

@@ -100,6 +100,4 @@ def unstack(R: Array, t: Array) -> tuple[gtsam.Pose3, ...]:
 
     The matrices are made orthonormal again, so that many small steps do not add up to a shear.
     """
-    return tuple(
-        gtsam.Pose3(gtsam.Rot3.ClosestTo(Ri), ti) for Ri, ti in zip(R, t, strict=True)
-    )
+    return tuple(gtsam.Pose3(gtsam.Rot3.ClosestTo(Ri), ti) for Ri, ti in zip(R, t, strict=True))

@@ -1,0 +1,1 @@
+"""Joint registration of the target's clouds."""

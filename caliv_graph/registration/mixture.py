@@ -82,9 +82,7 @@ class ShapeQuadratic:
         return np.asarray(H)
 
 
-def seed_mixture(
-    stack: CloudStack, R: Array, t: Array, components: int, sigma_m: float
-) -> Mixture:
+def seed_mixture(stack: CloudStack, R: Array, t: Array, components: int, sigma_m: float) -> Mixture:
     """A first mixture: components on points drawn where normals can be trusted.
 
     Every cloud gives the same number of points, so that a near cloud with many does not take all
@@ -92,7 +90,8 @@ def seed_mixture(
 
     Args:
         stack: the clouds.
-        R, t: (J, 3, 3), (J, 3) current `T_target_lidar`.
+        R: (J, 3, 3) rotations of current `T_target_lidar`.
+        t: (J, 3) translations of current `T_target_lidar`.
         components: how many; fewer if there are fewer points.
         sigma_m: first standard deviation along and across the normal.
     """
@@ -131,7 +130,8 @@ def expect(
 
     Args:
         stack: the clouds.
-        R, t: (J, 3, 3), (J, 3) current `T_target_lidar`.
+        R: (J, 3, 3) rotations of current `T_target_lidar`.
+        t: (J, 3) translations of current `T_target_lidar`.
         mixture: the current components.
         outlier_density: gamma / (h (gamma + 1)), per cubic metre.
         cloud_weights: (J,) robust weight of each cloud.
@@ -140,9 +140,7 @@ def expect(
     normals = stack.rotated(R, stack.normals)
     beams = stack.rotated(R, stack.beams)
     k = min(NEIGHBOURS, len(mixture.weights))
-    tree = cKDTree(
-        np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target])
-    )
+    tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
     # One worker: the trees are small, and threads that wait for each other cost more here.
     _, near = tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
     near = near.reshape(len(points), k)
@@ -174,7 +172,7 @@ def expect(
 def component_means(points: Array, who: Responsibilities, components: int) -> tuple[Array, Array]:
     """Weighted means of the points of each component (K, 3), and their weights (K,)."""
     flat = who.component.ravel()
-    mass = np.bincount(flat, who.alpha.ravel(), components) + PRIOR_COUNT
+    mass = np.asarray(np.bincount(flat, who.alpha.ravel(), components) + PRIOR_COUNT, np.float64)
     sums = [
         np.bincount(flat, (who.alpha * points[:, None, axis]).ravel(), components)
         for axis in range(3)
@@ -225,7 +223,7 @@ def shape_quadratic(
         axis=-1,
     ).reshape(count, K, 3)
     lever = np.zeros((count, K, 3, 6))
-    lever[..., :3] = -skew(sum_jk)
+    lever[..., :3] = -skew(np.asarray(sum_jk, dtype=np.float64))
     lever[..., diagonal, diagonal + 3] = mass_jk[..., None]
     n = mixture.normals_target
     root = (mixture.var_normal**-0.5 - mixture.var_tangent**-0.5)[:, None, None] * (
@@ -249,7 +247,8 @@ def maximise_shape(
 
     Args:
         stack: the clouds.
-        R, t: (J, 3, 3), (J, 3) the new `T_target_lidar`.
+        R: (J, 3, 3) rotations of the new `T_target_lidar`.
+        t: (J, 3) translations of the new `T_target_lidar`.
         mixture: the components of the E-step.
         who: its responsibilities.
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
@@ -261,10 +260,7 @@ def maximise_shape(
     trusted = who.alpha * stack.flatness[:, None]
     rotated = stack.rotated(R, stack.normals)
     normals = PRIOR_COUNT * mixture.normals_target + np.stack(
-        [
-            np.bincount(flat, (trusted * rotated[:, None, axis]).ravel(), K)
-            for axis in range(3)
-        ],
+        [np.bincount(flat, (trusted * rotated[:, None, axis]).ravel(), K) for axis in range(3)],
         axis=1,
     )
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]

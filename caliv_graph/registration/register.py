@@ -115,9 +115,7 @@ class JointRegistration:
         """M-step of the components at the new poses (R, t)."""
         if self._who is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
-        self._mixture = maximise_shape(
-            self.clouds, R, t, self.mixture, self._who, self._floor
-        )
+        self._mixture = maximise_shape(self.clouds, R, t, self.mixture, self._who, self._floor)
 
     def result(
         self,
@@ -133,6 +131,7 @@ class JointRegistration:
             observation=self.observation,
             T_target_lidar=unstack(R, t),
             information=quadratic.blocks,
+            information_joint=quadratic.joint(),
             mixture=self.mixture,
             inlier_ratio=self.inlier_ratio,
             iterations=iterations,

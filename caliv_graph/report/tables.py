@@ -42,9 +42,15 @@ def calibration_table(
         stages: what was done.
         seconds: how long all of it took.
     """
-    parts: list[RenderableType] = [_status_line(calibration), "", _mountings(calibration)]
+    parts: list[RenderableType] = [_status_line(calibration)]
+    parts += _titled(
+        "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _mountings(calibration)
+    )
     if len(calibration.lidars) > 1:
-        parts += ["", _sensor_to_sensor(calibration)]
+        parts += _titled(
+            "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
+            _sensor_to_sensor(calibration),
+        )
     if not _all_determined(calibration):
         parts.append(
             Text(
@@ -57,7 +63,7 @@ def calibration_table(
     weak = [direction.text for direction in calibration.weak]
     parts += _sentences("What it told only weakly:", weak)
     parts += _sentences("Asked for in the config, but not reached:", calibration.unmet)
-    parts += ["", _times(stages, seconds)]
+    parts += _titled("Time", _times(stages, seconds))
     return Group(*parts)
 
 
@@ -68,7 +74,7 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
         evaluation: what `uncertainty.evaluation.evaluate` returned.
         calibration: what was evaluated; tells which axes were held.
     """
-    table = _table("Errors in vehicle axes (estimate against truth)", "", *_headings("mm", "mrad"))
+    table = _table("", *_headings("mm", "mrad"))
     table.add_column("NEES\n6 dof", justify="right")
     any_held = False
     for name, errors in evaluation["lidars"].items():
@@ -80,17 +86,17 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
         seen = all(calibration.lidars[errors[end]].saw_target for end in ("from", "to"))
         name = f"S2S {errors['from']} to {errors['to']}"
         table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
-    if not any_held:
-        return table
-    note = "In brackets: the drive did not determine this axis; its error is that of the guess."
-    return Group(table, Text(note, style="yellow"))
+    parts = _titled("Errors in vehicle axes (estimate against truth)", table)
+    if any_held:
+        note = "In brackets: the drive did not determine this axis; its error is that of the guess."
+        parts.append(Text(note, style="yellow"))
+    return Group(*parts[1:])
 
 
 def inspection_table(inspection: Inspection) -> RenderableType:
     """What a recording holds."""
     drive = inspection.drive
     table = _table(
-        "Clouds (frame numbers; rates are nominal, at 10 frames per second)",
         "LiDAR",
         "clouds",
         "frames",
@@ -108,7 +114,8 @@ def inspection_table(inspection: Inspection) -> RenderableType:
             "-" if lidar.rate_hz is None else f"{lidar.rate_hz:.3g}",
             f"{points.min} / {points.median} / {points.max}",
         )
-    parts: list[RenderableType] = [Text(inspection.data, style="bold"), "", table]
+    parts: list[RenderableType] = [Text(inspection.data, style="bold")]
+    parts += _titled("Clouds by frame number (rates are nominal: 10 frames per second)", table)
     parts += [
         Text(f"{name}: clouds are missing between the frames {_runs(lidar.gaps, ' and ')}")
         for name, lidar in inspection.lidars.items()
@@ -126,7 +133,6 @@ def inspection_table(inspection: Inspection) -> RenderableType:
     for target in inspection.targets or ():
         x, y, z = target.centre_map_m
         seen = _table(
-            f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map",
             "LiDAR",
             "scans",
             "range\nm",
@@ -135,7 +141,7 @@ def inspection_table(inspection: Inspection) -> RenderableType:
         )
         for name, sighting in target.lidars.items():
             seen.add_row(Text(name), *_sighting_cells(sighting))
-        parts += ["", seen]
+        parts += _titled(f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map", seen)
     return Group(*parts)
 
 
@@ -149,7 +155,6 @@ def _status_line(calibration: Calibration) -> Text:
 
 def _mountings(calibration: Calibration) -> Table:
     table = _table(
-        "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes",
         "LiDAR",
         *_headings("m", "deg"),
         "scans\nused",
@@ -168,7 +173,6 @@ def _scans_cell(result: LidarResult) -> Text:
 
 def _sensor_to_sensor(calibration: Calibration) -> Table:
     table = _table(
-        "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
         "from\nto",
         *_headings("m", "deg"),
     )
@@ -200,7 +204,7 @@ def _sentences(heading: str, texts: Iterable[str]) -> list[RenderableType]:
 
 
 def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
-    table = _table("Time", "stage", "seconds", "done")
+    table = _table("stage", "seconds", "done")
     for stage in stages:
         taken = "-" if stage.seconds is None else f"{stage.seconds:.2f}"
         table.add_row(Text(f"{'  ' * stage.depth}{stage.name}"), taken, count_text(stage))
@@ -208,11 +212,13 @@ def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
     return table
 
 
-def _table(title: str, *columns: str) -> Table:
+def _titled(title: str, table: Table) -> list[RenderableType]:
+    """A table below its title. Rich's own titles are no wider than their tables."""
+    return ["", Text(title, style="bold"), table]
+
+
+def _table(*columns: str) -> Table:
     table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         collapse_padding=True,

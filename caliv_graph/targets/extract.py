@@ -72,18 +72,18 @@ def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
     return GUESS_SIGMAS * (max(sigma.xyz_m()) + max(sigma.rpy_rad()) * range_m)
 
 
-def _clusters(points: Array, link_m: float) -> Array:
+def _clusters(points: Array, link_m: float) -> IntArray:
     """Labels (N,) of connected components: points nearer than `link_m` are connected."""
     pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
     graph = coo_array(
         (np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])),
         shape=(len(points), len(points)),
     )
-    labels = connected_components(graph, directed=False)[1]
-    return np.asarray(labels)
+    _, labels = connected_components(graph, directed=False)
+    return np.asarray(labels, dtype=np.int64)
 
 
-def _filtered(points: Array, extraction: ExtractionConfig) -> Array:
+def _filtered(points: Array, extraction: ExtractionConfig) -> IntArray:
     """Indices of the points that survive the voxel and the statistical outlier filter."""
     keep = np.arange(len(points))
     if extraction.voxel > 0.0:
@@ -91,7 +91,8 @@ def _filtered(points: Array, extraction: ExtractionConfig) -> Array:
         keep = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     k = extraction.outlier_neighbours
     if k and len(keep) > k + 1:
-        distance = cKDTree(points[keep]).query(points[keep], k + 1)[0][:, 1:].mean(axis=1)
+        distances, _ = cKDTree(points[keep]).query(points[keep], k + 1)
+        distance = np.asarray(distances)[:, 1:].mean(axis=1)
         limit = distance.mean() + extraction.outlier_ratio * distance.std()
         keep = keep[distance <= limit]
     return keep
@@ -214,7 +215,7 @@ class RegionExtractor:
         inside = distance <= margin
         return points[inside], near[inside]
 
-    def _pick_object(self, points: Array, range_m: float) -> Array | None:
+    def _pick_object(self, points: Array, range_m: float) -> IntArray | None:
         """Indices of the object that is the target: of the right size, best inside the region."""
         if len(points) < 3:
             return None
@@ -284,9 +285,7 @@ def extract_targets(
     observations: list[TargetObservation] = []
     total = sum(len(r.scan_stamps_ns(name)) for r in recordings for name in config.lidars)
     with progress.stage("reading clouds", total) as advance:
-        for drive, (recording, trajectory) in enumerate(
-            zip(recordings, trajectories, strict=True)
-        ):
+        for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
             extractors = [RegionExtractor(r, config, trajectory) for r in config.target]
             clouds: list[list[TargetCloud]] = [[] for _ in extractors]
             for name in config.lidars:
@@ -330,6 +329,4 @@ def _observation(
             )
     if not kept:
         warnings = [_complain(label, config, extractor.tallies)]
-    return TargetObservation(
-        placement, label, extractor.centre_map, tuple(kept), tuple(warnings)
-    )
+    return TargetObservation(placement, label, extractor.centre_map, tuple(kept), tuple(warnings))

@@ -27,6 +27,12 @@ UNDETERMINED_RATIO = 0.5
 WEAK_RATIO = 0.1
 """The same for weak (SPEC 4)."""
 
+NOTABLE = 0.2
+"""Part of a direction's largest coordinate from which an axis is mentioned."""
+
+RIGID_MISFIT = 0.2
+"""Relative misfit up to which LiDARs count as moving together."""
+
 AXIS_SHARE = 0.05
 LIDAR_SHARE = 0.01
 """An axis is undetermined if it has this share of its LiDAR's part of the undetermined subspace,
@@ -88,16 +94,15 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
     return Spectrum(vectors, values, sigma_data, sigma_prior, lost, weak)
 
 
-def respectful_step(
-    D: Array, c: Array, prior: Array, offset: Array, split: Spectrum
-) -> Array:
+def respectful_step(D: Array, c: Array, prior: Array, offset: Array, split: Spectrum) -> Array:
     """The step of `auto`: data alone where they can tell, the joint prior alone where not.
 
     Minimises `e^T D e / 2 - c^T e` over the determined directions; along the others the step is
     the one at which the guesses of all LiDARs together are best met, `U^T prior (offset + e) = 0`.
 
     Args:
-        D, c: quadratic of the data in a step e, vehicle axes.
+        D: quadratic of the data in a step e, vehicle axes.
+        c: its linear part.
         prior: information of the guesses.
         offset: (6n,) where the current estimate is from the guesses.
         split: of D.
@@ -183,12 +188,14 @@ def _directions(
         # The largest coordinate is one unit (1 rad or 1 m), so that numbers can be read.
         scale = 1.0 / float(np.abs(vector).max())
         sign = math.copysign(1.0, vector[int(np.abs(column).argmax())])
+        text, together = describe(parts, T_vehicle_lidar)
         out.append(
             Direction(
                 {n: sign * scale * v for n, v in parts.items()},
                 sigma_data / scale,
                 sigma_prior / scale,
-                describe(parts, T_vehicle_lidar),
+                text,
+                together,
             )
         )
     return tuple(out)
@@ -217,29 +224,44 @@ def simplified(basis: Array) -> Array:
     return np.asarray(rotated[:, order])
 
 
+def rigid_twist(
+    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> Array | None:
+    """The twist (6,) of the whole sensor set that a direction amounts to.
+
+    Args:
+        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
+        T_vehicle_lidar: where the LiDARs sit.
+
+    Returns:
+        Rotation about and shift at the vehicle's origin; None if the LiDARs move apart.
+    """
+    rows, values = [], []
+    for name, part in parts.items():
+        arm = -skew(T_vehicle_lidar[name].translation())
+        rows.append(np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]]) / UNIT[:, None])
+        values.append(part / UNIT)
+    A, y = np.concatenate(rows), np.concatenate(values)
+    twist = np.linalg.lstsq(A, y, rcond=None)[0]
+    misfit = np.linalg.norm(A @ twist - y) / np.linalg.norm(y)
+    return np.asarray(twist) if misfit < RIGID_MISFIT else None
+
+
 def describe(
     parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
-) -> str:
-    """How a person says a direction.
+) -> tuple[str, bool]:
+    """How a person says a direction, and whether all LiDARs move together in it.
 
     Args:
         parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
         T_vehicle_lidar: where the LiDARs sit.
     """
+    twist = rigid_twist(parts, T_vehicle_lidar)
     names = list(parts)
-    # Do all LiDARs move together, as one rigid vehicle would? Then one twist explains them.
-    rows, values = [], []
-    for name in names:
-        arm = -skew(T_vehicle_lidar[name].translation())
-        rows.append(np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]]) / UNIT[:, None])
-        values.append(parts[name] / UNIT)
-    A, y = np.concatenate(rows), np.concatenate(values)
-    twist = np.linalg.lstsq(A, y, rcond=None)[0]
-    misfit = np.linalg.norm(A @ twist - y) / np.linalg.norm(y)
-    if misfit < 0.2:
-        whole = "all LiDARs" if len(names) > 1 else f"lidar '{names[0]}'"
-        return _describe_twist(twist, whole, len(names) > 1)
-    return _describe_apart(parts)
+    if twist is None:
+        return _describe_apart(parts), False
+    whole = "all LiDARs" if len(names) > 1 else f"lidar '{names[0]}'"
+    return _describe_twist(twist, whole, len(names) > 1), True
 
 
 def _describe_twist(twist: Array, whole: str, several: bool) -> str:
@@ -247,7 +269,7 @@ def _describe_twist(twist: Array, whole: str, several: bool) -> str:
     scaled = np.abs(twist / UNIT)
     together = " together" if several else ""
     leading = scaled / scaled.max()
-    big = [axis for axis, size in zip(AXES, leading, strict=True) if size > 0.2]
+    big = [axis for axis, size in zip(AXES, leading, strict=True) if size > NOTABLE]
     if big == ["z"]:
         return f"height of {whole}{together}"
     if len(big) == 1 and big[0] in ("x", "y"):
@@ -270,11 +292,19 @@ def _describe_twist(twist: Array, whole: str, several: bool) -> str:
 def _describe_apart(parts: Mapping[str, Array]) -> str:
     """A direction in which LiDARs move against each other."""
     largest = max(float(np.abs(p / UNIT).max()) for p in parts.values())
-    said = []
+    said = {}
     for name, part in parts.items():
         size = part / UNIT / largest
-        axes = [f"{axis} {value:+.1f}" for axis, value in zip(AXES, size, strict=True)]
-        axes = [a for a, value in zip(axes, size, strict=True) if abs(value) > 0.2]
+        axes = [
+            (axis, value) for axis, value in zip(AXES, size, strict=True) if abs(value) > NOTABLE
+        ]
         if axes:
-            said.append(f"{name}: {', '.join(axes)}")
-    return f"LiDARs against each other ({'; '.join(said)}; units of 1 mrad and 10 mm)"
+            said[name] = axes
+    if len(said) == 1:
+        name, axes = next(iter(said.items()))
+        together = " together" if len(axes) > 1 else ""
+        return f"{' and '.join(a for a, _ in axes)} of lidar '{name}'{together}"
+    listed = "; ".join(
+        f"{name}: {', '.join(f'{a} {v:+.1f}' for a, v in axes)}" for name, axes in said.items()
+    )
+    return f"LiDARs against each other ({listed}; units of 1 mrad and 10 mm)"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -23,10 +24,12 @@ def calibration(tmp_path: Path) -> Path:
 @pytest.fixture
 def truth(tmp_path: Path) -> Path:
     """The front LiDAR is 10 mm further left than it was found, the rear where it was found."""
+    # Nose down by 10 degrees; the rear LiDAR turned by 180 besides.
+    sin, cos = math.sin(math.radians(5.0)), math.cos(math.radians(5.0))
     mountings = {
-        "front": {"translation": [2.0, 0.01, 2.0], "quaternion_xyzw": [0, 0.0871557427, 0, 0.9961946981]},
-        "rear": {"translation": [-0.4, 0.0, 2.0], "quaternion_xyzw": [-0.0871557427, 0, 0.9961946981, 0]},
-    }  # fmt: skip
+        "front": {"translation": [2.0, 0.01, 2.0], "quaternion_xyzw": [0.0, sin, 0.0, cos]},
+        "rear": {"translation": [-0.4, 0.0, 2.0], "quaternion_xyzw": [-sin, 0.0, cos, 0.0]},
+    }
     path = tmp_path / "truth.yaml"
     lidars = {name: {"T_vehicle_lidar": pose} for name, pose in mountings.items()}
     path.write_text(yaml.safe_dump({"lidars": lidars}))

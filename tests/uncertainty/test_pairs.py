@@ -12,7 +12,7 @@ from tests.samples import make_calibration, unseen
 
 
 def direction(**vectors: list[float]) -> Direction:
-    return Direction({k: np.array(v) for k, v in vectors.items()}, math.inf, 1.0, "made up")
+    return Direction({k: np.array(v) for k, v in vectors.items()}, math.inf, 1.0, False, "made up")
 
 
 def test_every_pair_stands_once_and_ends_at_the_reference() -> None:

@@ -55,7 +55,13 @@ def turn_about_centre(lidars: Mapping[str, gtsam.Pose3]) -> Direction:
         name: np.concatenate([up, np.cross(up, T.translation() - centre)])
         for name, T in lidars.items()
     }
-    return Direction(vector, math.inf, 4.3e-3, True, "rotation of all LiDARs about the turn centre")
+    return Direction(
+        vector=vector,
+        sigma_data=math.inf,
+        sigma_prior=4.3e-3,
+        together=True,
+        text="rotation of all LiDARs about the turn centre",
+    )
 
 
 def make_calibration(*lidars: str, **changes: Any) -> Calibration:

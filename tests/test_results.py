@@ -73,7 +73,11 @@ def delete_at(*keys: Any) -> Callable[[Any], None]:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     weak = Direction(
-        {"front": np.arange(6.0), "rear": np.ones(6)}, 0.2, 1.0, False, "front's z: weakly"
+        vector={"front": np.arange(6.0), "rear": np.ones(6)},
+        sigma_data=0.2,
+        sigma_prior=1.0,
+        together=False,
+        text="front's z: weakly",
     )
     calibration = unseen(
         make_calibration("front", "left", "rear", status="ok", unmet=("s2v: yaw",), weak=(weak,)),

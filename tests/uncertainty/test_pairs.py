@@ -12,7 +12,13 @@ from tests.samples import make_calibration, unseen
 
 
 def direction(**vectors: list[float]) -> Direction:
-    return Direction({k: np.array(v) for k, v in vectors.items()}, math.inf, 1.0, False, "made up")
+    return Direction(
+        vector={name: np.array(vector) for name, vector in vectors.items()},
+        sigma_data=math.inf,
+        sigma_prior=1.0,
+        together=False,
+        text="made up",
+    )
 
 
 def test_every_pair_stands_once_and_ends_at_the_reference() -> None:

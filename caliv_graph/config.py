@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import yaml
 from pydantic import (
@@ -52,7 +52,7 @@ class _Section(BaseModel):
 class Mounting(_Section):
     """A pose as people measure it: `T_parent_child`."""
 
-    xyz: Triple = Field((0.0, 0.0, 0.0), description="metres, in the parent frame")
+    xyz: Triple = Field(description="metres, in the parent frame")
     rpy_deg: Triple = Field(
         (0.0, 0.0, 0.0), description="roll, pitch, yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll)"
     )
@@ -146,7 +146,7 @@ class GroundConfig(_Section):
 class ImuConfig(_Section):
     """Mounting of the IMU."""
 
-    T_vehicle_imu: Mounting = Mounting()
+    T_vehicle_imu: Mounting = Mounting(xyz=(0.0, 0.0, 0.0))
 
 
 class GnssConfig(_Section):
@@ -254,7 +254,9 @@ class Config(_Section):
     lidars: dict[str, LidarConfig] = Field(min_length=1)
     reference: str = Field("", description="reference LiDAR; empty: the first")
     target: tuple[TargetRegion, ...] | None = Field(
-        None, description="one region or a list of them; absent: the target is searched for"
+        None,
+        min_length=1,
+        description="one region or a list of them; absent: the target is searched for",
     )
     ground: GroundConfig = GroundConfig()
     imu: ImuConfig = ImuConfig()
@@ -268,36 +270,39 @@ class Config(_Section):
         ("s2s",), description="what exit code 0 promises to have determined"
     )
     limits: dict[str, Positive] = Field(
-        {}, description="largest sigma that exit code 0 allows, such as s2v_yaw_deg: 0.1"
+        {},
+        description="largest sigma that exit code 0 allows, vehicle axes: s2v_yaw_deg: 0.1, ...",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _empty_sections(cls, raw: Any) -> Any:
+        """`topics:` with nothing below it means its defaults, as a person would expect."""
+        if not isinstance(raw, Mapping):
+            return raw
+        return {key: value for key, value in raw.items() if value is not None or key == "lidars"}
 
     @model_validator(mode="before")
     @classmethod
     def _limits_inside_require(cls, raw: Any) -> Any:
         """`require` may carry the limits: `{limits: {...}}`, alone or as an item of the list."""
-        if not isinstance(raw, Mapping):
+        if not isinstance(raw, Mapping) or "require" not in raw:
             return raw
-        raw = dict(raw)
-        items = raw.get("require")
-        if items is None:
-            return raw
+        items = raw["require"]
         items = [items] if isinstance(items, str | Mapping) else items
         if not isinstance(items, list | tuple):
             return raw
-        names = []
-        limits = dict(raw.get("limits") or {})
-        for item in items:
-            if isinstance(item, Mapping):
-                # A bare {s2v_yaw_deg: 0.1} can only mean a limit as well.
-                limits.update(item.get("limits", item) or {})
-            else:
-                names.append(item)
-        if names or not limits:
-            raw["require"] = names
-        else:
-            raw["require"] = []
-        raw["limits"] = limits
-        return raw
+        names = [item for item in items if not isinstance(item, Mapping)]
+        found: list[Any] = [raw["limits"]] if "limits" in raw else []
+        # A bare {s2v_yaw_deg: 0.1} can only mean a limit as well.
+        found += [item.get("limits", item) for item in items if isinstance(item, Mapping)]
+        limits: Any = {}
+        for given in found:
+            if not isinstance(given, Mapping):
+                limits = given  # what is wrong with it, the field's own check says
+                break
+            limits = {**limits, **given}
+        return {**raw, "require": names, "limits": limits}
 
     @field_validator("target", mode="before")
     @classmethod
@@ -341,45 +346,82 @@ def _nearest(key: str, known: list[str]) -> str:
     return hint
 
 
-def _section_at(location: tuple[int | str, ...]) -> type[BaseModel] | None:
+def _section_at(location: tuple[int | str, ...]) -> type[BaseModel]:
     """The model that owns the key at `location` (its last item is the key itself)."""
-    model: Any = Config
+    annotation: Any = Config
     for item in location[:-1]:
-        if isinstance(item, int):
-            continue
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            return None
-        field = model.model_fields.get(item)
-        if field is None:
-            # A LiDAR's name: the dictionary's value model was already selected.
-            continue
-        annotation = field.annotation
-        while not isinstance(annotation, type) or get_args(annotation):
-            inner = [a for a in get_args(annotation) if a not in (type(None), Ellipsis)]
-            if not inner:
-                return None
-            annotation = inner[-1]
-        model = annotation
-    return model if isinstance(model, type) and issubclass(model, BaseModel) else None
+        annotation = _inner(annotation, item)
+    model = _model_in(annotation)
+    return model or Config
+
+
+def _inner(annotation: Any, item: int | str) -> Any:
+    """The annotation of what `item` selects: a field, a dictionary's value, an item of a list."""
+    model = _model_in(annotation)
+    if isinstance(item, int) or model is None:
+        return annotation
+    if get_origin(annotation) is dict:
+        return get_args(annotation)[1]
+    field = model.model_fields.get(item)
+    return field.annotation if field else annotation
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The first model in an annotation such as `tuple[TargetRegion, ...] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        model = _model_in(inner)
+        if model is not None:
+            return model
+    return None
 
 
 def _one_line(error: ValidationError) -> str:
-    """The first thing wrong, as one line a person can act upon."""
-    first = error.errors(include_url=False)[0]
-    location = tuple(first["loc"])
-    where = ".".join(str(item) for item in location) or "the file"
-    more = error.error_count() - 1
-    rest = f" (and {more} more)" if more else ""
+    """The first thing wrong, as one line a person can act upon; a typo before what it hides."""
+    errors = error.errors(include_url=False)
+    first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
+    # Pydantic names the branches of a union too: they are no keys of the file.
+    location = tuple(
+        item
+        for item in first["loc"]
+        if not (isinstance(item, str) and (item == "float" or "[" in item))
+    )
+    where = ".".join(str(item) for item in location)
+    # What a typo leaves missing is no second error.
+    alike = [e for e in errors if e["type"] == first["type"] or first["type"] != "extra_forbidden"]
+    others = len({tuple(e["loc"])[: len(location)] for e in alike}) - 1
+    rest = f" (and {others} more)" if others > 0 else ""
     if first["type"] == "extra_forbidden":
-        section = _section_at(location)
-        known = list(section.model_fields) if section else list(Config.model_fields)
+        known = list(_section_at(location).model_fields)
         return f"unknown key '{where}': {_nearest(str(location[-1]), known)}{rest}"
     if first["type"] == "missing":
         return f"'{where}' is missing{rest}"
     message = first["msg"].removeprefix("Value error, ")
+    if not location:
+        return f"{message}{rest}"
     given = first["input"]
     shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:60]!r})"
     return f"'{where}': {message}{shown}{rest}"
+
+
+class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """A safe loader to which a key that stands twice is an error, not the last one's victory."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Builds a dictionary."""
+        seen = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            if isinstance(key_node, yaml.ScalarNode):
+                if key_node.value in seen:
+                    raise yaml.MarkedYAMLError(
+                        problem=f"key '{key_node.value}' stands twice",
+                        problem_mark=key_node.start_mark,
+                    )
+                seen.add(key_node.value)
+        return super().construct_mapping(node, deep=deep)
 
 
 def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
@@ -398,9 +440,8 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
         raise error(f"{path}: is not text in UTF-8") from None
     except OSError as e:
         raise error(f"{path}: {e.strerror}") from None
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        return yaml.load(text, Loader=loader)
+        return yaml.load(text, Loader=_UniqueKeys)
     except yaml.MarkedYAMLError as e:
         line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
         raise error(f"{path}: not valid YAML{line}: {e.problem}") from None
@@ -427,7 +468,7 @@ def parse_config(raw: Any, source: str, base: Path) -> Config:
         raise ConfigError(f"{source}: {_one_line(e)}") from None
     if config.data.path is None:
         return config
-    data = config.data.model_copy(update={"path": base / config.data.path})
+    data = config.data.model_copy(update={"path": (base / config.data.path).absolute()})
     return config.model_copy(update={"data": data})
 
 

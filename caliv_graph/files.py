@@ -10,7 +10,7 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from caliv_graph.errors import OutputError
@@ -62,10 +62,11 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
 
     Args:
         path: the folder. An empty one that exists is filled.
-        content: patterns (`fnmatch`) of the names that a result of this kind consists of. The
-            first is the name of its main file: a folder without it is none of our results. With
-            `force` only a result is replaced, and only if all its names are known: what somebody
-            else has put there is never deleted.
+        content: the files that a result of this kind consists of, relative to the folder; each
+            part of such a path is a pattern (`fnmatch`). The first is the name of its main file:
+            a folder without it is none of our results. With `force` only a result is replaced,
+            and only if all that it holds is known: what somebody else has put there, in a
+            subfolder too, is never deleted.
         force: replace an older result.
 
     Yields:
@@ -83,9 +84,10 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
         try:
             fresh.mkdir(parents=True)
             yield fresh
-            for file in fresh.iterdir():
-                with file.open("rb") as opened:
-                    _flush_to_disk(opened)
+            for entry in fresh.rglob("*"):
+                if entry.is_file():
+                    with entry.open("rb") as opened:
+                        _flush_to_disk(opened)
             with _uninterrupted():
                 _swap(fresh, target, old)
         finally:
@@ -129,12 +131,28 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
                 f"{path}: is not replaced, for it holds no {content[0]} and is none of our "
                 "results. Give another --out"
             )
-        foreign = [name for name in names if not any(fnmatch.fnmatch(name, p) for p in content)]
+        foreign = sorted(
+            str(entry.relative_to(target))
+            for entry in target.rglob("*")
+            if not _belongs(entry, target, content)
+        )
         if foreign:
             raise OutputError(
                 f"{path}: is not replaced, for it also holds '{foreign[0]}', which is not part of "
                 "a result and would be lost. Move it elsewhere, or give another --out"
             )
+
+
+def _belongs(entry: Path, folder: Path, content: Sequence[str]) -> bool:
+    """Whether a file, or a folder on the way to one, is what `content` says is in `folder`."""
+    parts = entry.relative_to(folder).parts
+    for pattern in content:
+        wanted = PurePath(pattern).parts
+        if entry.is_dir() and not entry.is_symlink():
+            wanted = wanted[:-1][: len(parts)]
+        if len(wanted) == len(parts) and all(map(fnmatch.fnmatch, parts, wanted)):
+            return True
+    return False
 
 
 def _swap(fresh: Path, target: Path, old: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -169,12 +170,14 @@ def _provenance(
 ) -> dict[str, object]:
     """Versions, what was asked, and what the solve found out about its input."""
     noise = solution.pose_noise
+    # Where the drive lies on this machine is no part of what was asked.
+    asked = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
     return {
         "caliv_graph": caliv_graph.__version__,
-        "config_sha256": hashlib.sha256(dump_config(config).encode()).hexdigest(),
+        "config_sha256": hashlib.sha256(dump_config(asked).encode()).hexdigest(),
         "mode": solution.mode,
         "robust_kernel": config.robust.kernel,
-        "recordings": [r.name for r in recordings],
+        "recordings": [Path(r.name).absolute().name for r in recordings],
         "pose_noise": {
             "white_rotation_rad": noise.white_rotation_rad,
             "white_position_m": noise.white_position_m,

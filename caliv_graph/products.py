@@ -276,7 +276,7 @@ class Direction:
     sigma_data: float
     sigma_prior: float
     text: str
-    together: bool = True
+    together: bool
 
 
 @dataclass(frozen=True)

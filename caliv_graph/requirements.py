@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 
 from caliv_graph.config import LIMIT_KEY, Config
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.covariance import parent_axes_covariance, relative_covariance
+from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration
+from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
 
 def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
@@ -28,18 +29,27 @@ def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
     return replace(calibration, unmet=tuple(dict.fromkeys(unmet)))
 
 
+def _seen(calibration: Calibration) -> list[str]:
+    return [name for name, lidar in calibration.lidars.items() if lidar.saw_target]
+
+
 def _unmet(calibration: Calibration, requirement: str) -> list[str]:
-    seen = {n: r for n, r in calibration.lidars.items() if r.saw_target}
+    verdicts: dict[str, tuple[Sequence[str], Mapping[str, bool]]]
     if requirement == "s2s":
-        # What moves all LiDARs as one rigid body leaves sensor-to-sensor alone.
-        apart = [d.text for d in calibration.undetermined if not d.together]
-        return [f"require s2s: not determined: {text}" for text in apart]
-    axes = AXES[:3] if requirement == "s2v_rotation" else AXES
+        verdicts = {
+            f"'{a}' to '{b}'": (AXES, pair_determined(calibration, a, b))
+            for a, b in sensor_pairs(_seen(calibration), calibration.reference)
+        }
+    else:
+        axes = AXES[:3] if requirement == "s2v_rotation" else AXES
+        verdicts = {
+            f"'{name}'": (axes, calibration.lidars[name].determined) for name in _seen(calibration)
+        }
     out = []
-    for name, lidar in seen.items():
-        lost = [axis for axis in axes if not lidar.determined[axis]]
+    for what, (axes, determined) in verdicts.items():
+        lost = [axis for axis in axes if not determined[axis]]
         if lost:
-            out.append(f"require {requirement}: {', '.join(lost)} of '{name}' not determined")
+            out.append(f"require {requirement}: {', '.join(lost)} of {what} not determined")
     return out
 
 
@@ -49,15 +59,11 @@ def sigmas_s2v(calibration: Calibration, name: str) -> Array:
     return np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
 
 
-def sigmas_s2s(calibration: Calibration, first: str, second: str) -> Array:
-    """(6,) sigmas of `first` against `second` in vehicle axes, rad and m."""
-    names = list(calibration.lidars)
-    i, k = names.index(first), names.index(second)
-    T_a = calibration.lidars[first].T_vehicle_lidar
-    T_b = calibration.lidars[second].T_vehicle_lidar
-    index = [*range(6 * i, 6 * i + 6), *range(6 * k, 6 * k + 6)]
-    cov = relative_covariance(T_a, T_b, calibration.cov_joint[np.ix_(index, index)])
-    return np.sqrt(np.diag(parent_axes_covariance(T_a, cov)))
+def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
+    """(6,) sigmas of `source` against `to` in vehicle axes, rad and m."""
+    cov = pair_covariance(calibration, source, to)
+    T_vehicle_source = calibration.lidars[source].T_vehicle_lidar
+    return np.sqrt(np.diag(parent_axes_covariance(T_vehicle_source, cov)))
 
 
 def _over_limit(calibration: Calibration, key: str, limit: float) -> list[str]:
@@ -67,18 +73,16 @@ def _over_limit(calibration: Calibration, key: str, limit: float) -> list[str]:
     kind, angle, length = match.groups()
     axis = AXES.index(angle or length)
     unit, name_of_unit = (math.degrees(1.0), "degrees") if angle else (1.0, "m")
-    seen = [n for n, r in calibration.lidars.items() if r.saw_target]
-    out = []
+    seen = _seen(calibration)
     if kind == "s2v":
-        sigmas = {f"'{n}'": sigmas_s2v(calibration, n)[axis] for n in seen}
+        sigmas = {f"'{name}'": sigmas_s2v(calibration, name) for name in seen}
     else:
         sigmas = {
-            f"'{a}' to '{b}'": sigmas_s2s(calibration, a, b)[axis] for a, b in permutations(seen, 2)
+            f"'{a}' to '{b}'": sigmas_s2s(calibration, a, b)
+            for a, b in sensor_pairs(seen, calibration.reference)
         }
-    for what, sigma in sigmas.items():
-        if sigma * unit > limit:
-            out.append(
-                f"limits {key}: sigma of {what} is {sigma * unit:.3g} {name_of_unit}, "
-                f"limit {limit:g}"
-            )
-    return out
+    return [
+        f"limits {key}: sigma of {what} is {sigma[axis] * unit:.3g} {name_of_unit}, limit {limit:g}"
+        for what, sigma in sigmas.items()
+        if sigma[axis] * unit > limit
+    ]

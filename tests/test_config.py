@@ -38,7 +38,10 @@ require: [s2s]
 
 
 def parse(base: Path = Path("/base"), **sections: Any) -> Config:
-    lidars = {"front": {"topic": "a", "initial": {}}, "rear": {"topic": "b", "initial": {}}}
+    lidars = {
+        "front": {"topic": "a", "initial": {"xyz": [0, 0, 0]}},
+        "rear": {"topic": "b", "initial": {"xyz": [0, 0, 0]}},
+    }
     return parse_config({"lidars": lidars, **sections}, "config.yaml", base)
 
 
@@ -52,7 +55,7 @@ def error_of(**sections: Any) -> str:
 
 
 def lidar(**keys: Any) -> dict[str, Any]:
-    return {"front": {"topic": "a", "initial": {}, **keys}}
+    return {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0]}, **keys}}
 
 
 def test_the_example_of_the_specification() -> None:
@@ -285,3 +288,41 @@ def test_the_config_of_the_published_drive_shows_the_defaults() -> None:
     assert config.ground == defaults.ground.model_copy(update={"use": False})
     assert config.lidars["sensor_1"] == defaults.lidars["sensor_1"]
     assert config.lidars["sensor_2"].sigma.xyz_m() == defaults.lidars["sensor_2"].sigma.xyz_m()
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"limits": 5, "require": ["s2s"]}, "'limits': Input should be a valid dictionary"),
+        ({"require": [{"limits": [1]}]}, "'limits': Input should be a valid dictionary"),
+        ({"target": {"min": [0, 0, 0], "mx": [1, 1, 1]}}, "unknown key 'target.0.mx'"),
+        ({"target": []}, "'target': Tuple should have at least 1 item"),
+        (
+            {
+                "lidars": {
+                    "front": {"topic": "a", "initial": {"xyz": [0, 0, 0]}, "sigma": {"xyz": -1}}
+                }
+            },
+            "'lidars.front.sigma.xyz':",
+        ),
+        (
+            {"lidars": {"initial": {"topic": "a", "initial": {"xyz": [0, 0, 0]}, "min_rang": 1}}},
+            "unknown key 'lidars.initial.min_rang': did you mean 'min_range'?",
+        ),
+        ({"reference": "left"}, "reference 'left' is not a LiDAR of this config"),
+    ],
+)
+def test_what_is_wrong_is_said_where_it_is(sections: dict[str, Any], message: str) -> None:
+    assert error_of(**sections).startswith(message)
+
+
+def test_an_empty_section_means_its_defaults() -> None:
+    assert parse(topics=None, noise=None) == parse()
+
+
+def test_a_key_that_stands_twice_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("lidars:\n  front: {topic: a}\n  front: {topic: b}\n")
+
+    with pytest.raises(ConfigError, match="in line 3: key 'front' stands twice"):
+        load_config(path)

@@ -41,7 +41,7 @@ from caliv_graph.calibration.robust import RobustWeights
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_target, key_vehicle
 from caliv_graph.errors import SolveError
-from caliv_graph.geometry.se3 import stack, vehicle_axes_difference
+from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import (
     Array,
     PoseNoise,
@@ -52,7 +52,12 @@ from caliv_graph.products import (
 )
 from caliv_graph.progress import Progress
 from caliv_graph.registration.mixture import ShapeQuadratic
-from caliv_graph.registration.register import JointRegistration, left_step, register_jointly
+from caliv_graph.registration.register import (
+    FINE_SIGMA_M,
+    JointRegistration,
+    left_step,
+    register_jointly,
+)
 from caliv_graph.uncertainty.observability import (
     respectful_covariance,
     respectful_step,
@@ -74,9 +79,6 @@ REFINEMENTS = 25
 DECIDED_AFTER = 6
 """Iterations after which the number of undetermined directions is no longer changed, so that one
 at the threshold does not make the estimate jump for ever."""
-
-REHEATED_SIGMA_M = 0.02
-"""Width that the mixture goes back to when the graph takes over: the poses move by millimetres."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
@@ -135,29 +137,39 @@ def _estimate(
     progress: Progress,
 ) -> Solution:
     """The stages of `estimate`, timed."""
-    times: dict[str, float] = {}
+    staged = config.solve.mode == "staged"
+    limit = config.registration.max_iterations
     begun = time.perf_counter()
-    states, registrations = [], []
-    with progress.stage("registering the clouds", len(observations)) as advance:
-        for m, observation in enumerate(observations):
-            state = JointRegistration(observation, config)
-            registrations.append(
-                register_jointly(state, _prealigned(problem, m), config.registration.max_iterations)
-            )
-            states.append(state)
+    states = [JointRegistration(observation, config) for observation in observations]
+    registrations = []
+    with progress.stage("registering the clouds", len(states)) as advance:
+        for m, state in enumerate(states):
+            registrations.append(register_jointly(state, _prealigned(problem, m), limit))
             advance()
-    times["registration"] = time.perf_counter() - begun
-
-    begun = time.perf_counter()
+    times = {"registration": time.perf_counter() - begun}
     with progress.stage("solving the graph", None):
         solve = _solve_registered(problem, registrations, config)
-    if config.solve.mode == "staged":
-        solution = _staged(solve, registrations)
-    else:
-        with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
-            solution = _refine(solve, states, registrations, advance)
+        solution = _staged(solve, registrations) if staged else None
     times["graph"] = solve.graph_seconds
+    if solution is not None:
+        return replace(solution, stage_times_s=times)
+
+    # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
+    # shall depend on the data, not on the initial guess.
+    begun = time.perf_counter()
+    lines = linearise_clouds(problem, solve.values)
+    again = []
+    with progress.stage("registering again, from the solved graph", len(states)) as advance:
+        for state, (R, t) in zip(states, _per_placement(states, lines), strict=True):
+            again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
+            advance()
+    times["registration"] += time.perf_counter() - begun
+    begun = time.perf_counter()
+    with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
+        solve = _solve_registered(problem, again, config)
+        solution = _refine(solve, states, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
+    times["graph"] += solve.graph_seconds
     return replace(solution, stage_times_s=times)
 
 
@@ -451,7 +463,6 @@ def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
 def _refine(
     state: _State,
     states: Sequence[JointRegistration],
-    registrations: Sequence[Registration],
     advance: Callable[..., None],
 ) -> Solution:
     """Expectation-maximisation whose M-step is the graph solve."""
@@ -462,7 +473,7 @@ def _refine(
     # registration took from the initial guess.
     first = linearise_clouds(problem, state.values)
     for shape, (R, t) in zip(states, _per_placement(states, first), strict=True):
-        shape.seed(R, t, REHEATED_SIGMA_M)
+        shape.seed(R, t, FINE_SIGMA_M)
     _hand_weights(state, states)
     undetermined: int | None = None
     converged, iteration = False, 0

@@ -153,7 +153,7 @@ def fit_pose_noise(
         cost,
         start[free],
         method="Nelder-Mead",
-        options={"maxfev": 160, "xatol": 0.05, "fatol": 0.1},
+        options={"maxfev": 200, "xatol": 0.02, "fatol": 0.02},
     )
     full = start.copy()
     full[free] = found.x
@@ -178,8 +178,11 @@ def _stacked(
     values: gtsam.Values,
     chosen: IntArray,
 ) -> tuple[Array, Array, Array, Array]:
-    """Residuals (6m,), Jacobians by extrinsics and targets (6m, p), by pose errors (m, 6, 6)
-    (rotation in vehicle axes, position in map axes), and registration covariances (m, 6, 6).
+    """Residuals of the chosen clouds, and what they depend on.
+
+    Returns:
+        (6m,) residuals; (6m, p) Jacobians by extrinsics and targets; (m, 6, 6) by pose errors
+        (rotation in vehicle axes, position in map axes); (m, 6, 6) registration covariances.
     """
     columns = {
         key: 6 * i for i, key in enumerate((*problem.extrinsic_keys(), *problem.target_keys()))

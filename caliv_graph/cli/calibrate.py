@@ -107,7 +107,8 @@ def _check_guesses(config: Config, path: Path) -> None:
     from caliv_graph.config import Mounting
     from caliv_graph.errors import ConfigError
 
-    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == Mounting()]
+    unknown = Mounting(xyz=(0.0, 0.0, 0.0))
+    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
     if len(zeros) > 1:
         fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
         raise ConfigError(

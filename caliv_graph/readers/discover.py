@@ -51,7 +51,12 @@ def open_all(path: Path) -> Recording:
         RecordingError: the path is missing, no CaLiV folder, or incomplete.
     """
     lidars = {
-        sensor: LidarConfig(topic=sensor, initial=Mounting(), min_range=0.0, max_range=_ANY_RANGE_M)
+        sensor: LidarConfig(
+            topic=sensor,
+            initial=Mounting(xyz=(0.0, 0.0, 0.0)),
+            min_range=0.0,
+            max_range=_ANY_RANGE_M,
+        )
         for sensor in recorded_sensors(path)
     }
     return CalivFolder(path, lidars)

@@ -30,6 +30,9 @@ from caliv_graph.registration.mixture import (
 COARSE_SIGMA_M = 0.05
 """First standard deviation of the components. 3 degrees at the rim of a chair are 2 cm."""
 
+FINE_SIGMA_M = 0.02
+"""The same where a solved graph has put the clouds: their poses move by millimetres."""
+
 ANNEALING = 0.85
 """Factor on the floor of the standard deviation, per iteration."""
 
@@ -181,6 +184,7 @@ def register_jointly(
     state: JointRegistration,
     T_target_lidar: Sequence[gtsam.Pose3],
     max_iterations: int,
+    coarse: bool = True,
 ) -> Registration:
     """Registers all clouds of a placement to one reconstructed target (SPEC 3, paper III-D.2).
 
@@ -192,6 +196,8 @@ def register_jointly(
         state: the clouds; its mixture is seeded here.
         T_target_lidar: pre-alignment, a pose per cloud; right to about 10 degrees, any position.
         max_iterations: at most.
+        coarse: False if the pre-alignment is right to a centimetre or two: the clouds are then not
+            centred first, and annealing starts finer.
 
     Returns:
         A pose and a 6x6 information per cloud, and the reconstructed target.
@@ -200,8 +206,9 @@ def register_jointly(
         RegistrationError: the clouds could not be brought together.
     """
     R, t = stack(list(T_target_lidar))
-    t = centre_clouds(state.clouds, R, t)
-    state.seed(R, t, COARSE_SIGMA_M)
+    if coarse:
+        t = centre_clouds(state.clouds, R, t)
+    state.seed(R, t, COARSE_SIGMA_M if coarse else FINE_SIGMA_M)
     converged, step = False, (np.inf, np.inf)
     iteration = 0
     while iteration < max_iterations and not converged:

@@ -11,9 +11,11 @@ import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
+from caliv_graph.files import output_folder
+from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray
 from caliv_graph.progress import Progress, SilentProgress
-from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
+from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS, POSES_FILE
 from caliv_graph.simulation.drives import Drive, make_drive
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
 from caliv_graph.simulation.noise import (
@@ -26,7 +28,7 @@ from caliv_graph.simulation.noise import (
 from caliv_graph.simulation.scenario import Scenario
 from caliv_graph.simulation.worlds import RayCaster, World, make_world
 from caliv_graph.simulation.writer import (
-    new_folder,
+    CALIV_FOLDER,
     sensor_folders,
     write_config,
     write_ego_poses,
@@ -36,8 +38,15 @@ from caliv_graph.simulation.writer import (
     write_tum,
 )
 
-CONTENT = ("truth.yaml", "input", "trajectory.tum", "config.yaml", "scenario.yaml")
-"""What a simulated drive's folder holds; the first is what tells that it is one."""
+CONTENT = (
+    "truth.yaml",
+    "trajectory.tum",
+    "config.yaml",
+    "scenario.yaml",
+    f"{CALIV_FOLDER}/input/{POSES_FILE}",
+    f"{CALIV_FOLDER}/input/sensor_[0-9]*/[0-9]*.pcd",
+)
+"""What the folder of a simulated drive holds, for `files.output_folder`."""
 
 STRIDE_TOLERANCE = 1e-6
 """How far from a whole number a LiDAR's period may be, in frames: rounding of the YAML's rate."""
@@ -126,8 +135,8 @@ def simulate_caliv(
 ) -> SimulatedDrive:
     """Simulates a drive and writes it as a CaLiV folder with its truth.
 
-    Writes `input/`, `truth.yaml`, `trajectory.tum` (true poses of all frames), `config.yaml` (ready
-    to run, with a perturbed initial guess) and `scenario.yaml` (the effective one). The same
+    Writes `caliv/input/`, `truth.yaml`, `trajectory.tum` (true poses of all frames), `config.yaml`
+    (ready to run, with a perturbed initial guess) and `scenario.yaml` (the effective one). The same
     scenario and seed give the same bytes. A scan without a single return is not written.
 
     Args:
@@ -167,24 +176,29 @@ def simulate_caliv(
     ego_poses: dict[str, list[tuple[int, gtsam.Pose3]]] = {s: [] for s in sensors.values()}
     points: dict[str, list[int]] = {name: [] for name in sensors}
     target_points: dict[str, list[int]] = {name: [] for name in sensors}
-    with new_folder(out_dir, CONTENT, force) as folder:
+    with output_folder(out_dir, CONTENT, force) as folder:
+        clouds = folder / CALIV_FOLDER / "input"
         for sensor in sensors.values():
-            (folder / "input" / sensor).mkdir(parents=True)
+            (clouds / sensor).mkdir(parents=True)
         with (progress or SilentProgress()).stage("simulating", len(stamps_ns)) as advance:
             for frame, scans in _frames(scenario, world, drive, z_map, strides, seed, threads):
                 for name, returns in scans.items():
                     if not len(returns.points_lidar):
                         continue
                     sensor = sensors[name]
-                    write_pcd(folder / "input" / sensor / f"{frame}.pcd", returns.points_lidar)
+                    write_pcd(clouds / sensor / f"{frame}.pcd", returns.points_lidar)
                     ego_poses[sensor].append((frame, T_map_vehicle_given[frame]))
                     points[name].append(len(returns.points_lidar))
                     target_points[name].append(int(is_target[returns.objects].sum()))
                 advance()
-        write_ego_poses(folder / "input" / "ego_poses.yaml", ego_poses)
+        write_ego_poses(clouds / POSES_FILE, ego_poses)
         write_tum(folder / "trajectory.tum", stamps_ns, T_map_vehicle)
         write_config(folder / "config.yaml", scenario, world, guesses, drive.duration_s, seed)
-        write_truth(folder / "truth.yaml", scenario)
+        write_truth(
+            folder / "truth.yaml",
+            {name: pose_from_mounting(model.mounting) for name, model in scenario.lidars.items()},
+            {name: model.time_offset_s for name, model in scenario.lidars.items()},
+        )
         write_scenario(folder / "scenario.yaml", scenario, seed)
     return SimulatedDrive(
         folder=out_dir,

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import shutil
-import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,69 +13,15 @@ import yaml
 
 from caliv_graph.config import Mounting, parse_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.errors import OutputError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray
 from caliv_graph.simulation.scenario import Scenario, dump_scenario
 from caliv_graph.simulation.worlds import World
 
+CALIV_FOLDER = "caliv"
+"""Name of the CaLiV folder in the folder of a simulated drive."""
+
 UNIFORM_TO_SIGMA = 1.0 / math.sqrt(3.0)
 """Standard deviation of a uniform draw from -1 to 1."""
-
-
-@contextmanager
-def new_folder(path: Path, content: Collection[str], force: bool = False) -> Iterator[Path]:
-    """A folder that is there with all its content, or not at all.
-
-    Args:
-        path: the folder.
-        content: names of what will be in it. A folder that holds anything else is not replaced,
-            whatever `force` says: it is not one of ours.
-        force: replace an older one.
-
-    Yields:
-        An empty folder beside `path` to write to. It takes the place of `path` at the end, and is
-        removed if anything goes wrong.
-
-    Raises:
-        OutputError: `path` exists and is not to be replaced, or cannot be written.
-    """
-    path = path.absolute()
-    replace = path.exists()
-    if replace:
-        _check_replaceable(path, content, force)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-    except OSError as e:
-        raise OutputError(f"{path}: cannot be written: {e.strerror}") from None
-    fresh, old = scratch / "new", scratch / "old"
-    try:
-        fresh.mkdir()
-        yield fresh
-        # A folder cannot be renamed onto one that has content.
-        if replace:
-            path.rename(old)
-        fresh.rename(path)
-    except OSError as e:
-        raise OutputError(f"{e.filename or path}: cannot be written: {e.strerror}") from None
-    finally:
-        if old.exists() and not path.exists():
-            old.rename(path)
-        shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _check_replaceable(path: Path, content: Collection[str], force: bool) -> None:
-    if not path.is_dir():
-        raise OutputError(f"{path}: is a file. Choose another folder with --out")
-    if not force:
-        raise OutputError(f"{path}: exists already. Choose another --out, or replace with --force")
-    strangers = sorted(entry.name for entry in path.iterdir() if entry.name not in content)
-    if strangers:
-        raise OutputError(
-            f"{path}: is not replaced, for it holds '{strangers[0]}', which no simulated drive "
-            "does. Move it away, or choose another --out"
-        )
 
 
 def write_pcd(path: Path, points: Array) -> None:
@@ -139,19 +82,27 @@ def sensor_folders(scenario: Scenario) -> tuple[str, ...]:
     return tuple(f"sensor_{number}" for number in range(1, len(scenario.lidars) + 1))
 
 
-def truth_of(scenario: Scenario) -> dict[str, Any]:
-    """The content of `truth.yaml`."""
-    lidars = {}
-    for name, model in scenario.lidars.items():
-        T_vehicle_lidar = pose_from_mounting(model.mounting)
-        lidars[name] = {
-            "T_vehicle_lidar": {
-                "translation": [float(v) for v in T_vehicle_lidar.translation()],
-                "quaternion_xyzw": list(_quaternion_xyzw(T_vehicle_lidar.rotation())),
-            },
-            "time_offset": model.time_offset_s,
+def truth_of(
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3], time_offset_s: Mapping[str, float]
+) -> dict[str, Any]:
+    """The content of `truth.yaml`.
+
+    Args:
+        T_vehicle_lidar: true mounting per LiDAR.
+        time_offset_s: per LiDAR, stamp minus true acquisition time.
+    """
+    return {
+        "lidars": {
+            name: {
+                "T_vehicle_lidar": {
+                    "translation": [float(v) for v in pose.translation()],
+                    "quaternion_xyzw": list(_quaternion_xyzw(pose.rotation())),
+                },
+                "time_offset": time_offset_s[name],
+            }
+            for name, pose in T_vehicle_lidar.items()
         }
-    return {"lidars": lidars}
+    }
 
 
 def _target_regions(scenario: Scenario, world: World) -> list[dict[str, Any]]:
@@ -216,7 +167,7 @@ def config_of(
     if scenario.suspension.height_sigma_m > 0.0:
         ground["sigma"] = scenario.suspension.height_sigma_m
     return {
-        "data": {"format": "caliv", "path": "."},
+        "data": {"format": "caliv", "path": CALIV_FOLDER},
         "lidars": lidars,
         "reference": scenario.reference,
         "target": _target_regions(scenario, world),
@@ -238,15 +189,17 @@ def write_config(
     # What is called ready to run shall at least be a config.
     parse_config(content, str(path), path.parent)
     text = (
-        f"# Written by 'caliv-graph simulate' for scenario '{scenario.name}', seed {seed}.\n"
+        f"# A simulated drive: scenario '{scenario.name}', seed {seed}.\n"
         "# The initial guesses are off on purpose: truth.yaml has the true mountings.\n"
     )
     path.write_text(text + _dump_yaml(content), encoding="utf-8")
 
 
-def write_truth(path: Path, scenario: Scenario) -> None:
-    """Writes `truth.yaml`."""
-    path.write_text(_dump_yaml(truth_of(scenario)), encoding="utf-8")
+def write_truth(
+    path: Path, T_vehicle_lidar: Mapping[str, gtsam.Pose3], time_offset_s: Mapping[str, float]
+) -> None:
+    """Writes `truth.yaml`; see `truth_of`."""
+    path.write_text(_dump_yaml(truth_of(T_vehicle_lidar, time_offset_s)), encoding="utf-8")
 
 
 def write_scenario(path: Path, scenario: Scenario, seed: int) -> None:

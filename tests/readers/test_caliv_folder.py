@@ -440,7 +440,7 @@ def test_open_recording_takes_the_path_of_the_config(tmp_path: Path) -> None:
     drive = write_drive(tmp_path / "drive", {"sensor_1": [entry(1)]})
     raw = {
         "data": {"format": "caliv", "path": "drive"},
-        "lidars": {"front": {"topic": "sensor_1", "initial": {}}},
+        "lidars": {"front": {"topic": "sensor_1", "initial": {"xyz": [0, 0, 0]}}},
     }
     assert open_recording(parse_config(raw, "config.yaml", tmp_path)).name == str(drive)
     with pytest.raises(RecordingError, match="other: no such folder"):
@@ -448,7 +448,7 @@ def test_open_recording_takes_the_path_of_the_config(tmp_path: Path) -> None:
 
 
 def test_open_recording_without_a_path_or_a_reader() -> None:
-    lidars = {"front": {"topic": "sensor_1", "initial": {}}}
+    lidars = {"front": {"topic": "sensor_1", "initial": {"xyz": [0, 0, 0]}}}
     caliv = parse_config({"data": {"format": "caliv"}, "lidars": lidars}, "c.yaml", Path())
     with pytest.raises(ConfigError, match=r"data\.path"):
         open_recording(caliv)

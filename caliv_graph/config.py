@@ -235,14 +235,14 @@ class RegistrationConfig(_Section):
     """The mixture that all clouds of a target are registered to."""
 
     components: Annotated[int, Field(ge=20)] = Field(
-        600, description="number of Gaussian components of the reconstructed target"
+        1000, description="number of Gaussian components of the reconstructed target"
     )
     outlier_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
         0.05, description="assumed ratio of outliers to inliers (gamma)"
     )
     max_iterations: Annotated[int, Field(ge=5)] = Field(100, description="EM iterations at most")
     max_points: Annotated[int, Field(ge=20)] = Field(
-        1500, description="points of one cloud used at most; a larger cloud is thinned evenly"
+        600, description="points of one cloud used at most; a larger cloud is thinned"
     )
 
 

@@ -46,8 +46,8 @@ def _unmet(calibration: Calibration, requirement: str) -> list[str]:
             f"'{name}'": (axes, calibration.lidars[name].determined) for name in _seen(calibration)
         }
     out = []
-    for what, (axes, determined) in verdicts.items():
-        lost = [axis for axis in axes if not determined[axis]]
+    for what, (needed, determined) in verdicts.items():
+        lost = [axis for axis in needed if not determined[axis]]
         if lost:
             out.append(f"require {requirement}: {', '.join(lost)} of {what} not determined")
     return out

@@ -165,6 +165,57 @@ def test_what_others_put_into_a_result_is_never_deleted(result: Path) -> None:
     assert (result / "calibration.yaml").read_text() == "old"
 
 
+def test_a_result_may_have_subfolders(tmp_path: Path) -> None:
+    path, content = tmp_path / "drive", ("truth.yaml", "clouds/sensor_*/[0-9]*.pcd")
+    for text in ("old", "new"):
+        with output_folder(path, content, force=True) as folder:
+            (folder / "clouds/sensor_1").mkdir(parents=True)
+            (folder / "clouds/sensor_1/7.pcd").write_text(text)
+            (folder / "truth.yaml").write_text(text)
+            (folder / "clouds/sensor_2").mkdir()
+
+    assert (path / "clouds/sensor_1/7.pcd").read_text() == "new"
+    assert names(path) == ["clouds", "truth.yaml"]
+    assert names(path / "clouds") == ["sensor_1", "sensor_2"]
+    assert names(tmp_path) == ["drive"]
+
+
+@pytest.mark.parametrize(
+    "mine",
+    ["clouds/notes.txt", "clouds/sensor_1/map.pcd", "clouds/sensor_1/7.pcd/1.pcd", "sensor_1/"],
+)
+def test_what_others_put_into_a_subfolder_is_never_deleted(tmp_path: Path, mine: str) -> None:
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive/truth.yaml").write_text("old")
+    path = tmp_path / "drive" / mine
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.mkdir() if mine.endswith("/") else path.write_text("mine")
+    content = ("truth.yaml", "clouds/sensor_*/[0-9]*.pcd")
+
+    with (
+        pytest.raises(OutputError, match="also holds '"),
+        output_folder(tmp_path / "drive", content, force=True),
+    ):
+        pass
+
+    assert path.exists()
+
+
+def test_a_link_in_a_result_is_not_followed(tmp_path: Path, result: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("mine")
+    content = (*CONTENT, "clouds/[0-9]*.pcd")
+    (result / "clouds").symlink_to(tmp_path / "mine")
+
+    with pytest.raises(OutputError, match="also holds 'clouds'"):
+        check_output_folder(result, content, force=True)
+
+    (result / "target_2.ply").symlink_to(tmp_path / "mine")
+    (result / "clouds").unlink()
+    write_result(result, force=True)
+    assert (tmp_path / "mine/notes.txt").read_text() == "mine"
+
+
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "result").write_text("mine")
 

@@ -87,9 +87,6 @@ what 100 clouds of a chair can tell."""
 COUPLED_STEPS = 4
 """Gauss-Newton steps with the joint information: the problem is nearly linear there."""
 
-HELD_SIGMAS = np.full(6, 1e-6)
-"""Stiffness with which the staged solve holds what it does not estimate, rad and m."""
-
 
 @dataclass
 class _State:
@@ -137,10 +134,9 @@ def _estimate(
     progress: Progress,
 ) -> Solution:
     """The stages of `estimate`, timed."""
-    staged = config.solve.mode == "staged"
     limit = config.registration.max_iterations
     begun = time.perf_counter()
-    states = [JointRegistration(observation, config) for observation in observations]
+    states = [JointRegistration(o, config, rough=True) for o in observations]
     registrations = []
     with progress.stage("registering the clouds", len(states)) as advance:
         for m, state in enumerate(states):
@@ -149,25 +145,29 @@ def _estimate(
     times = {"registration": time.perf_counter() - begun}
     with progress.stage("solving the graph", None):
         solve = _solve_registered(problem, registrations, config)
-        solution = _staged(solve, registrations) if staged else None
     times["graph"] = solve.graph_seconds
-    if solution is not None:
-        return replace(solution, stage_times_s=times)
 
     # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
-    # shall depend on the data, not on the initial guess.
+    # shall depend on the data, not on the initial guess. And aligned clouds show normals that
+    # single ones do not.
     begun = time.perf_counter()
     lines = linearise_clouds(problem, solve.values)
+    states = [JointRegistration(observation, config) for observation in observations]
     again = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
         for state, (R, t) in zip(states, _per_placement(states, lines), strict=True):
+            state.refine_normals(R, t)
             again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
-    with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
-        solve = _solve_registered(problem, again, config)
-        solution = _refine(solve, states, advance)
+    solve = _solve_registered(problem, again, config)
+    if config.solve.mode == "staged":
+        with progress.stage("solving the graph in two stages", None):
+            solution = _staged(solve, again)
+    else:
+        with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
+            solution = _refine(solve, states, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     return replace(solution, stage_times_s=times)
@@ -255,47 +255,72 @@ def _reweight(
 
 
 def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
-    """The paper's second stage: S_a fixed, the reference's translation held, its rotation solved.
+    """The paper's two stages on the registered clouds.
+
+    Stage 1 estimates all S_a with E free under its prior. Stage 2 fixes S_a, holds the reference
+    LiDAR's translation at its guess and solves its rotation.
 
     The translation is reported as the guess has it, but the guess may be wrong by its sigma, and a
     fit that denies this bends the rotation to make up for it: on an arc 50 mm of y become 10 mrad
     of roll. So its error is *considered* (Schmidt 1966): it takes part with the guess's sigma
     while the rotation is solved for, and is not reported.
+
+    Both stages take the registration's joint information. Its blocks, one pose factor per cloud,
+    say twice what the clouds share, since the shape was estimated from them: where two LiDARs saw
+    different skins of the target, blocks tie them together and the joint information does not.
     """
     begun = time.perf_counter()
     problem = state.problem
     measured, information = _measured(registrations)
-    scaled = information / state.scale**2 * state.weights.values[:, None, None]
-    clouds = cloud_graph(problem, measured, scaled)
-    poses = pose_graph(problem, state.noise)
-    fixed = prior_graph(problem, sorted(problem.fixed))
-    information_data = _couple(state, registrations, merged(poses, fixed))
-    first = state.values
-    holds = gtsam.NonlinearFactorGraph()
-    stiff = gtsam.noiseModel.Diagonal.Sigmas(HELD_SIGMAS)
-    for key in problem.extrinsic_keys()[1:]:
-        holds.add(gtsam.PriorFactorPose3(key, first.atPose3(key), stiff))
-    guess = problem.guesses[problem.reference]
-    # The prior has a say in the translation alone: the paper's second stage minimises the data's
-    # error over the rotation. PoseTranslationPrior's error is in the map of the pose: the vehicle.
-    holds.add(
-        gtsam.PoseTranslationPrior3D(
-            key_mounting(),
-            guess,
-            gtsam.noiseModel.Diagonal.Sigmas(problem.prior_sigmas[problem.reference][3:]),
-        )
-    )
-    solved = optimise(merged(poses, fixed, holds, clouds), first, 30)
-    R_vehicle_ref = solved.atPose3(key_mounting()).rotation()
-    state.values = gtsam.Values(solved)
-    state.values.update(key_mounting(), gtsam.Pose3(R_vehicle_ref, guess.translation()))
+    root = np.repeat(np.sqrt(state.weights.values), 6)
+    H = block_diag(*[r.information_joint for r in registrations])
+    H *= np.outer(root, root) / state.scale**2
+    steady = _steady_graph(state)
     prior = _prior_information(problem)
+
+    def reduce() -> _Reduced:
+        lines = linearise_clouds(problem, state.values)
+        r = np.concatenate(
+            [
+                gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
+                for j, Z in enumerate(lines.predicted)
+            ]
+        )
+        return _reduce(problem, state.values, steady, (H, H @ r), lines)
+
+    for _ in range(COUPLED_STEPS):
+        reduced = reduce()
+        state.values = reduced.move(reduced.step_with(prior, _offset(state)))
+    first, information_data = state.values, reduced.D
+
+    guess = problem.guesses[problem.reference]
+    certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
+    for _ in range(COUPLED_STEPS):
+        reduced = reduce()
+        E = state.values.atPose3(key_mounting())
+        R = E.rotation().matrix()
+        Q = problem.to_vehicle_axes(state.values)[:, :6]
+        A, b = Q.T @ reduced.D @ Q, Q.T @ reduced.c
+        # The guess has a say in the translation alone: the paper's second stage minimises the
+        # data's error over the rotation.
+        A[3:, 3:] += R.T @ np.diag(certainty) @ R
+        b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
+        state.values = reduced.move(Q @ np.linalg.solve(A, b))
+    solved = state.values.atPose3(key_mounting())
+    state.values = gtsam.Values(state.values)
+    state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
+    weighted = information / state.scale**2 * state.weights.values[:, None, None]
+    graph = merged(
+        steady,
+        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
+        cloud_graph(problem, measured, weighted),
+    )
     state.graph_seconds += time.perf_counter() - begun
     return _solution(
         state,
         registrations,
-        merged(poses, prior_graph(problem, problem.lidars), clouds),
+        graph,
         measured,
         information / state.scale**2,
         information_data,
@@ -304,42 +329,6 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
         iterations=1,
         converged=True,
     )
-
-
-def _couple(
-    state: _State, registrations: Sequence[Registration], steady: gtsam.NonlinearFactorGraph
-) -> Array:
-    """Stage 1 once more, with the registration's joint information in place of the blocks.
-
-    Pose factors alone say twice what the clouds share: the shape was estimated from them. Where
-    two LiDARs saw different skins of the target, the blocks tie them together and the joint
-    information does not.
-
-    Args:
-        state: solved with pose factors; its values are moved.
-        registrations: the clouds' poses.
-        steady: given poses and trusted mountings.
-
-    Returns:
-        (6n, 6n) data information, vehicle axes.
-    """
-    problem = state.problem
-    measured, _ = _measured(registrations)
-    root = np.repeat(np.sqrt(state.weights.values), 6)
-    H = block_diag(*[r.information_joint for r in registrations])
-    H *= np.outer(root, root) / state.scale**2
-    prior = _prior_information(problem)
-    for _ in range(COUPLED_STEPS):
-        lines = linearise_clouds(problem, state.values)
-        r = np.concatenate(
-            [
-                gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
-                for j, Z in enumerate(lines.predicted)
-            ]
-        )
-        reduced = _reduce(problem, state.values, steady, (H, H @ r), lines)
-        state.values = reduced.move(reduced.step_with(prior, _offset(state)))
-    return reduced.D
 
 
 def _staged_covariance(
@@ -468,7 +457,7 @@ def _refine(
     """Expectation-maximisation whose M-step is the graph solve."""
     problem, config = state.problem, state.config
     prior = _prior_information(problem)
-    steady = merged(pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed)))
+    steady = _steady_graph(state)
     # A new mixture, where the graph puts the clouds: what is found shall not depend on the way the
     # registration took from the initial guess.
     first = linearise_clouds(problem, state.values)
@@ -507,6 +496,12 @@ def _refine(
         )
         advance()
     return _refined_solution(state, states, steady, prior, undetermined, iteration, converged)
+
+
+def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
+    """What stays the same while clouds are weighed anew: given poses and trusted mountings."""
+    problem = state.problem
+    return merged(pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed)))
 
 
 def _refined_solution(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -117,14 +117,88 @@ def stack_clouds(
     stacked = np.concatenate(points)
     flat = np.concatenate(flatness)
     beams = stacked / np.linalg.norm(stacked, axis=1)[:, None]
-    # Where the neighbourhood tells no normal, the surface at least faces the sensor.
-    mixed = flat[:, None] * np.concatenate(normals) - (1.0 - flat[:, None]) * beams
-    mixed /= np.maximum(np.linalg.norm(mixed, axis=1), 1e-12)[:, None]
     return CloudStack(
         points=stacked,
         cloud=np.repeat(np.arange(len(points)), sizes),
         starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
         beams=beams,
-        normals=mixed,
+        normals=_towards_sensor(np.concatenate(normals), flat, beams),
         flatness=flat,
     )
+
+
+MERGED_NEIGHBOURS = 60
+MERGED_RADIUS_M = 0.03
+"""Neighbourhood of a normal in aligned clouds: as wide as a chair's leg, and enough points to see
+a plane through the noise."""
+
+FEWEST_NEIGHBOURS = 6
+"""Fewer points make no normal."""
+
+TRUSTED_ANGLE_RAD = 0.35
+"""Uncertainty of a normal at which it is no longer trusted at all."""
+
+
+def merged_normals(
+    stack: CloudStack, R: Array, t: Array, lidar: IntArray, sigma_range_m: float
+) -> CloudStack:
+    """Normals again, from all clouds of a LiDAR together, once they are aligned.
+
+    One cloud has a column or two of points on a leg; forty of them show its faces. The noise along
+    the beams would tilt the planes: it is taken out of the covariances.
+
+    Args:
+        stack: the clouds.
+        R: (J, 3, 3) rotations of `T_target_lidar`, right to a few millimetres at the target.
+        t: (J, 3) translations of it.
+        lidar: (J,) which LiDAR each cloud is of. Clouds of different LiDARs are not merged: whether
+            they are aligned is the question.
+        sigma_range_m: noise along the beam, metres.
+
+    Returns:
+        The same clouds with new normals and flatness.
+    """
+    points = stack.moved(R, t)
+    beams = stack.rotated(R, stack.beams)
+    normals, flatness = np.zeros_like(points), np.zeros(len(points))
+    for which in np.unique(lidar):
+        member = np.flatnonzero(lidar[stack.cloud] == which)
+        n, flat = _aligned_normals(points[member], beams[member], sigma_range_m)
+        normals[member], flatness[member] = n, flat
+    back = np.swapaxes(R, 1, 2)
+    mixed = _towards_sensor(stack.rotated(back, normals), flatness, stack.beams)
+    return replace(stack, normals=mixed, flatness=flatness)
+
+
+def _towards_sensor(normals: Array, flatness: Array, beams: Array) -> Array:
+    """Normals, leaning the more to the sensor the less they can be trusted.
+
+    Where the neighbourhood tells no normal, the surface at least faces the sensor.
+    """
+    mixed = flatness[:, None] * normals - (1.0 - flatness[:, None]) * beams
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1), 1e-12)[:, None])
+
+
+def _aligned_normals(points: Array, beams: Array, sigma_range_m: float) -> tuple[Array, Array]:
+    """Normals (N, 3) and flatness (N,) of aligned points with their beams."""
+    k = min(MERGED_NEIGHBOURS, len(points))
+    distance, near = cKDTree(points).query(points, k, distance_upper_bound=MERGED_RADIUS_M)
+    inside = np.isfinite(distance)
+    near = np.where(inside, near, 0)
+    count = inside.sum(axis=1)
+    weight = inside / count[:, None]
+    centre = np.einsum("nk,nki->ni", weight, points[near])
+    local = points[near] - centre[:, None]
+    beam = np.einsum("nk,nki->ni", weight, beams[near])
+    scatter = np.einsum("nk,nki,nkj->nij", weight, local, local, optimize=True)
+    noise = sigma_range_m**2 * beam[:, :, None] * beam[:, None, :]
+    spread, axes = np.linalg.eigh(scatter - noise)
+    normals = axes[:, :, 0]
+    normals *= np.where(np.einsum("ni,ni->n", normals, beams) > 0.0, -1.0, 1.0)[:, None]
+    # How well the plane's direction is known: noise across it, over the width of the patch.
+    across2 = np.einsum("ni,nij,nj->n", normals, scatter, normals)
+    width2 = np.maximum(spread[:, 1], 1e-12)
+    angle = np.sqrt(across2 / (width2 * np.maximum(count - 3, 1)))
+    thin = np.maximum(spread[:, 0], 0.0) / width2
+    flatness = np.clip(1.0 - angle / TRUSTED_ANGLE_RAD, 0.0, 1.0) * np.clip(1.0 - 2.0 * thin, 0, 1)
+    return normals, np.where(count >= FEWEST_NEIGHBOURS, flatness, 0.0)

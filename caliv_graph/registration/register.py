@@ -17,7 +17,7 @@ from caliv_graph.config import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Mixture, Registration, TargetObservation
-from caliv_graph.registration.clouds import CloudStack, stack_clouds
+from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.mixture import (
     Responsibilities,
     ShapeQuadratic,
@@ -57,8 +57,13 @@ class JointRegistration:
     of the free M-step of the poses in `calibration`.
     """
 
-    def __init__(self, observation: TargetObservation, config: Config) -> None:
+    def __init__(self, observation: TargetObservation, config: Config, rough: bool = False) -> None:
         """Stacks the clouds of `observation`.
+
+        Args:
+            observation: the clouds.
+            config: size of the mixture and of the clouds.
+            rough: half the points and components, for a registration that another follows.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -69,9 +74,12 @@ class JointRegistration:
             )
         self.observation = observation
         self.clouds: CloudStack = stack_clouds(
-            observation, config.registration.max_points, config.noise.lidar_range_m
+            observation,
+            config.registration.max_points // (2 if rough else 1),
+            config.noise.lidar_range_m,
         )
-        self._components = config.registration.components
+        self._sigma_range = config.noise.lidar_range_m
+        self._components = config.registration.components // (2 if rough else 1)
         self._gamma = config.registration.outlier_ratio
         self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
         self._floor = COARSE_SIGMA_M
@@ -79,6 +87,13 @@ class JointRegistration:
         self._mixture: Mixture | None = None
         self._who: Responsibilities | None = None
         self.weights: Array = np.ones(self.clouds.count)
+
+    def refine_normals(self, R: Array, t: Array) -> None:
+        """Surface normals anew, from the clouds of each LiDAR merged at (R, t)."""
+        names = [cloud.lidar for cloud in self.observation.clouds]
+        index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+        lidar = np.array([index[name] for name in names])
+        self.clouds = merged_normals(self.clouds, R, t, lidar, self._sigma_range)
 
     @property
     def mixture(self) -> Mixture:

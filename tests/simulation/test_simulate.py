@@ -27,7 +27,6 @@ from caliv_graph.simulation.scenario import (
     WorldModel,
 )
 from caliv_graph.simulation.worlds import RayCaster, make_world
-from caliv_graph.simulation.writer import new_folder
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -76,7 +75,7 @@ def parse_pcd(path: Path) -> tuple[dict[str, str], Array]:
 
 
 def parse_poses(folder: Path) -> dict[str, dict[int, gtsam.Pose3]]:
-    raw = yaml.safe_load((folder / "input" / "ego_poses.yaml").read_text(encoding="utf-8"))
+    raw = yaml.safe_load((folder / "caliv/input/ego_poses.yaml").read_text(encoding="utf-8"))
     return {
         sensor: {int(file.removesuffix(".pcd")): pose_from(values) for file, values in entries}
         for sensor, entries in raw.items()
@@ -124,13 +123,14 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
 def test_folder_holds_what_it_should_and_nothing_else(small: SimulatedDrive) -> None:
     folder = small.folder
     assert sorted(path.name for path in folder.iterdir()) == [
+        "caliv",
         "config.yaml",
-        "input",
         "scenario.yaml",
         "trajectory.tum",
         "truth.yaml",
     ]
-    assert sorted(path.name for path in (folder / "input").iterdir()) == [
+    assert [path.name for path in (folder / "caliv").iterdir()] == ["input"]
+    assert sorted(path.name for path in (folder / "caliv/input").iterdir()) == [
         "ego_poses.yaml",
         "sensor_1",
         "sensor_2",
@@ -138,7 +138,7 @@ def test_folder_holds_what_it_should_and_nothing_else(small: SimulatedDrive) -> 
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     # 5 s: 51 frames, of which the second LiDAR, at 5 Hz, takes every other one.
     frames = {
-        sensor: sorted(int(path.stem) for path in (folder / "input" / sensor).glob("*.pcd"))
+        sensor: sorted(int(path.stem) for path in (folder / "caliv/input" / sensor).glob("*.pcd"))
         for sensor in ("sensor_1", "sensor_2")
     }
     assert frames == {"sensor_1": list(range(51)), "sensor_2": list(range(0, 51, 2))}
@@ -150,7 +150,7 @@ def test_folder_holds_what_it_should_and_nothing_else(small: SimulatedDrive) -> 
 def test_clouds_are_binary_pcd_of_floats(small: SimulatedDrive) -> None:
     for sensor, name in (("sensor_1", "front"), ("sensor_2", "side")):
         for frame, count in zip((0, 2), (0, 1) if name == "side" else (0, 2), strict=True):
-            path = small.folder / "input" / sensor / f"{frame}.pcd"
+            path = small.folder / "caliv/input" / sensor / f"{frame}.pcd"
             header, points = parse_pcd(path)
             assert header == {
                 "VERSION": "0.7",
@@ -187,7 +187,7 @@ def test_quiet_points_lie_on_the_world_seen_from_the_written_truth(quiet: Simula
     for sensor, name in (("sensor_1", "front"), ("sensor_2", "side")):
         assert max(quiet.scans[name].target_points) > 5
         for frame in (0, 20, 34, 50):
-            _, points_lidar = parse_pcd(quiet.folder / "input" / sensor / f"{frame}.pcd")
+            _, points_lidar = parse_pcd(quiet.folder / "caliv/input" / sensor / f"{frame}.pcd")
             T_map_lidar = poses[frame].compose(mountings[name])
             points_map = T_map_lidar.transformFrom(points_lidar.T).T
             assert caster.distance(points_map).max() < 1e-4
@@ -239,7 +239,7 @@ def test_truth_has_the_keys_of_its_format(small: SimulatedDrive) -> None:
 
 def test_config_is_ready_to_run(small: SimulatedDrive) -> None:
     config = load_config(small.folder / "config.yaml")
-    assert config.data.path == small.folder
+    assert config.data.path == small.folder / "caliv"
     assert config.reference == "front"
     assert [lidar.topic for lidar in config.lidars.values()] == ["sensor_1", "sensor_2"]
     assert config.lidars["side"].max_range == 60.0
@@ -314,7 +314,7 @@ def test_late_stamps_show_the_world_from_where_the_vehicle_was(tmp_path: Path) -
         scenario.model_copy(update={"lidars": on_time, "drive": delayed}), tmp_path / "ref", 0
     ).folder
     for frame in (0, 20, 34, 50):
-        name = f"input/sensor_1/{frame}.pcd"
+        name = f"caliv/input/sensor_1/{frame}.pcd"
         np.testing.assert_allclose(
             parse_pcd(folder / name)[1], parse_pcd(reference / name)[1], atol=1e-4
         )
@@ -326,8 +326,8 @@ def test_scan_without_a_return_is_not_written(tmp_path: Path) -> None:
     scenario = SMALL.model_copy(update={"lidars": {**SMALL.lidars, "front": blind}})
     drive = simulate_caliv(scenario, tmp_path / "drive", 0)
     assert drive.scans["front"].points == ()
-    assert not list((drive.folder / "input" / "sensor_1").iterdir())
-    raw = yaml.safe_load((drive.folder / "input" / "ego_poses.yaml").read_text())
+    assert not list((drive.folder / "caliv/input" / "sensor_1").iterdir())
+    raw = yaml.safe_load((drive.folder / "caliv/input" / "ego_poses.yaml").read_text())
     assert raw["sensor_1"] == []
     assert len(raw["sensor_2"]) == 26
 
@@ -359,7 +359,10 @@ def test_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
     folder = tmp_path / "home"
     folder.mkdir()
     (folder / "thesis.tex").write_text("years of work")
-    with pytest.raises(OutputError, match=r"holds 'thesis\.tex'"):
+    with pytest.raises(OutputError, match=r"holds no truth\.yaml"):
+        simulate_caliv(SMALL, folder, 0, force=True)
+    (folder / "truth.yaml").write_text("of another kind")
+    with pytest.raises(OutputError, match=r"also holds 'thesis\.tex'"):
         simulate_caliv(SMALL, folder, 0, force=True)
     assert (folder / "thesis.tex").read_text() == "years of work"
     file = tmp_path / "file"
@@ -386,29 +389,6 @@ def test_interruption_leaves_no_half_written_output(tmp_path: Path, force: bool)
     assert [path.name for path in tmp_path.iterdir()] == (["drive"] if force else [])
     if force:
         assert all_bytes(folder) == {"truth.yaml": b"older"}
-
-
-def test_older_folder_comes_back_if_the_new_one_cannot_take_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "drive"
-    folder.mkdir()
-    (folder / "truth.yaml").write_text("older")
-    rename = Path.rename
-
-    def refuse(self: Path, target: Path) -> Path:
-        if self.name == "new":
-            raise OSError(28, "No space left on device")
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", refuse)
-    with (
-        pytest.raises(OutputError, match="No space left"),
-        new_folder(folder, ("truth.yaml",), force=True) as fresh,
-    ):
-        (fresh / "truth.yaml").write_text("newer")
-    assert all_bytes(folder) == {"truth.yaml": b"older"}
-    assert [path.name for path in tmp_path.iterdir()] == ["drive"]
 
 
 def test_unwritable_place_is_an_error_of_the_output(tmp_path: Path) -> None:
@@ -438,8 +418,8 @@ def test_crop_thins_the_folder_only(small: SimulatedDrive, tmp_path: Path) -> No
     cropped = simulate_caliv(SMALL.model_copy(update={"crop": crop}), tmp_path / "drive", 7)
     for name in SMALL.lidars:
         assert cropped.scans[name].target_points == small.scans[name].target_points
-    full = parse_pcd(small.folder / "input" / "sensor_1" / "30.pcd")[1]
-    part = parse_pcd(cropped.folder / "input" / "sensor_1" / "30.pcd")[1]
+    full = parse_pcd(small.folder / "caliv/input" / "sensor_1" / "30.pcd")[1]
+    part = parse_pcd(cropped.folder / "caliv/input" / "sensor_1" / "30.pcd")[1]
     assert 0 < len(part) < len(full)
     assert {tuple(point) for point in part} <= {tuple(point) for point in full}
 

@@ -1,0 +1,240 @@
+"""Noise levels read off simulated poses whose errors are drawn from known ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.calibration.graph import with_given_poses
+from caliv_graph.calibration.noise import (
+    CEILINGS,
+    FLOORS,
+    TYPICAL,
+    TYPICAL_SCALE,
+    first_pose_noise,
+    fit_pose_noise,
+)
+from caliv_graph.config import NoiseConfig
+from caliv_graph.products import PoseNoise
+from tests.calibration.problems import PERIOD_NS, Case, make_case, noisy, with_poses
+
+NONE = PoseNoise(0.0, 0.0, 0.0, 0.0, 4.0)
+WANDERING = PoseNoise(2e-4, 2e-3, 5e-3, 0.05, 4.0)
+BOTH = PoseNoise(1e-3, 5e-3, 2e-3, 0.02, 4.0)
+WHITE = PoseNoise(3e-3, 0.02, 5e-4, 3e-3, 4.0)
+
+
+def given_poses(case: Case, noise: PoseNoise, seed: int) -> list[gtsam.Pose3]:
+    """The true poses with white errors and a first-order Gauss-Markov process on them."""
+    rng = np.random.default_rng(seed)
+    white = np.array([noise.white_rotation_rad] * 3 + [noise.white_position_m] * 3)
+    slow = np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
+    decay = math.exp(-PERIOD_NS * 1e-9 / noise.drift_time_s)
+    drift = slow * rng.normal(size=6)
+    poses = []
+    for T in case.problem.T_map_vehicle:
+        off = drift + white * rng.normal(size=6)
+        R = T.rotation().compose(gtsam.Rot3.Expmap(off[:3]))
+        poses.append(gtsam.Pose3(R, T.translation() + off[3:]))
+        drift = decay * drift + math.sqrt(1.0 - decay**2) * slow * rng.normal(size=6)
+    return poses
+
+
+def fitted(
+    true: PoseNoise, seed: int, *, scale: float = 1.0, config: NoiseConfig | None = None
+) -> tuple[PoseNoise, float]:
+    case = make_case(count=48, seed=seed)
+    problem = with_poses(case, given_poses(case, true, seed))
+    measured = noisy(case, seed + 10, scale)
+    return fit_pose_noise(
+        problem,
+        measured,
+        case.information,
+        np.ones(len(measured), dtype=np.bool_),
+        with_given_poses(problem, case.truth),
+        config or NoiseConfig(),
+    )
+
+
+def mean_range_m() -> float:
+    case = make_case(count=48)
+    return float(np.mean([np.linalg.norm(Z.translation()) for Z in case.measured]))
+
+
+RANGE_M = mean_range_m()
+"""Mean range of the target. A rotation of the vehicle and a shift by this times it look alike from
+one place; what can be told apart well is what both together do to the target."""
+
+
+def white_m(noise: PoseNoise) -> float:
+    """White error of the target's place, metres."""
+    return math.hypot(noise.white_position_m, RANGE_M * noise.white_rotation_rad)
+
+
+def drift_m(noise: PoseNoise) -> float:
+    """Slow error of the target's place, metres."""
+    return math.hypot(noise.drift_position_m, RANGE_M * noise.drift_rotation_rad)
+
+
+SEEDS = range(2)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_scale_of_the_registration_is_found(scale: float, seed: int) -> None:
+    _, found = fitted(BOTH, seed, scale=scale)
+    assert found == pytest.approx(scale, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_poses_that_wander_are_seen_to_wander(seed: int) -> None:
+    found, _ = fitted(WANDERING, seed)
+    assert 0.5 < drift_m(found) / drift_m(WANDERING) < 2.0
+    # 5 mm at the target, against slow errors of 114 mm.
+    assert white_m(found) < 0.4 * drift_m(found)
+
+
+STOPS_SHORT = (
+    "the simplex search stops at its limit of evaluations, at likelihoods e^3 to e^14 below those "
+    "of the true levels, and takes white errors for slow ones. (Powell's method gets there with "
+    "as many.)"
+)
+
+
+def typical_ratios(true: PoseNoise) -> tuple[float, float]:
+    """Geometric means over seeds of what was found over what was drawn: white, slow."""
+    found = [fitted(true, seed)[0] for seed in range(5)]
+    white = np.log([white_m(f) / white_m(true) for f in found])
+    drift = np.log([drift_m(f) / drift_m(true) for f in found])
+    return float(np.exp(white.mean())), float(np.exp(drift.mean()))
+
+
+@pytest.mark.xfail(strict=True, reason=STOPS_SHORT)
+def test_both_kinds_of_error_are_found_together() -> None:
+    white, drift = typical_ratios(BOTH)
+    assert 0.5 < white < 2.0
+    assert 0.5 < drift < 2.0
+
+
+@pytest.mark.xfail(strict=True, reason=STOPS_SHORT)
+def test_white_errors_are_not_taken_for_slow_ones() -> None:
+    # Slow errors of 11 mm beside white ones of 65 mm are hard to see; but they are not larger.
+    white, drift = typical_ratios(WHITE)
+    assert 0.5 < white < 2.0
+    assert drift * drift_m(WHITE) < 0.7 * white_m(WHITE)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_poses_without_errors(seed: int) -> None:
+    found, scale = fitted(NONE, seed)
+    # Nothing above what the registration, 1 mm and 2 mrad, would notice in 50 clouds.
+    assert white_m(found) < 1.5e-3
+    assert drift_m(found) < 1.5e-3
+    assert scale == pytest.approx(1.0, rel=0.15)
+    for value, floor, ceiling in zip(
+        (
+            found.white_rotation_rad,
+            found.white_position_m,
+            found.drift_rotation_rad,
+            found.drift_position_m,
+        ),
+        FLOORS,
+        CEILINGS,
+        strict=False,
+    ):
+        assert 0.999 * floor <= value <= 1.001 * ceiling
+
+
+def test_what_the_config_gives_is_kept() -> None:
+    config = NoiseConfig(pose_position_m=0.0123, pose_drift_rotation_deg=0.5, pose_drift_time_s=7.0)
+    found, _ = fitted(BOTH, 0, config=config)
+    assert found.white_position_m == pytest.approx(0.0123)
+    assert found.drift_rotation_rad == pytest.approx(math.radians(0.5))
+    assert found.drift_time_s == 7.0
+    # The others are fitted, not typical.
+    assert found.white_rotation_rad != TYPICAL.white_rotation_rad
+    assert found.drift_position_m != TYPICAL.drift_position_m
+
+
+def test_everything_given_leaves_the_scale_to_be_found() -> None:
+    config = NoiseConfig(
+        pose_position_m=BOTH.white_position_m,
+        pose_rotation_deg=math.degrees(BOTH.white_rotation_rad),
+        pose_drift_position_m=BOTH.drift_position_m,
+        pose_drift_rotation_deg=math.degrees(BOTH.drift_rotation_rad),
+    )
+    found, scale = fitted(BOTH, 1, scale=2.0, config=config)
+    for name in ("white_position_m", "white_rotation_rad", "drift_position_m"):
+        assert getattr(found, name) == pytest.approx(getattr(BOTH, name))
+    assert scale == pytest.approx(2.0, rel=0.15)
+
+
+def test_clouds_that_are_not_sound_have_no_say() -> None:
+    case = make_case(count=24)
+    problem = with_poses(case, given_poses(case, BOTH, 3))
+    values = with_given_poses(problem, case.truth)
+    measured = list(noisy(case, 4))
+    sound = np.ones(len(measured), dtype=np.bool_)
+    sound[[3, 20, 41]] = False
+    before = fit_pose_noise(problem, measured, case.information, sound, values, NoiseConfig())
+    for j in (3, 20, 41):
+        measured[j] = gtsam.Pose3.Expmap(np.full(6, 0.3)).compose(measured[j])
+    after = fit_pose_noise(problem, measured, case.information, sound, values, NoiseConfig())
+    assert after == before
+    # Had they had it, they would be noticed.
+    sound[:] = True
+    spoilt, scale = fit_pose_noise(
+        problem, measured, case.information, sound, values, NoiseConfig()
+    )
+    assert scale > 1.5 * before[1] or white_m(spoilt) > 1.5 * white_m(before[0])
+
+
+def test_wrong_mountings_are_not_taken_for_noise() -> None:
+    # Extrinsics and targets are integrated out: 5 mrad and 20 mm of them change nothing much.
+    case = make_case(count=32, seed=5)
+    problem = with_poses(case, given_poses(case, BOTH, 6))
+    measured = noisy(case, 7)
+    sound = np.ones(len(measured), dtype=np.bool_)
+    values = with_given_poses(problem, case.truth)
+    right = fit_pose_noise(problem, measured, case.information, sound, values, NoiseConfig())
+    off = gtsam.Values(values)
+    for key in (*problem.extrinsic_keys(), *problem.target_keys()):
+        off.update(key, off.atPose3(key).retract(np.array([5e-3] * 3 + [0.02] * 3)))
+    wrong = fit_pose_noise(problem, measured, case.information, sound, off, NoiseConfig())
+    assert wrong[1] == pytest.approx(right[1], rel=0.1)
+    assert drift_m(wrong[0]) == pytest.approx(drift_m(right[0]), rel=0.3)
+
+
+def test_errors_of_different_drives_are_not_correlated() -> None:
+    # Two drives whose poses are off by 60 mm each, the one east and the other west, for all of
+    # the drive. Each has its own target: there is nothing to see of it.
+    case = make_case(count=12, drives=2)
+    off = np.array([[0.06, 0.0, 0.0], [-0.06, 0.0, 0.0]])
+    poses = [
+        gtsam.Pose3(T.rotation(), T.translation() + off[drive])
+        for T, (drive, _) in zip(case.problem.T_map_vehicle, case.problem.poses, strict=True)
+    ]
+    problem = replace(case.problem, T_map_vehicle=tuple(poses))
+    found, scale = fit_pose_noise(
+        problem,
+        noisy(case, 8),
+        case.information,
+        np.ones(48, dtype=np.bool_),
+        with_given_poses(problem, case.truth),
+        NoiseConfig(),
+    )
+    assert white_m(found) < 2e-3
+    assert scale == pytest.approx(1.0, rel=0.2)
+
+
+def test_first_levels_are_typical_where_the_config_is_silent() -> None:
+    assert first_pose_noise(NoiseConfig()) == TYPICAL
+    config = NoiseConfig(pose_rotation_deg=0.1, pose_drift_position_m=0.03, pose_drift_time_s=9.0)
+    assert first_pose_noise(config) == PoseNoise(
+        math.radians(0.1), TYPICAL.white_position_m, TYPICAL.drift_rotation_rad, 0.03, 9.0
+    )
+    assert TYPICAL_SCALE >= 1.0

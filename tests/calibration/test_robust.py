@@ -1,0 +1,163 @@
+"""Weights of every kernel by numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from caliv_graph.calibration.robust import DOF, GNC_FACTOR, MIN_WEIGHT, RobustWeights
+from caliv_graph.config import RobustConfig
+from caliv_graph.products import Array
+
+SQUARED = np.array([0.0, 1.0, 6.0, 12.0, 54.0, 600.0])
+
+
+def settle(weights: RobustWeights, squared: Array, rounds: int = 100) -> int:
+    """Updates until the kernel has its final shape; the number of rounds it took."""
+    for done in range(1, rounds + 1):
+        change = weights.update(squared)
+        if weights.settled and change == 0.0:
+            return done
+    raise AssertionError(f"not settled after {rounds} rounds")
+
+
+def test_all_clouds_count_fully_at_first() -> None:
+    weights = RobustWeights(RobustConfig(), 4)
+    assert weights.values.tolist() == [1.0] * 4
+
+
+def test_without_a_kernel_all_clouds_count() -> None:
+    weights = RobustWeights(RobustConfig(kernel="none"), 6)
+    assert weights.update(SQUARED) == 0.0
+    assert weights.values.tolist() == [1.0] * 6
+    assert weights.settled
+
+
+def test_huber_by_hand() -> None:
+    # It bends at 1.5 sqrt(6) = 3.674, that is at a square of 13.5; beyond, 3.674 / |r|:
+    # 3.674 / 7.348 and 3.674 / 24.49.
+    weights = RobustWeights(RobustConfig(kernel="huber"), 6)
+    change = weights.update(SQUARED)
+    assert weights.values == pytest.approx([1.0, 1.0, 1.0, 1.0, 0.5, 0.15])
+    assert change == pytest.approx(0.85)
+    assert weights.settled
+    assert weights.update(SQUARED) == 0.0
+
+
+def test_huber_bends_where_the_config_says() -> None:
+    weights = RobustWeights(RobustConfig(kernel="huber", huber_k=1.0), 2)
+    # At sqrt(6): a square of 24 is twice that.
+    weights.update(np.array([5.9, 24.0]))
+    assert weights.values == pytest.approx([1.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("clouds", "percent", "dropped"),
+    [(20, 10.0, 2), (100, 10.0, 10), (136, 10.0, 13), (40, 25.0, 10), (9, 10.0, 0), (20, 0.0, 0)],
+)
+def test_trimmed_drops_exactly_the_worst(clouds: int, percent: float, dropped: int) -> None:
+    weights = RobustWeights(RobustConfig(kernel="trimmed", trim_percent=percent), clouds)
+    squared = np.random.default_rng(clouds).permutation(np.arange(1.0, clouds + 1.0))
+    weights.update(squared)
+    np.testing.assert_array_equal(weights.values < 0.5, squared > clouds - dropped)
+    assert set(weights.values.tolist()) <= {1.0, MIN_WEIGHT}
+
+
+def test_trimmed_chooses_anew_every_round() -> None:
+    weights = RobustWeights(RobustConfig(kernel="trimmed", trim_percent=25.0), 4)
+    weights.update(np.array([1.0, 2.0, 9.0, 3.0]))
+    assert weights.values.round(3).tolist() == [1.0, 1.0, 0.0, 1.0]
+    assert weights.update(np.array([9.0, 2.0, 1.0, 3.0])) == pytest.approx(1.0, abs=1e-5)
+    assert weights.values.round(3).tolist() == [0.0, 1.0, 1.0, 1.0]
+
+
+def test_trimmed_drops_one_of_equals_only() -> None:
+    weights = RobustWeights(RobustConfig(kernel="trimmed", trim_percent=10.0), 20)
+    weights.update(np.ones(20))
+    assert int((weights.values < 0.5).sum()) == 2
+
+
+def test_tls_starts_by_the_formula_of_graduated_non_convexity() -> None:
+    # Yang et al. 2020: with c^2 = 22.46, mu = c^2 / (2 max r^2 - c^2); then the weight is
+    # c sqrt(mu (mu + 1)) / |r| - mu, one below and zero above it.
+    config = RobustConfig(kernel="tls")
+    c2 = float(chi2.isf(0.001, DOF))
+    assert c2 == pytest.approx(22.458, abs=1e-3)
+    weights = RobustWeights(config, 3)
+    weights.update(np.array([1.0, 50.0, 100.0]))
+    mu = 22.458 / (200.0 - 22.458)
+    middle = math.sqrt(22.458 / 50.0 * mu * (mu + 1.0)) - mu
+    last = math.sqrt(22.458 / 100.0 * mu * (mu + 1.0)) - mu
+    assert weights.values == pytest.approx([1.0, middle, last], abs=1e-4)
+    # At first nobody is dropped: the surrogate is convex.
+    assert 0.0 < last < middle < 1.0
+    assert not weights.settled
+    weights.update(np.array([1.0, 50.0, 100.0]))
+    mu *= GNC_FACTOR
+    middle = math.sqrt(22.458 / 50.0 * mu * (mu + 1.0)) - mu
+    assert weights.values[1] == pytest.approx(middle, abs=1e-4)
+
+
+@pytest.mark.parametrize("worst", [30.0, 1e3, 1e6])
+def test_tls_ends_at_a_hard_cut(worst: float) -> None:
+    c2 = float(chi2.isf(0.001, DOF))
+    squared = np.array([0.1, 6.0, c2 - 0.01, c2 + 0.01, 30.0, worst])
+    weights = RobustWeights(RobustConfig(kernel="tls"), 6)
+    settle(weights, squared)
+    assert weights.values.tolist() == [1.0, 1.0, 1.0] + [MIN_WEIGHT] * 3
+
+
+def test_tls_takes_clouds_back_in_that_fit_in_the_end() -> None:
+    weights = RobustWeights(RobustConfig(kernel="tls"), 3)
+    settle(weights, np.array([1.0, 2.0, 500.0]))
+    assert weights.values[2] == MIN_WEIGHT
+    weights.update(np.array([1.0, 2.0, 5.0]))
+    assert weights.values.tolist() == [1.0] * 3
+
+
+def test_tls_without_outliers_is_over_at_once() -> None:
+    weights = RobustWeights(RobustConfig(kernel="tls"), 3)
+    assert weights.update(np.array([1.0, 6.0, 11.0])) == 0.0
+    assert weights.settled
+    assert weights.values.tolist() == [1.0] * 3
+
+
+def test_tls_cuts_where_the_config_says() -> None:
+    weights = RobustWeights(RobustConfig(kernel="tls", tls_p_value=0.1), 2)
+    c2 = float(chi2.isf(0.1, DOF))
+    settle(weights, np.array([c2 - 0.1, c2 + 20.0]))
+    assert weights.values.tolist() == [1.0, MIN_WEIGHT]
+
+
+@pytest.mark.parametrize("kernel", ["huber", "tls", "trimmed", "none"])
+def test_order_of_the_clouds_does_not_matter(kernel: str) -> None:
+    rng = np.random.default_rng(3)
+    squared = rng.chisquare(DOF, 50) * np.where(rng.random(50) < 0.2, 40.0, 1.0)
+    order = rng.permutation(50)
+    config = RobustConfig.model_validate({"kernel": kernel})
+    first, second = RobustWeights(config, 50), RobustWeights(config, 50)
+    for _ in range(60):
+        first.update(squared)
+        second.update(squared[order])
+    assert second.values == pytest.approx(first.values[order])
+    assert (first.values > 0.0).all()
+
+
+def test_gross_outliers_lose_their_say_under_every_kernel_that_has_a_cut() -> None:
+    # The mean of ten clouds at 0 and two at 100: 16.7 without a kernel.
+    position = np.array([0.0] * 10 + [100.0] * 2)
+    means = {}
+    for kernel in ("none", "huber", "tls", "trimmed"):
+        config = RobustConfig.model_validate({"kernel": kernel, "trim_percent": 20.0})
+        weights = RobustWeights(config, 12)
+        for _ in range(60):
+            mean = float(weights.values @ position / weights.values.sum())
+            weights.update((position - mean) ** 2)
+        means[kernel] = mean
+    assert means["none"] == pytest.approx(100.0 / 6.0)
+    assert means["huber"] < 1.0
+    assert means["tls"] < 1e-3
+    assert means["trimmed"] < 1e-3

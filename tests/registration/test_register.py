@@ -1,0 +1,482 @@
+"""Joint registration of clouds with known poses: a chair, and a plate whose two skins are seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config import Config
+from caliv_graph.errors import RegistrationError
+from caliv_graph.products import Array, Registration
+from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.register import (
+    MAX_STEP,
+    JointRegistration,
+    centre_clouds,
+    free_step,
+    left_step,
+    register_jointly,
+)
+from tests.registration.scenes import (
+    Scene,
+    chair_scene,
+    config_of,
+    errors,
+    guesses,
+    looking_at_target,
+    matrices,
+    observe,
+    plates,
+    rms,
+)
+
+SIGMA_M = 0.003
+"""Range noise of most scenes: that of a good LiDAR."""
+
+CONFIG = config_of(lidar_range_m=SIGMA_M)
+
+
+@cache
+def chair(sigma_m: float = SIGMA_M) -> Scene:
+    """12 places on a quarter circle around the chair, 6, 8 and 10 m away in turn."""
+    return chair_scene(np.linspace(20.0, 110.0, 12).tolist(), [6.0, 8.0, 10.0] * 4, sigma_m, 1)
+
+
+def clouds_of(scene: Scene) -> list[Array]:
+    return [cloud.points_lidar for cloud in scene.observation.clouds]
+
+
+def registered(
+    clouds: Sequence[Array], guess: Sequence[gtsam.Pose3], config: Config = CONFIG
+) -> Registration:
+    return register_jointly(JointRegistration(observe(clouds), config), guess, 100)
+
+
+@cache
+def chair_registration(seed: int = 1) -> Registration:
+    scene = chair()
+    return registered(clouds_of(scene), guesses(scene.T_target_lidar, seed))
+
+
+# ------------------------------------------------------------------ known transforms
+
+
+def test_poses_are_found_up_to_a_common_motion() -> None:
+    scene = chair()
+    guess = guesses(scene.T_target_lidar, 1)
+    wrong = rms(errors(guess, scene.T_target_lidar))
+    assert wrong[0] > 0.02
+    assert wrong[1] > 0.2
+
+    registration = chair_registration()
+
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert rms(e)[0] < 2e-3
+    assert rms(e)[1] < 1.5e-3
+    assert np.abs(e[:, :3]).max() < 6e-3
+    assert np.abs(e[:, 3:]).max() < 4e-3
+    assert registration.converged
+    assert registration.iterations < 50
+    assert registration.last_step[0] < 3e-4
+    assert registration.last_step[1] < 2e-4
+    assert registration.inlier_ratio.shape == (12,)
+    assert registration.inlier_ratio.min() > 0.9
+
+
+def test_frame_stays_where_the_guesses_put_it() -> None:
+    # Origin at the target's middle, axes those of the guesses: 3 degrees, averaged over 12.
+    scene, registration = chair(), chair_registration()
+    first, true = registration.T_target_lidar, scene.T_target_lidar
+    common = np.mean(
+        [gtsam.Pose3.Logmap(a.compose(b.inverse())) for a, b in zip(first, true, strict=True)],
+        axis=0,
+    )
+    assert np.linalg.norm(common[:3]) < math.radians(2.0)
+    assert np.linalg.norm(common[3:]) < 0.1
+    # Of a chair of 0.7 x 0.8 x 1.25 m, a face of the back and the armrests are never seen.
+    low, high = np.percentile(registration.mixture.means_target, [1, 99], axis=0)
+    assert np.abs(0.5 * (low + high)).max() < 0.1
+    assert high - low == pytest.approx([0.75, 0.7, 1.2], abs=0.12)
+
+
+def test_another_guess_finds_the_same() -> None:
+    first, second = chair_registration(1), chair_registration(2)
+    difference = rms(errors(first.T_target_lidar, second.T_target_lidar))
+    # A third of what either is off by.
+    assert difference[0] < 1e-3
+    assert difference[1] < 5e-4
+
+
+def test_order_of_the_clouds_does_not_matter() -> None:
+    scene = chair()
+    clouds, guess = clouds_of(scene), guesses(scene.T_target_lidar, 1)
+    order = np.random.default_rng(5).permutation(12).tolist()
+
+    shuffled = registered([clouds[j] for j in order], [guess[j] for j in order])
+
+    straight = chair_registration()
+    assert shuffled.iterations == straight.iterations
+    for j, T in zip(order, shuffled.T_target_lidar, strict=True):
+        assert T.equals(straight.T_target_lidar[j], 1e-6)
+    np.testing.assert_allclose(shuffled.information, straight.information[order], rtol=1e-4)
+    np.testing.assert_allclose(shuffled.inlier_ratio, straight.inlier_ratio[order], rtol=1e-6)
+
+
+def test_a_turned_world_gives_a_turned_registration() -> None:
+    # A quarter turn about the vertical, which keeps boxes boxes; and the map begins elsewhere.
+    scene = chair()
+    G = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi / 2), np.array([200.0, -100.0, 30.0]))
+    guess = [G.compose(T) for T in guesses(scene.T_target_lidar, 1)]
+
+    turned = registered(clouds_of(scene), guess)
+
+    R = gtsam.Pose3(G.rotation(), np.zeros(3))
+    for T, straight in zip(turned.T_target_lidar, chair_registration().T_target_lidar, strict=True):
+        assert T.equals(R.compose(straight), 1e-5)
+
+
+def test_the_paper_s_noise() -> None:
+    # 10 mm along the beam. The thin parts of the chair are then no surfaces any more, and clouds
+    # are drawn away from their LiDAR: it is this, not the noise, that the errors consist of.
+    scene = chair(0.01)
+    registration = registered(
+        clouds_of(scene), guesses(scene.T_target_lidar, 1), config_of(lidar_range_m=0.01)
+    )
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert registration.converged
+    assert rms(e)[0] < 6e-3
+    assert rms(e)[1] < 7e-3
+
+
+def test_clouds_of_very_different_size() -> None:
+    # 90 points from every other place, up to 1500 from the ones between.
+    scene = chair()
+    rng = np.random.default_rng(6)
+    clouds = [
+        p if j % 2 else p[np.sort(rng.permutation(len(p))[:90])]
+        for j, p in enumerate(clouds_of(scene))
+    ]
+    assert max(len(p) for p in clouds) > 1200
+
+    registration = registered(clouds, guesses(scene.T_target_lidar, 1))
+
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert rms(e[1::2])[0] < 2e-3
+    assert rms(e[1::2])[1] < 2e-3
+    assert rms(e[::2])[0] < 6e-3
+    assert rms(e[::2])[1] < 5e-3
+    # And they do not claim what they have not got.
+    claimed = np.trace(registration.information[:, 3:, 3:], axis1=1, axis2=2)
+    assert claimed[::2].max() < 0.5 * claimed[1::2].min()
+
+
+def test_a_fifth_of_outliers() -> None:
+    scene = chair()
+    rng = np.random.default_rng(7)
+    clouds = []
+    for T, points in zip(scene.T_target_lidar, clouds_of(scene), strict=True):
+        stray = rng.uniform([-0.6, -0.6, -0.7], [0.6, 0.6, 0.8], (len(points) // 4, 3))
+        clouds.append(np.vstack([points, T.transformTo(stray.T).T]))
+
+    registration = registered(clouds, guesses(scene.T_target_lidar, 1))
+
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert rms(e)[0] < 3e-3
+    assert rms(e)[1] < 2e-3
+    # Not all strays are far from a chair: but many are seen to be none of it.
+    assert 0.8 < registration.inlier_ratio.mean() < 0.95
+
+
+def test_half_of_the_target_is_hidden_from_some() -> None:
+    # Every third cloud lacks what is on the LiDAR's left of the chair's middle.
+    scene = chair()
+    clouds = clouds_of(scene)
+    for j in range(0, 12, 3):
+        y = clouds[j][:, 1]
+        clouds[j] = clouds[j][y < 0.5 * (y.min() + y.max())]
+
+    registration = registered(clouds, guesses(scene.T_target_lidar, 1, shift_m=0.1))
+
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert rms(e)[0] < 4e-3
+    assert rms(e)[1] < 3e-3
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="clouds without the lower third of the chair are centred 0.2 m too low, and slide down "
+    "the backrest no further than to the nearest fit: 50 mm and 120 mm off, and said to have "
+    "converged with 98 percent inliers",
+)
+def test_the_lower_third_of_the_target_is_hidden_from_some() -> None:
+    scene = chair()
+    clouds = clouds_of(scene)
+    for j in range(0, 12, 3):
+        z = scene.T_target_lidar[j].transformFrom(clouds[j].T)[2]
+        clouds[j] = clouds[j][z > -0.2]
+
+    registration = registered(clouds, guesses(scene.T_target_lidar, 1, shift_m=0.1))
+
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert rms(e)[0] < 4e-3
+    assert rms(e)[1] < 3e-3
+
+
+# ------------------------------------------------------------------ two skins
+
+
+def front_against_back(e: Array) -> Array:
+    return np.asarray(np.abs(e[::2].mean(axis=0) - e[1::2].mean(axis=0)))
+
+
+@pytest.mark.parametrize(("sigma_m", "tolerance"), [(0.003, 1.5e-3), (0.01, 4e-3)])
+def test_the_skins_of_a_plate_are_kept_apart(sigma_m: float, tolerance: float) -> None:
+    scene = plates(300, sigma_m, 1)
+    config = config_of(components=200, lidar_range_m=sigma_m)
+    guess = guesses(scene.T_target_lidar, 1, 1.0, 0.3)
+    e = errors(registered(clouds_of(scene), guess, config).T_target_lidar, scene.T_target_lidar)
+    apart = front_against_back(e)
+    # Of a plate of 25 mm.
+    assert apart[:3].max() < tolerance
+    assert apart[3:].max() < tolerance
+
+
+def test_without_normals_the_skins_are_pulled_together() -> None:
+    # What the test above is worth: the same, with every normal up and every beam from above.
+    scene = plates(300, 0.003, 1)
+    state = JointRegistration(scene.observation, config_of(components=200, lidar_range_m=0.003))
+    R, _ = matrices(scene.T_target_lidar)
+    up = np.swapaxes(R, 1, 2)[state.clouds.cloud][:, :, 2]
+    state.clouds = replace(state.clouds, normals=up, beams=-up, flatness=np.ones(len(up)))
+    guess = guesses(scene.T_target_lidar, 1, 1.0, 0.3)
+    registration = register_jointly(state, guess, 100)
+    e = errors(registration.T_target_lidar, scene.T_target_lidar)
+    assert front_against_back(e)[3] > 0.01
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="the skins are pulled together by 12 mm: at this density nine neighbours are a patch of "
+    "3 cm, the normals of which 10 mm of noise hides, so that they are not used",
+)
+def test_the_skins_of_a_plate_are_kept_apart_at_close_range() -> None:
+    # 2500 points on a square metre, as the paper's LiDAR has at 6 m, and its noise.
+    scene = plates(1500, 0.01, 1)
+    config = config_of(components=300, lidar_range_m=0.01, max_points=3000)
+    guess = guesses(scene.T_target_lidar, 1, 1.0, 0.3)
+    e = errors(registered(clouds_of(scene), guess, config).T_target_lidar, scene.T_target_lidar)
+    assert front_against_back(e)[3:].max() < 5e-3
+
+
+# ------------------------------------------------------------------ information
+
+
+@cache
+def against_a_known_shape(sigma_m: float) -> tuple[Array, Array]:
+    """Errors (S, J, 6) of clouds registered to a chair that is known, and their information.
+
+    The shape is that of 24 clouds at their true poses; the clouds are others, S draws of their
+    noise, J places. Each is on its own: only its block is used.
+    """
+    config = config_of(lidar_range_m=sigma_m)
+    dense = chair_scene(np.linspace(-60, 60, 24).tolist(), [5.0, 7.0, 9.0] * 8, sigma_m, 1)
+    teacher = JointRegistration(dense.observation, config)
+    R, t = matrices(dense.T_target_lidar)
+    teacher.seed(R, t, 0.02)
+    # Annealing takes 15 rounds.
+    for _ in range(18):
+        teacher.expect(R, t)
+        teacher.maximise(R, t)
+    assert teacher.finest
+    e, information = [], []
+    for seed in range(8):
+        scene = chair_scene(np.linspace(-45, 45, 6).tolist(), [8.0, 10.0] * 3, sigma_m, 50 + seed)
+        pupil = JointRegistration(scene.observation, config)
+        R, t = matrices(scene.T_target_lidar)
+        pupil.seed(R, t, 1e-4)
+        pupil._mixture = teacher.mixture
+        for _ in range(10):
+            quadratic = pupil.expect(R, t)
+            d = -np.linalg.solve(quadratic.blocks, quadratic.gradient[..., None])[..., 0]
+            R, t = left_step(R, t, np.asarray(d, dtype=np.float64))
+        result = pupil.result(R, t, pupil.expect(R, t), 10, True, (0.0, 0.0))
+        e.append(
+            [
+                gtsam.Pose3.Logmap(est.compose(true.inverse()))
+                for est, true in zip(result.T_target_lidar, scene.T_target_lidar, strict=True)
+            ]
+        )
+        information.append(result.information)
+    return np.array(e), np.array(information)
+
+
+def chi2_per_dof(e: Array, information: Array) -> float:
+    return float(np.einsum("sja,sjab,sjb->sj", e, information, e).mean() / 6.0)
+
+
+@pytest.mark.parametrize("sigma_m", [0.003, 0.01])
+def test_information_is_that_of_the_noise(sigma_m: float) -> None:
+    # From draw to draw: the errors about their mean over the 8 draws. 0.9 at both.
+    e, information = against_a_known_shape(sigma_m)
+    spread = (e - e.mean(axis=0)) * math.sqrt(8.0 / 7.0)
+    assert 0.5 < chi2_per_dof(spread, information) < 2.0
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="what is common to all draws is not in the information: away from its LiDAR, a cloud is "
+    "off by 1 mm and 2 mrad at 3 mm of noise, by 5 mm and 3 mrad at 10 mm, and the normalised "
+    "square of its error is 7 and 11 times what it should be",
+)
+@pytest.mark.parametrize("sigma_m", [0.003, 0.01])
+def test_information_is_that_of_the_error(sigma_m: float) -> None:
+    e, information = against_a_known_shape(sigma_m)
+    assert chi2_per_dof(e, information) < 3.0
+
+
+def test_information_falls_with_the_noise_and_the_points() -> None:
+    quiet = against_a_known_shape(0.003)[1][0]
+    loud = against_a_known_shape(0.01)[1][0]
+    for information in (quiet, loud):
+        np.testing.assert_allclose(
+            information, np.swapaxes(information, 1, 2), rtol=1e-9, atol=1e-3
+        )
+        assert np.linalg.eigvalsh(information).min() > 0.0
+        # Odd places are farther away.
+        trace = np.trace(information[:, 3:, 3:], axis1=1, axis2=2)
+        assert trace[1::2].max() < trace[::2].min()
+    ratio = np.trace(quiet[:, 3:, 3:], axis1=1, axis2=2) / np.trace(
+        loud[:, 3:, 3:], axis1=1, axis2=2
+    )
+    # (10 mm / 3 mm)^2 = 11 if the noise were all.
+    assert 2.0 < ratio.mean() < 12.0
+
+
+def test_joint_information_is_less_than_each_cloud_s_own() -> None:
+    registration = chair_registration()
+    H = registration.information_joint
+    assert H.shape == (72, 72)
+    for j in range(12):
+        own = H[6 * j : 6 * j + 6, 6 * j : 6 * j + 6]
+        less = np.linalg.eigvalsh(registration.information[j] - own)
+        assert less.min() > -1e-6 * less.max()
+    shift = np.tile(np.eye(6)[:, 3:], (12, 1))
+    claimed = np.trace(registration.information[:, 3:, 3:].sum(axis=0))
+    assert np.trace(shift.T @ H @ shift) < 1e-3 * claimed
+
+
+# ------------------------------------------------------------------ the steps
+
+
+def test_centring_puts_the_middle_of_every_extent_at_the_origin() -> None:
+    # Twice as many points on one side of a box do not move its middle.
+    rng = np.random.default_rng(8)
+    box = rng.uniform([4.0, -1.0, 0.0], [5.0, 1.0, 1.0], (400, 3))
+    lopsided = np.vstack([box, rng.uniform([4.0, -1.0, 0.0], [4.5, 1.0, 1.0], (800, 3))])
+    state = JointRegistration(observe([box, lopsided]), CONFIG)
+    state.clouds = replace(
+        state.clouds,
+        points=np.vstack([box, lopsided]),
+        cloud=np.repeat([0, 1], [400, 1200]),
+        starts=np.array([0, 400]),
+    )
+    R, t = matrices([gtsam.Pose3(), looking_at_target(90.0, 7.0)])
+    centred = centre_clouds(state.clouds, R, t)
+    assert centred[0] == pytest.approx([-4.5, 0.0, -0.5], abs=0.03)
+    points = lopsided @ R[1].T + centred[1]
+    low, high = np.percentile(points, [2, 98], axis=0)
+    assert 0.5 * (low + high) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_a_left_step_is_a_motion_of_the_target_frame() -> None:
+    rng = np.random.default_rng(9)
+    poses = [looking_at_target(a, 8.0) for a in (10.0, 100.0)]
+    d = 0.3 * rng.normal(size=(2, 6))
+    R, t = left_step(*matrices(poses), d)
+    for j, T in enumerate(poses):
+        expected = gtsam.Pose3.Expmap(d[j]).compose(T)
+        np.testing.assert_allclose(R[j], expected.rotation().matrix(), atol=1e-12)
+        np.testing.assert_allclose(t[j], expected.translation(), atol=1e-12)
+
+
+def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
+    """Clouds that are each drawn to a minimum, and nothing that couples them."""
+    return ShapeQuadratic(
+        blocks=information,
+        gradient=-np.einsum("jab,jb->ja", information, minima),
+        coupling=np.zeros((3, 6 * len(minima))),
+    )
+
+
+def test_a_free_step_goes_to_the_minimum_less_the_common_motion() -> None:
+    rng = np.random.default_rng(10)
+    minima = 0.01 * rng.normal(size=(4, 6))
+    root = rng.normal(size=(4, 6, 12))
+    step = free_step(quadratic_of(minima, root @ np.swapaxes(root, 1, 2)))
+    # Levenberg-Marquardt takes a thousandth of it.
+    assert step == pytest.approx((minima - minima.mean(axis=0)) / 1.001, abs=1e-9)
+
+
+def test_a_free_step_is_never_long() -> None:
+    minima = np.zeros((3, 6))
+    minima[0, 4] = 30.0
+    step = free_step(quadratic_of(minima, np.tile(np.eye(6), (3, 1, 1))))
+    assert np.abs(step).max() == pytest.approx(MAX_STEP)
+    assert step[0, 4] > 0.0
+    assert step[1, 4] == pytest.approx(-0.5 * step[0, 4])
+    assert not free_step(quadratic_of(np.zeros((3, 6)), np.tile(np.eye(6), (3, 1, 1)))).any()
+
+
+# ------------------------------------------------------------------ errors and weights
+
+
+def test_one_cloud_is_too_few() -> None:
+    with pytest.raises(RegistrationError, match=r"target: 1 cloud\(s\) to register, needs 2"):
+        JointRegistration(observe(clouds_of(chair())[:1]), CONFIG)
+
+
+def test_steps_in_the_wrong_order_are_said_to_be() -> None:
+    state = JointRegistration(observe(clouds_of(chair())[:2]), CONFIG)
+    R, t = matrices(chair().T_target_lidar[:2])
+    with pytest.raises(RegistrationError, match="not seeded yet"):
+        state.expect(R, t)
+    state.seed(R, t, 0.05)
+    with pytest.raises(RegistrationError, match="E-step missing"):
+        state.maximise(R, t)
+    assert state.inlier_ratio.tolist() == [1.0, 1.0]
+    assert not state.finest
+
+
+def test_a_cloud_that_is_dropped_does_not_shape_the_target() -> None:
+    # Cloud 3 is something else altogether, somewhere else; its weight is next to nothing.
+    scene = chair()
+    clouds = clouds_of(scene)
+    rng = np.random.default_rng(11)
+    other = scene.T_target_lidar[3].transformTo(rng.uniform(-0.4, 0.4, (900, 3)).T).T
+    R, t = matrices(scene.T_target_lidar)
+    shapes = []
+    for points in (clouds[3], other):
+        state = JointRegistration(observe([*clouds[:3], points, *clouds[4:]]), CONFIG)
+        state.weights = np.ones(12)
+        state.weights[3] = 1e-6
+        start = JointRegistration(observe(clouds), CONFIG)
+        start.seed(R, t, 0.02)
+        state.seed(R, t, 0.02)
+        state._mixture, state._volume = start.mixture, start._volume
+        for _ in range(3):
+            quadratic = state.expect(R, t)
+            state.maximise(R, t)
+        shapes.append((quadratic, state.mixture))
+    (first, first_mixture), (second, second_mixture) = shapes
+    keep = np.arange(12) != 3
+    np.testing.assert_allclose(second.blocks[keep], first.blocks[keep], rtol=1e-2, atol=1.0)
+    strong = first_mixture.weights > 1e-4
+    difference = np.abs(second_mixture.means_target - first_mixture.means_target)[strong]
+    assert difference.max() < 1e-4
+    assert np.trace(first.blocks[3]) < 1e-4 * np.trace(first.blocks[4])

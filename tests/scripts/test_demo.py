@@ -1,0 +1,107 @@
+"""The demo explains what it found, and says in one line what it lacks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts import _demo
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stands in for the installed `caliv-graph`, also where the package is not installed."""
+    script = tmp_path / "caliv-graph"
+    script.write_text(
+        f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m caliv_graph "$@"\n'
+    )
+    script.chmod(0o755)
+    monkeypatch.setattr(_demo, "COMMAND", script)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["demo", *map(str, arguments)])
+    return _demo.main()
+
+
+@pytest.mark.usefixtures("command")
+def test_the_main_job_is_done_and_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+
+    assert run(monkeypatch, "--out", out) == 0
+
+    shown = " ".join(capfd.readouterr().out.split())
+    for text in (
+        f"$ caliv-graph calibrate {out}/drive/config.yaml --out {out}/result --force",
+        "Determined: all six axes.",
+        "Not determined, in brackets: x, z, yaw.",
+        "On level ground the vehicle never moves up or down.",
+        "On an arc the vehicle only ever turns about one point.",
+    ):
+        assert text in shown
+    assert (out / "result/calibration.yaml").is_file()
+
+
+@pytest.mark.usefixtures("command")
+def test_a_folder_of_something_else_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive/notes.txt").write_text("mine")
+
+    assert run(monkeypatch, "--keep", tmp_path) == 2
+
+    assert "is not replaced" in capfd.readouterr().err
+    assert (tmp_path / "drive/notes.txt").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("command")
+def test_without_the_published_drive_it_says_so_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text(
+        "data: {format: caliv, path: nowhere}\n"
+        "lidars: {a: {topic: sensor_1, initial: {xyz: [0, 0, 0]}}}\n"
+    )
+    monkeypatch.setattr(_demo, "RELEASED", config)
+
+    assert run(monkeypatch, "--released", "--out", tmp_path / "out") == 2
+
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert f"{tmp_path}/nowhere: the drive that the CaLiV authors published is not there" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_the_command_it_says_so_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(_demo, "COMMAND", tmp_path / "caliv-graph")
+
+    assert run(monkeypatch, "--out", tmp_path / "out") == 2
+
+    assert capfd.readouterr().err == (
+        f"error: {tmp_path}/caliv-graph: no such command. Run scripts/demo, which installs it\n"
+    )
+
+
+def test_help_names_both_drives() -> None:
+    shown = subprocess.run(
+        [sys.executable, ROOT / "scripts/_demo.py", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={"PYTHONPATH": str(ROOT)},
+    ).stdout
+
+    assert "--released" in shown
+    assert "--out DIR" in shown

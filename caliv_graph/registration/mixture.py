@@ -32,6 +32,9 @@ NORMAL_CONCENTRATION = 4.0
 GRAZING = 0.05
 """Cosine between beam and surface at which visibility fades."""
 
+SEARCH_THREADS = 2
+"""Threads of the neighbour search, the one part of the E-step that is worth sharing out."""
+
 PRIOR_COUNT = 1e-3
 """Points' worth of weight that keeps an abandoned component defined."""
 
@@ -141,8 +144,9 @@ def expect(
     beams = stack.rotated(R, stack.beams)
     k = min(NEIGHBOURS, len(mixture.weights))
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
-    # One worker: the trees are small, and threads that wait for each other cost more here.
-    _, near = tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
+    _, near = tree.query(
+        np.column_stack([points, NORMAL_METRES * normals]), k, workers=SEARCH_THREADS
+    )
     near = near.reshape(len(points), k)
     n_k = mixture.normals_target[near]
     offset = points[:, None] - mixture.means_target[near]

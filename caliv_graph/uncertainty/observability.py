@@ -304,7 +304,11 @@ def _describe_apart(parts: Mapping[str, Array]) -> str:
         name, axes = next(iter(said.items()))
         together = " together" if len(axes) > 1 else ""
         return f"{' and '.join(a for a, _ in axes)} of lidar '{name}'{together}"
-    listed = "; ".join(
-        f"{name}: {', '.join(f'{a} {v:+.1f}' for a, v in axes)}" for name, axes in said.items()
-    )
-    return f"LiDARs against each other ({listed}; units of 1 mrad and 10 mm)"
+    # Which way each one moves stands in the vector; a person wants to know what is affected.
+    largest_of = dict.fromkeys(AXES, 0.0)
+    for axes in said.values():
+        for axis, value in axes:
+            largest_of[axis] = max(largest_of[axis], abs(value))
+    affected = sorted((a for a in AXES if largest_of[a] > 0.0), key=lambda a: -largest_of[a])
+    names = " and ".join(f"'{name}'" for name in said)
+    return f"{', '.join(affected)} of lidars {names} against each other"

@@ -401,7 +401,7 @@ def time_command(
             launched = subprocess.run(launch, check=True, capture_output=True, text=True)
             usage = json.loads(launched.stdout)
             if usage["code"] not in (0, 3):
-                why = launched.stderr.strip().splitlines()[-1]
+                why = "; ".join(launched.stderr.strip().splitlines()[-2:])
                 raise CalivError(f"caliv-graph calibrate with solve.mode {mode}: {why}")
             found.append((usage, read_log(result / "log.jsonl")))
             advance()

@@ -39,6 +39,9 @@ RADIUS_M = 9.16
 CHAIR_XYZ_M = (15.16, -9.16, 0.6)
 """Middle of the chair: 6 m outside the right-hand arc."""
 
+S_CHAIR_XY_M = (9.0, -19.0)
+"""Where a chair is in sight of the S-curve before and after it changes its curvature."""
+
 ARC = ArcDrive(duration_s=17.0, radius_m=RADIUS_M)
 ARC_LEFT = ArcDrive(duration_s=17.0, radius_m=RADIUS_M, turn="left")
 S_CURVE = SCurveDrive(duration_s=17.0, radius_m=RADIUS_M)
@@ -179,6 +182,7 @@ def paper_scenario(
     position_sigma_m: float = 0.0,
     rotation_sigma_rad: float = 0.0,
     others: Mapping[str, LidarModel] | None = None,
+    chair_xy_m: tuple[float, float] = CHAIR_XYZ_M[:2],
 ) -> Scenario:
     """The paper's front and rear LiDAR, its chair, cropped clouds.
 
@@ -188,8 +192,8 @@ def paper_scenario(
         position_sigma_m: white error of the given poses; 0: they are the truth.
         rotation_sigma_rad: the same of their rotations.
         others: more LiDARs.
+        chair_xy_m: where the chair stands.
     """
-    x, y, _ = CHAIR_XYZ_M
     return Scenario(
         name="arc",
         drive=drive,
@@ -200,7 +204,7 @@ def paper_scenario(
         },
         reference="rear",
         world=WorldModel(
-            objects={"chair": ChairModel(xy_m=(x, y), yaw_deg=90.0)}, targets=("chair",)
+            objects={"chair": ChairModel(xy_m=chair_xy_m, yaw_deg=90.0)}, targets=("chair",)
         ),
         crop=CropModel(margin_m=1.0, elsewhere_stride=16),
         poses=PoseNoiseModel(

@@ -110,6 +110,19 @@ def test_tls_ends_at_a_hard_cut(worst: float) -> None:
     assert weights.values.tolist() == [1.0, 1.0, 1.0] + [MIN_WEIGHT] * 3
 
 
+def test_tls_is_graduated_over_many_rounds() -> None:
+    # From mu = 22.46 / (2 x 100 - 22.46) = 0.126 to 1000 by factors of 1.4: 27 rounds.
+    weights = RobustWeights(RobustConfig(kernel="tls"), 3)
+    squared = np.array([1.0, 22.6, 100.0])
+    for _ in range(20):
+        weights.update(squared)
+    assert not weights.settled
+    # By then the cut is hard but for what is right at it: r^2 / c^2 = 1.006.
+    assert 0.1 < weights.values[1] < 0.9
+    assert weights.values[2] == MIN_WEIGHT
+    assert 26 <= 20 + settle(weights, squared) <= 30
+
+
 def test_tls_takes_clouds_back_in_that_fit_in_the_end() -> None:
     weights = RobustWeights(RobustConfig(kernel="tls"), 3)
     settle(weights, np.array([1.0, 2.0, 500.0]))

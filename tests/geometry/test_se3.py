@@ -115,7 +115,11 @@ def test_lidar_that_looks_back() -> None:
 
 def test_roll_comes_before_yaw() -> None:
     # Rz(90) Rx(90): y -> z -> z, x -> x -> y, z -> -y -> x. The other order would leave x at z.
-    R = pose_from_mounting(Mounting(rpy_deg=(90.0, 0.0, 90.0))).rotation().matrix()
+    R = (
+        pose_from_mounting(Mounting(xyz=(0.0, 0.0, 0.0), rpy_deg=(90.0, 0.0, 90.0)))
+        .rotation()
+        .matrix()
+    )
     expected = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     np.testing.assert_allclose(R, expected, atol=1e-12)
 
@@ -123,7 +127,7 @@ def test_roll_comes_before_yaw() -> None:
 @given(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(-179.0, 179.0))
 @SEEDED
 def test_rpy_undoes_a_mounting(roll: float, pitch: float, yaw: float) -> None:
-    T = pose_from_mounting(Mounting(rpy_deg=(roll, pitch, yaw)))
+    T = pose_from_mounting(Mounting(xyz=(0.0, 0.0, 0.0), rpy_deg=(roll, pitch, yaw)))
     assert np.degrees(rpy(T.rotation().matrix())) == pytest.approx([roll, pitch, yaw], abs=1e-7)
 
 

@@ -151,6 +151,8 @@ def test_points_drawn_from_a_raster_are_even_over_it() -> None:
 def three_clouds() -> tuple[list[Array], CloudStack]:
     rng = np.random.default_rng(7)
     clouds = [patch(rng, n, tilt_deg=t) for n, t in ((40, 0.0), (300, 30.0), (90, -20.0))]
+    # The large one is bent: its normals tell its points apart.
+    clouds[1][:, 0] += 0.6 * clouds[1][:, 2] ** 2
     return clouds, stack_clouds(observe(clouds), 100, 1e-4)
 
 
@@ -167,12 +169,15 @@ def test_clouds_stand_one_after_the_other_and_large_ones_are_thinned() -> None:
     assert drawn == sorted(set(drawn))
     normals, flatness = surface_normals(clouds[1], 1e-4)
     np.testing.assert_array_equal(stack.flatness[40:140], flatness[drawn])
-    assert angle_deg(stack.normals[40:140], normals[drawn]).max() < 3.0
+    trusted = stack.flatness[40:140] > 0.98
+    assert trusted.sum() > 60
+    assert angle_deg(stack.normals[40:140], normals[drawn])[trusted].max() < 1.0
+    assert angle_deg(stack.normals[40:140], normals[:100])[trusted].max() > 10.0
 
 
 def test_drawn_points_do_not_depend_on_stray_points() -> None:
     clouds, stack = three_clouds()
-    stray = np.vstack([clouds[1], [[8.0, 2.0, 2.0]]])
+    stray = np.vstack([[[8.0, 2.0, 2.0]], clouds[1]])
     with_stray = stack_clouds(observe([stray]), 100, 1e-4)
     before = {tuple(p) for p in stack.points[40:140].tolist()}
     after = {tuple(p) for p in with_stray.points.tolist()}

@@ -12,7 +12,6 @@ import pytest
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.mixture import (
-    NORMAL_CONCENTRATION,
     Responsibilities,
     ShapeQuadratic,
     expect,
@@ -147,8 +146,9 @@ def test_normals_that_disagree_cost_their_exponent() -> None:
     stack = stack_of(np.zeros((3, 3)), normals, beams=-UP.repeat(3, axis=0))
     density = 1e6  # so that alpha is the density of the component over it
     alpha = expect(stack, *IDENTITY, component((0, 0, 0)), density, np.ones(1)).alpha[:, 0]
-    assert alpha[1] / alpha[0] == pytest.approx(math.exp(-0.5 * NORMAL_CONCENTRATION), rel=1e-3)
-    assert alpha[2] / alpha[0] == pytest.approx(math.exp(-NORMAL_CONCENTRATION), rel=1e-3)
+    # 60 degrees a factor of e^2, 90 degrees e^4.
+    assert alpha[1] / alpha[0] == pytest.approx(math.exp(-2.0), rel=1e-3)
+    assert alpha[2] / alpha[0] == pytest.approx(math.exp(-4.0), rel=1e-3)
     # A normal that cannot be trusted costs nothing.
     blind = replace(stack, flatness=np.zeros(3))
     alpha = expect(blind, *IDENTITY, component((0, 0, 0)), density, np.ones(1)).alpha[:, 0]
@@ -447,6 +447,17 @@ def test_components_learn_the_surface_and_its_noise() -> None:
     floored = maximise_shape(stack, *IDENTITY, before, who, 0.01)
     assert math.sqrt(floored.var_normal[0]) == pytest.approx(0.01)
     assert floored.var_tangent == pytest.approx(after.var_tangent)
+
+
+def test_normals_of_components_are_those_that_can_be_trusted() -> None:
+    # Of 20 points 4 have a normal, upwards; what the others say, sideways, is noise.
+    normals = np.tile([1.0, 0.0, 0.0], (20, 1))
+    normals[:4] = UP
+    flatness = np.where(np.arange(20) < 4, 1.0, 0.0)
+    stack = stack_of(np.zeros((20, 3)), normals, flatness=flatness)
+    who = Responsibilities(np.zeros((20, 1), np.int64), np.ones((20, 1)), np.ones(1))
+    after = maximise_shape(stack, *IDENTITY, component((0, 0, 0)), who, 0.01)
+    assert after.normals_target[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-3)
 
 
 def test_weights_of_components_are_their_part_of_the_points() -> None:

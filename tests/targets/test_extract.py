@@ -298,6 +298,15 @@ def test_walls_and_poles_are_not_the_target() -> None:
     assert strangers == 0
 
 
+def test_a_pole_alone_is_no_target() -> None:
+    pole = BoxModel(xy_m=(11.0, 0.0), size_m=(0.12, 0.12, 2.0))
+    alone = scene({"pole": pole})
+    assert len(alone.of("pole")) > 100
+    cloud, rejected = extracted(alone.points_lidar, config_of(tight_region(alone.world, "pole")))
+    assert cloud is None
+    assert rejected == {"nothing above the ground that is 0.2 to 2 m wide": 1}
+
+
 def scene_with_chair(**others: ObjectModel) -> Scene:
     return scene({"chair": CHAIR_AT_10, **others})
 

@@ -26,8 +26,8 @@ from caliv_graph.products import Array, IntArray, PoseNoise
 TYPICAL = PoseNoise(
     white_rotation_rad=2e-4,
     white_position_m=2e-3,
-    drift_rotation_rad=1e-3,
-    drift_position_m=1e-2,
+    drift_rotation_rad=3e-4,
+    drift_position_m=3e-3,
     drift_time_s=4.0,
 )
 """What is assumed before the data speak: a filter of a good GNSS/INS."""

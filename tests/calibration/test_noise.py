@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import gtsam
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.noise import (
@@ -20,6 +22,14 @@ from caliv_graph.calibration.noise import (
 from caliv_graph.config import NoiseConfig
 from caliv_graph.products import PoseNoise
 from tests.calibration.problems import PERIOD_NS, Case, make_case, noisy, with_poses
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """As `estimate` does: threads of linear algebra on small matrices wait for each other."""
+    with threadpool_limits(limits=1):
+        yield
+
 
 NONE = PoseNoise(0.0, 0.0, 0.0, 0.0, 4.0)
 WANDERING = PoseNoise(2e-4, 2e-3, 5e-3, 0.05, 4.0)

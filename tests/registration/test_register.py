@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
 import gtsam
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from caliv_graph.config import Config
 from caliv_graph.errors import RegistrationError
@@ -35,6 +36,14 @@ from tests.registration.scenes import (
     plates,
     rms,
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """As `estimate` does: threads of linear algebra on small matrices wait for each other."""
+    with threadpool_limits(limits=1):
+        yield
+
 
 SIGMA_M = 0.003
 """Range noise of most scenes: that of a good LiDAR."""

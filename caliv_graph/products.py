@@ -169,7 +169,7 @@ class Mixture:
         normals_target: (K, 3) unit vectors, towards the side the surface was seen from.
         var_normal: (K,) m^2, variance along the normal.
         var_tangent: (K,) m^2, variance along each tangent.
-        weights: (K,) priors of the components; with the outlier class they add up to one.
+        weights: (K,) priors of the components given a point is no outlier; they add up to one.
     """
 
     means_target: Array

@@ -36,7 +36,7 @@ from caliv_graph.calibration.graph import (
     with_given_poses,
 )
 from caliv_graph.calibration.noise import TYPICAL_SCALE, first_pose_noise, fit_pose_noise
-from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
 from caliv_graph.calibration.robust import RobustWeights
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_target, key_vehicle
@@ -622,6 +622,15 @@ def _offset(state: _State) -> Array:
     )
 
 
+def _target_in_its_map(state: _State, placement: int) -> gtsam.Pose3:
+    """T_target_map of a placement in the map of its drive."""
+    problem = state.problem
+    cloud = int(np.flatnonzero(problem.cloud_placement == placement)[0])
+    drive = problem.poses[problem.cloud_pose[cloud]][0]
+    T_target_map = state.values.atPose3(key_target(placement))
+    return T_target_map.compose(gtsam.Pose3(gtsam.Rot3(), -problem.origins_map[drive]))
+
+
 def _solution(
     state: _State,
     registrations: Sequence[Registration],
@@ -647,9 +656,10 @@ def _solution(
         reference=problem.reference,
         T_vehicle_lidar={n: problem.mounting(state.values, n) for n in problem.lidars},
         T_map_vehicle={
-            pose: state.values.atPose3(key_vehicle(i)) for i, pose in enumerate(problem.poses)
+            pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
+            for i, pose in enumerate(problem.poses)
         },
-        T_target_map=tuple(state.values.atPose3(key_target(m)) for m in range(problem.placements)),
+        T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
         cloud_weights=tuple(np.split(state.weights.values, cuts)),
         residuals=tuple(np.split(white, cuts)),

@@ -144,8 +144,8 @@ def optimise(
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-6)
     parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     try:
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         result = optimiser.optimizeSafely()
     except RuntimeError as e:
         raise SolveError(f"the graph could not be solved: {str(e).splitlines()[0]}") from None

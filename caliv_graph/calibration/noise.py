@@ -152,8 +152,8 @@ def fit_pose_noise(
     found = minimize(
         cost,
         start[free],
-        method="Nelder-Mead",
-        options={"maxfev": 200, "xatol": 0.02, "fatol": 0.02},
+        method="Powell",  # Nelder-Mead stops short in the valleys between white and slow errors
+        options={"maxfev": 300, "xtol": 1e-2, "ftol": 1e-5},
     )
     full = start.copy()
     full[free] = found.x

@@ -37,7 +37,9 @@ class Problem:
         prior_sigmas: (6,) per LiDAR, vehicle axes.
         fixed: names of the LiDARs whose guess is trusted.
         poses: (drive, stamp_ns) of every pose used, ascending.
-        T_map_vehicle: the given pose of each.
+        T_map_vehicle: the given pose of each, its map's origin moved to `origins_map`.
+        origins_map: (3,) per drive, metres: where the problem's map begins in the drive's. Poses in
+            a national grid are thousands of kilometres from its origin; no matrix bears that.
         cloud_lidar: (J,) index into `lidars`.
         cloud_pose: (J,) index into `poses`.
         cloud_placement: (J,) index of the placement.
@@ -51,6 +53,7 @@ class Problem:
     fixed: frozenset[str]
     poses: tuple[tuple[int, int], ...]
     T_map_vehicle: tuple[gtsam.Pose3, ...]
+    origins_map: Mapping[int, Array]
     cloud_lidar: IntArray
     cloud_pose: IntArray
     cloud_placement: IntArray
@@ -94,7 +97,7 @@ class Problem:
         )
 
     def times_s(self) -> Array:
-        """(n,) times of the poses in seconds; drives are infinitely far apart."""
+        """(n,) times of the poses in seconds; between drives they mean nothing."""
         first = self.poses[0][1]
         return np.array([(stamp - first) / NANOSECONDS_PER_SECOND for _, stamp in self.poses])
 
@@ -128,6 +131,11 @@ class Problem:
         return out
 
 
+def moved_map(T_map_vehicle: gtsam.Pose3, shift: Array) -> gtsam.Pose3:
+    """The same pose in a map whose origin is at minus `shift` of the old one."""
+    return gtsam.Pose3(T_map_vehicle.rotation(), T_map_vehicle.translation() + shift)
+
+
 def pose_problem(
     observations: Sequence[TargetObservation],
     trajectories: Sequence[Trajectory],
@@ -147,6 +155,10 @@ def pose_problem(
     reference = config.reference if config.reference in lidars else lidars[0]
     poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds}))
     index = {pose: i for i, pose in enumerate(poses)}
+    origins = {
+        d: np.asarray(trajectories[d].pose_at(stamp).translation(), np.float64)
+        for d, stamp in reversed(poses)
+    }
     fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
     sigmas = {}
     for name in lidars:
@@ -161,7 +173,10 @@ def pose_problem(
         prior_sigmas=sigmas,
         fixed=fixed,
         poses=poses,
-        T_map_vehicle=tuple(trajectories[d].pose_at(stamp) for d, stamp in poses),
+        T_map_vehicle=tuple(
+            moved_map(trajectories[d].pose_at(stamp), -origins[d]) for d, stamp in poses
+        ),
+        origins_map=origins,
         cloud_lidar=np.array([lidars.index(c.lidar) for _, c in clouds]),
         cloud_pose=np.array([index[c.drive, c.stamp_ns] for _, c in clouds]),
         cloud_placement=np.array([m for m, _ in clouds]),

@@ -35,7 +35,7 @@ GRAZING = 0.05
 SEARCH_THREADS = 2
 """Threads of the neighbour search, the one part of the E-step that is worth sharing out."""
 
-PRIOR_COUNT = 1e-3
+PRIOR_COUNT = 1e-6
 """Points' worth of weight that keeps an abandoned component defined."""
 
 
@@ -173,15 +173,23 @@ def expect(
     return Responsibilities(near, alpha * cloud_weights[stack.cloud][:, None], inlier)
 
 
-def component_means(points: Array, who: Responsibilities, components: int) -> tuple[Array, Array]:
-    """Weighted means of the points of each component (K, 3), and their weights (K,)."""
+def component_means(points: Array, who: Responsibilities, before: Array) -> tuple[Array, Array]:
+    """Weighted means of the points of each component (K, 3), and their weights (K,).
+
+    Args:
+        points: (N, 3) in the target frame.
+        who: responsibilities of the components for them.
+        before: (K, 3) means that components without points keep.
+    """
+    components = len(before)
     flat = who.component.ravel()
     mass = np.asarray(np.bincount(flat, who.alpha.ravel(), components) + PRIOR_COUNT, np.float64)
     sums = [
         np.bincount(flat, (who.alpha * points[:, None, axis]).ravel(), components)
         for axis in range(3)
     ]
-    return np.stack(sums, axis=1) / mass[:, None], mass
+    means = (np.stack(sums, axis=1) + PRIOR_COUNT * before) / mass[:, None]
+    return np.asarray(means, np.float64), mass
 
 
 def shape_quadratic(
@@ -194,7 +202,7 @@ def shape_quadratic(
     """
     count, K = stack.count, len(mixture.weights)
     points = stack.moved(R, t)
-    means, mass = component_means(points, who, K)
+    means, mass = component_means(points, who, mixture.means_target)
     near, alpha = who.component, who.alpha
     n_k = mixture.normals_target[near]
     w_n, w_t = alpha / mixture.var_normal[near], alpha / mixture.var_tangent[near]
@@ -259,7 +267,7 @@ def maximise_shape(
     """
     K = len(mixture.weights)
     points = stack.moved(R, t)
-    means, mass = component_means(points, who, K)
+    means, mass = component_means(points, who, mixture.means_target)
     flat = who.component.ravel()
     trusted = who.alpha * stack.flatness[:, None]
     rotated = stack.rotated(R, stack.normals)

@@ -46,6 +46,9 @@ of the ground's tilt and noise make them larger than the 0.3 to 1.5 m of SPEC 6.
 LINK_M = 0.3
 """Points nearer than this belong to one object, at least; sparse clouds link farther."""
 
+OUTSIDE_M = 0.2
+"""An object this far outside the region counts for a third of one inside it."""
+
 EDGE_RAD = math.radians(0.4)
 """A target within this angle of the edge of the field of view may be cut off by it."""
 
@@ -117,9 +120,16 @@ def _azimuth_edges(points_lidar: Array) -> tuple[float, float] | None:
     return float(first) + half, half
 
 
-def _is_cut(target_lidar: Array, edges: tuple[float, float] | None) -> bool:
-    """Whether the edge of the field of view may cut the target's points (N, 3) off."""
-    if edges is None:
+def _is_cut(target_lidar: Array, edges: tuple[float, float] | None, points: int) -> bool:
+    """Whether the edge of the field of view may cut the target's points (N, 3) off.
+
+    Args:
+        target_lidar: the target's points.
+        edges: of the field of view.
+        points: size of the whole cloud.
+    """
+    if edges is None or len(target_lidar) > 0.5 * points:
+        # A cloud of little else than the target shows no field of view.
         return False
     centre, half = edges
     azimuth = np.arctan2(target_lidar[:, 1], target_lidar[:, 0])
@@ -188,7 +198,7 @@ class RegionExtractor:
             tally.rejected[f"under {extraction.min_points} points"] += 1
             return None
         target = scan.points_lidar[near]
-        if _is_cut(target, _azimuth_edges(scan.points_lidar)):
+        if _is_cut(target, _azimuth_edges(scan.points_lidar), len(scan.points_lidar)):
             tally.rejected["cut off by the edge of the field of view"] += 1
             return None
         tally.kept += 1
@@ -229,7 +239,7 @@ class RegionExtractor:
                 continue
             centre = points[member].mean(axis=0)
             off = np.maximum(np.maximum(self._low - centre, centre - self._high), 0.0)
-            score = len(member) * math.exp(-float(np.linalg.norm(off)))
+            score = len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M)
             if score > best_score:
                 best, best_score = member, score
         return best
@@ -242,7 +252,7 @@ def _complain(region: str, config: Config, tallies: dict[str, _Tally]) -> str:
         reasons = ", ".join(f"{n} {why}" for why, n in tally.rejected.most_common(3))
         near = (
             f"nearest return {tally.nearest_m:.2f} m from the region"
-            if tally.nearest_m > 0.0
+            if 0.0 < tally.nearest_m < math.inf
             else f"at most {tally.most_points} target points in a scan"
         )
         parts.append(

@@ -86,6 +86,7 @@ def make_case(
         fixed=frozenset(),
         poses=tuple((i // count, (i % count) * PERIOD_NS) for i in range(len(poses))),
         T_map_vehicle=tuple(poses),
+        origins_map={drive: np.zeros(3) for drive in range(drives)},
         cloud_lidar=np.array([a for a, _, _ in clouds]),
         cloud_pose=np.array([i for _, i, _ in clouds]),
         cloud_placement=np.array([m for _, _, m in clouds]),

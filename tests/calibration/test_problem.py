@@ -66,7 +66,8 @@ def small_problem(**changes: str) -> Problem:
 def test_poses_are_those_of_clouds_in_order_of_drive_and_stamp() -> None:
     problem = small_problem()
     assert problem.poses == ((0, 10), (0, 30), (1, 5), (1, 10))
-    assert [T.x() for T in problem.T_map_vehicle] == [10.0, 30.0, 1005.0, 1010.0]
+    # Each drive's map begins at its first pose.
+    assert [T.x() for T in problem.T_map_vehicle] == [0.0, 20.0, 0.0, 5.0]
     assert problem.clouds == 6
     # In order of placement and cloud.
     assert [problem.lidars[a] for a in problem.cloud_lidar] == [
@@ -190,3 +191,19 @@ def test_moving_the_reference_moves_all_lidars_with_it() -> None:
     for lidar in (shift[:6], shift[6:]):
         assert lidar[:3] == pytest.approx(np.zeros(3), abs=1e-12)
         assert lidar[3:] == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_map_of_a_problem_begins_at_each_drive_s_first_pose() -> None:
+    # Poses in a national grid are thousands of kilometres from its origin.
+    observations = [
+        observed(0, ("front", 0, 10), ("front", 0, 30)),
+        observed(1, ("front", 1, 5), ("front", 1, 6)),
+    ]
+    trajectories = [drive(10, 30, x=5_334_000.0), drive(5, 6, x=-700.0)]
+
+    problem = pose_problem(observations, trajectories, config_of("front"))
+
+    x = [T.translation()[0] for T in problem.T_map_vehicle]
+    assert x == [0.0, 20.0, 0.0, 1.0]
+    assert problem.origins_map[0] == pytest.approx([5_334_010.0, 0.0, 0.0])
+    assert problem.origins_map[1] == pytest.approx([-695.0, 0.0, 0.0])

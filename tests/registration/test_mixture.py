@@ -481,11 +481,6 @@ def test_an_abandoned_component_stays_defined() -> None:
     assert (after.var_normal >= 0.01**2 - 1e-12).all()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="PRIOR_COUNT holds the means at the origin of the target frame, not where they were: "
-    "an abandoned component jumps into the middle of the target, others are pulled there",
-)
 def test_an_abandoned_component_stays_where_it_was() -> None:
     stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
     who = Responsibilities(np.zeros((20, 1), np.int64), np.ones((20, 1)), np.ones(1))

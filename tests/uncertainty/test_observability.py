@@ -143,6 +143,7 @@ def make_case(drives: Sequence[Sequence[gtsam.Pose3]], *lidars: str) -> Case:
         fixed=frozenset(),
         poses=tuple((d, 500_000_000 * i) for i, d in enumerate(drive_of)),
         T_map_vehicle=tuple(poses),
+        origins_map={drive: np.zeros(3) for drive in range(len(drives))},
         cloud_lidar=np.repeat(np.arange(len(names)), len(poses)),
         cloud_pose=np.tile(np.arange(len(poses)), len(names)),
         cloud_placement=np.tile(np.array(drive_of), len(names)),

@@ -76,7 +76,10 @@ GROSS = 30.0
 REFINEMENTS = 25
 """Iterations of the joint loop at most."""
 
-DECIDED_AFTER = 6
+SHAPES_BEGUN_AGAIN = 8
+"""Iteration after which normals and mixture begin anew, now that annealing has come to its end."""
+
+DECIDED_AFTER = 9
 """Iterations after which the number of undetermined directions is no longer changed, so that one
 at the threshold does not make the estimate jump for ever."""
 
@@ -458,12 +461,7 @@ def _refine(
     problem, config = state.problem, state.config
     prior = _prior_information(problem)
     steady = _steady_graph(state)
-    # A new mixture, where the graph puts the clouds: what is found shall not depend on the way the
-    # registration took from the initial guess.
-    first = linearise_clouds(problem, state.values)
-    for shape, (R, t) in zip(states, _per_placement(states, first), strict=True):
-        shape.seed(R, t, FINE_SIGMA_M)
-    _hand_weights(state, states)
+    _begin_shapes(state, states)
     undetermined: int | None = None
     converged, iteration = False, 0
     while iteration < REFINEMENTS and not converged:
@@ -487,15 +485,31 @@ def _refine(
             shape.maximise(R, t)
         change = state.weights.update(_shape_measurements(state, shapes).squared)
         _hand_weights(state, states)
+        if iteration == SHAPES_BEGUN_AGAIN:
+            _begin_shapes(state, states)
         size = np.abs(step.reshape(-1, 6))
         converged = (
-            all(s.finest for s in states)
+            iteration > SHAPES_BEGUN_AGAIN
+            and all(s.finest for s in states)
             and size[:, :3].max() < STEP_TOLERANCE[0]
             and size[:, 3:].max() < STEP_TOLERANCE[1]
             and change < 10.0 * WEIGHT_TOLERANCE
         )
         advance()
     return _refined_solution(state, states, steady, prior, undetermined, iteration, converged)
+
+
+def _begin_shapes(state: _State, states: Sequence[JointRegistration]) -> None:
+    """New normals and a new mixture, where the graph puts the clouds.
+
+    EM ends near where it starts: what it starts from shall not depend on the way that the
+    registration took from the initial guess.
+    """
+    lines = linearise_clouds(state.problem, state.values)
+    for shape, (R, t) in zip(states, _per_placement(states, lines), strict=True):
+        shape.refine_normals(R, t)
+        shape.seed(R, t, FINE_SIGMA_M)
+    _hand_weights(state, states)
 
 
 def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:

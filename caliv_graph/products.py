@@ -194,7 +194,8 @@ class Registration:
         inlier_ratio: (J,) part of each cloud's points that the mixture explains.
         iterations: EM iterations done.
         converged: whether the last step was below the tolerance.
-        last_step: (rotation rad, translation m), largest over the clouds, of the last iteration.
+        last_step: (rotation rad, translation m) of the last iteration: of the median cloud, or of
+            the extrinsics where the graph solve took part.
     """
 
     observation: TargetObservation

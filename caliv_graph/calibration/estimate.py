@@ -313,17 +313,11 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     state.values = gtsam.Values(state.values)
     state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
-    weighted = information / state.scale**2 * state.weights.values[:, None, None]
-    graph = merged(
-        steady,
-        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
-        cloud_graph(problem, measured, weighted),
-    )
     state.graph_seconds += time.perf_counter() - begun
     return _solution(
         state,
         registrations,
-        graph,
+        steady,
         measured,
         information / state.scale**2,
         information_data,
@@ -496,7 +490,10 @@ def _refine(
             and change < 10.0 * WEIGHT_TOLERANCE
         )
         advance()
-    return _refined_solution(state, states, steady, prior, undetermined, iteration, converged)
+    last_step = (float(size[:, :3].max()), float(size[:, 3:].max()))
+    return _refined_solution(
+        state, states, steady, prior, undetermined, iteration, converged, last_step
+    )
 
 
 def _begin_shapes(state: _State, states: Sequence[JointRegistration]) -> None:
@@ -526,6 +523,7 @@ def _refined_solution(
     undetermined: int | None,
     iterations: int,
     converged: bool,
+    last_step: tuple[float, float],
 ) -> Solution:
     """Reads covariance, residuals and registrations off the last estimate."""
     problem = state.problem
@@ -546,20 +544,14 @@ def _refined_solution(
         start = part.stop
         R, t = left_step(R, t, pulls.pull[part])
         quadratic = replace(quadratic, blocks=pulls.information[part] * state.scale**2)
-        result = shape.result(R, t, quadratic, iterations, converged, (0.0, 0.0))
+        result = shape.result(R, t, quadratic, iterations, converged, last_step)
         registrations.append(result)
         measured += list(result.T_target_lidar)
-    weighted = pulls.information * state.weights.values[:, None, None]
-    graph = merged(
-        steady,
-        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
-        cloud_graph(problem, measured, weighted),
-    )
     state.graph_seconds += time.perf_counter() - begun
     return _solution(
         state,
         registrations,
-        graph,
+        steady,
         measured,
         pulls.information,
         reduced.D,
@@ -648,7 +640,7 @@ def _target_in_its_map(state: _State, placement: int) -> gtsam.Pose3:
 def _solution(
     state: _State,
     registrations: Sequence[Registration],
-    graph: gtsam.NonlinearFactorGraph,
+    steady: gtsam.NonlinearFactorGraph,
     measured: Sequence[gtsam.Pose3],
     information: Array,
     information_data: Array,
@@ -657,8 +649,13 @@ def _solution(
     iterations: int,
     converged: bool,
 ) -> Solution:
-    """Packs the result."""
+    """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds."""
     problem = state.problem
+    graph = merged(
+        steady,
+        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
+        cloud_graph(problem, measured, information * state.weights.values[:, None, None]),
+    )
     if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
         raise SolveError("the covariance of the extrinsics is not finite")
     lines = linearise_clouds(problem, state.values)

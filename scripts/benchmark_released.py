@@ -561,7 +561,7 @@ def document(
             {
                 "mode": run.mode,
                 "kernel": run.kernel,
-                "guesses": [*map(outcome_document, run.outcomes)],
+                "outcomes": [outcome_document(outcome) for outcome in run.outcomes],
             }
             for run in runs
         ],

@@ -482,7 +482,7 @@ def _refine(
         if iteration == SHAPES_BEGUN_AGAIN:
             _begin_shapes(state, states)
         size = np.abs(step.reshape(-1, 6))
-        converged = (
+        converged = bool(
             iteration > SHAPES_BEGUN_AGAIN
             and all(s.finest for s in states)
             and size[:, :3].max() < STEP_TOLERANCE[0]

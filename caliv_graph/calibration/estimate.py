@@ -35,7 +35,12 @@ from caliv_graph.calibration.graph import (
     retract,
     with_given_poses,
 )
-from caliv_graph.calibration.noise import TYPICAL_SCALE, first_pose_noise, fit_pose_noise
+from caliv_graph.calibration.noise import (
+    TYPICAL_SCALE,
+    first_pose_noise,
+    fit_pose_noise,
+    sound_clouds,
+)
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
 from caliv_graph.calibration.robust import RobustWeights
 from caliv_graph.config import Config, RobustConfig
@@ -69,9 +74,6 @@ REWEIGHTINGS = 12
 
 WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
-
-GROSS = 30.0
-"""A cloud whose squared residual is this many times the median's has no say in the noise levels."""
 
 REFINEMENTS = 25
 """Iterations of the joint loop at most."""
@@ -224,10 +226,8 @@ def _solve_registered(
     plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
     state.weights, kernel = plain, state.weights
     _reweight(state, measured, information, 1)
-    lines = linearise_clouds(problem, state.values)
-    squared = _residuals(lines, measured, information)[1]
-    sound = squared < GROSS * np.median(squared)
     given = with_given_poses(problem, state.values)
+    sound = sound_clouds(problem, measured, information, given, state.noise)
     state.noise, state.scale = fit_pose_noise(
         problem, measured, information, sound, given, config.noise
     )

@@ -43,6 +43,9 @@ FLOORS = np.array([2e-5, 2e-4, 1e-5, 1e-4, 0.5])
 
 CEILINGS = np.array([0.05, 1.0, 0.1, 2.0, 10.0])
 
+GROSS = 30.0
+"""A cloud whose squared residual is this many times the median's has no say in the noise levels."""
+
 CLOUDS_USED = 50
 """Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
 
@@ -73,6 +76,37 @@ def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     ]
     values = [t if g is None else g for g, t in zip(given, typical, strict=False)]
     return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
+
+
+def sound_clouds(
+    problem: Problem,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    values: gtsam.Values,
+    noise: PoseNoise,
+) -> npt.NDArray[np.bool_]:
+    """Which clouds are not far off: (J,), those to estimate noise levels from.
+
+    A cloud is judged where the given pose puts it. The solved pose would not do: it follows a cloud
+    that is a third of a metre off, and the white error of the poses would be taken for as large.
+
+    Args:
+        problem: the clouds and poses.
+        measured: registered pose of each cloud.
+        information: (J, 6, 6), without robust weights.
+        values: the current extrinsics and targets, and the poses as given.
+        noise: what is assumed of the poses so far.
+    """
+    lines = linearise_clouds(problem, values)
+    every = np.arange(problem.clouds)
+    r, _, B, R = _stacked(problem, lines, measured, information, values, every)
+    rotation = noise.white_rotation_rad**2 + noise.drift_rotation_rad**2
+    position = noise.white_position_m**2 + noise.drift_position_m**2
+    spread = np.array([rotation] * 3 + [position] * 3)
+    V = R + np.einsum("jax,x,jbx->jab", B, spread, B)
+    r = r.reshape(-1, 6)
+    squared = np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0])
+    return np.asarray(squared < GROSS * np.median(squared))
 
 
 def fit_pose_noise(

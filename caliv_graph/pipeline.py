@@ -86,10 +86,11 @@ def _warnings(
     out += [w for o in observations for w in o.warnings]
     for registration in solution.registrations:
         if not registration.converged:
+            turn, shift = registration.last_step
             out.append(
-                f"{registration.observation.name}: the registration was still moving after "
-                f"{registration.iterations} iterations: treat the result with care, or raise "
-                "registration.max_iterations"
+                f"{registration.observation.name}: shape and poses still moved by "
+                f"{1e3 * turn:.2f} mrad and {1e3 * shift:.2f} mm in the last of "
+                f"{registration.iterations} iterations: trust the result no further than its sigmas"
             )
     return tuple(out)
 

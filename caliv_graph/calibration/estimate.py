@@ -75,7 +75,7 @@ REWEIGHTINGS = 12
 WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
 
-REFINEMENTS = 25
+REFINEMENTS = 20
 """Iterations of the joint loop at most."""
 
 SHAPES_BEGUN_AGAIN = 8

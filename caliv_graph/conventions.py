@@ -41,6 +41,16 @@ def key_vehicle(index: int) -> int:
 
 def key_drift(index: int) -> int:
     """Key of the slow error of the given pose at the i-th stamp used."""
+    return int(gtsam.symbol("d", index))
+
+
+def key_velocity(index: int) -> int:
+    """Key of the velocity of the vehicle frame's origin in the map, (3,) m/s, beside X_i."""
+    return int(gtsam.symbol("v", index))
+
+
+def key_bias(index: int) -> int:
+    """Key of the IMU's `gtsam.imuBias.ConstantBias` (imu frame) beside X_i."""
     return int(gtsam.symbol("b", index))
 
 

@@ -6,7 +6,7 @@ Solution -> Uncertainty -> Calibration. Frames and tangent order are in `convent
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -27,12 +27,16 @@ class LidarScan:
         stamp_ns: stamp of the cloud in nanoseconds.
         points_lidar: (N, 3) float64, metres, lidar frame; every value finite.
         source: what to call it in messages: a file, or a topic and stamp.
+        point_times_s: (N,) seconds after the stamp at which each point was taken (negative where
+            stamps mark the end of the sweep), or None if the format does not tell: then all points
+            are as of the stamp.
     """
 
     lidar: str
     stamp_ns: int
     points_lidar: Array
     source: str
+    point_times_s: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -42,10 +46,90 @@ class GivenPoses:
     Attributes:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n poses.
+        cov: (n, 6, 6) as the messages state it, right perturbations, rotation then translation;
+            NaN where unknown. None: nothing is stated.
     """
 
     stamps_ns: IntArray
     T_map_vehicle: tuple[gtsam.Pose3, ...]
+    cov: Array | None = None
+
+
+@dataclass(frozen=True)
+class ImuSamples:
+    """What the IMU said, in its own frame.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        angular_velocity: (n, 3) rad/s, imu frame.
+        specific_force: (n, 3) m/s^2, imu frame: +g along the upward axis at rest.
+        orientation_xyzw: (n, 4) unit quaternions of R_map_imu (ENU), rows of NaN where a message
+            has none; None if no message has one.
+        orientation_cov: (n, 3, 3) rad^2 as the messages state it, NaN where unknown, or None.
+        angular_velocity_cov: (3, 3) (rad/s)^2 per sample, or None if unknown.
+        specific_force_cov: (3, 3) (m/s^2)^2 per sample, or None if unknown.
+    """
+
+    stamps_ns: IntArray
+    angular_velocity: Array
+    specific_force: Array
+    orientation_xyzw: Array | None = None
+    orientation_cov: Array | None = None
+    angular_velocity_cov: Array | None = None
+    specific_force_cov: Array | None = None
+
+
+@dataclass(frozen=True)
+class GnssFixes:
+    """Positions of the GNSS antenna; messages without a fix are left out.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        latitude_deg: (n,) WGS84.
+        longitude_deg: (n,) WGS84.
+        altitude_m: (n,) above the WGS84 ellipsoid.
+        cov_enu: (n, 3, 3) m^2 as the messages state it, NaN where unknown, or None.
+    """
+
+    stamps_ns: IntArray
+    latitude_deg: Array
+    longitude_deg: Array
+    altitude_m: Array
+    cov_enu: Array | None = None
+
+
+@dataclass(frozen=True)
+class TwistSamples:
+    """Velocities of the vehicle frame's origin, in vehicle axes.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        velocity: (n, 3) m/s, vehicle frame.
+        velocity_cov: (n, 3, 3) (m/s)^2 as the messages state it, NaN where unknown, or None.
+    """
+
+    stamps_ns: IntArray
+    velocity: Array
+    velocity_cov: Array | None = None
+
+
+@dataclass(frozen=True)
+class MotionData:
+    """Everything in a recording that tells how the vehicle moved; None: it is not there.
+
+    Attributes:
+        name: of the recording, for messages.
+        poses: vehicle poses, instead of or beside raw sensors.
+        imu: inertial measurements.
+        gnss: positions.
+        twist: velocities.
+    """
+
+    name: str
+    poses: GivenPoses | None = None
+    imu: ImuSamples | None = None
+    gnss: GnssFixes | None = None
+    twist: TwistSamples | None = None
 
 
 class Recording(Protocol):
@@ -62,11 +146,17 @@ class Recording(Protocol):
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         """Stamps of the clouds of one LiDAR, ascending, without reading a cloud."""
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in order of their stamps; never more than one in memory."""
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in order of their stamps; never more than one in memory.
 
-    def given_poses(self) -> GivenPoses:
-        """The vehicle poses that came with the recording."""
+        Args:
+            lidar: its name.
+            wanted: stamps of the clouds that are asked for, None: all. The others need not be
+                decoded.
+        """
+
+    def motion(self) -> MotionData:
+        """What the recording tells of the vehicle's motion, read in one pass."""
 
     def warnings(self) -> Sequence[str]:
         """What was left out so far, and why, a line each."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 from caliv_graph.config import Config, LidarConfig, Mounting, load_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
-from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan
+from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
 from caliv_graph.readers import open_recording
 from caliv_graph.simulation import simulate_caliv
 from caliv_graph.simulation.drives import Drive, make_drive, smoothstep, smoothstep_rate
@@ -99,11 +99,11 @@ class Memory:
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         return [scan.stamp_ns for scan in self.clouds[lidar]]
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
-        return iter(self.clouds[lidar])
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        return (s for s in self.clouds[lidar] if wanted is None or s.stamp_ns in wanted)
 
-    def given_poses(self) -> GivenPoses:
-        return self.poses
+    def motion(self) -> MotionData:
+        return MotionData(self.name, poses=self.poses)
 
     def warnings(self) -> Sequence[str]:
         return []
@@ -224,9 +224,11 @@ def simulated(scenario: Scenario, seed: int, folder: Path) -> ChairDrive:
     regions = tuple(r.model_copy(update={"frame": "start"}) for r in config.target)
     config = config.model_copy(update={"target": regions})
     reader = open_recording(config)
+    given = reader.motion().poses
+    assert given is not None
     clouds = {name: tuple(reader.scans(name)) for name in config.lidars}
     return ChairDrive(
-        recording=Memory(clouds, reader.given_poses()),
+        recording=Memory(clouds, given),
         config=config,
         truth={name: pose_from_mounting(m.mounting) for name, m in scenario.lidars.items()},
     )

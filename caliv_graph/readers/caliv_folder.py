@@ -10,7 +10,7 @@ import math
 import re
 import reprlib
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from caliv_graph.config import LidarConfig, read_yaml
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import Array, GivenPoses, LidarScan
+from caliv_graph.products import Array, GivenPoses, LidarScan, MotionData
 from caliv_graph.readers.pcd import read_pcd
 
 FRAME_PERIOD_NS = 100_000_000
@@ -109,8 +109,10 @@ class CalivFolder:
         """Stamps of the clouds of one LiDAR, ascending: frame number times FRAME_PERIOD_NS."""
         return [frame * FRAME_PERIOD_NS for frame in self._clouds[lidar]]
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """Reads the clouds of one LiDAR in order of their frames, one at a time.
+
+        Those whose stamp is not in `wanted` are not read, unless it is None.
 
         NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
         than its `max_range`. A scan of which nothing is left is a scan: it sees nothing.
@@ -119,6 +121,8 @@ class CalivFolder:
             RecordingError: a cloud is missing, empty, cut off or damaged.
         """
         for frame, path in self._clouds[lidar].items():
+            if wanted is not None and frame * FRAME_PERIOD_NS not in wanted:
+                continue
             # No name for the scan here: it would keep it alive while the next one is read.
             yield self._read_scan(lidar, frame, path)
 
@@ -132,9 +136,9 @@ class CalivFolder:
             source=str(path),
         )
 
-    def given_poses(self) -> GivenPoses:
+    def motion(self) -> MotionData:
         """The vehicle's pose at each frame of which a LiDAR of the config has a cloud."""
-        return self._poses
+        return MotionData(self._name, poses=self._poses)
 
     def warnings(self) -> Sequence[str]:
         """What was left out, and why, a line each."""

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Recording, TargetObservation
 from caliv_graph.progress import Progress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
@@ -192,7 +193,9 @@ def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSumma
 
 
 def _summarise_drive(recording: Recording) -> DriveSummary:
-    given = recording.given_poses()
+    given = recording.motion().poses
+    if given is None:
+        raise TrajectoryError(f"{recording.name}: has no vehicle poses")
     poses = given.T_map_vehicle
     positions_map = np.array([pose.translation() for pose in poses])
     turns = [

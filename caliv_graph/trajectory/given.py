@@ -17,7 +17,9 @@ def given_trajectories(recordings: Sequence[Recording]) -> tuple[Trajectory, ...
     """
     out = []
     for recording in recordings:
-        poses = recording.given_poses()
+        poses = recording.motion().poses
+        if poses is None:
+            raise TrajectoryError(f"{recording.name}: has no vehicle poses")
         if len(poses.stamps_ns) < 2:
             raise TrajectoryError(
                 f"{recording.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"

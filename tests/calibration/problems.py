@@ -136,7 +136,7 @@ def moved(values: gtsam.Values, seed: int, rotation_rad: float, position_m: floa
     scale = np.array([rotation_rad] * 3 + [position_m] * 3)
     out = gtsam.Values(values)
     for key in values.keys():  # noqa: SIM118 - gtsam.Values is no dict
-        if chr(gtsam.Symbol(key).chr()) != "b":
+        if chr(gtsam.Symbol(key).chr()) != "d":
             out.update(key, values.atPose3(key).retract(scale * rng.uniform(-1.0, 1.0, 6)))
     return out
 

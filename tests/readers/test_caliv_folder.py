@@ -15,7 +15,7 @@ import yaml
 
 from caliv_graph.config import Config, parse_config
 from caliv_graph.errors import ConfigError, RecordingError
-from caliv_graph.products import Array, LidarScan, Recording
+from caliv_graph.products import Array, GivenPoses, LidarScan, Recording
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.caliv_folder import CalivFolder
 from caliv_graph.readers.pcd import read_pcd
@@ -69,6 +69,12 @@ def open_drive(path: Path, lidars: Mapping[str, str] | None = None, **changed: A
     return open_recording(config, path)
 
 
+def poses_of(recording: Recording) -> GivenPoses:
+    poses = recording.motion().poses
+    assert poses is not None
+    return poses
+
+
 def read_all(recording: Recording) -> list[LidarScan]:
     return [scan for lidar in recording.lidars for scan in recording.scans(lidar)]
 
@@ -93,7 +99,7 @@ def test_frames_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     stamps = [200_000_000, 900_000_000, 1_000_000_000, 10_000_000_000]  # 0.1 s a frame
     assert list(recording.scan_stamps_ns("front")) == stamps
     assert [scan.stamp_ns for scan in recording.scans("front")] == stamps
-    poses = recording.given_poses()
+    poses = poses_of(recording)
     assert poses.stamps_ns.dtype == np.int64
     assert poses.stamps_ns.tolist() == stamps
     assert [pose.x() for pose in poses.T_map_vehicle] == [2.0, 9.0, 10.0, 100.0]
@@ -104,7 +110,7 @@ def test_pose_is_xyz_and_quaternion_xyzw(tmp_path: Path) -> None:
     """Yaw by 90 degrees at (1, 2, 3): what is ahead of the vehicle lies along the map's y."""
     half = math.sqrt(0.5)
     drive = write_drive(tmp_path, {"sensor_1": [entry(0, [1, 2, 3, 0, 0, half, half])]})
-    (T_map_vehicle,) = open_drive(drive).given_poses().T_map_vehicle
+    (T_map_vehicle,) = poses_of(open_drive(drive)).T_map_vehicle
     np.testing.assert_allclose(T_map_vehicle.transformFrom([5.0, 0.0, 0.0]), [1.0, 7.0, 3.0])
 
 
@@ -164,7 +170,7 @@ def test_sensors_that_the_config_does_not_name_are_not_looked_at(tmp_path: Path)
     drive = write_drive(tmp_path, poses, {"sensor_1": [1], "sensor_2": [5]})
     recording = open_drive(drive)
     assert recording.lidars == ("front",)
-    assert recording.given_poses().stamps_ns.tolist() == [100_000_000]
+    assert poses_of(recording).stamps_ns.tolist() == [100_000_000]
     assert recording.warnings() == ()
 
 
@@ -176,8 +182,8 @@ def test_poses_are_those_of_any_lidar(tmp_path: Path) -> None:
     lidars = {"c": "sensor_3", "a": "sensor_1", "b": "sensor_2"}
     recording = open_drive(write_drive(tmp_path, poses), lidars)
     assert recording.lidars == ("c", "a", "b")
-    assert (recording.given_poses().stamps_ns // 100_000_000).tolist() == [1, 2, 3, 7]
-    assert len(recording.given_poses().T_map_vehicle) == 4
+    assert (poses_of(recording).stamps_ns // 100_000_000).tolist() == [1, 2, 3, 7]
+    assert len(poses_of(recording).T_map_vehicle) == 4
 
 
 def test_poses_without_a_cloud_are_skipped_and_counted(tmp_path: Path) -> None:
@@ -187,7 +193,7 @@ def test_poses_without_a_cloud_are_skipped_and_counted(tmp_path: Path) -> None:
     (warning,) = recording.warnings()
     assert "3 of sensor_1, 1 of sensor_2" in warning
     assert str(drive / "input/ego_poses.yaml") in warning
-    assert (recording.given_poses().stamps_ns // 100_000_000).tolist() == [0, 1, 2, 3]
+    assert (poses_of(recording).stamps_ns // 100_000_000).tolist() == [0, 1, 2, 3]
     assert len(list(recording.scans("front"))) == 2
 
 
@@ -230,14 +236,14 @@ def test_zero_padded_names_are_the_same_frames(tmp_path: Path) -> None:
 def test_numbers_as_yaml_cpp_writes_them(tmp_path: Path) -> None:
     drive = write_drive(tmp_path, {"sensor_1": [entry(1)]})
     (drive / "input/ego_poses.yaml").write_text("sensor_1: [[1.pcd, [-2e-05, 3, 1.5, 0, 0, 0, 1]]]")
-    (pose,) = open_drive(drive).given_poses().T_map_vehicle
+    (pose,) = poses_of(open_drive(drive)).T_map_vehicle
     np.testing.assert_array_equal(pose.translation(), [-2e-05, 3.0, 1.5])
 
 
 def test_rounded_quaternion_is_normalised(tmp_path: Path) -> None:
     """0.707 instead of the root of a half: norm 0.99985, still a turn by 90 degrees."""
     drive = write_drive(tmp_path, {"sensor_1": [entry(1, [0, 0, 0, 0, 0, 0.707, 0.707])]})
-    (pose,) = open_drive(drive).given_poses().T_map_vehicle
+    (pose,) = poses_of(open_drive(drive)).T_map_vehicle
     np.testing.assert_allclose(pose.rotation().matrix() @ [1, 0, 0], [0, 1, 0], atol=1e-12)
 
 
@@ -266,7 +272,7 @@ def test_poses_of_one_frame_must_agree(tmp_path: Path) -> None:
     # Rounding to six decimals, and the same rotation's other quaternion, are no contradiction.
     same = [1e-6, -1e-6, 1e-6, 1e-6, -1e-6, 1e-6, -1.0]
     recording = open_drive(drive("same", same), lidars)
-    assert recording.given_poses().T_map_vehicle[0].equals(gtsam.Pose3(), 1e-12)
+    assert poses_of(recording).T_map_vehicle[0].equals(gtsam.Pose3(), 1e-12)
 
 
 def test_cloud_without_a_pose(tmp_path: Path) -> None:
@@ -463,7 +469,7 @@ def test_open_recording_without_a_path_or_a_reader() -> None:
 def test_the_drive_of_the_authors() -> None:
     recording = open_drive(AUTHORS_DRIVE, {"front": "sensor_1", "rear": "sensor_2"})
     assert recording.warnings() == ()
-    poses = recording.given_poses()
+    poses = poses_of(recording)
     assert len(poses.T_map_vehicle) == 115  # 58 and 78 frames, 21 of them common
     assert (np.diff(poses.stamps_ns) > 0).all()
     # The frame period is the drive's: with it the vehicle goes at the pace of a parking lot.

@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 
 import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.products import GivenPoses, LidarScan, TargetCloud, TargetObservation
+from caliv_graph.products import GivenPoses, LidarScan, MotionData, TargetCloud, TargetObservation
 from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 from caliv_graph.report.inspection import Points, add_targets, inspect_recording
@@ -30,13 +30,13 @@ class Drive:
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         return [frame * FRAME_PERIOD_NS for frame in self._frames[lidar]]
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for frame in self._frames[lidar]:
             yield LidarScan(lidar, frame * FRAME_PERIOD_NS, np.ones((frame, 3)), f"{frame}.pcd")
 
-    def given_poses(self) -> GivenPoses:
+    def motion(self) -> MotionData:
         stamps_ns = np.arange(len(self._poses), dtype=np.int64) * FRAME_PERIOD_NS
-        return GivenPoses(stamps_ns, self._poses)
+        return MotionData(self.name, poses=GivenPoses(stamps_ns, self._poses))
 
     def warnings(self) -> Sequence[str]:
         return ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -18,9 +18,9 @@ from caliv_graph.errors import TargetError
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import (
     Array,
-    GivenPoses,
     IntArray,
     LidarScan,
+    MotionData,
     TargetCloud,
     TargetObservation,
     Trajectory,
@@ -143,11 +143,11 @@ class Scans:
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         return range(len(self.clouds[lidar]))
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp, points in enumerate(self.clouds[lidar]):
             yield LidarScan(lidar, stamp, points, f"{lidar}/{stamp}.pcd")
 
-    def given_poses(self) -> GivenPoses:
+    def motion(self) -> MotionData:
         raise AssertionError("poses come with the trajectory")
 
     def warnings(self) -> Sequence[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import RecordingError, TrajectoryError
-from caliv_graph.products import GivenPoses, LidarScan
+from caliv_graph.products import GivenPoses, LidarScan, MotionData
 from caliv_graph.trajectory.given import given_trajectories
 
 
@@ -29,16 +29,17 @@ class PosesOnly:
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         raise AssertionError(f"clouds of {lidar} are not needed")
 
-    def scans(self, lidar: str) -> Iterator[LidarScan]:
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         raise AssertionError(f"clouds of {lidar} are not needed")
 
-    def given_poses(self) -> GivenPoses:
+    def motion(self) -> MotionData:
         if not self.readable:
             raise RecordingError(f"{self.name}: damaged")
-        return GivenPoses(
+        poses = GivenPoses(
             np.array(self.stamps_ns, dtype=np.int64),
             tuple(pose_of(self.name, stamp) for stamp in self.stamps_ns),
         )
+        return MotionData(self.name, poses=poses)
 
     def warnings(self) -> Sequence[str]:
         return ()

@@ -352,10 +352,6 @@ def test_the_map_does_not_matter(quiet: list[Tried]) -> None:
     assert widened(quiet[0], other) < 0.01
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the noise levels come from every n-th cloud, which are others then: 0.8 sigma apart",
-)
 def test_the_order_of_the_lidars_does_not_matter(quiet: list[Tried]) -> None:
     # The same sums in another order: rounding, as above.
     lidars = quiet[0].drive.config.lidars
@@ -383,10 +379,6 @@ def test_the_reference_does_not_matter(quiet: list[Tried]) -> None:
 # ------------------------------------------------------------------ outliers
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="one of seven clouds that are 0.3 m off keeps its weight: its pose follows it",
-)
 @pytest.mark.parametrize("kernel", ["huber", "tls", "trimmed"])
 def test_displaced_clouds_lose_their_say(quiet: list[Tried], kernel: RobustKernel) -> None:
     # A tenth of the clouds that see the chair, each 0.3 m off to some side.

@@ -40,6 +40,7 @@ from caliv_graph.calibration.noise import (
     first_pose_noise,
     fit_pose_noise,
     sound_clouds,
+    squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
 from caliv_graph.calibration.robust import RobustWeights
@@ -88,6 +89,10 @@ at the threshold does not make the estimate jump for ever."""
 STEP_TOLERANCE = (5e-5, 3e-4)
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
 what 100 clouds of a chair can tell."""
+
+EXPLAINED = 0.75
+"""Clouds of which the target explains at least this part of what it explains of the median cloud
+count in full."""
 
 COUPLED_STEPS = 4
 """Gauss-Newton steps with the joint information: the problem is nearly linear there."""
@@ -193,18 +198,19 @@ def _measured(registrations: Sequence[Registration]) -> tuple[list[gtsam.Pose3],
     return poses, np.concatenate([r.information for r in registrations])
 
 
-def _residuals(
-    lines: CloudLinearisation, measured: Sequence[gtsam.Pose3], information: Array
-) -> tuple[Array, Array]:
-    """Whitened residuals (J, 6) of the pose factors and their squares (J,)."""
-    r = np.array(
+def _residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:
+    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`."""
+    return np.array(
         [
             gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
             for j, Z in enumerate(lines.predicted)
         ]
     )
-    white = np.einsum("jba,jb->ja", np.linalg.cholesky(information), r)
-    return white, np.sum(white**2, axis=1)
+
+
+def _whitened(residuals: Array, information: Array) -> Array:
+    """Residuals (J, 6), whitened by the root of their (J, 6, 6) information."""
+    return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
 
 
 def _solve_registered(
@@ -249,7 +255,10 @@ def _reweight(
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
         state.values = optimise(merged(steady, clouds), state.values, 10)
         lines = linearise_clouds(problem, state.values)
-        change = state.weights.update(_residuals(lines, measured, scaled)[1])
+        r = _residuals(lines, measured)
+        change = state.weights.update(
+            squares_without_own_pose(problem, lines, r, scaled, state.values, state.noise)
+        )
         if change < WEIGHT_TOLERANCE and state.weights.settled:
             break
 
@@ -283,12 +292,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
 
     def reduce() -> _Reduced:
         lines = linearise_clouds(problem, state.values)
-        r = np.concatenate(
-            [
-                gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
-                for j, Z in enumerate(lines.predicted)
-            ]
-        )
+        r = _residuals(lines, measured).ravel()
         return _reduce(problem, state.values, steady, (H, H @ r), lines)
 
     for _ in range(COUPLED_STEPS):
@@ -421,14 +425,10 @@ class _ShapeMeasurements:
     Attributes:
         pull: (J, 6) left perturbations that lead there from the predicted poses.
         information: (J, 6, 6) without robust weights.
-        white: (J, 6) whitened residuals.
-        squared: (J,) their squares.
     """
 
     pull: Array
     information: Array
-    white: Array
-    squared: Array
 
 
 def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
@@ -442,8 +442,7 @@ def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
     information = information + ridge[:, None, None] * np.eye(6)
     force = gradient / weights[:, None] / state.scale**2
     pull = -np.linalg.solve(information, force[..., None])[..., 0]
-    white = np.einsum("jba,jb->ja", np.linalg.cholesky(information), -pull)
-    return _ShapeMeasurements(pull, information, white, np.sum(white**2, axis=1))
+    return _ShapeMeasurements(pull, information)
 
 
 def _refine(
@@ -472,12 +471,16 @@ def _refine(
             step = respectful_step(reduced.D, reduced.c, prior, _offset(state), split)
         else:
             step = reduced.step_with(prior, _offset(state))
+        wanted = _shape_measurements(state, shapes)
+        squared = squares_without_own_pose(
+            problem, lines, -wanted.pull, wanted.information, state.values, state.noise
+        )
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
         new = linearise_clouds(problem, state.values)
         for shape, (R, t) in zip(states, _per_placement(states, new), strict=True):
             shape.maximise(R, t)
-        change = state.weights.update(_shape_measurements(state, shapes).squared)
+        change = state.weights.update(squared)
         _hand_weights(state, states)
         if iteration == SHAPES_BEGUN_AGAIN:
             _begin_shapes(state, states)
@@ -612,6 +615,15 @@ def _reduce(
     return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values)
 
 
+def _explained(registration: Registration) -> Array:
+    """Part of each cloud's weight that is left (J,), given how much of it is target at all.
+
+    A cloud that lies where the target is not has no residual: all its points are outliers.
+    """
+    typical = max(float(np.median(registration.inlier_ratio)), 1e-6)
+    return np.minimum(1.0, registration.inlier_ratio / (EXPLAINED * typical))
+
+
 def _prior_information(problem: Problem) -> Array:
     """(6n, 6n) information of the guesses, vehicle axes."""
     return np.diag(np.concatenate([problem.prior_sigmas[n] for n in problem.lidars]) ** -2.0)
@@ -658,8 +670,7 @@ def _solution(
     )
     if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
         raise SolveError("the covariance of the extrinsics is not finite")
-    lines = linearise_clouds(problem, state.values)
-    white, _ = _residuals(lines, measured, information)
+    white = _whitened(_residuals(linearise_clouds(problem, state.values), measured), information)
     cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
     return Solution(
         mode=state.config.solve.mode,
@@ -672,7 +683,10 @@ def _solution(
         },
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
-        cloud_weights=tuple(np.split(state.weights.values, cuts)),
+        cloud_weights=tuple(
+            w * _explained(r)
+            for w, r in zip(np.split(state.weights.values, cuts), registrations, strict=True)
+        ),
         residuals=tuple(np.split(white, cuts)),
         pose_noise=state.noise,
         registration_scale=state.scale,

@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config import NoiseConfig
+from caliv_graph.conventions import key_drift, key_vehicle
 from caliv_graph.products import Array, IntArray, PoseNoise
 
 TYPICAL = PoseNoise(
@@ -130,7 +131,7 @@ def fit_pose_noise(
     """
     first = first_pose_noise(config)
     given = _names(config)
-    chosen = _spread(sound)
+    chosen = _spread(problem, sound)
     lines = linearise_clouds(problem, values)
     r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
     times = problem.times_s()[problem.cloud_pose[chosen]]
@@ -198,10 +199,67 @@ def fit_pose_noise(
     return noise, float(value[4])
 
 
-def _spread(sound: npt.NDArray[np.bool_]) -> IntArray:
-    """Indices of at most CLOUDS_USED of the sound clouds, evenly over each LiDAR's."""
+def _spread(problem: Problem, sound: npt.NDArray[np.bool_]) -> IntArray:
+    """Indices of at most CLOUDS_USED of the sound clouds, evenly over the drives.
+
+    In the order of their poses: which LiDAR comes first in the config does not matter.
+    """
     usable = np.flatnonzero(sound)
-    return usable[:: max(1, math.ceil(len(usable) / CLOUDS_USED))]
+    usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
+    step = max(1, math.ceil(len(usable) / CLOUDS_USED))
+    return np.sort(usable[::step])
+
+
+def squares_without_own_pose(
+    problem: Problem,
+    lines: CloudLinearisation,
+    residuals: Array,
+    information: Array,
+    values: gtsam.Values,
+    noise: PoseNoise,
+) -> Array:
+    """Squared residuals (J,) of the clouds, the white error of their own pose integrated out.
+
+    A solved pose follows its cloud as far as the given pose lets it: a cloud that is a third of a
+    metre off would be judged by a pose that has moved with it. So the white error that the solve
+    found is taken back, and counted as noise. The slow error stays: the neighbours in time have a
+    say in it.
+
+    Args:
+        problem: the clouds and poses.
+        lines: Jacobians of the predicted poses at `values`.
+        residuals: (J, 6) `Log(predicted measured^-1)` at `values`.
+        information: (J, 6, 6) of the measured poses, without robust weights.
+        values: the current estimate.
+        noise: error model of the given poses.
+    """
+    white = np.array([noise.white_rotation_rad] * 3 + [noise.white_position_m] * 3)
+    B = _pose_effects(problem, lines, values, np.arange(problem.clouds))
+    found = np.zeros((len(problem.poses), 6))
+    for i, given in enumerate(problem.T_map_vehicle):
+        X = values.atPose3(key_vehicle(i))
+        turn = gtsam.Rot3.Logmap(given.rotation().between(X.rotation()))
+        error = np.concatenate([turn, X.translation() - given.translation()])
+        found[i] = error - values.atVector(key_drift(i))
+    r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
+    V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B)
+    return np.asarray(np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0]))
+
+
+def _pose_effects(
+    problem: Problem, lines: CloudLinearisation, values: gtsam.Values, chosen: IntArray
+) -> Array:
+    """What pose errors do to the residuals of the chosen clouds; (m, 6, 6).
+
+    Rotation errors are in vehicle axes, position errors in map axes.
+    """
+    B = np.zeros((len(chosen), 6, 6))
+    for row, j in enumerate(chosen):
+        key = key_vehicle(int(problem.cloud_pose[j]))
+        jacobian = lines.jacobians[j][lines.keys[j].index(key)]
+        B[row, :, :3] = jacobian[:, :3]
+        B[row, :, 3:] = jacobian[:, 3:] @ values.atPose3(key).rotation().matrix().T
+    return B
 
 
 def _stacked(
@@ -223,17 +281,13 @@ def _stacked(
     }
     r = np.zeros(6 * len(chosen))
     A = np.zeros((6 * len(chosen), 6 * len(columns)))
-    B = np.zeros((len(chosen), 6, 6))
+    B = _pose_effects(problem, lines, values, chosen)
     for row, j in enumerate(chosen):
         block = slice(6 * row, 6 * row + 6)
         r[block] = gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse()))
         for key, jacobian in zip(lines.keys[j], lines.jacobians[j], strict=True):
             if key in columns:
                 A[block, columns[key] : columns[key] + 6] = jacobian
-            else:
-                R_map_vehicle = values.atPose3(key).rotation().matrix()
-                B[row, :, :3] = jacobian[:, :3]
-                B[row, :, 3:] = jacobian[:, 3:] @ R_map_vehicle.T
     return r, A, B, np.asarray(np.linalg.inv(information[chosen]), dtype=np.float64)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +11,41 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray, TargetObservation
 
-NORMAL_NEIGHBOURS = 9
-"""Points of a local plane fit: a ring of eight and the point itself."""
+SINGLE_NEIGHBOURS = 16
+SINGLE_RADIUS_M = 0.15
+"""Neighbourhood of a normal in one cloud, across the beam: two rings of points, and in a sparse
+cloud no more than a part of a chair is flat."""
+
+MERGED_NEIGHBOURS = 60
+MERGED_RADIUS_M = 0.03
+"""The same in aligned clouds: as wide as a chair's leg, and enough points to see a plane through
+the noise."""
+
+WINDOW_RAD = math.radians(10.0)
+WINDOW_CLOUDS = 30
+"""Clouds are merged with those of the same LiDAR that saw the target from about the same side, the
+nearest ones first: from farther around, other surfaces hide behind the same beam."""
+
+DEPTH_GATE_M = 0.06
+"""Neighbours farther than this from the first plane are of another surface."""
+
+GATE_SIGMAS = 3.0
+"""The same of the last plane, in standard deviations along the beam."""
+
+GATE_ROUNDS = 5
+"""Plane fits per normal, while the gate narrows."""
+
+RIDGE = 1e-6
+"""Keeps plane fits solvable."""
+
+FEWEST_NEIGHBOURS = 6
+"""Effective number of neighbours below which there is no normal."""
+
+TRUSTED_ANGLE_RAD = 0.35
+"""Uncertainty of a normal at which it is no longer trusted at all."""
+
+TRUSTED_FLATNESS = 0.2
+"""Flatness from which on a normal is taken as it is. To lean them all would bias every one."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +59,7 @@ class CloudStack:
         beams: (N, 3) unit vectors from the sensor to the point, lidar frame.
         normals: (N, 3) unit vectors, lidar frame, towards the sensor.
         flatness: (N,) 0 to 1, how far the normal can be trusted: 0 where the neighbourhood is
-            sparse, thin or noisy (there the normal is the direction to the sensor).
+            sparse or noisy (there the normal is the direction to the sensor).
     """
 
     points: Array
@@ -72,7 +106,7 @@ def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
 
 
 def surface_normals(points: Array, sigma_range_m: float) -> tuple[Array, Array]:
-    """Surface normals of one cloud by local principal components, towards the sensor.
+    """Surface normals of one cloud, towards the sensor.
 
     Args:
         points: (N, 3) metres, lidar frame.
@@ -81,17 +115,9 @@ def surface_normals(points: Array, sigma_range_m: float) -> tuple[Array, Array]:
     Returns:
         (N, 3) unit normals and (N,) flatness between 0 and 1.
     """
-    k = min(NORMAL_NEIGHBOURS, len(points))
-    _, near = cKDTree(points).query(points, k)
-    local = points[near] - points[near].mean(axis=1, keepdims=True)
-    scatter = np.einsum("nki,nkj->nij", local, local) / k
-    spread, axes = np.linalg.eigh(scatter)
-    normals = axes[:, :, 0]
-    normals *= -np.where(np.sum(normals * points, axis=1) < 0, -1.0, 1.0)[:, None]
-    # A plane has one small and two large spreads. Half the noise variance is added to the small
-    # one: a patch as small as the noise looks flat by chance.
-    thin = (spread[:, 0] + 0.5 * sigma_range_m**2) / np.maximum(spread[:, 1], 1e-12)
-    return normals, np.clip(1.0 - 2.0 * thin, 0.0, 1.0)
+    return _normals_across(
+        points, points, points, SINGLE_NEIGHBOURS, SINGLE_RADIUS_M, sigma_range_m
+    )
 
 
 def stack_clouds(
@@ -127,25 +153,12 @@ def stack_clouds(
     )
 
 
-MERGED_NEIGHBOURS = 60
-MERGED_RADIUS_M = 0.03
-"""Neighbourhood of a normal in aligned clouds: as wide as a chair's leg, and enough points to see
-a plane through the noise."""
-
-FEWEST_NEIGHBOURS = 6
-"""Fewer points make no normal."""
-
-TRUSTED_ANGLE_RAD = 0.35
-"""Uncertainty of a normal at which it is no longer trusted at all."""
-
-
 def merged_normals(
     stack: CloudStack, R: Array, t: Array, lidar: IntArray, sigma_range_m: float
 ) -> CloudStack:
     """Normals again, from all clouds of a LiDAR together, once they are aligned.
 
-    One cloud has a column or two of points on a leg; forty of them show its faces. The noise along
-    the beams would tilt the planes: it is taken out of the covariances.
+    One cloud has a column or two of points on a leg; a dozen of them show its faces.
 
     Args:
         stack: the clouds.
@@ -160,45 +173,106 @@ def merged_normals(
     """
     points = stack.moved(R, t)
     beams = stack.rotated(R, stack.beams)
+    views = stack.sum_per_cloud(beams)
+    views /= np.linalg.norm(views, axis=1)[:, None]
+    ends = np.append(stack.starts[1:], len(points))
     normals, flatness = np.zeros_like(points), np.zeros(len(points))
-    for which in np.unique(lidar):
-        member = np.flatnonzero(lidar[stack.cloud] == which)
-        n, flat = _aligned_normals(points[member], beams[member], sigma_range_m)
-        normals[member], flatness[member] = n, flat
+    for j in range(stack.count):
+        apart = np.where(lidar == lidar[j], np.arccos(np.clip(views @ views[j], -1.0, 1.0)), np.inf)
+        near = np.argsort(apart, kind="stable")[:WINDOW_CLOUDS]
+        near = near[apart[near] <= WINDOW_RAD]
+        around = np.concatenate([points[stack.starts[i] : ends[i]] for i in near])
+        own = slice(stack.starts[j], ends[j])
+        normals[own], flatness[own] = _normals_across(
+            points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, sigma_range_m
+        )
     back = np.swapaxes(R, 1, 2)
     mixed = _towards_sensor(stack.rotated(back, normals), flatness, stack.beams)
     return replace(stack, normals=mixed, flatness=flatness)
 
 
 def _towards_sensor(normals: Array, flatness: Array, beams: Array) -> Array:
-    """Normals, leaning the more to the sensor the less they can be trusted.
+    """Normals; those that can hardly be trusted lean to the sensor.
 
     Where the neighbourhood tells no normal, the surface at least faces the sensor.
     """
-    mixed = flatness[:, None] * normals - (1.0 - flatness[:, None]) * beams
+    own = np.minimum(flatness / TRUSTED_FLATNESS, 1.0)[:, None]
+    mixed = own * normals - (1.0 - own) * beams
     return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1), 1e-12)[:, None])
 
 
-def _aligned_normals(points: Array, beams: Array, sigma_range_m: float) -> tuple[Array, Array]:
-    """Normals (N, 3) and flatness (N,) of aligned points with their beams."""
-    k = min(MERGED_NEIGHBOURS, len(points))
-    distance, near = cKDTree(points).query(points, k, distance_upper_bound=MERGED_RADIUS_M)
+def _normals_across(
+    points: Array,
+    around: Array,
+    beams: Array,
+    neighbours: int,
+    radius_m: float,
+    sigma_range_m: float,
+) -> tuple[Array, Array]:
+    """Normals by regression of the depth along the beam over the position across it.
+
+    The noise is in the depth and in nothing else. A plane through the points of a ball, the common
+    way, leans to the sensor by 10 degrees and more on slanted surfaces: the ball cuts off just the
+    points that the noise has moved far. Across the beam nothing is cut off, and neighbours that
+    are too far from the *plane* along the beam are so on either side alike.
+
+    Args:
+        points: (n, 3) where normals are wanted, seen from about the same side.
+        around: (N, 3) points of the same surface, seen from there too; `points` among them.
+        beams: (n, 3) directions from the sensor to `points`, of any length.
+        neighbours: of each point at most.
+        radius_m: of the neighbourhood across the beam.
+        sigma_range_m: noise along the beam.
+
+    Returns:
+        (n, 3) unit normals towards the sensor, (n,) flatness.
+    """
+    along = beams.mean(axis=0)
+    along /= np.linalg.norm(along)
+    u, v = _across(along)
+    plane = np.column_stack([u, v])
+    k = min(neighbours, len(around))
+    distance, near = cKDTree(around @ plane).query(points @ plane, k, distance_upper_bound=radius_m)
+    distance, near = np.reshape(distance, (-1, k)), np.reshape(near, (-1, k))
     inside = np.isfinite(distance)
     near = np.where(inside, near, 0)
-    count = inside.sum(axis=1)
-    weight = inside / count[:, None]
-    centre = np.einsum("nk,nki->ni", weight, points[near])
-    local = points[near] - centre[:, None]
-    beam = np.einsum("nk,nki->ni", weight, beams[near])
-    scatter = np.einsum("nk,nki,nkj->nij", weight, local, local, optimize=True)
-    noise = sigma_range_m**2 * beam[:, :, None] * beam[:, None, :]
-    spread, axes = np.linalg.eigh(scatter - noise)
-    normals = axes[:, :, 0]
-    normals *= np.where(np.einsum("ni,ni->n", normals, beams) > 0.0, -1.0, 1.0)[:, None]
-    # How well the plane's direction is known: noise across it, over the width of the patch.
-    across2 = np.einsum("ni,nij,nj->n", normals, scatter, normals)
-    width2 = np.maximum(spread[:, 1], 1e-12)
-    angle = np.sqrt(across2 / (width2 * np.maximum(count - 3, 1)))
-    thin = np.maximum(spread[:, 0], 0.0) / width2
-    flatness = np.clip(1.0 - angle / TRUSTED_ANGLE_RAD, 0.0, 1.0) * np.clip(1.0 - 2.0 * thin, 0, 1)
-    return normals, np.where(count >= FEWEST_NEIGHBOURS, flatness, 0.0)
+    # Two standard deviations fit in: nothing changes abruptly when a point comes in or drops out.
+    sigma_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius_m)
+    sigma_m = np.maximum(sigma_m, 1e-6)
+    kernel = np.where(inside, np.exp(-0.5 * (np.where(inside, distance, 0.0) / sigma_m) ** 2), 0.0)
+    offset = around[near] - points[:, None]
+    depth = offset @ along
+    A = np.concatenate([np.ones((*near.shape, 1)), (offset @ plane) / sigma_m[..., None]], axis=2)
+    ridge = RIDGE * np.eye(3)
+    residual = depth
+    # A wide neighbourhood on a slanted surface is deep.
+    first = np.maximum(DEPTH_GATE_M, GATE_SIGMAS * sigma_m)
+    last = max(GATE_SIGMAS * sigma_range_m, 1e-3)
+    for gate_m in first * (last / first) ** np.linspace(0.0, 1.0, GATE_ROUNDS)[:, None, None]:
+        weight = kernel * np.maximum(1.0 - (residual / gate_m) ** 2, 0.0) ** 2
+        weighted = weight[..., None] * A
+        normal_matrix = np.swapaxes(weighted, 1, 2) @ A + ridge
+        right = np.einsum("nki,nk->ni", weighted, depth)
+        fit = np.linalg.solve(normal_matrix, right[..., None])[..., 0]
+        residual = depth - np.einsum("nki,ni->nk", A, fit)
+    slope = fit[:, 1:] / sigma_m
+    normals = slope @ plane.T - along
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    inverse = np.linalg.inv(normal_matrix)
+    # The ridge is no observation: along a line of points the slope across it is unknown.
+    cov = inverse @ (np.swapaxes(weighted, 1, 2) @ weighted + ridge) @ inverse
+    sigma_slope = sigma_range_m / sigma_m[:, 0] * np.sqrt(np.maximum(cov[:, 1, 1], cov[:, 2, 2]))
+    # An angle changes by less than its tangent where the surface is slanted.
+    angle = sigma_slope / (1.0 + np.sum(slope**2, axis=1))
+    flatness = np.clip(1.0 - angle / TRUSTED_ANGLE_RAD, 0.0, 1.0)
+    total, square = weight.sum(axis=1), np.sum(weight**2, axis=1)
+    enough = total**2 >= FEWEST_NEIGHBOURS * square
+    return normals, np.where(enough, flatness, 0.0)
+
+
+def _across(along: Array) -> tuple[Array, Array]:
+    """Two unit vectors at right angles to `along` and to each other."""
+    other = np.eye(3)[np.abs(along).argmin()]
+    u = np.cross(other, along)
+    u /= np.linalg.norm(u)
+    return u, np.cross(along, u)

@@ -66,10 +66,10 @@ def test_noise_takes_the_trust_out_of_normals() -> None:
         normals, flatness = surface_normals(patch(rng, 600, sigma_m=sigma), sigma)
         medians.append(float(np.median(flatness)))
         off.append(float(np.median(angle_deg(normals, np.array([-1.0, 0.0, 0.0])))))
-    # 600 points on 0.25 m^2: nine of them span 6 cm.
+    # 600 points on 0.25 m^2: sixteen of them span 9 cm.
     assert medians == sorted(medians, reverse=True)
     assert medians[0] > 0.9
-    assert medians[-1] == 0.0
+    assert medians[-1] < 0.1
     assert off[1] < 8.0 < off[2]
 
 
@@ -93,14 +93,14 @@ def test_fewer_points_than_neighbours() -> None:
     assert normals.shape == (5, 3)
     assert flatness.shape == (5,)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-    np.testing.assert_allclose(normals, np.tile(normals[0], (5, 1)), atol=1e-9)
+    # Five points may be anything.
+    np.testing.assert_array_equal(flatness, 0.0)
 
 
 @pytest.mark.xfail(
     strict=True,
-    reason="nine neighbours are a patch of 5 cm at the density of 6 m range, half of which is "
-    "noise at 10 mm: the flatness is 0.25 and the normals are given up where a larger patch has "
-    "good ones",
+    reason="sixteen neighbours are a patch of 9 cm at the density of 6 m: 10 mm of noise turn "
+    "their normals by 12 degrees in the median",
 )
 def test_a_plane_at_the_papers_noise_and_density_has_normals() -> None:
     # 0.18 degrees at 6 m: 2800 points on a square metre of a flat wall.
@@ -259,16 +259,10 @@ def test_aligned_clouds_trust_normals_that_a_single_cloud_cannot_see() -> None:
     # A cloud has 30 points on the leg, 3 cm apart, with 1 cm of noise.
     stack, R, t = leg_face(azimuth_deg=-6.0)
     merged = merged_normals(stack, R, t, one_lidar(stack), 0.01)
-    assert np.median(stack.flatness) < 0.3
-    assert np.median(merged.flatness) > 0.5
+    assert np.median(stack.flatness) < 0.45
+    assert np.median(merged.flatness) > 0.55
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the 60 nearest points, or those within 3 cm, cut the noise along the beam off: taking "
-    "out all of its variance turns the normals to the sensor, by 17 degrees of 55 with 24 clouds "
-    "and by 38 with 60",
-)
 def test_noise_along_the_beams_does_not_turn_normals_to_the_sensor() -> None:
     stack, R, t = leg_face(azimuth_deg=49.0)
     merged = merged_normals(stack, R, t, one_lidar(stack), 0.01)
@@ -289,9 +283,9 @@ def test_clouds_of_another_lidar_are_not_merged() -> None:
     first = lidar[stack.cloud] == 0
     np.testing.assert_allclose(moved.normals[first], aligned.normals[first], atol=1e-12)
     np.testing.assert_allclose(moved.flatness[first], aligned.flatness[first], atol=1e-12)
-    # Merged, they would blur.
+    # Merged, those of the other would have a say.
     together = merged_normals(stack, R, off, one_lidar(stack), 0.01)
-    assert np.median(together.flatness) < 0.7 * np.median(aligned.flatness)
+    assert np.median(angle_deg(together.normals[first], aligned.normals[first])) > 1.0
 
 
 def test_points_that_are_alone_have_no_normal_among_aligned_clouds() -> None:

@@ -87,8 +87,9 @@ DECIDED_AFTER = 9
 at the threshold does not make the estimate jump for ever."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
+STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
-what 100 clouds of a chair can tell."""
+what 100 clouds of a chair can tell. Or else in joint standard deviations of the extrinsics."""
 
 EXPLAINED = 0.75
 """Clouds of which the target explains at least this part of what it explains of the median cloud
@@ -485,11 +486,12 @@ def _refine(
         if iteration == SHAPES_BEGUN_AGAIN:
             _begin_shapes(state, states)
         size = np.abs(step.reshape(-1, 6))
+        sigmas = float(np.sqrt(step @ (reduced.D + prior) @ step))
+        small = size[:, :3].max() < STEP_TOLERANCE[0] and size[:, 3:].max() < STEP_TOLERANCE[1]
         converged = bool(
             iteration > SHAPES_BEGUN_AGAIN
             and all(s.finest for s in states)
-            and size[:, :3].max() < STEP_TOLERANCE[0]
-            and size[:, 3:].max() < STEP_TOLERANCE[1]
+            and (small or sigmas < STEP_SIGMAS)
             and change < 10.0 * WEIGHT_TOLERANCE
         )
         advance()

@@ -330,7 +330,9 @@ def _observation(
     for name, tally in extractor.tallies.items():
         if tally.kept >= config.extraction.min_scans:
             kept += [c for c in found if c.lidar == name]
-        elif tally.scans:
+        elif not tally.scans:
+            warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
+        else:
             reasons = ", ".join(f"{n} {why}" for why, n in tally.rejected.most_common(3))
             warnings.append(
                 f"{label}: lidar '{name}' sees it in {tally.kept} scans, needs "

@@ -23,6 +23,7 @@ from caliv_graph.cli.evaluate import evaluate
 from caliv_graph.cli.exits import DEFECT, DONE, INTERRUPTED, USAGE
 from caliv_graph.cli.init import init
 from caliv_graph.cli.inspect import inspect
+from caliv_graph.cli.simulate import simulate
 from caliv_graph.errors import CalivError
 
 _PROGRAM = "caliv-graph"
@@ -47,7 +48,7 @@ def _paragraphs(docstring: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
 
 
-for _command in (init, inspect, calibrate, evaluate):
+for _command in (init, simulate, inspect, calibrate, evaluate):
     app.command(help=_paragraphs(_command.__doc__ or ""))(_command)
 
 

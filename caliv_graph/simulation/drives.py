@@ -4,7 +4,8 @@ The vehicle steers its front axle (Ackermann, single-track model) and its frame 
 the rear axle: it moves along its own x axis, and its heading changes by the curvature per metre.
 Speed is a function of time, curvature one of path length, so that the path does not depend on the
 speed. Distance and heading are closed-form; the position is their integral by quadrature, to
-better than a micrometre.
+better than a micrometre. Over a ramp (`terrain`) the frame follows the ground; velocity,
+acceleration and angular velocity are derivatives of that, not differences.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import assert_never
+from typing import TYPE_CHECKING, assert_never
 
 import gtsam
 import numpy as np
@@ -28,6 +29,9 @@ from caliv_graph.simulation.scenario import (
     StandstillDrive,
     StraightDrive,
 )
+
+if TYPE_CHECKING:
+    from caliv_graph.simulation.terrain import Terrain
 
 PANEL_M = 0.25
 """Length of one quadrature panel. With 8 nodes the rule is exact to rounding at driving radii."""
@@ -149,8 +153,33 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class VehicleStates:
+    """Pose of the vehicle frame at n times, and its exact derivatives.
+
+    Attributes:
+        stamps_ns: (n,) since the start of the drive.
+        position_map: (n, 3) metres.
+        R_map_vehicle: (n, 3, 3).
+        velocity_map: (n, 3) m/s.
+        acceleration_map: (n, 3) m/s^2, without gravity.
+        angular_velocity: (n, 3) rad/s of the vehicle in the map, vehicle axes.
+    """
+
+    stamps_ns: IntArray
+    position_map: Array
+    R_map_vehicle: Array
+    velocity_map: Array
+    acceleration_map: Array
+    angular_velocity: Array
+
+
+@dataclass(frozen=True)
 class Drive:
-    """A drive on flat ground.
+    """A drive over ground, flat or with ramps.
+
+    Path, speed and curvature are those of its picture on the map. On a ramp the vehicle's frame
+    lies in the plane that touches the ground below its origin, x axis along the path; it is faster
+    there than `speed` by 1 / cos(slope).
 
     Attributes:
         speed: speed over time.
@@ -158,6 +187,7 @@ class Drive:
         wheelbase_m: distance of the axles.
         start_xy_m: start in the map.
         start_yaw_rad: heading at the start.
+        terrain: the ground; None: flat.
     """
 
     speed: SpeedProfile
@@ -165,6 +195,7 @@ class Drive:
     wheelbase_m: float
     start_xy_m: tuple[float, float] = (0.0, 0.0)
     start_yaw_rad: float = 0.0
+    terrain: Terrain | None = None
 
     @property
     def duration_s(self) -> float:
@@ -211,19 +242,72 @@ class Drive:
             steering_rad=np.arctan(self.wheelbase_m * curvature),
         )
 
+    def states(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> VehicleStates:
+        """Pose and derivatives at any times.
+
+        Args:
+            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
+            z_map: height of the vehicle frame in the map where the ground is level, in metres, a
+                number or (n,). Ramps add theirs. The derivatives take it for constant.
+        """
+        motion = self.motion(stamps_ns)
+        n = len(motion.stamps_ns)
+        heights, gradient, hessian = (
+            (np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2)))
+            if self.terrain is None
+            else self.terrain.heights(motion.xy_map)
+        )
+        cos, sin = np.cos(motion.heading_rad), np.sin(motion.heading_rad)
+        along = np.column_stack([cos, sin])
+        along_rate = motion.yaw_rate_rad_s[:, None] * np.column_stack([-sin, cos])
+        speed = motion.speed_m_s[:, None]
+        gradient_rate = np.einsum("nij,nj->ni", hessian, speed * along)
+        slope = _dot(gradient, along)
+        slope_rate = _dot(gradient_rate, along) + _dot(gradient, along_rate)
+
+        # The path's tangent and the ground's normal, and their rates; perpendicular by nature.
+        ones, zeros = np.ones((n, 1)), np.zeros((n, 1))
+        x, x_rate = _unit(np.hstack([along, slope]), np.hstack([along_rate, slope_rate]))
+        z, z_rate = _unit(np.hstack([-gradient, ones]), np.hstack([-gradient_rate, zeros]))
+        y = np.cross(z, x)
+        y_rate = np.cross(z_rate, x) + np.cross(z, x_rate)
+        acceleration = motion.acceleration_m_s2[:, None]
+        level = np.broadcast_to(np.asarray(z_map, dtype=np.float64), (n,))
+        return VehicleStates(
+            stamps_ns=motion.stamps_ns,
+            position_map=np.column_stack([motion.xy_map, level + heights]),
+            R_map_vehicle=np.stack([x, y, z], axis=-1),
+            velocity_map=speed * np.hstack([along, slope]),
+            acceleration_map=acceleration * np.hstack([along, slope])
+            + speed * np.hstack([along_rate, slope_rate]),
+            angular_velocity=np.hstack([_dot(z, y_rate), _dot(x, z_rate), _dot(y, x_rate)]),
+        )
+
     def poses(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> tuple[gtsam.Pose3, ...]:
         """T_map_vehicle at any times.
 
         Args:
             stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
-            z_map: height of the vehicle frame in the map in metres, a number or (n,).
+            z_map: see `states`.
         """
-        motion = self.motion(stamps_ns)
-        heights = np.broadcast_to(np.asarray(z_map, dtype=np.float64), motion.heading_rad.shape)
+        states = self.states(stamps_ns, z_map)
         return tuple(
-            gtsam.Pose3(gtsam.Rot3.Yaw(float(yaw)), np.array([x, y, z]))
-            for (x, y), yaw, z in zip(motion.xy_map, motion.heading_rad, heights, strict=True)
+            gtsam.Pose3(gtsam.Rot3(R), t)
+            for R, t in zip(states.R_map_vehicle, states.position_map, strict=True)
         )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """(n, 1) scalar products of (n, k) vectors."""
+    product: Array = np.einsum("ni,ni->n", a, b)[:, None]
+    return product
+
+
+def _unit(vectors: Array, rates: Array) -> tuple[Array, Array]:
+    """(n, 3) vectors brought to length 1, and the rates of what results."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = vectors / length
+    return unit, (rates - unit * _dot(unit, rates)) / length
 
 
 def _figure_eight(model: FigureEightDrive) -> tuple[SpeedProfile, float]:
@@ -239,12 +323,17 @@ def _figure_eight(model: FigureEightDrive) -> tuple[SpeedProfile, float]:
     )
 
 
-def make_drive(model: DriveModel) -> Drive:
-    """The drive that a scenario describes."""
+def make_drive(model: DriveModel, terrain: Terrain | None = None) -> Drive:
+    """The drive that a scenario describes.
+
+    Args:
+        model: the drive.
+        terrain: the ground under it; None: flat.
+    """
     start_yaw_rad = math.radians(model.start_yaw_deg)
     if isinstance(model, StandstillDrive):
         speed = SpeedProfile(0.0, 0.0, 1.0, model.duration_s)
-        return Drive(speed, CurvatureProfile(0.0), 1.0, model.start_xy_m, start_yaw_rad)
+        return Drive(speed, CurvatureProfile(0.0), 1.0, model.start_xy_m, start_yaw_rad, terrain)
     if isinstance(model, FigureEightDrive):
         speed, middle_m = _figure_eight(model)
     else:
@@ -261,4 +350,4 @@ def make_drive(model: DriveModel) -> Drive:
             curvature = CurvatureProfile(first, (change,))
         else:
             assert_never(model)
-    return Drive(speed, curvature, model.wheelbase_m, model.start_xy_m, start_yaw_rad)
+    return Drive(speed, curvature, model.wheelbase_m, model.start_xy_m, start_yaw_rad, terrain)

@@ -8,25 +8,33 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray
-from caliv_graph.simulation.scenario import CropModel, LidarModel
-from caliv_graph.simulation.worlds import RayCaster, World
+from caliv_graph.simulation.scenario import CropModel, EdgeModel, LidarModel
+from caliv_graph.simulation.worlds import NO_OBJECT, RayCaster, World
 
 BoolArray = npt.NDArray[np.bool_]
+SingleArray = npt.NDArray[np.float32]
 
 
 def beam_directions(model: LidarModel) -> Array:
     """Directions of all beams.
 
-    Channels spread evenly from the lowest to the highest elevation, both included. Columns spread
+    Channels spread evenly from the lowest to the highest elevation, both included, unless each has
+    an elevation of its own. Columns spread
     evenly over the azimuths, as near to the resolution asked for as a whole number of them allows,
     each in the middle of its slot, so that a full turn has none twice.
 
     Returns:
         (channels, columns, 3) of length 1, lidar frame.
     """
-    elevation = np.radians(np.linspace(*model.vertical_fov_deg, model.channels))[:, None]
+    elevations_deg = (
+        np.linspace(*model.vertical_fov_deg, model.channels)
+        if model.elevations_deg is None
+        else np.array(model.elevations_deg)
+    )
+    elevation = np.radians(elevations_deg)[:, None]
     low, high = model.horizontal_fov_deg
     columns = round((high - low) / model.horizontal_resolution_deg)
     azimuth = np.radians(low + (high - low) * (np.arange(columns) + 0.5) / columns)[None, :]
@@ -44,16 +52,36 @@ def beams_through_sphere(directions: Array, centre: Array, radius_m: float) -> B
     """Which beams from the origin pass through a sphere.
 
     Args:
-        directions: (n, 3) of length 1.
-        centre: (3,) metres, in the frame of the directions.
+        directions: (..., 3) of length 1.
+        centre: (3,) metres, in the frame of the directions, or one for each of their last axis.
         radius_m: radius; a sphere that holds the origin is met by every beam.
     """
-    along_m = directions @ centre
-    square = float(centre @ centre)
-    if square <= radius_m**2:
-        return np.ones(len(directions), dtype=np.bool_)
-    passes: BoolArray = (along_m > 0.0) & (square - along_m**2 <= radius_m**2)
+    along_m = (
+        directions @ centre
+        if centre.ndim == 1
+        else np.einsum("...ci,ci->...c", directions, centre, optimize=True)
+    )
+    square = (centre**2).sum(axis=-1)
+    ahead = (along_m > 0.0) & (square - along_m**2 <= radius_m**2)
+    passes: BoolArray = ahead | (square <= radius_m**2)
     return passes
+
+
+def column_times(model: LidarModel, columns: int) -> Array:
+    """Seconds after the stamp at which each column is taken, to the nanosecond.
+
+    Returns:
+        (columns,) in the order of the azimuths, or (1,) zero if all is taken at one instant.
+    """
+    sweep = model.sweep
+    if sweep is None:
+        return np.zeros(1)
+    part = np.arange(columns) / columns
+    times_s = model.sweep_s * (part if sweep.direction == "counter_clockwise" else part[::-1])
+    if sweep.stamp_at == "end":
+        times_s = times_s - model.sweep_s
+    nanoseconds: Array = np.rint(times_s * NANOSECONDS_PER_SECOND)
+    return nanoseconds / NANOSECONDS_PER_SECOND
 
 
 @dataclass(frozen=True)
@@ -62,15 +90,23 @@ class LidarReturns:
 
     Attributes:
         points_lidar: (n, 3) metres, lidar frame.
-        objects: (n,) index into `World.names` of what each beam hit.
+        objects: (n,) index into `World.names` of what each beam hit; `NO_OBJECT` for a return from
+            between two surfaces.
+        beams: (n,) number of each beam: its channel times the columns, and its column.
     """
 
     points_lidar: Array
     objects: IntArray
+    beams: IntArray
 
 
 class SimulatedLidar:
-    """A LiDAR on the vehicle that takes its whole cloud at one instant."""
+    """A LiDAR on the vehicle.
+
+    Attributes:
+        T_vehicle_lidar: its true mounting.
+        column_times_s: see `column_times`.
+    """
 
     def __init__(
         self,
@@ -93,7 +129,11 @@ class SimulatedLidar:
         self._model = model
         self._caster = caster
         self._rng = rng
+        # Of its own, so that a LiDAR with edge effects has the range noise of one without.
+        self._edge_rng = rng.spawn(1)[0]
         directions = beam_directions(model)
+        self._columns = directions.shape[1]
+        self.column_times_s = column_times(model, self._columns)
         self._directions_lidar = directions.reshape(-1, 3)
         self._spheres_map: list[tuple[Array, float]] = []
         always = np.full(directions.shape[:2], crop is None)
@@ -105,28 +145,157 @@ class SimulatedLidar:
             if crop.elsewhere_stride:
                 always[:: crop.elsewhere_stride, :: crop.elsewhere_stride] = True
         self._always = always.reshape(-1)
+        # The vehicle's body does not move in the LiDAR's frame.
+        self._vehicle_m, self._vehicle_index = caster.cast_at_vehicle(
+            self.T_vehicle_lidar.translation(),
+            self._directions_lidar @ self.T_vehicle_lidar.rotation().matrix().T,
+        )
 
-    def scan(self, T_map_vehicle: gtsam.Pose3) -> LidarReturns:
+    def scan(self, T_map_vehicle: gtsam.Pose3, time_s: float = 0.0) -> LidarReturns:
         """One cloud, taken from one pose. The order of the points is that of the beams.
 
         Args:
             T_map_vehicle: true pose of the vehicle.
+            time_s: since the start of the drive: where walkers are.
         """
-        T_map_lidar = T_map_vehicle.compose(self.T_vehicle_lidar)
-        # Drawn for all beams, so that cropping leaves the noise of the beams that it keeps alone.
-        noise_m = self._model.range_sigma_m * self._rng.standard_normal(len(self._directions_lidar))
-        cast = self._always.copy()
-        for centre_map, radius_m in self._spheres_map:
-            centre_lidar = T_map_lidar.transformTo(centre_map)
-            cast |= beams_through_sphere(self._directions_lidar, centre_lidar, radius_m)
-        directions_lidar = self._directions_lidar[cast]
-        distance_m, objects = self._caster.cast(
-            T_map_lidar.translation(), directions_lidar @ T_map_lidar.rotation().matrix().T
+        return self.sweep(
+            T_map_vehicle.rotation().matrix()[None],
+            T_map_vehicle.translation()[None],
+            np.array([time_s]),
         )
-        measured_m = distance_m + noise_m[cast]
+
+    def skip(self) -> None:
+        """Draws what the next cloud would draw, so that the one after it stays what it is."""
+        self._draw_noise()
+        if self._model.edges is not None:
+            self._draw_edges()
+
+    def columns_of(self, returns: LidarReturns) -> IntArray:
+        """(n,) column of each return."""
+        columns: IntArray = returns.beams % self._columns
+        return columns
+
+    def sweep(self, R_map_vehicle: Array, t_map_vehicle: Array, times_s: Array) -> LidarReturns:
+        """One cloud, each column taken from its own pose.
+
+        Args:
+            R_map_vehicle: (columns, 3, 3) true rotation of the vehicle at each of
+                `column_times_s`; (1, 3, 3): all is taken from there.
+            t_map_vehicle: (columns, 3) or (1, 3) metres.
+            times_s: (columns,) or (1,) seconds since the start of the drive.
+        """
+        R_map_lidar = R_map_vehicle @ self.T_vehicle_lidar.rotation().matrix()
+        t_map_lidar = t_map_vehicle + R_map_vehicle @ self.T_vehicle_lidar.translation()
+        # Drawn for all beams, so that cropping leaves the noise of the beams that it keeps alone.
+        noise_m = self._draw_noise()
+        beams = np.flatnonzero(self._kept(R_map_lidar, t_map_lidar))
+
+        column = np.zeros(1, np.int64) if len(R_map_lidar) == 1 else beams % self._columns
+        origin_map, times_s = t_map_lidar[column], times_s[column]
+
+        def turned(directions_lidar: Array) -> Array:
+            directions_map: Array = (
+                directions_lidar @ R_map_lidar[0].T
+                if len(column) == 1
+                else np.einsum("nij,nj->ni", R_map_lidar[column], directions_lidar)
+            )
+            return directions_map
+
+        directions_lidar = self._directions_lidar[beams]
+        directions_map = turned(directions_lidar)
+        distance_m, objects, normals_map = self._caster.cast_with_normals(
+            origin_map, directions_map, times_s
+        )
+        vehicle_m = self._vehicle_m[beams]
+        if self._model.edges is not None:
+            normal, uniform = (draws[beams] for draws in self._draw_edges())
+            beside_map = turned(_beside(directions_lidar, self._model.edges, normal))
+            aside_m, _ = self._caster.cast(origin_map, beside_map, times_s)
+            # Infinite or no number where nothing was hit, or the beam grazes: no such face.
+            with np.errstate(divide="ignore", invalid="ignore"):
+                faced = np.einsum("ni,ni->n", directions_map, normals_map)
+                same_face_m = distance_m * faced / np.einsum("ni,ni->n", beside_map, normals_map)
+            distance_m, objects = _at_edges(
+                self._model.edges, distance_m, objects, aside_m, same_face_m, uniform
+            )
+        on_vehicle = vehicle_m < distance_m
+        distance_m[on_vehicle] = vehicle_m[on_vehicle]
+        objects[on_vehicle] = self._vehicle_index
+        measured_m = distance_m + noise_m[beams]
         # Infinite where nothing was hit.
         reported = (measured_m >= self._model.min_range_m) & (measured_m <= self._model.max_range_m)
         return LidarReturns(
             points_lidar=directions_lidar[reported] * measured_m[reported, None],
             objects=objects[reported],
+            beams=beams[reported],
         )
+
+    def _draw_noise(self) -> Array:
+        return self._model.range_sigma_m * self._rng.standard_normal(len(self._directions_lidar))
+
+    def _draw_edges(self) -> tuple[SingleArray, SingleArray]:
+        """(beams, 2) normal and (beams, 3) uniform draws."""
+        n = len(self._directions_lidar)
+        # Single precision in half the time; nothing depends on more.
+        return (
+            self._edge_rng.standard_normal((n, 2), dtype=np.float32),
+            self._edge_rng.random((n, 3), dtype=np.float32),
+        )
+
+    def _kept(self, R_map_lidar: Array, t_map_lidar: Array) -> BoolArray:
+        """(beams,) those that are cast."""
+        kept = self._always.copy()
+        for centre_map, radius_m in self._spheres_map:
+            centres_lidar = np.einsum("cji,cj->ci", R_map_lidar, centre_map - t_map_lidar)
+            if len(centres_lidar) == 1:
+                kept |= beams_through_sphere(self._directions_lidar, centres_lidar[0], radius_m)
+            else:
+                grid = self._directions_lidar.reshape(-1, self._columns, 3)
+                kept |= beams_through_sphere(grid, centres_lidar, radius_m).reshape(-1)
+        return kept
+
+
+def _beside(directions: Array, edges: EdgeModel, draws: SingleArray) -> Array:
+    """(n, 3) directions of another part of each beam: its sigma is a quarter of its width."""
+    # A quarter of the full width; to first order in it, and square to the beam up to its length.
+    sigma_rad = 0.25e-3 * edges.divergence_mrad
+    horizontal = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))])
+    horizontal /= np.maximum(np.linalg.norm(horizontal, axis=1, keepdims=True), 1e-9)
+    vertical = np.cross(directions, horizontal)
+    moved = directions + sigma_rad * (draws[:, :1] * horizontal + draws[:, 1:] * vertical)
+    beside: Array = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+    return beside
+
+
+def _at_edges(
+    edges: EdgeModel,
+    distance_m: Array,
+    objects: IntArray,
+    aside_m: Array,
+    same_face_m: Array,
+    draws: SingleArray,
+) -> tuple[Array, IntArray]:
+    """Distance and object of each beam, given how far another part of it reaches.
+
+    Args:
+        edges: how the LiDAR takes edges.
+        distance_m: (n,) what the middle of each beam hits.
+        objects: (n,) likewise.
+        aside_m: (n,) what the other part hits.
+        same_face_m: (n,) what it would hit if the face in the middle went on for ever: a beam that
+            grazes the ground is long, but meets no edge.
+        draws: (n, 3) uniform.
+    """
+    # Infinite minus infinite is no edge.
+    with np.errstate(invalid="ignore"):
+        step_m = aside_m - distance_m
+        edge = ~(np.abs(aside_m - same_face_m) <= edges.gap_m) & (np.abs(step_m) > edges.gap_m)
+    gap_m = np.abs(step_m)
+    lost = (draws[:, 0] < edges.dropout_probability) | (
+        edge & (draws[:, 1] < edges.lost_probability)
+    )
+    # Of what remains at an edge, the share that melts; uniform once more, given that it is left.
+    chosen = (draws[:, 1] - edges.lost_probability) / max(1.0 - edges.lost_probability, 1e-12)
+    mixed = edge & ~lost & (gap_m <= edges.mixing_m) & (chosen < edges.mixed_probability)
+    distance_m = distance_m + draws[:, 2] * np.where(mixed, step_m, 0.0)
+    return np.where(lost, np.inf, distance_m), np.where(mixed | lost, NO_OBJECT, objects)

@@ -28,6 +28,12 @@ class Stream(enum.IntEnum):
     SUSPENSION = 1
     INITIAL_GUESS = 2
     LIDAR = 3
+    IMU = 4
+    IMU_BIAS = 5
+    ORIENTATION = 6
+    GNSS = 7
+    GNSS_OUTLIERS = 8
+    VELOCITY = 9
 
 
 def random_stream(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
@@ -46,9 +52,21 @@ def vehicle_heights(model: SuspensionModel, count: int, rng: np.random.Generator
 
     White from frame to frame: frames are 0.1 s apart, and a body on its springs forgets as fast.
     """
-    common_m = model.height_sigma_m * rng.standard_normal()
-    heights_m: Array = common_m + model.heave_sigma_m * rng.standard_normal(count)
-    return heights_m
+    height_m, heave_m = height_and_heave(model, count, rng)
+    return height_m + heave_m
+
+
+def height_and_heave(
+    model: SuspensionModel, count: int, rng: np.random.Generator
+) -> tuple[float, Array]:
+    """What `vehicle_heights` adds up: one height for the drive, and the heave of each frame.
+
+    Returns:
+        Metres, and (count,) metres.
+    """
+    height_m = model.height_sigma_m * float(rng.standard_normal())
+    heave_m: Array = model.heave_sigma_m * rng.standard_normal(count)
+    return height_m, heave_m
 
 
 def noisy_poses(

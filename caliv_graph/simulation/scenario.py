@@ -1,12 +1,21 @@
-"""A simulated drive past a target, described: vehicle, LiDARs, world, noise.
+"""A simulated drive past a target, described: vehicle, sensors, world, noise.
 
 Frozen models with units in the `Field` descriptions; `configs/scenarios/` holds commented ones.
-Nothing here draws, moves or casts: `drives`, `worlds` and `lidar` turn the models into that.
+Nothing here draws, moves or casts: `drives`, `worlds`, `lidar` and `motion` turn the models into
+that.
+
+The noise of IMU, GNSS, velocity and orientation is that of table I of CaLiV, read as follows. All
+figures are 1 sigma of white noise per sample and axis, at the rates of SPEC 8 (IMU and orientation
+100 Hz, GNSS and velocity 10 Hz). The GPS's 1.5e-7 degrees of latitude and longitude are an angle at
+the centre of the earth: 1.5e-7 pi / 180 x 6378 km = 16.7 mm, taken for north and east alike, as on
+the equator. The orientation's 0.005 rad is a rotation about each axis of the IMU.
 """
 
 from __future__ import annotations
 
 import difflib
+import itertools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,6 +35,8 @@ from caliv_graph.errors import ConfigError
 
 Pair = tuple[Finite, Finite]
 Turn = Literal["left", "right"]
+PerAxis = NonNegative | tuple[NonNegative, NonNegative, NonNegative]
+TimeField = Literal["t", "time", "timestamp", "time_stamp"]
 
 
 class _Section(BaseModel):
@@ -126,8 +137,60 @@ DriveModel = Annotated[
 ]
 
 
+class SweepModel(_Section):
+    """A cloud taken column by column while the vehicle moves."""
+
+    duration_s: Positive | None = Field(
+        None, description="seconds from the first to after the last column; absent: 1 / rate_hz"
+    )
+    direction: Literal["counter_clockwise", "clockwise"] = Field(
+        "clockwise", description="which way the columns follow one another, seen from above"
+    )
+    stamp_at: Literal["start", "end"] = Field(
+        "start", description="end of the sweep that the stamp of the cloud tells"
+    )
+    time_field: TimeField = Field(
+        "t",
+        description="per-point time in the bag: t (uint32 ns after the stamp, Ouster), time "
+        "(float32 s after it, Velodyne), timestamp (float64 s, absolute, Hesai and Robosense), "
+        "time_stamp (uint32 ns after it, Autoware)",
+    )
+
+    @model_validator(mode="after")
+    def _unsigned_times_count_from_the_start(self) -> SweepModel:
+        if self.stamp_at == "end" and self.time_field in ("t", "time_stamp"):
+            raise ValueError(
+                f"time_field '{self.time_field}' is unsigned and cannot count back from the end "
+                "of the sweep: take 'time' or 'timestamp', or stamp_at: start"
+            )
+        return self
+
+
+class EdgeModel(_Section):
+    """What a beam of finite width returns at an edge, and beams that return nothing."""
+
+    divergence_mrad: Positive = Field(
+        3.0, description="milliradians, full width of a beam (2 sigma to either side)"
+    )
+    gap_m: Positive = Field(
+        0.05, description="metres of range between two parts of a beam that make it an edge"
+    )
+    mixing_m: NonNegative = Field(
+        1.5, description="metres of range up to which the two parts melt into one return"
+    )
+    mixed_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        0.7, description="part of these that come from between the two surfaces"
+    )
+    lost_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        0.3, description="part of all edge beams that return nothing"
+    )
+    dropout_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        0.0, description="part of all beams that return nothing"
+    )
+
+
 class LidarModel(_Section):
-    """A LiDAR that takes its whole cloud at one instant, as CARLA's do in synchronous mode.
+    """A LiDAR. Without `sweep` it takes its whole cloud at one instant, as in CARLA.
 
     A beam is given by its elevation over the LiDAR's xy plane and its azimuth about the
     LiDAR's z axis.
@@ -139,6 +202,12 @@ class LidarModel(_Section):
         (-12.5, 12.5), description="degrees of elevation, lowest and highest channel"
     )
     channels: Annotated[int, Field(ge=2)] = Field(152, description="beams above one another")
+    elevations_deg: tuple[Finite, ...] | None = Field(
+        None,
+        min_length=2,
+        description="degrees of elevation per channel, ascending, where they are uneven; takes "
+        "the place of vertical_fov_deg and channels",
+    )
     horizontal_resolution_deg: Positive = Field(
         0.18237, description="degrees between two beams of a channel"
     )
@@ -152,6 +221,23 @@ class LidarModel(_Section):
         0.0,
         description="seconds, stamp minus true acquisition time (positive: stamps are late)",
     )
+    phase_s: NonNegative = Field(0.0, description="seconds, stamp of the first cloud")
+    sweep: SweepModel | None = Field(None, description="absent: a cloud is taken at one instant")
+    edges: EdgeModel | None = Field(None, description="absent: infinitely thin beams")
+
+    @property
+    def sweep_s(self) -> float:
+        """Seconds that a cloud takes; 0 if it is taken at one instant."""
+        return 0.0 if self.sweep is None else self.sweep.duration_s or 1.0 / self.rate_hz
+
+    @model_validator(mode="after")
+    def _sweep_within_the_period(self) -> LidarModel:
+        if self.sweep_s > (1.0 + 1e-9) / self.rate_hz:
+            raise ValueError(
+                f"sweep.duration_s ({self.sweep_s} s) exceeds the {1.0 / self.rate_hz:g} s "
+                f"between two clouds at {self.rate_hz:g} Hz"
+            )
+        return self
 
     @model_validator(mode="after")
     def _in_order(self) -> LidarModel:
@@ -169,6 +255,11 @@ class LidarModel(_Section):
             )
         if min(self.vertical_fov_deg) < -90.0 or max(self.vertical_fov_deg) > 90.0:
             raise ValueError("vertical_fov_deg must lie within -90 and 90 degrees")
+        elevations = self.elevations_deg or ()
+        if any(low >= high for low, high in itertools.pairwise(elevations)):
+            raise ValueError("elevations_deg must ascend")
+        if elevations and (elevations[0] < -90.0 or elevations[-1] > 90.0):
+            raise ValueError("elevations_deg must lie within -90 and 90 degrees")
         if self.min_range_m >= self.max_range_m:
             raise ValueError(
                 f"min_range_m ({self.min_range_m} m) must be below "
@@ -177,11 +268,28 @@ class LidarModel(_Section):
         return self
 
 
+class RampModel(_Section):
+    """A smooth rise of the ground: up a flank, a level top, down a flank.
+
+    The steepest place of a flank has a slope of 35/16 height_m / flank_m.
+    """
+
+    xy_m: Pair = Field(description="metres, middle of its top in the map")
+    yaw_deg: Finite = Field(0.0, description="degrees, direction of its flanks, from map +x")
+    height_m: Positive = Field(description="metres from the ground to the top")
+    flank_m: Positive = Field(description="metres of ground that each flank takes")
+    top_m: NonNegative = Field(0.0, description="metres, length of the level top")
+    width_m: Positive = Field(
+        6.0, description="metres, width of the level top, beside which flanks come down as well"
+    )
+
+
 class GroundModel(_Section):
-    """Flat ground, a square about the map's origin."""
+    """Flat ground, a square about the map's origin, with ramps on it."""
 
     height_m: Finite = Field(0.0, description="metres, its z in the map")
     half_size_m: Positive = Field(200.0, description="metres from the origin to each edge")
+    ramps: tuple[RampModel, ...] = Field((), description="absent: flat all over")
 
 
 class _ObjectSection(_Section):
@@ -202,16 +310,39 @@ class BoxModel(_ObjectSection):
     size_m: PositiveTriple = Field(description="metres along its x, y, z")
 
 
-ObjectModel = Annotated[ChairModel | BoxModel, Field(discriminator="shape")]
+class PoleModel(_ObjectSection):
+    """An upright round pole."""
+
+    shape: Literal["pole"] = "pole"
+    radius_m: Positive = Field(0.08, description="metres")
+    height_m: Positive = Field(4.0, description="metres")
+
+
+ObjectModel = Annotated[ChairModel | BoxModel | PoleModel, Field(discriminator="shape")]
+
+
+class WalkerModel(_Section):
+    """A person, 1.75 m tall, who walks to and fro along a line."""
+
+    from_xy_m: Pair = Field(description="metres, one end of the line in the map")
+    to_xy_m: Pair = Field(description="metres, the other end")
+    speed_m_s: Positive = Field(1.3, description="metres per second")
+
+    @model_validator(mode="after")
+    def _somewhere_to_go(self) -> WalkerModel:
+        if math.dist(self.from_xy_m, self.to_xy_m) < 0.1:
+            raise ValueError("from_xy_m and to_xy_m are less than 0.1 m apart: nowhere to walk")
+        return self
 
 
 class WorldModel(_Section):
     """What stands around the drive."""
 
     ground: GroundModel = GroundModel()
-    objects: dict[str, ObjectModel] = Field(min_length=1, description="by name")
+    objects: dict[str, ObjectModel] = Field({}, description="what stands, by name")
+    walkers: dict[str, WalkerModel] = Field({}, description="who walks, by name")
     targets: tuple[str, ...] = Field(
-        min_length=1, description="names of the objects that serve as calibration targets"
+        (), description="names of the objects that serve as calibration targets"
     )
     region_margin_m: Positive = Field(
         5.0,
@@ -225,6 +356,12 @@ class WorldModel(_Section):
                 raise ValueError(
                     f"target '{name}' is not one of the objects: {', '.join(self.objects)}"
                 )
+        for name in self.walkers:
+            if name in self.objects:
+                raise ValueError(f"'{name}' is the name of an object and of a walker")
+        for name in (*self.objects, *self.walkers):
+            if name in ("ground", "vehicle"):
+                raise ValueError(f"'{name}' is the name of something else: give another one")
         return self
 
 
@@ -244,7 +381,7 @@ class CropModel(_Section):
 
 
 class PoseNoiseModel(_Section):
-    """Errors of the given vehicle poses. They are those of a filter: partly correlated in time."""
+    """Errors of the poses in a CaLiV folder: those of a filter, partly correlated in time."""
 
     position_sigma_m: NonNegative = Field(
         0.005, description="metres, 1 sigma per map axis, white from pose to pose"
@@ -262,8 +399,134 @@ class PoseNoiseModel(_Section):
     )
 
 
+class _SampledSection(_Section):
+    """What is published at a rate."""
+
+    enabled: bool = Field(True, description="false: the vehicle has none")
+    phase_s: NonNegative = Field(0.0, description="seconds, stamp of the first sample")
+
+
+class OrientationModel(_Section):
+    """The orientation that the IMU reports: of the IMU in ENU axes."""
+
+    enabled: bool = Field(True, description="false: messages say that there is none")
+    sigma_rad: NonNegative = Field(
+        0.005, description="radians, 1 sigma of white noise per sample and axis of the IMU"
+    )
+    yaw_bias_deg: Finite = Field(
+        0.0, description="degrees, constant error of its heading, positive to the left"
+    )
+
+
+class ImuModel(_SampledSection):
+    """An IMU, sampled at instants; the earth does not turn."""
+
+    mounting: Mounting = Field(
+        Mounting(xyz=(0.0, 0.0, 0.0)), description="true and known T_vehicle_imu"
+    )
+    rate_hz: Positive = Field(100.0, description="samples per second")
+    accelerometer_sigma_m_s2: NonNegative = Field(
+        0.05, description="m/s^2, 1 sigma of white noise per sample and axis"
+    )
+    gyroscope_sigma_rad_s: NonNegative = Field(
+        0.005, description="rad/s, 1 sigma of white noise per sample and axis"
+    )
+    accelerometer_bias_sigma_m_s2: PerAxis = Field(
+        0.0, description="m/s^2, 1 sigma of the bias at the start, one number or one per axis"
+    )
+    gyroscope_bias_sigma_rad_s: PerAxis = Field(
+        0.0, description="rad/s, 1 sigma of the bias at the start, one number or one per axis"
+    )
+    accelerometer_bias_walk_m_s3_sqrthz: NonNegative = Field(
+        0.0, description="m/s^2 per sqrt(second), random walk of the bias"
+    )
+    gyroscope_bias_walk_rad_s2_sqrthz: NonNegative = Field(
+        0.0, description="rad/s per sqrt(second), random walk of the bias"
+    )
+    orientation: OrientationModel = OrientationModel()
+
+
+class OutageModel(_Section):
+    """A time without a fix."""
+
+    start_s: NonNegative = Field(description="seconds since the start of the drive")
+    duration_s: Positive = Field(description="seconds")
+
+
+class JumpModel(_Section):
+    """A time during which all fixes are off by the same, as by a reflected signal."""
+
+    start_s: NonNegative = Field(description="seconds since the start of the drive")
+    duration_s: Positive = Field(description="seconds")
+    offset_enu_m: tuple[Finite, Finite, Finite] = Field(description="metres east, north, up")
+
+
+class GnssModel(_SampledSection):
+    """A GNSS receiver."""
+
+    lever_arm: tuple[Finite, Finite, Finite] = Field(
+        (0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame, true and known"
+    )
+    rate_hz: Positive = Field(10.0, description="fixes per second")
+    horizontal_sigma_m: NonNegative = Field(
+        0.0167, description="metres, 1 sigma of white noise, east and north alike"
+    )
+    vertical_sigma_m: NonNegative = Field(0.02, description="metres, 1 sigma of white noise")
+    outlier_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        0.0, description="part of the fixes that are outliers"
+    )
+    outlier_sigma_m: NonNegative = Field(
+        2.0, description="metres, 1 sigma of an outlier per axis; no covariance tells of it"
+    )
+    outages: tuple[OutageModel, ...] = Field((), description="absent: always a fix")
+    jumps: tuple[JumpModel, ...] = Field((), description="absent: none")
+    latitude_deg: Annotated[float, Field(ge=-89.0, le=89.0)] = Field(
+        48.2627, description="degrees, WGS84, of the map's origin"
+    )
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = Field(
+        11.6681, description="degrees, WGS84, of the map's origin"
+    )
+    altitude_m: Finite = Field(
+        520.0, description="metres above the WGS84 ellipsoid, of the map's origin"
+    )
+
+
+class VelocityModel(_SampledSection):
+    """The velocity of the vehicle frame's origin in vehicle axes."""
+
+    rate_hz: Positive = Field(10.0, description="samples per second")
+    sigma_m_s: NonNegative = Field(
+        0.1, description="m/s, 1 sigma of white noise per sample and axis"
+    )
+
+
+class BodyBoxModel(_Section):
+    """A box that is part of the vehicle."""
+
+    centre_m: tuple[Finite, Finite, Finite] = Field(description="metres, vehicle frame")
+    size_m: PositiveTriple = Field(description="metres along the vehicle's x, y, z")
+
+
+class BagModel(_Section):
+    """How the bag is written."""
+
+    start_time_s: Annotated[int, Field(ge=0)] = Field(
+        1_750_000_000, description="seconds since 1970, stamp of the drive's start"
+    )
+    compression: Literal["none", "zstd"] = Field("none", description="of the MCAP's chunks")
+    covariances: Literal["stated", "unknown"] = Field(
+        "stated",
+        description="covariances in the messages: those of the white noise, or zeros, which "
+        "mean unknown",
+    )
+
+
 class SuspensionModel(_Section):
-    """What the vehicle frame's height above the ground, nominally zero, does."""
+    """What the vehicle frame's height above the ground, nominally zero, does.
+
+    Heave lifts vehicle and LiDARs while a cloud is taken. It is white from scan to scan and
+    therefore no motion that an IMU could feel: IMU, GNSS and velocity know nothing of it.
+    """
 
     height_sigma_m: NonNegative = Field(
         0.005, description="metres, 1 sigma, one error for the whole drive"
@@ -294,6 +557,17 @@ class Scenario(_Section):
     world: WorldModel
     crop: CropModel | None = Field(None, description="absent: full clouds")
     poses: PoseNoiseModel = PoseNoiseModel()
+    imu: ImuModel = ImuModel()
+    gnss: GnssModel = GnssModel()
+    velocity: VelocityModel = VelocityModel()
+    gravity_m_s2: Positive = Field(9.80665, description="m/s^2, towards map -z")
+    vehicle_body: tuple[BodyBoxModel, ...] = Field(
+        (), description="what the LiDARs see of the vehicle; absent: nothing"
+    )
+    bag: BagModel = BagModel()
+    config_target: Literal["region", "search"] = Field(
+        "region", description="whether the written config names the target's region"
+    )
     suspension: SuspensionModel = SuspensionModel()
     initial_guess: InitialGuessModel = InitialGuessModel()
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, assert_never
 
 import gtsam
 import numpy as np
@@ -17,9 +17,20 @@ import numpy.typing as npt
 
 from caliv_graph._open3d import import_open3d
 from caliv_graph.products import Array, IntArray
-from caliv_graph.simulation.scenario import ChairModel, ObjectModel, WorldModel
+from caliv_graph.simulation.scenario import (
+    BodyBoxModel,
+    BoxModel,
+    ChairModel,
+    ObjectModel,
+    PoleModel,
+    WalkerModel,
+    WorldModel,
+)
+from caliv_graph.simulation.terrain import Terrain, make_terrain
 
 GROUND = "ground"
+
+VEHICLE = "vehicle"
 
 NO_OBJECT = -1
 
@@ -173,35 +184,121 @@ def chair() -> Mesh:
     return join([_seat(), _backrest(), *_side(1.0), *_side(-1.0)])
 
 
-def ground(half_size_m: float) -> Mesh:
-    """Flat ground at z = 0, a square about the origin, looking up. It alone has no thickness."""
-    side_m = 2.0 * half_size_m
-    square = _rectangle((0.0, 0.0, 0.0), (side_m, side_m), (0, 1))
-    return Mesh(square.reshape(-1, 3), _grid_quads(np.arange(4).reshape(2, 2)))
+def cylinder(begin: Point, end: Point, begin_radius_m: float, end_radius_m: float) -> Mesh:
+    """An upright round solid of 24 sides between two levels, tapered if the radii differ."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 24, endpoint=False)
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    low = np.array(begin) + begin_radius_m * rim
+    high = np.array(end) + end_radius_m * rim
+    n = len(angle)
+    i = np.arange(n)
+    j = (i + 1) % n
+    low_centre, high_centre = np.full(n, 2 * n), np.full(n, 2 * n + 1)
+    triangles = np.vstack(
+        [
+            _quads(i, j, j + n, i + n),
+            np.column_stack([j, i, low_centre]),
+            np.column_stack([i + n, j + n, high_centre]),
+        ]
+    )
+    return Mesh(np.vstack([low, high, [begin], [end]]), triangles)
+
+
+def person() -> Mesh:
+    """A person in mid-step, 1.75 m tall, facing +x, origin on the ground between the feet."""
+    return join(
+        [
+            cylinder((0.22, 0.1, 0.0), (0.0, 0.09, 0.86), 0.06, 0.085),
+            cylinder((-0.22, -0.1, 0.0), (0.0, -0.09, 0.86), 0.06, 0.085),
+            bar((0.0, 0.0, 0.84), (0.0, 0.0, 1.46), (0.22, 0.34), (0.24, 0.42)),
+            bar((-0.2, 0.26, 0.8), (0.0, 0.23, 1.42), (0.09, 0.08), (0.11, 0.09)),
+            bar((0.2, -0.26, 0.8), (0.0, -0.23, 1.42), (0.09, 0.08), (0.11, 0.09)),
+            cylinder((0.0, 0.0, 1.45), (0.01, 0.0, 1.75), 0.09, 0.08),
+        ]
+    )
+
+
+def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
+    """Ground about the origin, a square at z = 0 with ramps on it, looking up.
+
+    It alone has no thickness.
+    """
+    if terrain is None:
+        side_m = 2.0 * half_size_m
+        square = _rectangle((0.0, 0.0, 0.0), (side_m, side_m), (0, 1))
+        return Mesh(square.reshape(-1, 3), _grid_quads(np.arange(4).reshape(2, 2)))
+    x, y = np.meshgrid(*terrain.grid_lines(half_size_m), indexing="ij")
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    vertices = np.column_stack([xy, terrain.heights(xy)[0]])
+    return Mesh(vertices, _grid_quads(np.arange(len(xy)).reshape(x.shape)))
 
 
 def _object_mesh(model: ObjectModel) -> Mesh:
-    return chair() if isinstance(model, ChairModel) else box(model.size_m)
+    if isinstance(model, ChairModel):
+        return chair()
+    if isinstance(model, BoxModel):
+        return box(model.size_m)
+    if isinstance(model, PoleModel):
+        top = (0.0, 0.0, model.height_m)
+        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m)
+    assert_never(model)
+
+
+@dataclass(frozen=True)
+class Walker:
+    """Somebody who walks to and fro.
+
+    Attributes:
+        mesh: in a frame that walks along: origin on the ground, x axis in the direction of going.
+        model: where and how fast.
+        ground_z_map: height of the level ground in metres.
+        terrain: the ramps on it.
+    """
+
+    mesh: Mesh
+    model: WalkerModel
+    ground_z_map: float
+    terrain: Terrain | None
+
+    def poses(self, times_s: Array) -> tuple[Array, Array]:
+        """(n, 3, 3) R_map_walker and (n, 3) t_map_walker at (n,) seconds since the start."""
+        begin, end = np.array(self.model.from_xy_m), np.array(self.model.to_xy_m)
+        length_m = float(np.linalg.norm(end - begin))
+        way = np.mod(self.model.speed_m_s * times_s / length_m, 2.0)
+        part = np.where(way < 1.0, way, 2.0 - way)
+        xy = begin + part[:, None] * (end - begin)
+        z = np.full(len(xy), self.ground_z_map)
+        if self.terrain is not None:
+            z += self.terrain.heights(xy)[0]
+        cos, sin = np.where(way < 1.0, 1.0, -1.0) * ((end - begin) / length_m)[:, None]
+        zeros, ones = np.zeros_like(z), np.ones_like(z)
+        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
+        return R.reshape(-1, 3, 3), np.column_stack([xy, z])
 
 
 @dataclass(frozen=True)
 class World:
-    """Meshes in the map, by name.
+    """What there is to be hit, by name.
 
     Attributes:
-        meshes: the ground first, then the objects.
+        meshes: what stands, in the map: the ground first, then the objects.
         targets: names of the meshes that serve as targets.
-        ground_z_map: height of the ground in metres.
+        ground_z_map: height of the level ground in metres.
+        walkers: who walks.
+        vehicle: the vehicle's body in its own frame; None: it has none.
     """
 
     meshes: dict[str, Mesh]
     targets: tuple[str, ...]
     ground_z_map: float
+    walkers: dict[str, Walker] = field(default_factory=dict)
+    vehicle: Mesh | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in the order that `RayCaster.cast` counts objects in."""
-        return tuple(self.meshes)
+        """Names in the order that `RayCaster` counts objects in: what stands, walks, drives."""
+        vehicle = () if self.vehicle is None else (VEHICLE,)
+        return (*self.meshes, *self.walkers, *vehicle)
 
     def bounds(self, name: str) -> tuple[Array, Array]:
         """(3,) lower and (3,) upper corner of a mesh in the map."""
@@ -215,24 +312,45 @@ class World:
         return centre, float(np.linalg.norm(self.meshes[name].vertices - centre, axis=1).max())
 
 
-def make_world(model: WorldModel) -> World:
-    """The world that a scenario describes."""
+def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> World:
+    """The world that a scenario describes.
+
+    Args:
+        model: what stands and walks.
+        vehicle_body: the boxes that the vehicle consists of.
+    """
     z = model.ground.height_m
+    terrain = make_terrain(model.ground)
     T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))
-    meshes = {GROUND: ground(model.ground.half_size_m).moved(T_map_ground)}
+    meshes = {GROUND: ground(model.ground.half_size_m, terrain).moved(T_map_ground)}
     for name, placed in model.objects.items():
+        rise = 0.0 if terrain is None else terrain.height_at(placed.xy_m)
         T_map_object = gtsam.Pose3(
-            gtsam.Rot3.Yaw(math.radians(placed.yaw_deg)), np.array([*placed.xy_m, z])
+            gtsam.Rot3.Yaw(math.radians(placed.yaw_deg)), np.array([*placed.xy_m, z + rise])
         )
         meshes[name] = _object_mesh(placed).moved(T_map_object)
-    return World(meshes, model.targets, z)
+    parts = [
+        box(part.size_m).moved(
+            gtsam.Pose3(
+                gtsam.Rot3(), np.array(part.centre_m) - np.array([0.0, 0.0, 0.5 * part.size_m[2]])
+            )
+        )
+        for part in vehicle_body
+    ]
+    return World(
+        meshes,
+        model.targets,
+        z,
+        {name: Walker(person(), who, z, terrain) for name, who in model.walkers.items()},
+        join(parts) if parts else None,
+    )
 
 
 class RayCaster:
     """Casts rays at a world with Embree."""
 
     def __init__(self, world: World, threads: int = 1) -> None:
-        """Builds the scene.
+        """Builds the scenes.
 
         Args:
             world: what to cast at.
@@ -243,41 +361,115 @@ class RayCaster:
         """
         self._o3d: Any = import_open3d()
         self._threads = threads
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
         # float32 resolves 1 micrometre at 10 m but 30 mm at the 500 km of a UTM grid.
-        self._origin_map = world.bounding_sphere(world.targets[0])[0]
-        for mesh in world.meshes.values():
-            self._scene.add_triangles(
-                self._tensor(mesh.vertices - self._origin_map, np.float32),
-                self._tensor(mesh.triangles, np.uint32),
+        self._origin_map = _middle(world)
+        self._scene = self._scene_of(
+            [
+                Mesh(mesh.vertices - self._origin_map, mesh.triangles)
+                for mesh in world.meshes.values()
+            ]
+        )
+        self._walkers = [
+            (len(world.meshes) + i, walker, self._scene_of([walker.mesh]))
+            for i, walker in enumerate(world.walkers.values())
+        ]
+        self._vehicle = None if world.vehicle is None else self._scene_of([world.vehicle])
+        self._vehicle_index = len(world.names) - 1
+
+    def _scene_of(self, meshes: Sequence[Mesh]) -> Any:
+        scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        for mesh in meshes:
+            scene.add_triangles(
+                self._tensor(mesh.vertices, np.float32), self._tensor(mesh.triangles, np.uint32)
             )
+        return scene
 
     def _tensor(self, values: npt.NDArray[Any], dtype: npt.DTypeLike) -> Any:
         return self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=dtype))
 
-    def cast(self, origin_map: Array, directions_map: Array) -> tuple[Array, IntArray]:
-        """Casts rays from one point.
+    def _hits(self, scene: Any, origin: Array, directions: Array) -> tuple[Array, IntArray, Array]:
+        """Distance, number of the mesh in the scene, and normal of its face."""
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3] = origin
+        rays[:, 3:] = directions
+        answer = scene.cast_rays(self._tensor(rays, np.float32), nthreads=self._threads)
+        distance_m = answer["t_hit"].numpy().astype(np.float64)
+        normals = answer["primitive_normals"].numpy().astype(np.float64)
+        return distance_m, answer["geometry_ids"].numpy().astype(np.int64), normals
+
+    def cast(
+        self, origin_map: Array, directions_map: Array, times_s: npt.ArrayLike = 0.0
+    ) -> tuple[Array, IntArray]:
+        """Casts rays at all but the vehicle.
 
         Args:
-            origin_map: (3,) metres.
+            origin_map: (3,) or (n, 3) metres.
             directions_map: (n, 3) of length 1.
+            times_s: seconds since the start of the drive, one number or (n,): where walkers are.
 
         Returns:
             (n,) distance in metres, infinite without a hit, and (n,) index into `World.names` of
             what was hit, `NO_OBJECT` without a hit.
         """
-        rays = np.empty((len(directions_map), 6), dtype=np.float32)
-        rays[:, :3] = origin_map - self._origin_map
-        rays[:, 3:] = directions_map
-        answer = self._scene.cast_rays(self._tensor(rays, np.float32), nthreads=self._threads)
-        distance_m = answer["t_hit"].numpy().astype(np.float64)
-        objects = answer["geometry_ids"].numpy().astype(np.int64)
-        objects[~np.isfinite(distance_m)] = NO_OBJECT
+        distance_m, objects, _ = self.cast_with_normals(origin_map, directions_map, times_s)
         return distance_m, objects
 
+    def cast_with_normals(
+        self, origin_map: Array, directions_map: Array, times_s: npt.ArrayLike = 0.0
+    ) -> tuple[Array, IntArray, Array]:
+        """Like `cast`, and (n, 3) normals in the map of the faces that were hit."""
+        distance_m, objects, normals = self._hits(
+            self._scene, origin_map - self._origin_map, directions_map
+        )
+        for index, walker, scene in self._walkers:
+            times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
+            R, t = walker.poses(times)
+            own_m, _, own_normals = self._hits(
+                scene, _turned(R, origin_map - t), _turned(R, directions_map)
+            )
+            nearer = own_m < distance_m
+            distance_m[nearer] = own_m[nearer]
+            objects[nearer] = index
+            normals[nearer] = _turned(np.swapaxes(R, 1, 2), own_normals)[nearer]
+        objects[~np.isfinite(distance_m)] = NO_OBJECT
+        return distance_m, objects, normals
+
+    def cast_at_vehicle(self, origin: Array, directions: Array) -> tuple[Array, int]:
+        """Casts rays at the vehicle's body.
+
+        Args:
+            origin: (3,) metres, vehicle frame.
+            directions: (n, 3) of length 1, vehicle frame.
+
+        Returns:
+            (n,) distance in metres, infinite without a hit, and the index of the vehicle in
+            `World.names`.
+        """
+        if self._vehicle is None:
+            return np.full(len(directions), np.inf), self._vehicle_index
+        return self._hits(self._vehicle, origin, directions)[0], self._vehicle_index
+
     def distance(self, points_map: Array) -> Array:
-        """(n,) distance in metres of each of (n, 3) points to the nearest surface."""
+        """(n,) distance in metres of each of (n, 3) points to the nearest surface that stands."""
         points = self._tensor(points_map - self._origin_map, np.float32)
         distance_m = self._scene.compute_distance(points, nthreads=self._threads)
         result: Array = distance_m.numpy().astype(np.float64)
         return result
+
+
+def _turned(R_a_b: Array, vectors_a: Array) -> Array:
+    """(n, 3) vectors of frame a in frame b; (1, 3, 3) or (n, 3, 3) rotations."""
+    turned: Array = (
+        vectors_a @ R_a_b[0] if len(R_a_b) == 1 else np.einsum("nji,nj->ni", R_a_b, vectors_a)
+    )
+    return turned
+
+
+def _middle(world: World) -> Array:
+    """(3,) a place in the map near to what matters: the first target, else the objects."""
+    if world.targets:
+        return world.bounding_sphere(world.targets[0])[0]
+    standing = [name for name in world.meshes if name != GROUND]
+    centres = [world.bounding_sphere(name)[0] for name in standing]
+    middle: Array = np.mean(centres, axis=0) if centres else np.zeros(3)
+    return middle

@@ -1,8 +1,12 @@
-"""Writing a simulated drive: a CaLiV folder, the truth, and a config that is ready to run."""
+"""Writing what lies beside a simulated drive: its truth, and a config that is ready to run.
+
+And the parts of a CaLiV folder; `bag` writes bags.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,17 +15,40 @@ import gtsam
 import numpy as np
 import yaml
 
-from caliv_graph.config import Mounting, parse_config
+from caliv_graph.config import parse_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.simulation.motion import antenna_positions
+from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import Scenario, dump_scenario
-from caliv_graph.simulation.worlds import World
+
+BAG_FOLDER = "drive"
+"""Name of the bag in the folder of a simulated drive."""
+
+TOPIC_IMU = "/imu/data"
+TOPIC_GNSS = "/gnss/fix"
+TOPIC_TWIST = "/vehicle/twist"
 
 CALIV_FOLDER = "caliv"
 """Name of the CaLiV folder in the folder of a simulated drive."""
 
 UNIFORM_TO_SIGMA = 1.0 / math.sqrt(3.0)
 """Standard deviation of a uniform draw from -1 to 1."""
+
+
+def topic_of_lidar(name: str) -> str:
+    """Topic of a LiDAR's clouds.
+
+    Raises:
+        ConfigError: the name cannot be part of a topic.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ConfigError(
+            f"lidars.{name}: a bag's topics have letters, digits and underscores, and begin with a "
+            "letter. Rename the LiDAR, or write a CaLiV folder (--format caliv)"
+        )
+    return f"/lidar/{name}/points"
 
 
 def write_pcd(path: Path, points: Array) -> None:
@@ -50,7 +77,9 @@ def _pose_values(pose: gtsam.Pose3) -> list[str]:
 
     Never in Python's own form: 1e-05 is a string to YAML 1.1.
     """
-    return [f"{v:.12f}" for v in (*pose.translation(), *_quaternion_xyzw(pose.rotation()))]
+    values = (*pose.translation(), *_quaternion_xyzw(pose.rotation()))
+    # Adding zero turns the minus zero of a rounded -1e-17 into zero.
+    return [f"{round(v, 12) + 0.0:.12f}" for v in values]
 
 
 def write_ego_poses(path: Path, poses: Mapping[str, Sequence[tuple[int, gtsam.Pose3]]]) -> None:
@@ -68,9 +97,18 @@ def write_ego_poses(path: Path, poses: Mapping[str, Sequence[tuple[int, gtsam.Po
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_tum(path: Path, stamps_ns: IntArray, T_map_vehicle: Sequence[gtsam.Pose3]) -> None:
-    """Writes a trajectory in the TUM format: stamp in seconds, x y z qx qy qz qw."""
-    lines = []
+def write_tum(
+    path: Path, stamps_ns: IntArray, T_map_vehicle: Sequence[gtsam.Pose3], comment: str = ""
+) -> None:
+    """Writes a trajectory in the TUM format: stamp in seconds, x y z qx qy qz qw.
+
+    Args:
+        path: the file.
+        stamps_ns: (n,) nanoseconds.
+        T_map_vehicle: n poses.
+        comment: one line to put before them, after `#`.
+    """
+    lines = [f"# {comment}"] if comment else []
     for stamp_ns, pose in zip(stamps_ns.tolist(), T_map_vehicle, strict=True):
         seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
         lines.append(f"{seconds}.{nanoseconds:09d} {' '.join(_pose_values(pose))}")
@@ -105,91 +143,163 @@ def truth_of(
     }
 
 
-def _target_regions(scenario: Scenario, world: World) -> list[dict[str, Any]]:
+def _target_regions(recording: SimulatedRecording, has_bag: bool) -> list[dict[str, Any]]:
+    world = recording.world
+    margin_m = recording.scenario.world.region_margin_m
+    # With a bag, the map begins where the antenna had its first fix.
+    origin_map = _first_antenna_position(recording) if has_bag else np.zeros(3)
     regions = []
     for name in world.targets:
         low, high = world.bounds(name)
-        margin_m = scenario.world.region_margin_m
         regions.append(
             {
-                "min": [round(float(v), 3) for v in low - margin_m],
-                "max": [round(float(v), 3) for v in high + margin_m],
+                "min": [round(float(v), 3) for v in low - margin_m - origin_map],
+                "max": [round(float(v), 3) for v in high + margin_m - origin_map],
                 "frame": "map",
             }
         )
     return regions
 
 
-def _noise_section(scenario: Scenario, duration_s: float) -> dict[str, float]:
-    """What the config says of the noise: only what there is, for a sigma cannot be zero."""
-    poses = scenario.poses
-    root_s = math.sqrt(duration_s)
-    noise = {
-        "lidar_range_m": max(lidar.range_sigma_m for lidar in scenario.lidars.values()),
-        "pose_position_m": poses.position_sigma_m,
-        "pose_rotation_deg": math.degrees(poses.rotation_sigma_rad),
-        # What the walk has come to by the end of the drive.
-        "pose_drift_position_m": poses.position_walk_m_sqrts * root_s,
-        "pose_drift_rotation_deg": math.degrees(poses.rotation_walk_rad_sqrts) * root_s,
-    }
+def _first_antenna_position(recording: SimulatedRecording) -> Array:
+    """(3,) true position of the antenna in the map at the first fix; zero without a fix."""
+    gnss = recording.motion().gnss
+    if gnss is None or not len(gnss.stamps_ns):
+        return np.zeros(3)
+    states = recording.truth.states(gnss.stamps_ns[:1])
+    first: Array = antenna_positions(states, recording.scenario.gnss)[0]
+    return first
+
+
+def _positive(noise: Mapping[str, float]) -> dict[str, float]:
+    """Only what there is, for a sigma cannot be zero."""
     return {key: value for key, value in noise.items() if value > 0.0}
 
 
-def config_of(
-    scenario: Scenario, world: World, guesses: Mapping[str, Mounting], duration_s: float
-) -> dict[str, Any]:
+def _range_sigma_m(scenario: Scenario) -> float:
+    return max(lidar.range_sigma_m for lidar in scenario.lidars.values())
+
+
+def _noise_of_poses(scenario: Scenario, duration_s: float) -> dict[str, float]:
+    """What the config says of the noise of a CaLiV folder."""
+    poses = scenario.poses
+    root_s = math.sqrt(duration_s)
+    return _positive(
+        {
+            "lidar_range_m": _range_sigma_m(scenario),
+            "pose_position_m": poses.position_sigma_m,
+            "pose_rotation_deg": math.degrees(poses.rotation_sigma_rad),
+            # What the walk has come to by the end of the drive.
+            "pose_drift_position_m": poses.position_walk_m_sqrts * root_s,
+            "pose_drift_rotation_deg": math.degrees(poses.rotation_walk_rad_sqrts) * root_s,
+        }
+    )
+
+
+def _noise_of_sensors(scenario: Scenario) -> dict[str, float]:
+    """What the config says of the noise of a bag: what its messages do not say."""
+    imu, gnss = scenario.imu, scenario.gnss
+    noise = {"lidar_range_m": _range_sigma_m(scenario)}
+    if imu.enabled:
+        noise |= {
+            "accelerometer_bias_walk_m_s3_sqrthz": imu.accelerometer_bias_walk_m_s3_sqrthz,
+            "gyroscope_bias_walk_rad_s2_sqrthz": imu.gyroscope_bias_walk_rad_s2_sqrthz,
+        }
+    if scenario.bag.covariances == "unknown":
+        # White noise of a sample becomes a density over the time that it stands for.
+        root_s = 1.0 / math.sqrt(imu.rate_hz)
+        if imu.enabled:
+            noise |= {
+                "accelerometer_density_m_s2_sqrthz": imu.accelerometer_sigma_m_s2 * root_s,
+                "gyroscope_density_rad_s_sqrthz": imu.gyroscope_sigma_rad_s * root_s,
+            }
+        if imu.enabled and imu.orientation.enabled:
+            noise["orientation_deg"] = math.degrees(imu.orientation.sigma_rad)
+        if gnss.enabled:
+            noise["gnss_horizontal_m"] = gnss.horizontal_sigma_m
+            noise["gnss_vertical_m"] = gnss.vertical_sigma_m
+        if scenario.velocity.enabled:
+            noise["velocity_m_s"] = scenario.velocity.sigma_m_s
+    return _positive(noise)
+
+
+def _motion_sections(scenario: Scenario) -> dict[str, Any]:
+    """Topics and places of what moves the vehicle, as far as it has them."""
+    topics: dict[str, str] = {}
+    sections: dict[str, Any] = {}
+    if scenario.imu.enabled:
+        mounting = scenario.imu.mounting
+        topics["imu"] = TOPIC_IMU
+        sections["imu"] = {
+            "T_vehicle_imu": {"xyz": list(mounting.xyz), "rpy_deg": list(mounting.rpy_deg)}
+        }
+    if scenario.gnss.enabled:
+        topics["gnss"] = TOPIC_GNSS
+        sections["gnss"] = {"lever_arm": list(scenario.gnss.lever_arm)}
+    if scenario.velocity.enabled:
+        topics["twist"] = TOPIC_TWIST
+    return {"topics": topics, **sections}
+
+
+def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
     """The content of a `config.yaml` that calibrates the drive as it is written.
 
     Args:
-        scenario: the drive.
-        world: its world, for the targets' regions.
-        guesses: initial guess per LiDAR.
-        duration_s: duration of the drive.
+        recording: the drive.
+        has_bag: it is written as a bag; else as a CaLiV folder.
+
+    Raises:
+        ConfigError: a LiDAR whose name cannot be part of a topic.
     """
+    scenario = recording.scenario
     guess = scenario.initial_guess
     sigma = {
         "xyz": guess.translation_m * UNIFORM_TO_SIGMA,
         "rpy_deg": guess.rotation_deg * UNIFORM_TO_SIGMA,
     }
+    topics = map(topic_of_lidar, scenario.lidars) if has_bag else sensor_folders(scenario)
     lidars = {
         name: {
-            "topic": sensor,
-            "initial": {"xyz": list(guesses[name].xyz), "rpy_deg": list(guesses[name].rpy_deg)},
+            "topic": topic,
+            "initial": {
+                "xyz": list(recording.guesses[name].xyz),
+                "rpy_deg": list(recording.guesses[name].rpy_deg),
+            },
             "sigma": {key: value for key, value in sigma.items() if value > 0.0},
             "min_range": model.min_range_m,
             "max_range": model.max_range_m,
         }
-        for sensor, (name, model) in zip(
-            sensor_folders(scenario), scenario.lidars.items(), strict=True
-        )
+        for topic, (name, model) in zip(topics, scenario.lidars.items(), strict=True)
     }
     ground: dict[str, Any] = {"use": True, "vehicle_height": 0.0}
     if scenario.suspension.height_sigma_m > 0.0:
         ground["sigma"] = scenario.suspension.height_sigma_m
-    return {
-        "data": {"format": "caliv", "path": CALIV_FOLDER},
+    data = {"format": "rosbag", "path": BAG_FOLDER}
+    content = {
+        "data": data if has_bag else {"format": "caliv", "path": CALIV_FOLDER},
+        **(_motion_sections(scenario) if has_bag else {}),
         "lidars": lidars,
         "reference": scenario.reference,
-        "target": _target_regions(scenario, world),
+        "target": _target_regions(recording, has_bag),
         "ground": ground,
-        "noise": _noise_section(scenario, duration_s),
+        "noise": (
+            _noise_of_sensors(scenario)
+            if has_bag
+            else _noise_of_poses(scenario, recording.truth.drive.duration_s)
+        ),
     }
+    if scenario.config_target == "search" or not recording.world.targets:
+        del content["target"]
+    return content
 
 
-def write_config(
-    path: Path,
-    scenario: Scenario,
-    world: World,
-    guesses: Mapping[str, Mounting],
-    duration_s: float,
-    seed: int,
-) -> None:
+def write_config(path: Path, recording: SimulatedRecording, has_bag: bool) -> None:
     """Writes `config.yaml`; see `config_of`."""
-    content = config_of(scenario, world, guesses, duration_s)
+    content = config_of(recording, has_bag)
     # What is called ready to run shall at least be a config.
     parse_config(content, str(path), path.parent)
     text = (
-        f"# A simulated drive: scenario '{scenario.name}', seed {seed}.\n"
+        f"# A simulated drive: scenario '{recording.scenario.name}', seed {recording.seed}.\n"
         "# The initial guesses are off on purpose: truth.yaml has the true mountings.\n"
     )
     path.write_text(text + _dump_yaml(content), encoding="utf-8")

@@ -14,9 +14,19 @@ from caliv_graph.simulation.lidar import (
     SimulatedLidar,
     beam_directions,
     beams_through_sphere,
+    column_times,
 )
-from caliv_graph.simulation.scenario import ChairModel, CropModel, LidarModel, WorldModel
-from caliv_graph.simulation.worlds import RayCaster, World, make_world
+from caliv_graph.simulation.scenario import (
+    BodyBoxModel,
+    BoxModel,
+    ChairModel,
+    CropModel,
+    EdgeModel,
+    LidarModel,
+    SweepModel,
+    WorldModel,
+)
+from caliv_graph.simulation.worlds import NO_OBJECT, RayCaster, World, make_world
 
 FRONT = LidarModel(mounting=Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)))
 CHAIR_WORLD = make_world(
@@ -202,3 +212,174 @@ def test_chair_has_as_many_points_as_the_authors_clouds_have() -> None:
         returns = scan(FRONT, world=world, T_map_vehicle=gtsam.Pose3())
         count = int((returns.objects == world.names.index("chair")).sum())
         assert 0.75 * expected < count < 1.33 * expected
+
+
+def test_channels_may_be_uneven() -> None:
+    model = FRONT.model_copy(update={"elevations_deg": (-20.0, -3.0, -2.0, 0.5)})
+    _, elevation = angles_deg(beam_directions(model))
+    assert elevation.shape == (4, 658)
+    np.testing.assert_allclose(elevation[:, 17], [-20.0, -3.0, -2.0, 0.5])
+
+
+def swept(**changes: object) -> LidarModel:
+    return FRONT.model_copy(update={"sweep": SweepModel(**changes)})  # type: ignore[arg-type]
+
+
+def test_columns_follow_one_another_through_the_sweep() -> None:
+    assert column_times(FRONT, 5).tolist() == [0.0]
+    times = {
+        (way, at): column_times(
+            swept(direction=way, stamp_at=at, time_field="time", duration_s=0.05), 5
+        ).tolist()
+        for way in ("clockwise", "counter_clockwise")
+        for at in ("start", "end")
+    }
+    # The first column is the rightmost; seen from above, clockwise begins on the left.
+    rising = [0.0, 0.01, 0.02, 0.03, 0.04]
+    assert times["counter_clockwise", "start"] == pytest.approx(rising)
+    assert times["clockwise", "start"] == pytest.approx(rising[::-1])
+    assert times["counter_clockwise", "end"] == pytest.approx([t - 0.05 for t in rising])
+    assert times["clockwise", "end"] == pytest.approx([t - 0.05 for t in rising[::-1]])
+    # Without a duration it takes the whole period.
+    assert column_times(swept(), 5).max() == pytest.approx(0.08)
+
+
+def moving_poses(columns: int) -> tuple[Array, Array]:
+    """The vehicle turns by 0.2 rad and drives 1 m from the first to the last column."""
+    part = np.linspace(0.0, 1.0, columns)
+    poses = [
+        gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.02 * p, 0.2 * p), np.array([p, 0.1 * p, 0.0]))
+        for p in part
+    ]
+    return (
+        np.array([pose.rotation().matrix() for pose in poses]),
+        np.array([pose.translation() for pose in poses]),
+    )
+
+
+def sweeping(
+    model: LidarModel, crop: CropModel | None = None, seed: int = 0
+) -> tuple[SimulatedLidar, LidarReturns]:
+    rng = np.random.default_rng(seed)
+    lidar = SimulatedLidar(model, CHAIR_WORLD, RayCaster(CHAIR_WORLD), crop, rng)
+    R, t = moving_poses(658)
+    return lidar, lidar.sweep(R, t, lidar.column_times_s)
+
+
+def test_each_column_of_a_sweep_is_taken_from_its_own_pose() -> None:
+    lidar, returns = sweeping(quiet(swept()))
+    R, t = moving_poses(658)
+    T_vehicle_lidar = pose_from_mounting(FRONT.mounting)
+    points_vehicle = T_vehicle_lidar.transformFrom(returns.points_lidar.T).T
+    column = lidar.columns_of(returns)
+    points_map = np.einsum("nij,nj->ni", R[column], points_vehicle) + t[column]
+    on_chair = returns.objects == CHAIR_WORLD.names.index("chair")
+    assert on_chair.sum() > 500
+    caster = RayCaster(CHAIR_WORLD)
+    assert caster.distance(points_map).max() < 1e-4
+    # Taken for an instant, they do not fit.
+    still = points_vehicle @ R[0].T + t[0]
+    assert np.median(caster.distance(still[on_chair])) > 0.05
+
+
+def test_crop_of_a_sweep_keeps_the_target_and_changes_no_return() -> None:
+    _, full = sweeping(swept())
+    _, part = sweeping(swept(), CropModel(margin_m=0.0, elsewhere_stride=0))
+    chair = CHAIR_WORLD.names.index("chair")
+    kept = dict(zip(part.beams.tolist(), part.points_lidar.tolist(), strict=True))
+    whole = dict(zip(full.beams.tolist(), full.points_lidar.tolist(), strict=True))
+    assert set(full.beams[full.objects == chair].tolist()) <= set(kept)
+    assert len(kept) < 0.2 * len(whole)
+    assert all(whole[beam] == point for beam, point in kept.items())
+
+
+def test_skipped_cloud_leaves_the_next_as_it_is() -> None:
+    for model in (FRONT, FRONT.model_copy(update={"edges": EdgeModel()})):
+        one, other = (
+            SimulatedLidar(
+                model, CHAIR_WORLD, RayCaster(CHAIR_WORLD), None, np.random.default_rng(3)
+            )
+            for _ in range(2)
+        )
+        one.scan(T_MAP_VEHICLE)
+        other.skip()
+        np.testing.assert_array_equal(
+            one.scan(T_MAP_VEHICLE).points_lidar, other.scan(T_MAP_VEHICLE).points_lidar
+        )
+
+
+BOX_WORLD = make_world(
+    WorldModel(
+        objects={
+            "near": BoxModel(xy_m=(9.0, 0.0), size_m=(0.2, 2.0, 3.0)),
+            "wall": BoxModel(xy_m=(10.0, 0.0), size_m=(0.2, 40.0, 9.0)),
+        },
+        targets=("near",),
+    )
+)
+
+
+def edged(**changes: float) -> LidarReturns:
+    model = quiet(FRONT).model_copy(update={"edges": EdgeModel(**changes)})
+    return scan(model, world=BOX_WORLD, T_map_vehicle=gtsam.Pose3())
+
+
+def test_mixed_returns_lie_between_the_two_surfaces_and_at_edges_only() -> None:
+    clean = scan(quiet(FRONT), world=BOX_WORLD, T_map_vehicle=gtsam.Pose3())
+    mixed = edged(mixed_probability=1.0, lost_probability=0.0, divergence_mrad=10.0)
+    between = mixed.objects == NO_OBJECT
+    # The box's two upright edges, 100 channels each, and where ground and walls meet.
+    assert 50 < between.sum() < 3000
+    # A beam that grazes the ground is long, but meets no edge but where the box stands.
+    on_ground = clean.objects == 0
+    assert (between & on_ground).sum() < 0.01 * on_ground.sum()
+    np.testing.assert_array_equal(mixed.beams, clean.beams)
+    np.testing.assert_allclose(
+        mixed.points_lidar[~between], clean.points_lidar[~between], atol=1e-9
+    )
+    T_vehicle_lidar = pose_from_mounting(FRONT.mounting)
+    points = T_vehicle_lidar.transformFrom(mixed.points_lidar[between].T).T
+    # Beside the box, above the ground: between its front at 8.9 m and the wall's at 9.9 m.
+    beside = (
+        (np.abs(np.abs(points[:, 1]) - 1.0) < 0.06) & (points[:, 2] > 0.2) & (points[:, 2] < 2.9)
+    )
+    assert beside.sum() > 30
+    x = points[beside, 0]
+    assert x.min() > 8.89
+    assert x.max() < 9.91
+    assert ((x > 9.2) & (x < 9.6)).sum() > 5
+
+
+def test_edges_are_lost_as_often_as_stated() -> None:
+    all_mixed = edged(mixed_probability=1.0, lost_probability=0.0, mixing_m=1e3)
+    half_lost = edged(mixed_probability=1.0, lost_probability=0.5, mixing_m=1e3)
+    edge = int((all_mixed.objects == NO_OBJECT).sum())
+    lost = len(all_mixed.points_lidar) - len(half_lost.points_lidar)
+    assert lost == pytest.approx(0.5 * edge, rel=0.15)
+    some = edged(mixed_probability=0.4, lost_probability=0.5, mixing_m=1e3)
+    assert (some.objects == NO_OBJECT).sum() == pytest.approx(0.2 * edge, rel=0.25)
+    thinned = edged(mixed_probability=0.0, lost_probability=0.0, dropout_probability=0.1)
+    assert len(thinned.points_lidar) / len(all_mixed.points_lidar) == pytest.approx(0.9, abs=0.01)
+
+
+def test_edge_effects_leave_the_range_noise_alone() -> None:
+    plain = scan(FRONT, world=BOX_WORLD)
+    edges = EdgeModel(mixed_probability=0.0, lost_probability=0.0)
+    same = scan(FRONT.model_copy(update={"edges": edges}), world=BOX_WORLD)
+    np.testing.assert_array_equal(plain.points_lidar, same.points_lidar)
+
+
+def test_body_of_the_vehicle_is_seen_the_same_from_everywhere() -> None:
+    # The roof, 1.9 m up, from 2 m at 10 degrees nose down: the lowest beam comes down by 22.5.
+    body = (BodyBoxModel(centre_m=(2.0, 0.0, 1.5), size_m=(3.0, 1.8, 0.8)),)
+    world = make_world(WorldModel(), body)
+    model = quiet(FRONT).model_copy(update={"min_range_m": 0.1})
+    returns = [
+        scan(model, world=world, T_map_vehicle=pose) for pose in (gtsam.Pose3(), T_MAP_VEHICLE)
+    ]
+    roofs = [r.points_lidar[r.objects == world.names.index("vehicle")] for r in returns]
+    assert len(roofs[0]) > 1000
+    np.testing.assert_array_equal(roofs[0], roofs[1])
+    points_vehicle = pose_from_mounting(FRONT.mounting).transformFrom(roofs[0].T).T
+    np.testing.assert_allclose(points_vehicle[:, 2], 1.9, atol=1e-5)
+    assert np.abs(points_vehicle[:, 1]).max() <= 0.9 + 1e-5

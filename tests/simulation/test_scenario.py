@@ -9,13 +9,17 @@ import yaml
 from caliv_graph.errors import ConfigError
 from caliv_graph.simulation.scenario import (
     ArcDrive,
+    FigureEightDrive,
     Scenario,
     dump_scenario,
     load_scenario,
     parse_scenario,
 )
+from caliv_graph.simulation.worlds import make_world
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
+
+SHIPPED = sorted(path.stem for path in SCENARIOS.glob("*.yaml"))
 
 
 def minimal() -> dict[str, Any]:
@@ -71,23 +75,55 @@ def test_demo_arc_differs_in_nothing_but_size() -> None:
     assert full == paper
 
 
-@pytest.mark.parametrize("name", ["paper_arc", "demo_arc"])
-def test_shipped_scenarios_comment_every_key(name: str) -> None:
-    path = SCENARIOS / f"{name}.yaml"
+def test_paper_arc_shows_every_key() -> None:
+    path = SCENARIOS / "paper_arc.yaml"
     effective = yaml.safe_load(dump_scenario(load_scenario(path)))
     written = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert all_keys(written) == all_keys(effective)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_scenarios_comment_every_key(name: str) -> None:
+    path = SCENARIOS / f"{name}.yaml"
+    written = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert load_scenario(path).name == written["name"] == name
     commented = set()
     for line in path.read_text(encoding="utf-8").splitlines():
         key, colon, rest = line.strip().removeprefix("- ").partition(":")
         if colon and "#" in rest:
             commented.add(key)
-    names = {"name", "drive", "lidars", "world", "ground", "objects", "chair", "front", "rear"}
-    assert all_keys(effective) - names <= commented | {"mounting", "crop", "poses"}
+    speak_for_themselves = {"name", "drive", "lidars", "world", "ground", "objects", "mounting"}
+    speak_for_themselves |= {"imu", "gnss", "bag", "enabled", "shape", "rate_hz", "phase_s"}
+    named = {*written["lidars"], *written["world"]["objects"]}
+    named |= set(written["world"].get("walkers", {}))
+    assert all_keys(written) - named - speak_for_themselves <= commented
+
+
+def test_figure_eights_have_the_chair_6_m_outside_both_circles() -> None:
+    for name in ("figure_eight", "ramp", "tri_lidar", "distorted", "noisy", "real_like"):
+        scenario = load_scenario(SCENARIOS / f"{name}.yaml")
+        assert isinstance(scenario.drive, FigureEightDrive)
+        assert scenario.drive.radius_m == 9.16
+        x, y = scenario.world.objects["chair"].xy_m
+        for side in (-9.16, 9.16):
+            assert (x**2 + (y - side) ** 2) ** 0.5 - 9.16 == pytest.approx(6.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_nothing_but_the_target_and_walkers_is_in_its_region(name: str) -> None:
+    scenario = load_scenario(SCENARIOS / f"{name}.yaml")
+    world = make_world(scenario.world)
+    for target in world.targets:
+        low, high = world.bounds(target)
+        margin_m = scenario.world.region_margin_m
+        for other in set(scenario.world.objects) - {target}:
+            other_low, other_high = world.bounds(other)
+            apart = (other_low > high + margin_m) | (other_high < low - margin_m)
+            assert apart.any(), other
 
 
 def test_dumped_scenario_loads_to_the_same(tmp_path: Path) -> None:
-    for name in ("paper_arc", "demo_arc"):
+    for name in SHIPPED:
         scenario = load_scenario(SCENARIOS / f"{name}.yaml")
         path = tmp_path / f"{name}.yaml"
         path.write_text(dump_scenario(scenario), encoding="utf-8")
@@ -133,6 +169,27 @@ def broken(path: str, value: Any) -> dict[str, Any]:
         ("world/targets", ["table"], "target 'table' is not one of the objects: chair"),
         ("world/objects/chair/shape", "table", "'table'"),
         ("name", "two\nlines", "name"),
+        ("lidars/front/elevations_deg", [-3.0, -3.0, 1.0], "elevations_deg must ascend"),
+        ("lidars/front/elevations_deg", [-95.0, 1.0], "elevations_deg must lie within -90 and 90"),
+        ("lidars/front/sweep", {"duration_s": 0.2}, "exceeds the 0.1 s between two clouds"),
+        (
+            "lidars/front/sweep",
+            {"stamp_at": "end"},
+            "time_field 't' is unsigned and cannot count back from the end",
+        ),
+        ("lidars/front/sweep", {"time_field": "stamp"}, "time_field"),
+        ("lidars/front/edges", {"lost_probability": 1.2}, "less than or equal to 1"),
+        ("world/objects/ground", {"shape": "box", "xy_m": [9, 9], "size_m": [1, 1, 1]}, "ground"),
+        (
+            "world/walkers",
+            {"chair": {"from_xy_m": [1, 1], "to_xy_m": [4, 4]}},
+            "'chair' is the name of an object and of a walker",
+        ),
+        ("world/walkers", {"who": {"from_xy_m": [1, 1], "to_xy_m": [1, 1]}}, "nowhere to walk"),
+        ("imu", {"rate_hz": 0.0}, "greater than 0"),
+        ("imu", {"acc_sigma": 0.1}, "unknown key 'acc_sigma'"),
+        ("gnss", {"jumps": [{"start_s": 1.0}]}, "missing"),
+        ("bag", {"compression": "lz4"}, "compression"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(path: str, value: Any, message: str) -> None:

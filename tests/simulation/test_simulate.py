@@ -15,7 +15,13 @@ from caliv_graph.errors import ConfigError, OutputError
 from caliv_graph.products import Array
 from caliv_graph.progress import SilentProgress, StageRecord
 from caliv_graph.readers.caliv_folder import CalivFolder
-from caliv_graph.simulation import Scenario, SimulatedDrive, load_scenario, simulate_caliv
+from caliv_graph.simulation import (
+    Scenario,
+    SimulatedDrive,
+    load_scenario,
+    simulate_caliv,
+    write_drive,
+)
 from caliv_graph.simulation.scenario import (
     ArcDrive,
     ChairModel,
@@ -24,8 +30,10 @@ from caliv_graph.simulation.scenario import (
     LidarModel,
     PoseNoiseModel,
     SuspensionModel,
+    SweepModel,
     WorldModel,
 )
+from caliv_graph.simulation.simulate import Format
 from caliv_graph.simulation.worlds import RayCaster, make_world
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
@@ -341,6 +349,64 @@ def test_rate_that_the_folder_cannot_express_is_an_error(tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"phase_s": 0.03}, r"lidars\.side\.phase_s: .* none at 0\.03 s"),
+        ({"sweep": SweepModel()}, r"lidars\.side\.sweep: .*\(--format bag\)"),
+    ],
+)
+def test_clouds_that_the_folder_cannot_express_are_an_error(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    side = SMALL.lidars["side"].model_copy(update=changes)
+    scenario = SMALL.model_copy(update={"lidars": {"side": side}})
+    formats: tuple[Format, ...] = ("caliv", "both")
+    for output in formats:
+        with pytest.raises(ConfigError, match=message):
+            write_drive(scenario, tmp_path / "drive", 0, output=output)
+    assert not list(tmp_path.iterdir())
+
+
+def test_clouds_a_whole_number_of_frames_late_keep_their_frames(tmp_path: Path) -> None:
+    side = SMALL.lidars["side"].model_copy(update={"phase_s": 0.3, "rate_hz": 5.0})
+    scenario = SMALL.model_copy(update={"lidars": {"side": side}, "reference": "side"})
+    folder = simulate_caliv(scenario, tmp_path / "drive", 0).folder
+    frames = sorted(int(p.stem) for p in (folder / "caliv/input/sensor_1").glob("*.pcd"))
+    assert frames == list(range(3, 50, 2))
+
+
+def test_both_formats_hold_the_same_clouds(small: SimulatedDrive, tmp_path: Path) -> None:
+    drive = write_drive(SMALL, tmp_path / "both", 7, output="both")
+    alone, both = all_bytes(small.folder), all_bytes(drive.folder)
+    assert {name for name in both if name.startswith("drive/")} == {
+        "drive/drive.mcap",
+        "drive/metadata.yaml",
+    }
+    for name in alone:
+        if name.startswith("caliv/"):
+            assert both[name] == alone[name], name
+    assert drive.scans == small.scans
+    # The config is for the bag.
+    config = load_config(drive.folder / "config.yaml")
+    assert config.data.format == "rosbag"
+    assert config.lidars["side"].topic == "/lidar/side/points"
+    # A later drive of another format replaces all of it.
+    write_drive(SMALL, tmp_path / "both", 7, output="caliv", force=True)
+    assert all_bytes(tmp_path / "both") == alone
+
+
+def test_interrupted_bag_leaves_nothing(tmp_path: Path) -> None:
+    class Interrupting(SilentProgress):
+        def _show(self, record: StageRecord) -> None:
+            if record.done == 10:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_drive(SMALL, tmp_path / "drive", 0, progress=Interrupting())
+    assert not list(tmp_path.iterdir())
+
+
 def test_existing_folder_is_not_overwritten_unless_told(
     small: SimulatedDrive, tmp_path: Path
 ) -> None:
@@ -424,8 +490,11 @@ def test_crop_thins_the_folder_only(small: SimulatedDrive, tmp_path: Path) -> No
     assert {tuple(point) for point in part} <= {tuple(point) for point in full}
 
 
-def test_open3d_is_not_imported_before_it_is_needed() -> None:
-    code = "import sys, caliv_graph.simulation; sys.exit('open3d' in sys.modules)"
+def test_open3d_and_rosbags_are_not_imported_before_they_are_needed() -> None:
+    code = (
+        "import sys, caliv_graph.simulation; "
+        "sys.exit('open3d' in sys.modules or 'rosbags' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -7,7 +7,18 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.simulation.scenario import BoxModel, ChairModel, GroundModel, WorldModel
+from caliv_graph.simulation.scenario import (
+    BodyBoxModel,
+    BoxModel,
+    ChairModel,
+    GroundModel,
+    ObjectModel,
+    PoleModel,
+    RampModel,
+    WalkerModel,
+    WorldModel,
+)
+from caliv_graph.simulation.terrain import Terrain
 from caliv_graph.simulation.worlds import (
     GROUND,
     NO_OBJECT,
@@ -20,15 +31,18 @@ from caliv_graph.simulation.worlds import (
     bar,
     box,
     chair,
+    cylinder,
     ground,
     join,
     make_world,
+    person,
 )
 
 SOLIDS: dict[str, Mesh] = {
     "box": box((1.0, 2.0, 3.0)),
     "bar": bar((0.0, 0.0, 1.0), (0.5, 0.1, 0.0), (0.1, 0.2), (0.2, 0.1)),
     "lying bar": bar((1.0, 0.0, 1.0), (0.0, 0.1, 1.0), (0.1, 0.2), (0.2, 0.1), (1, 2)),
+    "cylinder": cylinder((0.0, 0.0, 0.0), (0.1, 0.0, 2.0), 0.2, 0.1),
     "seat": _seat(),
     "backrest": _backrest(),
     **{f"side {i}": part for i, part in enumerate([*_side(1.0), *_side(-1.0)])},
@@ -201,3 +215,117 @@ def test_number_of_threads_changes_nothing(threads: int) -> None:
     many = RayCaster(world, threads).cast(np.array([2.0, 0.0, 1.0]), d)
     np.testing.assert_array_equal(one[0], many[0])
     np.testing.assert_array_equal(one[1], many[1])
+
+
+def test_pole_is_round_and_upright() -> None:
+    world = make_world(
+        WorldModel(objects={"pole": PoleModel(xy_m=(5.0, 1.0), radius_m=0.2, height_m=3.0)})
+    )
+    for z, name in ((0.5, "pole"), (2.9, "pole"), (3.1, None)):
+        distance, hit = cast_one(world, (0.0, 1.0, z), (1.0, 0.0, 0.0))
+        assert hit == name
+        if name:
+            assert distance == pytest.approx(4.8, abs=0.002)
+    assert cast_one(world, (0.0, 1.21, 1.0), (1.0, 0.0, 0.0))[1] is None
+
+
+def test_person_has_the_size_of_one() -> None:
+    mesh = person()
+    size = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
+    np.testing.assert_allclose(size, [0.56, 0.6, 1.75], atol=0.05)
+    assert mesh.vertices[:, 2].min() == 0.0
+    # About 70 litres.
+    assert 0.05 < mesh.signed_volume() < 0.1
+
+
+RAMP = RampModel(xy_m=(6.0, -2.0), yaw_deg=30.0, height_m=0.6, flank_m=5.0, top_m=1.0, width_m=2.0)
+
+
+def test_mesh_of_the_ground_is_the_function() -> None:
+    world = make_world(WorldModel(ground=GroundModel(height_m=0.3, ramps=(RAMP,))))
+    terrain = Terrain((RAMP,))
+    rng = np.random.default_rng(0)
+    near = rng.uniform(-8.0, 8.0, (300, 2)) + np.array([6.0, -2.0])
+    xy = np.vstack([near, rng.uniform(-90.0, 90.0, (50, 2))])
+    origins = np.column_stack([xy, np.full(len(xy), 5.0)])
+    down = np.array([[0.0, 0.0, -1.0]])
+    caster = RayCaster(world)
+    heights = np.array([5.0 - caster.cast(origin, down)[0][0] for origin in origins])
+    expected = 0.3 + terrain.heights(xy)[0]
+    assert expected.max() > 0.85
+    # It bends by 7.5 x 0.6 / 5^2 per metre at most: half a millimetre over a square of 0.1 m.
+    np.testing.assert_allclose(heights, expected, atol=5e-4)
+
+
+def test_ground_with_a_ramp_ends_where_it_should_and_is_not_huge() -> None:
+    mesh = ground(100.0, Terrain((RAMP,)))
+    np.testing.assert_allclose(mesh.vertices[:, :2].min(axis=0), [-100.0, -100.0])
+    np.testing.assert_allclose(mesh.vertices[:, :2].max(axis=0), [100.0, 100.0])
+    assert len(mesh.vertices) < 50_000
+    a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] > 0.0).all()
+    assert 0.5 * normals[:, 2].sum() == pytest.approx(40_000.0)
+
+
+def test_objects_stand_on_a_ramp() -> None:
+    model = WorldModel(
+        ground=GroundModel(ramps=(RAMP,)),
+        objects={
+            "chair": ChairModel(xy_m=(6.0, -2.0)),
+            "box": BoxModel(xy_m=(30.0, 0.0), size_m=(1, 1, 1)),
+        },
+        targets=("chair",),
+    )
+    world = make_world(model)
+    assert world.bounds("chair")[0][2] == pytest.approx(0.6)
+    assert world.bounds("box")[0][2] == 0.0
+
+
+def test_walker_goes_to_and_fro_facing_ahead() -> None:
+    walker = WalkerModel(from_xy_m=(5.0, 0.0), to_xy_m=(5.0, 4.0), speed_m_s=2.0)
+    world = make_world(WorldModel(walkers={"who": walker}))
+    R, t = world.walkers["who"].poses(np.array([0.0, 1.0, 2.5, 3.0, 4.5]))
+    np.testing.assert_allclose(
+        t[:, :2], [[5.0, 0.0], [5.0, 2.0], [5.0, 3.0], [5.0, 2.0], [5.0, 1.0]], atol=1e-12
+    )
+    np.testing.assert_allclose(R[:, :2, 0], [[0, 1], [0, 1], [0, -1], [0, -1], [0, 1]], atol=1e-12)
+    assert world.names == (GROUND, "who")
+    caster = RayCaster(world)
+    ahead = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    at_once = np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 1.0]])
+    distance, objects = caster.cast(at_once, ahead, np.array([1.0, 1.0]))
+    assert distance[0] == pytest.approx(5.0 - 0.2, abs=0.1)
+    assert objects.tolist() == [1, NO_OBJECT]
+    # Each ray at its own time: now it is at the other place.
+    _, objects = caster.cast(at_once, ahead, np.array([2.0, 4.0]))
+    assert objects.tolist() == [NO_OBJECT, 1]
+    # One time for all.
+    assert caster.cast(at_once[0], ahead, 1.0)[1].tolist() == [1, 1]
+
+
+def test_walker_hides_what_is_behind_and_not_what_is_before() -> None:
+    walker = WalkerModel(from_xy_m=(5.0, -1.0), to_xy_m=(5.0, 1.0), speed_m_s=1.0)
+    boxes: dict[str, ObjectModel] = {"far": BoxModel(xy_m=(9.0, 0.0), size_m=(1.0, 1.0, 2.0))}
+    world = make_world(WorldModel(objects=boxes, walkers={"who": walker}))
+    caster = RayCaster(world)
+    ahead = np.array([[1.0, 0.0, 0.0]])
+    assert caster.cast(np.array([0.0, 0.0, 1.0]), ahead, 1.0)[1].tolist() == [2]
+    assert caster.cast(np.array([0.0, 0.0, 1.0]), ahead, 0.0)[1].tolist() == [1]
+    assert caster.cast(np.array([10.0, 0.0, 1.0]), -ahead, 1.0)[1].tolist() == [1]
+
+
+def test_body_of_the_vehicle_is_in_its_own_frame() -> None:
+    body = (BodyBoxModel(centre_m=(1.0, 0.0, 1.5), size_m=(2.0, 1.0, 0.5)),)
+    world = make_world(WorldModel(), body)
+    assert world.names == (GROUND, "vehicle")
+    down = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    distance, index = RayCaster(world).cast_at_vehicle(np.array([0.5, 0.2, 3.0]), down)
+    assert world.names[index] == "vehicle"
+    np.testing.assert_allclose(distance, [3.0 - 1.75, np.inf], atol=1e-6)
+    # It stands nowhere in the map.
+    below_m, name = cast_one(world, (0.5, 0.2, 3.0), (0.0, 0.0, -1.0))
+    assert name == GROUND
+    assert below_m == pytest.approx(3.0)
+    bare, _ = RayCaster(make_world(WorldModel())).cast_at_vehicle(np.zeros(3), down)
+    assert np.isinf(bare).all()

@@ -1,0 +1,308 @@
+"""A simulated drive as a recording, in memory: what a reader of its bag would hand out."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config import Mounting
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.products import Array, IntArray, LidarScan, MotionData
+from caliv_graph.simulation.drives import Drive, VehicleStates, make_drive
+from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
+from caliv_graph.simulation.motion import (
+    SimulatedGnss,
+    SimulatedImu,
+    sample_stamps,
+    simulate_gnss,
+    simulate_imu,
+    simulate_velocity,
+    start_ns,
+)
+from caliv_graph.simulation.noise import (
+    Stream,
+    height_and_heave,
+    perturbed_mounting,
+    random_stream,
+)
+from caliv_graph.simulation.scenario import LidarModel, Scenario
+from caliv_graph.simulation.terrain import make_terrain
+from caliv_graph.simulation.worlds import RayCaster, World, make_world
+
+HEAVE_PERIOD_NS = NANOSECONDS_PER_SECOND // 10
+"""The heave of the vehicle is drawn anew as often: clouds taken together share it."""
+
+
+@dataclass(frozen=True)
+class SimulatedTruth:
+    """What is true of a simulated drive.
+
+    Stamps are those of the recording. The map is ENU, its origin at the datum; `trajectory` is
+    free to choose another origin (the first fix), so compare poses after moving one to the other.
+
+    Attributes:
+        T_vehicle_lidar: mounting per LiDAR.
+        time_offset_s: per LiDAR, stamp minus true acquisition time.
+        datum: latitude and longitude in degrees and altitude in metres of the map's origin.
+        start_ns: stamp of the start.
+        end_ns: stamp of the end.
+        drive: the drive, its stamps counted from its start.
+        level_z_map: height of the vehicle frame in the map where the ground is level, in metres:
+            that of the ground, and this drive's error of the vehicle's height.
+        heave_m: (n,) metres that the vehicle is lifted by while clouds are taken, one value per
+            `HEAVE_PERIOD_NS` of their stamps. The poses of this class are without it.
+    """
+
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+    time_offset_s: Mapping[str, float]
+    datum: tuple[float, float, float]
+    start_ns: int
+    end_ns: int
+    drive: Drive
+    level_z_map: float
+    heave_m: Array
+
+    def states(self, stamps_ns: IntArray) -> VehicleStates:
+        """Pose, velocity, acceleration and angular velocity at any stamps of the recording."""
+        return self.drive.states(np.asarray(stamps_ns) - self.start_ns, self.level_z_map)
+
+    def T_map_vehicle(self, stamps_ns: IntArray) -> tuple[gtsam.Pose3, ...]:
+        """The vehicle's poses at any stamps of the recording."""
+        return self.drive.poses(np.asarray(stamps_ns) - self.start_ns, self.level_z_map)
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """One cloud and what is true of it.
+
+    Attributes:
+        scan: the cloud.
+        frame: number of the cloud of this LiDAR, from 0.
+        objects: (n,) index into `World.names` of what each point lies on, -1 for a return that
+            comes from between two surfaces.
+    """
+
+    scan: LidarScan
+    frame: int
+    objects: IntArray
+
+
+class SimulatedRecording:
+    """A simulated drive (products.Recording). Casts rays when it is asked for clouds.
+
+    Attributes:
+        scenario: what is simulated.
+        seed: of all that is drawn.
+        world: what stands around.
+        truth: what is true.
+        guesses: initial guess of T_vehicle_lidar per LiDAR.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
+        """Draws what concerns the whole drive.
+
+        Args:
+            scenario: the drive.
+            seed: of all that is drawn.
+            threads: threads that cast rays; the result does not depend on it.
+
+        Raises:
+            ConfigError: the seed is negative.
+        """
+        self.scenario = scenario
+        self.seed = seed
+        self.world: World = make_world(scenario.world, scenario.vehicle_body)
+        self._threads = threads
+        drive = make_drive(scenario.drive, make_terrain(scenario.world.ground))
+        last_ns = round(drive.duration_s * NANOSECONDS_PER_SECOND)
+        height_m, heave_m = height_and_heave(
+            scenario.suspension,
+            last_ns // HEAVE_PERIOD_NS + 1,
+            random_stream(seed, Stream.SUSPENSION),
+        )
+        begin_ns = start_ns(scenario)
+        gnss = scenario.gnss
+        self.truth = SimulatedTruth(
+            T_vehicle_lidar={
+                name: pose_from_mounting(model.mounting) for name, model in scenario.lidars.items()
+            },
+            time_offset_s={name: model.time_offset_s for name, model in scenario.lidars.items()},
+            datum=(gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m),
+            start_ns=begin_ns,
+            end_ns=begin_ns + last_ns,
+            drive=drive,
+            level_z_map=self.world.ground_z_map + height_m,
+            heave_m=heave_m,
+        )
+        self.guesses: dict[str, Mounting] = {
+            name: perturbed_mounting(
+                model.mounting,
+                scenario.initial_guess,
+                random_stream(seed, Stream.INITIAL_GUESS, index),
+            )
+            for index, (name, model) in enumerate(scenario.lidars.items())
+        }
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+        return f"simulated {self.scenario.name}, seed {self.seed}"
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """LiDARs in the scenario's order."""
+        return tuple(self.scenario.lidars)
+
+    @cached_property
+    def imu(self) -> SimulatedImu | None:
+        """The IMU's samples with their true biases; None if there is none."""
+        if not self.scenario.imu.enabled:
+            return None
+        return simulate_imu(self.truth.drive, self.scenario, self.seed)
+
+    @cached_property
+    def gnss(self) -> SimulatedGnss | None:
+        """The GNSS receiver's fixes, and when it had none; None if there is none."""
+        if not self.scenario.gnss.enabled:
+            return None
+        return simulate_gnss(self.truth.drive, self.scenario, self.truth.level_z_map, self.seed)
+
+    @cached_property
+    def _motion(self) -> MotionData:
+        velocity = self.scenario.velocity.enabled
+        return MotionData(
+            name=self.name,
+            imu=self.imu.samples if self.imu else None,
+            gnss=self.gnss.fixes if self.gnss else None,
+            twist=(
+                simulate_velocity(self.truth.drive, self.scenario, self.seed) if velocity else None
+            ),
+        )
+
+    def motion(self) -> MotionData:
+        """IMU, GNSS and velocity, as far as the scenario has them."""
+        return self._motion
+
+    def warnings(self) -> Sequence[str]:
+        """Nothing: nothing is left out."""
+        return ()
+
+    def _frame_stamps(self, lidar: str) -> IntArray:
+        """(n,) stamps of the clouds of a LiDAR, counted from the start of the drive."""
+        model = self.scenario.lidars[lidar]
+        at_start = model.sweep is None or model.sweep.stamp_at == "start"
+        stamps_ns = sample_stamps(
+            f"lidars.{lidar}",
+            model.rate_hz,
+            model.phase_s,
+            self.truth.drive.duration_s,
+            model.sweep_s if at_start else 0.0,
+        )
+        # A sweep that began before the drive did is no part of it.
+        first_ns = 0 if at_start else round(model.sweep_s * NANOSECONDS_PER_SECOND)
+        return stamps_ns[stamps_ns >= first_ns]
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """Stamps of the clouds of one LiDAR, ascending, without casting a ray."""
+        stamps = self._frame_stamps(lidar) + self.truth.start_ns
+        return [int(stamp) for stamp in stamps]
+
+    def complete_ns(self, scan: LidarScan) -> int:
+        """When a cloud is complete, by the clock of its stamps: its stamp, or the sweep's end."""
+        return scan.stamp_ns + self._sweep_after_ns(scan.lidar)
+
+    def complete_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """`complete_ns` of the clouds of one LiDAR, without casting a ray."""
+        after_ns = self._sweep_after_ns(lidar)
+        return [stamp_ns + after_ns for stamp_ns in self.scan_stamps_ns(lidar)]
+
+    def _sweep_after_ns(self, lidar: str) -> int:
+        model = self.scenario.lidars[lidar]
+        at_start = model.sweep is None or model.sweep.stamp_at == "start"
+        return round(model.sweep_s * NANOSECONDS_PER_SECOND) if at_start else 0
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        return RayCaster(self.world, self._threads)
+
+    def scans_with_truth(
+        self, lidar: str, wanted: Container[int] | None = None
+    ) -> Iterator[SimulatedScan]:
+        """Like `scans`, with what each point lies on."""
+        model = self.scenario.lidars[lidar]
+        index = list(self.scenario.lidars).index(lidar)
+        simulated = SimulatedLidar(
+            model,
+            self.world,
+            self._caster,
+            self.scenario.crop,
+            random_stream(self.seed, Stream.LIDAR, index),
+        )
+        for frame, stamp_ns in enumerate(self._frame_stamps(lidar).tolist()):
+            absolute_ns = stamp_ns + self.truth.start_ns
+            if wanted is not None and absolute_ns not in wanted:
+                simulated.skip()
+                continue
+            returns, times_s = self._take(simulated, model, stamp_ns)
+            yield SimulatedScan(
+                LidarScan(
+                    lidar=lidar,
+                    stamp_ns=absolute_ns,
+                    points_lidar=returns.points_lidar,
+                    source=f"{lidar} at {stamp_ns / NANOSECONDS_PER_SECOND:.3f} s",
+                    point_times_s=times_s,
+                ),
+                frame,
+                returns.objects,
+            )
+
+    def _take(
+        self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int
+    ) -> tuple[LidarReturns, Array | None]:
+        """A cloud and its times after the stamp, which is counted from the start of the drive."""
+        after_s = simulated.column_times_s
+        taken_ns = (
+            stamp_ns
+            + np.rint(after_s * NANOSECONDS_PER_SECOND).astype(np.int64)
+            - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
+        )
+        heave_m = self.truth.heave_m[stamp_ns // HEAVE_PERIOD_NS]
+        states = self.truth.drive.states(taken_ns, self.truth.level_z_map + heave_m)
+        returns = simulated.sweep(
+            states.R_map_vehicle, states.position_map, taken_ns / NANOSECONDS_PER_SECOND
+        )
+        times_s = None if model.sweep is None else after_s[simulated.columns_of(returns)]
+        return returns, times_s
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in order of their stamps; each is what it is without the others.
+
+        Args:
+            lidar: its name.
+            wanted: stamps of the clouds that are asked for, None: all.
+
+        Raises:
+            CalivError: open3d cannot be loaded.
+        """
+        return (taken.scan for taken in self.scans_with_truth(lidar, wanted))
+
+
+def simulate_drive(scenario: Scenario, seed: int, threads: int = 1) -> SimulatedRecording:
+    """Simulates a drive in memory: motion data at once, clouds when they are asked for.
+
+    The same scenario and seed give the same numbers as `write_drive` writes.
+
+    Args:
+        scenario: the drive.
+        seed: of all that is drawn.
+        threads: threads that cast rays; the result does not depend on it.
+
+    Raises:
+        ConfigError: the seed is negative.
+    """
+    return SimulatedRecording(scenario, seed, threads)

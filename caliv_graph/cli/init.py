@@ -11,28 +11,37 @@ from caliv_graph.cli import streams
 
 
 def init(
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="The drive: a CaLiV folder.")],
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="The drive: a bag, or a CaLiV folder.")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="CONFIG", help="The config to write.")],
+    urdf: Annotated[
+        Path | None,
+        typer.Option(
+            "--urdf", metavar="FILE", help="The vehicle's URDF, for the initial guesses (of a bag)."
+        ),
+    ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Replace the config if it exists.")
     ] = False,
 ) -> None:
     """Write a commented config for a drive.
 
-    It names the LiDARs found. Initial guesses and the target's region are taken from a config of
-    the CaLiV authors' program (transform_sensor_N, min_bound, max_bound) if one lies beside the
-    data; what is left for you to fill in is marked TODO.
+    It names the LiDARs and, of a bag, the topics that tell the motion. Initial guesses are taken
+    from /tf_static or a URDF; of a CaLiV folder, they and the target's region from a config of the
+    CaLiV authors' program (transform_sensor_N, min_bound, max_bound) if one lies beside the data.
+    What is left for you to fill in is marked TODO.
 
-    Example: caliv-graph init drive/ --out config.yaml
+    Example: caliv-graph init drive/ --urdf vehicle.urdf --out config.yaml
     """
     from caliv_graph.config_draft import draft_config
     from caliv_graph.files import atomic_write, check_output_file
 
     check_output_file(out, force)
-    draft = draft_config(data, out)
+    draft = draft_config(data, out, urdf)
     atomic_write(out, draft.text, force)
     streams.say(f"{out} written. LiDARs: {', '.join(draft.lidars)}")
-    if draft.source:
-        streams.say(f"Initial guesses and target taken from {draft.source}")
+    if draft.origin:
+        streams.say(draft.origin)
     if draft.unknown:
         streams.warn([f"{out}: fill in before you calibrate: {', '.join(draft.unknown)}"])

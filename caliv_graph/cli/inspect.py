@@ -11,7 +11,9 @@ from caliv_graph.cli import streams
 
 
 def inspect(
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="The drive: a CaLiV folder.")],
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="The drive: a bag or a CaLiV folder.")
+    ],
     config: Annotated[
         Path | None,
         typer.Option(
@@ -20,7 +22,7 @@ def inspect(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Show what a recording holds: clouds, gaps, points, the drive.
+    """Show what a recording holds: topics, rates, gaps, clocks, times of points, units, the drive.
 
     With a config, also which LiDAR sees the target when.
 
@@ -29,22 +31,23 @@ def inspect(
     from caliv_graph.config import load_config
     from caliv_graph.readers import open_recording
     from caliv_graph.readers.discover import open_all
-    from caliv_graph.report.inspection import add_targets, inspect_recording
+    from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
     from caliv_graph.report.tables import inspection_table
 
     settings = None if config is None else load_config(config)
     recording = open_all(data) if settings is None else open_recording(settings, data)
     with streams.progress_on_stdout(as_json) as progress:
-        inspection = inspect_recording(recording, progress)
-        warnings = list(recording.warnings())
+        inspection = inspect_any(recording, progress)
+        warnings: list[str] = []
         if settings is not None:
             from caliv_graph.targets import extract_targets
-            from caliv_graph.trajectory.given import given_trajectories
+            from caliv_graph.trajectory.select import smooth_trajectories
 
-            trajectories = given_trajectories([recording])
+            trajectories = smooth_trajectories([recording], settings, [[]])
             observations = extract_targets([recording], trajectories, settings, progress)
-            inspection = add_targets(inspection, observations)
+            inspection = add_any_targets(inspection, observations)
             warnings += [line for seen in observations for line in seen.warnings]
+        warnings = [*recording.warnings(), *warnings]
     if as_json:
         streams.show_json(inspection.document())
     else:

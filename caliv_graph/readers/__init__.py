@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from caliv_graph.config import Config
-from caliv_graph.errors import ConfigError, RecordingError
+from caliv_graph.errors import ConfigError
 from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import CalivFolder
 
@@ -27,8 +27,8 @@ def open_recording(config: Config, path: Path | None = None) -> Recording:
     if path is None:
         raise ConfigError("no recording given: set data.path in the config, or give --data")
     if config.data.format == "rosbag":
-        raise RecordingError(
-            f"{path}: rosbags cannot be read yet. Export the drive as a CaLiV folder and set "
-            "data.format: caliv"
-        )
+        # Here, for a CaLiV folder needs none of what reading bags takes.
+        from caliv_graph.readers.rosbag import RosbagRecording
+
+        return RosbagRecording(path, config.lidars, config.topics)
     return CalivFolder(path, config.lidars)

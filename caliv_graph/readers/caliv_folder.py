@@ -17,12 +17,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.config import LidarConfig, read_yaml
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import Array, GivenPoses, LidarScan, MotionData
+from caliv_graph.products import GivenPoses, LidarScan, MotionData
 from caliv_graph.readers.pcd import read_pcd
+from caliv_graph.readers.returns import is_return
 
 FRAME_PERIOD_NS = 100_000_000
 """Nanoseconds from one frame number to the next. The files carry no time; the LiDARs of the paper
@@ -132,7 +132,7 @@ class CalivFolder:
         return LidarScan(
             lidar=lidar,
             stamp_ns=frame * FRAME_PERIOD_NS,
-            points_lidar=points[_is_return(points, config.min_range, config.max_range)],
+            points_lidar=points[is_return(points, config.min_range, config.max_range)],
             source=str(path),
         )
 
@@ -311,17 +311,6 @@ def _check_agreement(
             f"{_AGREEMENT_M * 1e3:g} mm, {_AGREEMENT_RAD * 1e3:g} mrad). A frame is one moment: "
             "give both sensors the vehicle's pose at it, or the clouds different frame numbers"
         )
-
-
-def _is_return(points_lidar: Array, min_range: float, max_range: float) -> npt.NDArray[np.bool_]:
-    """Which points are returns within the ranges, (N,).
-
-    NaN compares false, infinity exceeds any `max_range`, and (0, 0, 0) is a beam without a return
-    even where `min_range` is 0.
-    """
-    squared_range = np.einsum("ij,ij->i", points_lidar, points_lidar)
-    within = (squared_range >= min_range**2) & (squared_range <= max_range**2)
-    return np.asarray(within & (squared_range > 0.0))
 
 
 def _shorten(value: Any) -> str:

@@ -2,17 +2,65 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from caliv_graph.config import LidarConfig, Mounting, read_yaml
+from caliv_graph.config import LidarConfig, Mounting, TopicsConfig, read_yaml
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import POSES_FILE, CalivFolder
 
-_BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+if TYPE_CHECKING:
+    from caliv_graph.readers.bag import Bag
 
 _ANY_RANGE_M = 1e6
 """Farther than any return: nothing is dropped for its range."""
+
+_GENERIC = re.compile(
+    r"lidars?|sensing|sensors?|points?|raw|clouds?|pointclouds?|pointcloud2|packets|driver\d?|scan|"
+    r"data|ros"
+)
+"""Words in the names of topics that do not tell one LiDAR from another."""
+
+_DERIVED = re.compile(
+    r"map|radar|camera|depth|ground|filter|crop|downsampl|concat|fused|merged|obstacle|cluster|"
+    r"segment|deskew|undistort|rectif|corrected|aligned|registered|accumul|debug|freespace|free_space"
+)
+"""In the names of clouds that are not what one LiDAR measured."""
+
+_SECONDARY = re.compile(r"raw|livox|ouster|os_cloud|os\d|velodyne|camera|realsense|zed|mag|cmd")
+"""In the names of topics that are unlikely to be the vehicle's own IMU, velocity or pose."""
+
+
+@dataclass(frozen=True)
+class MotionTopics:
+    """Topics of a bag that tell the vehicle's motion.
+
+    Attributes:
+        chosen: by key of `topics` in the config: imu, gnss, twist, pose.
+        others: those that would do as well, by the same keys.
+    """
+
+    chosen: Mapping[str, str]
+    others: Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class LidarTopics:
+    """Topics of clouds of a bag.
+
+    Attributes:
+        chosen: topic by a name made from it.
+        frame_ids: frame of the first cloud, by that name.
+        others: topics of clouds that seem to be no LiDAR's own, or another's once more, and why.
+    """
+
+    chosen: Mapping[str, str]
+    frame_ids: Mapping[str, str]
+    others: Mapping[str, str]
 
 
 def drive_folder(path: Path) -> Path:
@@ -24,11 +72,6 @@ def drive_folder(path: Path) -> Path:
     Raises:
         RecordingError: the path is missing, or no CaLiV folder.
     """
-    if _is_bag(path):
-        raise RecordingError(
-            f"{path}: rosbags cannot be read yet. Export the drive as a CaLiV folder: "
-            f"input/{POSES_FILE} and input/sensor_1/<frame>.pcd"
-        )
     # Without LiDARs it opens nothing but the poses, and says what is wrong with them.
     CalivFolder(path, {})
     return path / "input" if (path / "input" / POSES_FILE).is_file() else path
@@ -44,28 +87,180 @@ def recorded_sensors(path: Path) -> tuple[str, ...]:
     return tuple(sorted((str(sensor) for sensor in listed), key=_by_number))
 
 
+def is_recorded_bag(path: Path) -> bool:
+    """Whether a path is a bag rather than a CaLiV folder."""
+    from caliv_graph.readers.bag import is_bag
+
+    try:
+        return is_bag(path)
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+
+
 def open_all(path: Path) -> Recording:
-    """Opens a drive with all its sensors, each by its own name, and all ranges.
+    """Opens a drive with all its LiDARs, each by its own name, and all ranges.
+
+    Of a bag, all topics that could tell the motion are looked at.
 
     Raises:
-        RecordingError: the path is missing, no CaLiV folder, or incomplete.
+        RecordingError: the path is missing, no recording, or incomplete.
     """
-    lidars = {
-        sensor: LidarConfig(
-            topic=sensor,
-            initial=Mounting(xyz=(0.0, 0.0, 0.0)),
-            min_range=0.0,
-            max_range=_ANY_RANGE_M,
+    if not is_recorded_bag(path):
+        return CalivFolder(path, {sensor: _any_lidar(sensor) for sensor in recorded_sensors(path)})
+    from caliv_graph.readers.bag import Bag
+    from caliv_graph.readers.motion import MOTION_TYPES
+    from caliv_graph.readers.pointcloud2 import CLOUD_TYPES
+    from caliv_graph.readers.rosbag import RosbagRecording
+
+    bag = Bag(path)
+    filled = [topic for topic in bag.topics.values() if topic.messages]
+    names = lidar_names(topic.name for topic in filled if topic.type in CLOUD_TYPES)
+    motion = {kind_type for types in MOTION_TYPES.values() for kind_type in types}
+    return RosbagRecording(
+        path,
+        {name: _any_lidar(topic) for name, topic in names.items()},
+        TopicsConfig(**choose_motion_topics(bag).chosen),
+        also=[t.name for t in filled if t.type in motion and not t.name.endswith("/tf_static")],
+    )
+
+
+def lidar_names(topics: Iterable[str]) -> dict[str, str]:
+    """Names LiDARs after what their topics do not have in common; topic by name.
+
+    `/lidar/front/points` and `/lidar/rear/points` become `front` and `rear`.
+    """
+    topics = list(topics)
+    words = {topic: _words(topic) for topic in topics}
+    common = set.intersection(*map(set, words.values())) if len(words) > 1 else set()
+    names: dict[str, str] = {}
+    for topic in topics:
+        telling = [word for word in words[topic] if word not in common] or words[topic]
+        stem = "_".join(telling) or "lidar"
+        name, number = stem, 2
+        while name in names:
+            name, number = f"{stem}_{number}", number + 1
+        names[name] = topic
+    return names
+
+
+def choose_lidar_topics(bag: Bag) -> LidarTopics:
+    """Topics of a bag that are likely to be the LiDARs' own clouds.
+
+    Raises:
+        RecordingError: the bag is damaged, or has no clouds.
+    """
+    from caliv_graph.readers.bag import DamagedMessageError
+    from caliv_graph.readers.frames import clean_frame
+    from caliv_graph.readers.pointcloud2 import CLOUD_TYPES
+
+    frames: dict[str, str] = {}
+    for topic in bag.topics.values():
+        raw = bag.first_message(topic.name) if topic.type in CLOUD_TYPES else None
+        if raw is None:
+            continue
+        try:
+            frames[topic.name] = clean_frame(bag.header(raw).frame_id)
+        except DamagedMessageError:
+            frames[topic.name] = ""
+    if not frames:
+        shown = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values())
+        raise RecordingError(
+            f"{bag.name}: has no clouds ({', '.join(CLOUD_TYPES)}). It has: {shown or 'nothing'}"
         )
-        for sensor in recorded_sensors(path)
+    others: dict[str, str] = {}
+    own = [topic for topic in frames if not _DERIVED.search(topic.lower())]
+    others.update({topic: "by its name made from others" for topic in frames if topic not in own})
+    if not own:
+        own, others = list(frames), {}
+    # /points_without_body is /points once more, if the frame agrees. The frame alone proves
+    # nothing: drivers are often started twice with the same one.
+    for name in list(own):
+        plain = next(
+            (p for p in own if p != name and name.startswith(p) and frames[p] == frames[name]), None
+        )
+        if plain is not None:
+            others[name] = f"of the same frame as {plain}"
+    own = [name for name in own if name not in others]
+    names = lidar_names(own)
+    return LidarTopics(names, {name: frames[topic] for name, topic in names.items()}, others)
+
+
+def choose_motion_topics(bag: Bag) -> MotionTopics:
+    """Topics of a bag that are likely to tell the vehicle's motion best.
+
+    IMU and GNSS with a velocity if there are both; else poses, with the IMU if there is one.
+
+    Raises:
+        RecordingError: the bag is damaged.
+    """
+    from caliv_graph.readers.motion import MOTION_TYPES
+
+    ranked = {}
+    for kind, types in MOTION_TYPES.items():
+        fitting = [t for t in bag.topics.values() if t.type in types and t.messages]
+        # A command is no measurement; links between static frames no pose.
+        fitting = [t for t in fitting if "cmd" not in t.name and not t.name.endswith("/tf_static")]
+        fitting.sort(
+            key=lambda t: (
+                bool(_SECONDARY.search(t.name.lower())),
+                types.index(t.type),
+                -t.messages,
+                t.name,
+            )
+        )
+        ranked[kind] = [t.name for t in fitting]
+    # What names no vehicle frame is no pose of one.
+    ranked["pose"] = [name for name in ranked["pose"] if _tells_poses(bag, name)]
+    if ranked["imu"] and ranked["gnss"]:
+        keys = ["imu", "gnss", "twist"]
+    elif ranked["pose"]:
+        keys = ["pose"]
+    else:
+        keys = ["imu", "gnss", "twist"]
+    chosen = {key: ranked[key][0] for key in keys if ranked[key]}
+    others = {
+        kind: tuple(name for name in names if chosen.get(kind) != name)
+        for kind, names in ranked.items()
     }
-    return CalivFolder(path, lidars)
+    return MotionTopics(chosen, others)
 
 
-def _is_bag(path: Path) -> bool:
-    if path.suffix in _BAG_SUFFIXES:
+def _tells_poses(bag: Bag, topic: str) -> bool:
+    """Whether a topic of transforms has one of the vehicle; others are taken at their word."""
+    from caliv_graph.readers.bag import DamagedMessageError
+    from caliv_graph.readers.frames import TF_TYPES, VEHICLE_FRAMES, message_transforms
+
+    if bag.topics[topic].type not in TF_TYPES:
         return True
-    return path.is_dir() and any(entry.suffix in _BAG_SUFFIXES for entry in path.iterdir())
+    for count, (_, _, raw) in enumerate(bag.messages([topic])):
+        try:
+            links = [link for _, link in message_transforms(bag.decode(topic, raw))]
+        except DamagedMessageError:
+            continue
+        if any(link.child in VEHICLE_FRAMES for link in links):
+            return True
+        if count > 200:  # a few seconds: who sends the vehicle's pose has begun by then
+            break
+    return False
+
+
+def _any_lidar(topic: str) -> LidarConfig:
+    return LidarConfig(
+        topic=topic,
+        initial=Mounting(xyz=(0.0, 0.0, 0.0)),
+        min_range=0.0,
+        max_range=_ANY_RANGE_M,
+    )
+
+
+def _words(topic: str) -> list[str]:
+    """The parts of a topic's name that may tell one LiDAR from another."""
+    found = []
+    for part in topic.split("/"):
+        kept = [word for word in part.split("_") if word and not _GENERIC.fullmatch(word.lower())]
+        if kept:
+            found.append(re.sub(r"\W", "_", "_".join(kept)))
+    return found
 
 
 def _by_number(sensor: str) -> tuple[str, int]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Recording, TargetObservation
+from caliv_graph.products import Array, GivenPoses, Recording, TargetObservation
 from caliv_graph.progress import Progress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 
@@ -84,15 +84,17 @@ class Sighting:
 
     Attributes:
         scans: scans with enough points on the target.
-        frames: runs of frames, in the LiDAR's rhythm, from first to last.
+        frames: runs of frames, in the LiDAR's rhythm, from first to last; none of a bag.
         points: points on the target per scan; None if it is never seen.
         range_m: nearest and farthest distance of the target from the LiDAR; None if never seen.
+        times_s: of a bag the same runs, in seconds from its first record time.
     """
 
     scans: int
     frames: tuple[Run, ...]
     points: Points | None
     range_m: tuple[float, float] | None
+    times_s: tuple[tuple[float, float], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,10 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
                 counts.append(len(scan.points_lidar))
                 advance()
             lidars[lidar] = _summarise_lidar(_frames(recording, lidar), counts)
-    return Inspection(data=recording.name, lidars=lidars, drive=_summarise_drive(recording))
+    given = recording.motion().poses
+    if given is None:
+        raise TrajectoryError(f"{recording.name}: has no vehicle poses")
+    return Inspection(data=recording.name, lidars=lidars, drive=summarise_drive(given))
 
 
 def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
@@ -159,7 +164,7 @@ def add_targets(inspection: Inspection, observations: Iterable[TargetObservation
     targets = tuple(
         TargetSummary(
             name=observation.name,
-            centre_map_m=_triple(observation.centre_map),
+            centre_map_m=centre_of(observation),
             lidars={
                 lidar: _summarise_sighting(observation, lidar, summary.step)
                 for lidar, summary in inspection.lidars.items()
@@ -188,14 +193,12 @@ def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSumma
         step=step,
         gaps=tuple(gaps),
         rate_hz=rate_hz,
-        points=_points(counts),
+        points=summarise_points(counts),
     )
 
 
-def _summarise_drive(recording: Recording) -> DriveSummary:
-    given = recording.motion().poses
-    if given is None:
-        raise TrajectoryError(f"{recording.name}: has no vehicle poses")
+def summarise_drive(given: GivenPoses) -> DriveSummary:
+    """The vehicle's motion by given poses, at least one of them."""
     poses = given.T_map_vehicle
     positions_map = np.array([pose.translation() for pose in poses])
     turns = [
@@ -217,29 +220,38 @@ def _summarise_sighting(observation: TargetObservation, lidar: str, step: int) -
     clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
     if not clouds:
         return Sighting(scans=0, frames=(), points=None, range_m=None)
-    ranges_m = [float(np.linalg.norm(cloud.points_lidar.mean(axis=0))) for cloud in clouds]
+    clouds_lidar = [cloud.points_lidar for cloud in clouds]
     return Sighting(
         scans=len(clouds),
-        frames=_runs([cloud.stamp_ns // FRAME_PERIOD_NS for cloud in clouds], step),
-        points=_points([len(cloud.points_lidar) for cloud in clouds]),
-        range_m=(min(ranges_m), max(ranges_m)),
+        frames=runs_of([cloud.stamp_ns // FRAME_PERIOD_NS for cloud in clouds], step),
+        points=summarise_points([len(points) for points in clouds_lidar]),
+        range_m=nearest_and_farthest(clouds_lidar),
     )
 
 
-def _runs(frames: Sequence[int], step: int) -> tuple[Run, ...]:
+def nearest_and_farthest(clouds_lidar: Sequence[Array]) -> tuple[float, float]:
+    """Least and greatest distance of the centres of clouds (N, 3) from the LiDAR, metres."""
+    ranges_m = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds_lidar]
+    return min(ranges_m), max(ranges_m)
+
+
+def runs_of(values: Sequence[int], step: int) -> tuple[Run, ...]:
+    """First and last of each run of ascending values that are no more than `step` apart."""
     runs: list[Run] = []
-    for frame in frames:
-        if runs and frame - runs[-1][1] <= step:
-            runs[-1] = (runs[-1][0], frame)
+    for value in values:
+        if runs and value - runs[-1][1] <= step:
+            runs[-1] = (runs[-1][0], value)
         else:
-            runs.append((frame, frame))
+            runs.append((value, value))
     return tuple(runs)
 
 
-def _points(counts: Sequence[int]) -> Points:
+def summarise_points(counts: Sequence[int]) -> Points:
+    """Least, median and greatest number of points."""
     return Points(min=min(counts), median=int(np.median(counts)), max=max(counts))
 
 
-def _triple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
+def centre_of(observation: TargetObservation) -> tuple[float, float, float]:
+    """Rough centre of a target in the map, metres."""
+    x, y, z = (float(v) for v in observation.centre_map)
     return x, y, z

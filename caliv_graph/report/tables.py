@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -16,8 +16,11 @@ from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.progress import StageRecord, count_text
-from caliv_graph.report.inspection import Inspection, Run, Sighting
+from caliv_graph.report.inspection import DriveSummary, Inspection, Run, Sighting, TargetSummary
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
+
+if TYPE_CHECKING:
+    from caliv_graph.report.bag_inspection import BagInspection, BagLidarSummary, TopicSummary
 
 _SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 """Order in tables: as people write a mounting down."""
@@ -25,6 +28,9 @@ _SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _MOST_DECIMALS = 6
 
 _HELD = "held"
+
+_TEXT_COLUMNS = ("frames", "seconds", "type", "times of points")
+"""Last columns that hold text of any length."""
 
 _STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
 
@@ -59,6 +65,7 @@ def calibration_table(
                 style="yellow",
             )
         )
+    parts += _sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
     parts += _sentences("What the drive could not tell:", _undetermined_texts(calibration))
     weak = [direction.text for direction in calibration.weak]
     parts += _sentences("What it told only weakly:", weak)
@@ -93,9 +100,10 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
     return Group(*parts[1:])
 
 
-def inspection_table(inspection: Inspection) -> RenderableType:
+def inspection_table(inspection: Inspection | BagInspection) -> RenderableType:
     """What a recording holds."""
-    drive = inspection.drive
+    if not isinstance(inspection, Inspection):
+        return _bag_inspection(inspection)
     table = _table(
         "LiDAR",
         "clouds",
@@ -121,28 +129,112 @@ def inspection_table(inspection: Inspection) -> RenderableType:
         for name, lidar in inspection.lidars.items()
         if lidar.gaps
     ]
-    parts += [
-        "",
-        Text(
-            f"Drive: {drive.poses} poses, {drive.path_length_m:.1f} m in {drive.duration_s:.1f} s "
-            f"(nominal), {drive.climb_m:.2f} m up and down; heading changes by "
-            f"{drive.heading_change_deg:+.1f} degrees (positive: left), turns add up to "
-            f"{drive.turned_deg:.1f} degrees."
-        ),
-    ]
-    for target in inspection.targets or ():
+    parts += ["", _drive_text(inspection.drive, " (nominal)")]
+    return Group(*parts, *_target_parts(inspection.targets))
+
+
+def _drive_text(drive: DriveSummary, note: str) -> Text:
+    return Text(
+        f"Drive: {drive.poses} poses, {drive.path_length_m:.1f} m in {drive.duration_s:.1f} s"
+        f"{note}, {drive.climb_m:.2f} m up and down; heading changes by "
+        f"{drive.heading_change_deg:+.1f} degrees (positive: left), turns add up to "
+        f"{drive.turned_deg:.1f} degrees."
+    )
+
+
+def _target_parts(targets: Iterable[TargetSummary] | None) -> list[RenderableType]:
+    parts: list[RenderableType] = []
+    for target in targets or ():
         x, y, z = target.centre_map_m
+        in_time = any(sighting.times_s is not None for sighting in target.lidars.values())
         seen = _table(
             "LiDAR",
             "scans",
             "range\nm",
             "points per scan\nmin / median / max",
-            "frames",
+            "seconds" if in_time else "frames",
         )
         for name, sighting in target.lidars.items():
             seen.add_row(Text(name), *_sighting_cells(sighting))
         parts += _titled(f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map", seen)
-    return Group(*parts)
+    return parts
+
+
+def _bag_inspection(inspection: BagInspection) -> RenderableType:
+    parts: list[RenderableType] = [
+        Text(f"{inspection.data}: {inspection.duration_s:.1f} s", style="bold")
+    ]
+    topics = _table(
+        "topic",
+        "messages",
+        "rate\nHz",
+        "gaps\nlongest",
+        "header - record\nmedian (min to max) s",
+        "type",
+    )
+    for name, topic in inspection.topics.items():
+        topics.add_row(Text(name), *_topic_cells(topic))
+    parts += _titled("Topics", topics)
+    lidars = _table(
+        "LiDAR", "frame", "clouds", "points per cloud\nmin / median / max", "times of points"
+    )
+    for name, lidar in inspection.lidars.items():
+        lidars.add_row(Text(name), *_bag_lidar_cells(lidar))
+    sampled = max((lidar.sampled for lidar in inspection.lidars.values()), default=0)
+    parts += _titled(f"LiDARs (points and times of up to {sampled} clouds of each)", lidars)
+    parts += [
+        Text(f"{name}: times of points are not used: {lidar.times_problem}", style="yellow")
+        for name, lidar in inspection.lidars.items()
+        if lidar.times_problem
+    ]
+    lines = [
+        Text(
+            f"IMU {topic}: median specific force {imu.specific_force_m_s2:.2f} m/s^2, 95 % of the "
+            f"angular rates below {imu.angular_rate_rad_s:.2f} rad/s: "
+            f"{'; '.join(imu.problems) or 'as expected'}",
+            style="yellow" if imu.problems else "",
+        )
+        for topic, imu in inspection.imus.items()
+    ]
+    lines += [
+        Text(f"GNSS {topic}: {fixes} of {inspection.topics[topic].messages} messages have a fix")
+        for topic, fixes in inspection.gnss_fixes.items()
+    ]
+    if inspection.drive is not None:
+        lines.append(_drive_text(inspection.drive, ""))
+    if lines:
+        parts += ["", *lines]
+    return Group(*parts, *_target_parts(inspection.targets))
+
+
+def _topic_cells(topic: TopicSummary) -> list[Text | str]:
+    rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
+    gaps = "-" if topic.read else ""
+    if topic.longest_gaps_s:
+        longest_s = max(last - first for first, last in topic.longest_gaps_s)
+        gaps = f"{topic.gaps}\n{longest_s:.3g} s"
+    offset = ""
+    if topic.header_minus_record_s is not None:
+        # Rounded first: a minus before zeros says nothing.
+        low, median, high = (round(v, 3) + 0.0 for v in topic.header_minus_record_s)
+        offset = f"{median:+.3f} ({low:+.3f} to {high:+.3f})"
+    return [str(topic.messages), rate, gaps, offset, Text(topic.type)]
+
+
+def _bag_lidar_cells(lidar: BagLidarSummary) -> list[Text | str]:
+    points, times = lidar.points, lidar.times
+    shown = "none"
+    if times is not None:
+        shown = (
+            f"{times.field} ({times.type}): {times.unit}, {times.first_s:+.4f} to "
+            f"{times.last_s:+.4f} s"
+        )
+    return [
+        Text(lidar.frame_id or "-"),
+        str(lidar.clouds),
+        "-" if points is None else f"{points.min} / {points.median} / {points.max}",
+        Text(shown),
+    ]
 
 
 def _status_line(calibration: Calibration) -> Text:
@@ -189,6 +281,15 @@ def _all_determined(calibration: Calibration) -> bool:
     return all(all(result.determined.values()) for result in calibration.lidars.values())
 
 
+def _offset_texts(calibration: Calibration) -> list[str]:
+    return [
+        f"LiDAR '{name}': {1e3 * result.time_offset[0]:+.2f} ms, sigma "
+        f"{1e3 * result.time_offset[1]:.2f} ms"
+        for name, result in calibration.lidars.items()
+        if result.time_offset is not None
+    ]
+
+
 def _undetermined_texts(calibration: Calibration) -> list[str]:
     texts = [direction.text for direction in calibration.undetermined]
     return texts + [
@@ -225,7 +326,7 @@ def _table(*columns: str) -> Table:
         show_edge=False,
     )
     for number, column in enumerate(columns):
-        last_of_text = column == "frames" and number == len(columns) - 1
+        last_of_text = column in _TEXT_COLUMNS and number == len(columns) - 1
         left = number == 0 or last_of_text
         table.add_column(
             column, justify="left" if left else "right", no_wrap=not last_of_text, overflow="fold"
@@ -284,7 +385,9 @@ def _sighting_cells(sighting: Sighting) -> list[str]:
         str(sighting.scans),
         f"{near:.1f} to {far:.1f}",
         f"{points.min} / {points.median} / {points.max}",
-        _runs(sighting.frames, " to "),
+        _runs(sighting.frames, " to ")
+        if sighting.times_s is None
+        else ", ".join(f"{first:.1f} to {last:.1f}" for first, last in sighting.times_s),
     ]
 
 

@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
 from caliv_graph.config import load_config
-from caliv_graph.errors import ConfigError, OutputError
+from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.readers import open_recording
 from tests.cli.commands import write_drive
+from tests.readers.bags import START, cloud, fix, imu, livox, odometry, tf, write_bag
 
 ORIGINAL = """\
 number_of_sensors: 2
@@ -126,3 +130,176 @@ def test_a_damaged_caliv_config_is_named(drive: Path, tmp_path: Path) -> None:
     assert isinstance(result.exception, ConfigError)
     assert "transform_sensor_1[0][2]: expected a finite number" in str(result.exception)
     assert not (tmp_path / "out.yaml").exists()
+
+
+NONE = (0.0, 0.0, 0.0, 1.0)
+PITCHED = (0.0, math.sin(math.radians(5)), 0.0, math.cos(math.radians(5)))
+STATIC = tf(
+    ("base_link", "mast", (1.0, 0, 2.0), NONE),
+    ("mast", "/lidar_front", (1.0, 0.25, 0), PITCHED),
+    ("base_link", "imu_link", (0.5, 0, 0.25), NONE),
+    ("lidar_rear", "base_footprint", (3.0, 0, -2.0), (0, 0, 1, 0)),
+    ("base_footprint", "base_link", (0, 0, 0.5), NONE),
+)
+
+
+def write_sensors(path: Path, static: Any = STATIC, kind: str = "mcap") -> Path:
+    messages = [
+        ("/lidar/front/points", START, cloud(START, [[1, 2, 3]], frame_id="lidar_front")),
+        ("/lidar/front/points_cropped", START, cloud(START, [[1, 2, 3]], frame_id="base_link")),
+        ("/lidar/rear/points", START, livox(START, [[1, 2, 3]], [0], frame_id="lidar_rear")),
+        ("/imu/data", START, imu(START)),
+        ("/livox/imu", START, imu(START)),
+        ("/fix", START, fix(START)),
+        ("/odom", START, odometry(START, (0, 0, 0))),
+    ]
+    if static is not None:
+        messages.insert(0, ("/tf_static", START, static))
+    return write_bag(path, messages, kind)
+
+
+@pytest.mark.parametrize("kind", ["mcap-zstd", "sqlite3", "ros1"])
+def test_a_config_of_a_bag(tmp_path: Path, kind: str) -> None:
+    bag = write_sensors(tmp_path / "drive", kind=kind)
+    out = tmp_path / "configs/config.yaml"
+
+    result = init(bag, "--out", out)
+
+    assert result.exit_code == 0
+    assert "Initial guesses of front, rear taken from /tf_static" in result.stdout
+    assert result.stderr == f"warning: {out}: fill in before you calibrate: gnss.lever_arm\n"
+    config = load_config(out)
+    assert config.data.format == "rosbag"
+    assert {name: lidar.topic for name, lidar in config.lidars.items()} == {
+        "front": "/lidar/front/points",
+        "rear": "/lidar/rear/points",
+    }
+    front, rear = config.lidars["front"].initial, config.lidars["rear"].initial
+    assert (front.xyz, front.rpy_deg) == ((2.0, 0.25, 2.0), (0.0, 10.0, 0.0))
+    # From base_link up to base_footprint and to the LiDAR's own frame, which is its parent.
+    assert (rear.xyz, rear.rpy_deg) == ((3.0, 0.0, 1.5), (0.0, 0.0, 180.0))
+    topics = config.topics
+    assert (topics.imu, topics.gnss, topics.twist) == ("/imu/data", "/fix", "/odom")
+    assert topics.pose is None
+    assert config.imu.T_vehicle_imu.xyz == (0.5, 0.0, 0.25)
+    text = out.read_text()
+    assert text.count("TODO") == 1
+    assert "  # imu: /livox/imu" in text
+    assert "# not taken: /lidar/front/points_cropped" in text
+    # The path in it leads from the config to the data, and every topic will do.
+    recording = open_recording(config)
+    assert recording.lidars == ("front", "rear")
+    assert recording.motion().imu is not None
+
+
+def test_every_key_of_a_config_of_a_bag_is_commented(tmp_path: Path) -> None:
+    init(write_sensors(tmp_path / "drive"), "--out", tmp_path / "config.yaml")
+
+    lines = (tmp_path / "config.yaml").read_text().splitlines()
+
+    names = [line.strip().rstrip(":") for line in lines if line and "#" not in line]
+    assert names == ["data", "path: drive", "imu", "front", "rear", "solve", "robust"]
+
+
+def test_mountings_from_a_urdf(tmp_path: Path) -> None:
+    urdf = tmp_path / "car.urdf"
+    urdf.write_text(
+        """<robot name="car">
+        <joint name="a" type="fixed"><parent link="chassis"/><child link="mast"/>
+          <origin xyz="1 0 2" rpy="0 0 0"/></joint>
+        <joint name="b" type="fixed"><parent link="mast"/><child link="lidar_front"/>
+          <origin xyz="0.5 0 0" rpy="0 0 1.5707963267948966"/></joint>
+        <joint name="c" type="revolute"><parent link="chassis"/><child link="lidar_rear"/></joint>
+        </robot>"""
+    )
+    bag = write_sensors(tmp_path / "drive", static=None)
+    out = tmp_path / "config.yaml"
+
+    result = init(bag, "--urdf", urdf, "--out", out)
+
+    assert result.exit_code == 0
+    assert "Initial guesses of front taken from car.urdf" in result.stdout
+    assert "lidars.rear.initial, imu.T_vehicle_imu, gnss.lever_arm" in result.stderr
+    front = load_config(out).lidars["front"].initial
+    assert (front.xyz, front.rpy_deg) == ((1.5, 0.0, 2.0), (0.0, 0.0, 90.0))
+    assert "car.urdf does not lead from chassis to lidar_rear" in out.read_text()
+
+
+def test_a_urdf_has_the_last_word(tmp_path: Path) -> None:
+    urdf = tmp_path / "car.urdf"
+    urdf.write_text(
+        """<robot name="car"><joint name="a" type="fixed"><parent link="mast"/>
+        <child link="lidar_front"/><origin xyz="0 0 0.1"/></joint></robot>"""
+    )
+
+    init(write_sensors(tmp_path / "drive"), "--urdf", urdf, "--out", tmp_path / "config.yaml")
+
+    config = load_config(tmp_path / "config.yaml")
+    assert config.lidars["front"].initial.xyz == (1.0, 0.0, 2.1)
+    assert config.lidars["rear"].initial.xyz == (3.0, 0.0, 1.5)
+
+
+def test_a_bag_that_tells_no_mountings(tmp_path: Path) -> None:
+    out = tmp_path / "config.yaml"
+
+    result = init(write_sensors(tmp_path / "drive", static=None), "--out", out)
+
+    assert result.exit_code == 0
+    assert "taken" not in result.stdout
+    assert "lidars.front.initial, lidars.rear.initial, imu.T_vehicle_imu, gnss" in result.stderr
+    assert load_config(out).lidars["front"].initial.xyz == (0.0, 0.0, 0.0)
+    assert "(the bag, which has no /tf_static, has no frame base_link)" in out.read_text()
+
+
+def test_mountings_that_are_repeated_on_tf(tmp_path: Path) -> None:
+    moving = [
+        ("/tf", START + k, tf(("odom", "base_link", (k, 0, 0), NONE), *links))
+        for k, links in enumerate([[("base_link", "lidar", (1, 0, 2), NONE)]] * 5)
+    ]
+    points = ("/points", START, cloud(START, [[1, 2, 3]], frame_id="lidar"))
+
+    init(write_bag(tmp_path / "drive", [points, *moving]), "--out", tmp_path / "config.yaml")
+
+    config = load_config(tmp_path / "config.yaml")
+    assert config.lidars["lidar"].initial.xyz == (1.0, 0.0, 2.0)
+    assert config.topics.pose == "/tf"
+
+
+def test_a_bag_without_anything_that_tells_the_motion(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive", [("/points", START, cloud(START, [[1, 2, 3]]))])
+
+    result = init(bag, "--out", tmp_path / "config.yaml")
+
+    assert "fill in before you calibrate: topics, lidars.lidar.initial" in result.stderr
+    assert load_config(tmp_path / "config.yaml").topics.imu is None
+
+
+@pytest.mark.parametrize("frame", ["a: b # c", "new\nline", "tab\there", "\x07", "'", "täst"])
+def test_odd_names_in_a_bag(tmp_path: Path, frame: str) -> None:
+    messages = [
+        ("/1e3/points", START, cloud(START, [[1, 2, 3]], frame_id=frame)),
+        ("/no/points", START, cloud(START, [[1, 2, 3]], frame_id="base_link")),
+    ]
+
+    init(write_bag(tmp_path / "drive", messages), "--out", tmp_path / "config.yaml")
+
+    config = load_config(tmp_path / "config.yaml")
+    assert list(config.lidars) == ["1e3", "no"]
+    assert "\t" not in (tmp_path / "config.yaml").read_text()
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["reference"] == "1e3"
+
+
+def test_a_urdf_places_nothing_in_a_caliv_folder(drive: Path, tmp_path: Path) -> None:
+    result = init(drive, "--urdf", tmp_path / "car.urdf", "--out", tmp_path / "config.yaml")
+
+    assert isinstance(result.exception, ConfigError)
+    assert "is no bag" in str(result.exception)
+
+
+def test_a_bag_without_clouds_is_no_drive(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive", [("/imu", START, imu(START))])
+
+    result = init(bag, "--out", tmp_path / "config.yaml")
+
+    assert isinstance(result.exception, RecordingError)
+    assert not (tmp_path / "config.yaml").exists()

@@ -11,9 +11,11 @@ from typer.testing import CliRunner, Result
 from caliv_graph.cli.main import app
 from caliv_graph.config import Config
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import Recording, TargetCloud, TargetObservation, Trajectory
+from caliv_graph.products import Recording, TargetCloud, TargetObservation
 from caliv_graph.progress import Progress
+from caliv_graph.trajectory.select import VehicleTrajectory
 from tests.cli.commands import write_config, write_drive
+from tests.readers.bags import SECOND, START, cloud, fix, imu, odometry, write_bag
 
 
 def inspect(*arguments: object) -> Result:
@@ -62,11 +64,11 @@ def test_with_a_config_who_sees_the_target_when(
 ) -> None:
     def extract(
         recordings: Sequence[Recording],
-        trajectories: Sequence[Trajectory],
+        trajectories: Sequence[VehicleTrajectory],
         config: Config,
         progress: Progress,
     ) -> tuple[TargetObservation, ...]:
-        assert len(trajectories[0].T_map_vehicle) == 3
+        assert len(trajectories[0].trajectory.T_map_vehicle) == 3
         cloud = TargetCloud("front", 0, 100_000_000, np.full((60, 3), 4.0), "1.pcd")
         return (TargetObservation(0, "target", np.zeros(3), (cloud,), ("2 scans were cut",)),)
 
@@ -85,16 +87,113 @@ def test_with_a_config_who_sees_the_target_when(
     assert result.stderr == "warning: 2 scans were cut\n"
 
 
-@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "bag"])
-def test_bags_are_named_as_what_they_are(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    if path.suffix:
-        path.touch()
-    else:
-        path.mkdir()
-        (path / "bag_0.db3").touch()
+def bag_messages(count: int = 20) -> list[tuple[str, int, dict[str, object]]]:
+    out = []
+    for k in range(count):
+        stamp = START + k * SECOND // 10
+        points = [[4.0, 0, 0]] * (k + 2)
+        out.append(("/odom", stamp, odometry(stamp, (k, 0, 0))))
+        if k not in (5, 6):
+            out.append(("/lidar/front/points", stamp + 9, cloud(stamp, points, range(k + 2))))
+        out.append(("/imu", stamp, imu(stamp, (0, 0, 1))))
+        out.append(("/fix", stamp, fix(stamp, status=-1 if k < 4 else 0)))
+        out.append(("/chatter", stamp, {"_type": "std_msgs/msg/String", "data": "hello"}))
+    return out
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_a_bag_without_a_config(tmp_path: Path, kind: str) -> None:
+    bag = write_bag(tmp_path / "drive", bag_messages(), kind)
+
+    result = inspect(bag, "--json")
+
+    assert result.exit_code == 0
+    document = json.loads(result.stdout)
+    assert document["duration_s"] == pytest.approx(1.9, abs=1e-6)
+    topics = document["topics"]
+    assert list(topics) == ["/chatter", "/fix", "/imu", "/lidar/front/points", "/odom"]
+    assert (topics["/chatter"]["messages"], topics["/chatter"]["read"]) == (20, False)
+    assert topics["/chatter"]["rate_hz"] == pytest.approx(10.0)
+    points = topics["/lidar/front/points"]
+    assert (points["messages"], points["gaps"], points["frame_id"]) == (18, 1, "lidar")
+    assert points["longest_gaps_s"] == [[pytest.approx(0.4), pytest.approx(0.7)]]
+    assert points["header_minus_record_s"] == pytest.approx([-9e-9] * 3)
+    front = document["lidars"]["front"]
+    assert (front["topic"], front["clouds"], front["sampled"]) == ("/lidar/front/points", 18, 18)
+    assert front["points"] == {"min": 2, "median": 12, "max": 21}
+    assert front["times"] == {
+        "field": "t",
+        "type": "uint32",
+        "unit": "ns after the stamp",
+        "first_s": 0.0,
+        "last_s": pytest.approx(20e-9),
+    }
+    assert "units of g" in document["imus"]["/imu"]["problems"][0]
+    assert document["gnss_fixes"] == {"/fix": 16}
+    assert document["targets"] is None
+
+
+def test_a_table_of_a_bag(tmp_path: Path) -> None:
+    messages = [m for m in bag_messages() if m[0] not in ("/imu", "/fix")]
+    result = inspect(write_bag(tmp_path / "drive", messages))
+
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    lines = [line.split() for line in result.stdout.splitlines()]
+    cells = next(cells for cells in lines if cells[:1] == ["/lidar/front/points"])
+    assert cells[1:4] == ["18", "10", "1"]
+    assert "0.3 s" in result.stdout
+    cells = next(cells for cells in lines if cells[:1] == ["front"])
+    assert cells[1:8] == ["lidar", "18", "2", "/", "12", "/", "21"]
+    assert "Drive: 20 poses, 19.0 m in 1.9 s, " in result.stdout
+
+
+def test_a_long_bag_is_sampled(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive", bag_messages(100))
+
+    front = json.loads(inspect(bag, "--json").stdout)["lidars"]["front"]
+
+    assert (front["clouds"], front["sampled"]) == (98, 20)
+    # The first and the last are among them.
+    assert (front["points"]["min"], front["points"]["max"]) == (2, 101)
+
+
+def test_a_bag_with_a_config_tells_times_of_sightings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def extract(recordings: Sequence[Recording], *_: object) -> tuple[TargetObservation, ...]:
+        stamps = recordings[0].scan_stamps_ns("front")
+        clouds = tuple(
+            TargetCloud("front", 0, stamps[k], np.full((60, 3), 4.0), "a cloud")
+            for k in (0, 1, 2, 9, 10)
+        )
+        return (TargetObservation(0, "target", np.zeros(3), clouds),)
+
+    monkeypatch.setattr("caliv_graph.targets.extract_targets", extract)
+    bag = write_bag(tmp_path / "drive", bag_messages())
+    lidars = {"front": {"topic": "/lidar/front/points", "initial": {"xyz": [0, 0, 0]}}}
+    config = write_config(
+        tmp_path / "config.yaml",
+        data={"format": "rosbag"},
+        topics={"pose": "/odom"},
+        lidars=lidars,
+    )
+
+    document = json.loads(inspect(bag, "--config", config, "--json").stdout)
+
+    (target,) = document["targets"]
+    # The eighth cloud is that of 0.9 s, after a gap of two.
+    first, second = target["lidars"]["front"]["times_s"]
+    assert (first, second) == (pytest.approx([0.0, 0.2]), pytest.approx([1.1, 1.2]))
+    table = inspect(bag, "--config", config).stdout
+    assert "0.0 to 0.2, 1.1 to 1.2" in table
+
+
+def test_a_bag_that_is_cut_off_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    path.touch()
 
     result = inspect(path)
 
     assert isinstance(result.exception, RecordingError)
-    assert "rosbags cannot be read yet" in str(result.exception)
+    assert str(result.exception).startswith(f"{path}: the bag is cut off, damaged")

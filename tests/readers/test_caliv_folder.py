@@ -453,13 +453,13 @@ def test_open_recording_takes_the_path_of_the_config(tmp_path: Path) -> None:
         open_recording(parse_config(raw, "config.yaml", tmp_path), tmp_path / "other")
 
 
-def test_open_recording_without_a_path_or_a_reader() -> None:
+def test_open_recording_without_a_path_or_with_a_bag_that_is_not_there() -> None:
     lidars = {"front": {"topic": "sensor_1", "initial": {"xyz": [0, 0, 0]}}}
     caliv = parse_config({"data": {"format": "caliv"}, "lidars": lidars}, "c.yaml", Path())
     with pytest.raises(ConfigError, match=r"data\.path"):
         open_recording(caliv)
     bag = parse_config({"data": {"format": "rosbag"}, "lidars": lidars}, "c.yaml", Path())
-    with pytest.raises(RecordingError, match=r"drive\.mcap: rosbags cannot be read yet"):
+    with pytest.raises(RecordingError, match=r"drive\.mcap: no such file or folder"):
         open_recording(bag, Path("drive.mcap"))
 
 

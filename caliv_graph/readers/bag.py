@@ -1,0 +1,381 @@
+"""ROS 1 and ROS 2 bags through `rosbags`: topics, raw messages, and one kind of error."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import RecordingError
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+
+_METADATA = "metadata.yaml"
+
+_RECOVERY = {
+    ".mcap": "Recover it with 'mcap recover', or record the drive again",
+    ".bag": "Recover it with 'rosbag reindex', or record the drive again",
+    ".db3": "Recover it with 'sqlite3 FILE .recover', or record the drive again",
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a bag.
+
+    Attributes:
+        name: as recorded.
+        type: of its messages in ROS 2 spelling, such as sensor_msgs/msg/Imu.
+        messages: how many there are.
+    """
+
+    name: str
+    type: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class Header:
+    """The `std_msgs/Header` that a message begins with.
+
+    Attributes:
+        stamp_ns: its stamp, 0 if the sender did not set it.
+        frame_id: its frame.
+    """
+
+    stamp_ns: int
+    frame_id: str
+
+
+class DamagedMessageError(Exception):
+    """A message is not what its type says; the reader of the bag decides what becomes of that."""
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: a file by its name, a folder by what it holds."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() or any(
+            entry.suffix in BAG_SUFFIXES for entry in path.iterdir()
+        )
+    return path.suffix in BAG_SUFFIXES
+
+
+class Bag:
+    """A recorded bag: a ROS 2 folder (MCAP or sqlite3), a bare .mcap or .db3, ROS 1 .bag file(s).
+
+    Opening it reads its index only. Messages are handed out raw, one at a time: most are skipped,
+    and of clouds the stamp alone is wanted at first.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Opens a bag.
+
+        Args:
+            path: a file; or the folder of a ROS 2 bag, or of the parts of a split bag.
+
+        Raises:
+            RecordingError: it is missing, no bag, damaged, or in a form that is not supported.
+        """
+        self._path = path
+        self._files = _find_files(path)
+        self._is_ros1 = self._files[0].suffix == ".bag"
+        self._stores: dict[str, Typestore] = {}
+        # Readers between two passes. Opening one can mean to unpack or to scan the whole bag.
+        self._idle: list[_Readers] = []
+        weakref.finalize(self, _close_all, self._idle)
+        self._definitions: dict[str, MessageDefinition] = {}
+        found: dict[str, Topic] = {}
+        with self._readers() as readers:
+            filled = [reader for reader in readers.opened if reader.message_count]
+            self._span_ns = (
+                min((reader.start_time for reader in filled), default=0),
+                max((reader.end_time for reader in filled), default=0),
+            )
+            for connection in readers.connections():
+                self._definitions.setdefault(connection.msgtype, connection.msgdef)
+                before = found.get(connection.topic)
+                if before and before.type != connection.msgtype:
+                    raise RecordingError(
+                        f"{path}: topic '{before.name}' holds messages of two types, "
+                        f"{before.type} and {connection.msgtype}. Split the bag by type"
+                    )
+                count = connection.msgcount + (before.messages if before else 0)
+                found[connection.topic] = Topic(connection.topic, connection.msgtype, count)
+        self._topics = dict(sorted(found.items()))
+
+    @property
+    def name(self) -> str:
+        """The path as given."""
+        return str(self._path)
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """Topics by name, in alphabetical order."""
+        return self._topics
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last record time, nanoseconds; zeros if the bag is empty."""
+        return self._span_ns
+
+    @property
+    def is_ros1(self) -> bool:
+        """Whether messages are serialised as in ROS 1; else CDR."""
+        return self._is_ros1
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Raw messages of some topics, in the order of their record times within each file.
+
+        Args:
+            topics: names of topics of this bag.
+            start_ns: only messages recorded at or after this time, nanoseconds.
+            stop_ns: only messages recorded before this time, nanoseconds.
+
+        Yields:
+            Topic, record time in nanoseconds, the serialised message.
+
+        Raises:
+            RecordingError: the bag is damaged.
+        """
+        if not topics:
+            return
+        with self._readers() as readers:
+            for reader in readers.opened:
+                wanted = [c for c in reader.connections if c.topic in topics]
+                if not wanted or (stop_ns is not None and reader.start_time >= stop_ns):
+                    continue
+                if start_ns is not None and reader.end_time < start_ns:
+                    continue
+                with self._errors_named(reader.path):
+                    source = reader.messages(wanted, start_ns, stop_ns)
+                while True:
+                    # Not around the yield: what the caller does wrong is not the bag's damage.
+                    with self._errors_named(reader.path):
+                        message = next(source, None)
+                    if message is None:
+                        break
+                    yield message[0].topic, message[1], message[2]
+
+    def first_message(self, topic: str) -> bytes | None:
+        """The first message of a topic, serialised; None if it has none.
+
+        Raises:
+            RecordingError: the bag is damaged.
+        """
+        for _, _, raw in self.messages([topic]):
+            return raw
+        return None
+
+    def decode(self, topic: str, raw: bytes) -> Any:
+        """A message as an object with the fields of its type. Arrays are views into `raw`.
+
+        Raises:
+            DamagedMessageError: it is not what its type says.
+            RecordingError: its type is not known.
+        """
+        type_name = self._topics[topic].type
+        store = self._stores.get(type_name)
+        if store is None:
+            store = self._stores[type_name] = self._typestore(type_name)
+        try:
+            if self._is_ros1:
+                return store.deserialize_ros1(raw, type_name)
+            return store.deserialize_cdr(raw, type_name)
+        except Exception as e:  # whatever the generated decoder runs into
+            raise DamagedMessageError(str(e)) from None
+
+    def header(self, raw: bytes) -> Header:
+        """The header of a message whose type begins with one, without decoding the rest.
+
+        Raises:
+            DamagedMessageError: the message is cut off.
+        """
+        try:
+            if self._is_ros1:
+                _, seconds, nanoseconds, size = struct.unpack_from("<IIII", raw)
+                start, end = 16, 16 + size
+            else:
+                order = "<" if raw[1] else ">"
+                # The string's size counts a zero at its end.
+                seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", raw, 4)
+                start, end = 16, 15 + size
+        except (struct.error, IndexError):
+            raise DamagedMessageError("is cut off in its header") from None
+        if end > len(raw):
+            raise DamagedMessageError("is cut off in its header")
+        frame_id = bytes(raw[start:end]).decode("utf-8", "replace")
+        return Header(seconds * NANOSECONDS_PER_SECOND + nanoseconds, frame_id)
+
+    def _typestore(self, type_name: str) -> Typestore:
+        """Types of a topic: as the bag defines them, else as the current ROS does."""
+        definition = self._definitions[type_name]
+        store = get_typestore(Stores.EMPTY)
+        # A definition that cannot be parsed is no loss where the type is a standard one.
+        with suppress(Exception):
+            if definition.format == MessageDefinitionFormat.MSG:
+                store.register(get_types_from_msg(definition.data, type_name))
+            elif definition.format == MessageDefinitionFormat.IDL:
+                # One file, or all that it needs: for each a rule, `IDL: its name`, and the file.
+                for part in filter(None, definition.data.split(f"{'=' * 80}\n")):
+                    named = part.startswith("IDL: ")
+                    store.register(get_types_from_idl(part.partition("\n")[2] if named else part))
+        standard = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+        if type_name in store.fielddefs and _has_all_fields(store, standard):
+            return store
+        if type_name in standard.fielddefs:
+            return standard
+        raise RecordingError(f"{self._path}: holds no definition of the type {type_name}")
+
+    @contextmanager
+    def _readers(self) -> Iterator[_Readers]:
+        """Open readers that nobody else uses: two passes may run at the same time."""
+        readers = self._idle.pop() if self._idle else self._open()
+        try:
+            yield readers
+        except RecordingError:
+            readers.close()
+            raise
+        except BaseException:
+            self._idle.append(readers)
+            raise
+        self._idle.append(readers)
+
+    def _open(self) -> _Readers:
+        readers = _Readers([])
+        try:
+            for file in self._files:
+                with self._errors_named(file):
+                    reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
+                    reader.open()
+                readers.opened.append(reader)
+        except BaseException:
+            readers.close()
+            raise
+        readers.opened.sort(key=lambda reader: reader.start_time)
+        return readers
+
+    @contextmanager
+    def _errors_named(self, file: Any) -> Iterator[None]:
+        """Turns whatever `rosbags` runs into in a damaged file into one line."""
+        try:
+            yield
+        except RecordingError:
+            raise
+        except OSError as e:
+            raise RecordingError(f"{file}: cannot be read: {e.strerror or e}") from None
+        except Exception as e:  # struct.error, KeyError, MemoryError of a size gone wrong, ...
+            said = " ".join(str(e).split()).rstrip(".") or type(e).__name__
+            advice = _RECOVERY.get(Path(file).suffix, "Record the drive again, or recover the bag")
+            if "empty" in said:
+                advice = "Record the drive again"
+            elif "Profile is not ros2" in said:
+                advice = "Convert it with 'rosbags-convert', or give the original bag"
+            raise RecordingError(
+                f"{file}: the bag is cut off, damaged or of an unsupported kind "
+                f"({type(e).__name__}: {said}). {advice}"
+            ) from None
+
+
+@dataclass(frozen=True)
+class _Readers:
+    """Open readers of all files of a bag."""
+
+    opened: list[Reader1 | Reader2]
+
+    def connections(self) -> list[Connection]:
+        return [connection for reader in self.opened for connection in reader.connections]
+
+    def close(self) -> None:
+        while self.opened:
+            with suppress(Exception):
+                self.opened.pop().close()
+
+
+def _has_all_fields(store: Typestore, standard: Typestore) -> bool:
+    """Whether types that go by the name of a standard one have its fields: code relies on them."""
+    return all(
+        {field for field, _ in standard.fielddefs[name][1]} <= {field for field, _ in fields}
+        for name, (_, fields) in store.fielddefs.items()
+        if name in standard.fielddefs
+    )
+
+
+def _close_all(idle: list[_Readers]) -> None:
+    for readers in idle:
+        readers.close()
+
+
+def _find_files(path: Path) -> list[Path]:
+    """What `rosbags` is to open: the files of a bag, or its folder."""
+    try:
+        if not path.exists():
+            raise RecordingError(
+                f"{path}: no such file or folder. Set data.path (or --data) to a bag"
+            )
+        if path.is_dir():
+            return _find_files_in(path)
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+    if path.suffix not in BAG_SUFFIXES:
+        packed = path.suffix in (".zst", ".zstd", ".gz", ".lz4", ".active")
+        hint = " Unpack it first" if packed else ""
+        raise RecordingError(
+            f"{path}: is no bag by its name: expected {', '.join(BAG_SUFFIXES)}, or the folder of "
+            f"a ROS 2 bag.{hint}"
+        )
+    return [path]
+
+
+def _find_files_in(folder: Path) -> list[Path]:
+    metadata = folder / _METADATA
+    if metadata.is_file():
+        return _listed_files(metadata)
+    # A recorder that died leaves no metadata, but the files are there; so is a split ROS 1 bag.
+    files = sorted(entry for entry in folder.iterdir() if entry.suffix in BAG_SUFFIXES)
+    if not files:
+        caliv = (folder / "input").is_dir() or (folder / "ego_poses.yaml").is_file()
+        hint = "For a CaLiV folder set data.format: caliv" if caliv else "Give the folder of a bag"
+        raise RecordingError(f"{folder}: holds no bag ({', '.join(BAG_SUFFIXES)}). {hint}")
+    if len({file.suffix for file in files}) > 1:
+        raise RecordingError(
+            f"{folder}: holds bags of several kinds ({files[0].name}, {files[-1].name}). Give one "
+            "of them"
+        )
+    return files
+
+
+def _listed_files(metadata: Path) -> list[Path]:
+    try:
+        information = yaml.safe_load(metadata.read_text(encoding="utf-8"))
+        information = information["rosbag2_bagfile_information"]
+        names = [Path(name).name for name in information["relative_file_paths"]]
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+        raise RecordingError(
+            f"{metadata}: is not the description of a ROS 2 bag. Make it anew with "
+            "'ros2 bag reindex', or give the .mcap or .db3 itself"
+        ) from None
+    missing = [name for name in names if not (metadata.parent / name).is_file()]
+    if missing or not names:
+        raise RecordingError(
+            f"{metadata}: names the file '{', '.join(missing) or 'none'}', which is not there. "
+            "Copy the bag completely, or make the description anew with 'ros2 bag reindex'"
+        )
+    if information.get("compression_mode", "").lower() in ("file", "message"):
+        return [metadata.parent]  # `rosbags` unpacks what is packed as a whole
+    # One by one: opened as a folder, topics whose QoS the description tells otherwise than the
+    # file come out empty.
+    return [metadata.parent / name for name in names]

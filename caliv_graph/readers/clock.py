@@ -1,0 +1,154 @@
+"""Stamps of a topic against the time of its recording, and against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import IntArray
+
+_FAR_S = 1.0
+"""Seconds between header stamps and record times that are worth telling (SPEC, clock sanity)."""
+
+_ALIKE_S = 0.5
+"""Seconds within which offsets of several topics count as the same one: transport takes less."""
+
+_GAP_FACTOR = 1.75
+"""An interval longer than so many usual ones is a gap: one message lost makes it two."""
+
+TAI_UTC_S = 37.0
+"""TAI is ahead of UTC by so much since 2017: what a LiDAR on PTP is off from a computer on NTP."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The stamps of one topic.
+
+    Attributes:
+        messages: how many there are.
+        first_ns: earliest stamp; 0 if there are no messages.
+        last_ns: latest stamp; 0 if there are no messages.
+        rate_hz: of the median interval; None if there are fewer than two different stamps.
+        gaps: (before, after) stamps around each gap, nanoseconds.
+        unset: messages without a stamp, for which the record time is taken.
+        backwards: messages stamped before the one that was recorded before them.
+        duplicates: messages with the stamp of another.
+        offset_s: (min, median, max) of header stamp minus record time; None without stamps.
+    """
+
+    messages: int
+    first_ns: int
+    last_ns: int
+    rate_hz: float | None
+    gaps: tuple[tuple[int, int], ...]
+    unset: int
+    backwards: int
+    duplicates: int
+    offset_s: tuple[float, float, float] | None
+
+
+def effective_stamps(header_ns: IntArray, record_ns: IntArray) -> IntArray:
+    """Header stamps (n,), or the record time where a header has none."""
+    return np.where(header_ns == 0, record_ns, header_ns)
+
+
+def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
+    """Summarises the stamps of a topic.
+
+    Args:
+        header_ns: (n,) as recorded, 0 where unset.
+        record_ns: (n,) in the order of the recording.
+    """
+    stamps_ns = effective_stamps(header_ns, record_ns)
+    distinct = np.unique(stamps_ns)
+    steps = np.diff(distinct)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > _GAP_FACTOR * usual)
+    is_set = header_ns != 0
+    offsets_s = (header_ns[is_set] - record_ns[is_set]) / NANOSECONDS_PER_SECOND
+    offset_s = None
+    if len(offsets_s):
+        median = float(np.median(offsets_s))
+        offset_s = (float(offsets_s.min()), median, float(offsets_s.max()))
+    return Clock(
+        messages=len(stamps_ns),
+        first_ns=int(distinct[0]) if len(distinct) else 0,
+        last_ns=int(distinct[-1]) if len(distinct) else 0,
+        rate_hz=NANOSECONDS_PER_SECOND / usual if len(steps) else None,
+        gaps=tuple((int(distinct[i]), int(distinct[i + 1])) for i in gaps),
+        unset=int(np.count_nonzero(~is_set)),
+        backwards=int(np.count_nonzero(np.diff(stamps_ns) < 0)),
+        duplicates=len(stamps_ns) - len(distinct),
+        offset_s=offset_s,
+    )
+
+
+def clock_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
+    """What is odd about the stamps of some topics, a line each.
+
+    Args:
+        name: of the bag.
+        clocks: by topic.
+    """
+    return [*_offset_warnings(name, clocks), *_order_warnings(name, clocks)]
+
+
+def _offset_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
+    offsets = {topic: clock.offset_s for topic, clock in clocks.items() if clock.offset_s}
+    medians = {topic: offset[1] for topic, offset in offsets.items()}
+    lines = []
+    if medians and all(abs(median) > _FAR_S for median in medians.values()):
+        middle = float(np.median(list(medians.values())))
+        if all(abs(median - middle) < _ALIKE_S for median in medians.values()):
+            lines.append(
+                f"{name}: the header stamps of all topics are {_ahead(middle)} the record times, "
+                "as in a replayed or simulated drive: harmless if they share one clock"
+            )
+            medians = {}
+    for topic, median in medians.items():
+        if abs(median) > _FAR_S:
+            tai = abs(abs(median) - TAI_UTC_S) < _FAR_S
+            hint = f" ({TAI_UTC_S:g} s: TAI against UTC)" if tai else ""
+            lines.append(
+                f"{name}: header stamps of {topic} are {_ahead(median)} the record times{hint}, "
+                "those of other topics are not so: its clock is off, and it cannot be combined "
+                "with theirs. Synchronise the clocks and record again"
+                if len(offsets) > 1
+                else f"{name}: header stamps of {topic} are {_ahead(median)} the record times{hint}"
+            )
+    for topic, (low, median, high) in offsets.items():
+        if max(median - low, high - median) > _FAR_S:
+            lines.append(
+                f"{name}: header stamps of {topic} against record times vary from {low:+.3f} to "
+                f"{high:+.3f} s: its clock jumped, or messages were held back"
+            )
+    return lines
+
+
+def _ahead(offset_s: float) -> str:
+    return f"{abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'}"
+
+
+def _order_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
+    lines = []
+    for topic, clock in clocks.items():
+        of_all = f"of {clock.messages} messages of {topic}"
+        if clock.unset:
+            lines.append(
+                f"{name}: {clock.unset} {of_all} have no header stamp: the time of their recording "
+                "stands in, which is late by the transport"
+            )
+        if clock.backwards:
+            lines.append(
+                f"{name}: {clock.backwards} {of_all} are stamped before the one recorded before "
+                "them: sorted by stamp"
+            )
+        if clock.duplicates:
+            lines.append(
+                f"{name}: {clock.duplicates} {of_all} have the stamp of another: the first "
+                "recorded is taken"
+            )
+    return lines

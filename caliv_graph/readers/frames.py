@@ -1,0 +1,176 @@
+"""Mountings between named frames: from `/tf_static` or the fixed joints of a URDF."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.errors import ConfigError
+
+VEHICLE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle")
+"""Names of the vehicle frame, the usual one first (REP-105)."""
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_NORM_TOLERANCE = 1e-2
+"""Of a quaternion: single precision and a few digits of text are off by less."""
+
+
+@dataclass(frozen=True)
+class FrameTransform:
+    """One link of a tree of frames.
+
+    Attributes:
+        parent: frame.
+        child: frame.
+        T_parent_child: its pose.
+    """
+
+    parent: str
+    child: str
+    T_parent_child: gtsam.Pose3
+
+
+class FrameTree:
+    """Frames that are fixed to each other."""
+
+    def __init__(self, transforms: Iterable[FrameTransform]) -> None:
+        """Builds the tree.
+
+        Args:
+            transforms: where two tell the same child's parent, the later one counts, as for tf.
+        """
+        self._up = {link.child: link for link in transforms if link.child != link.parent}
+        self._frames = dict.fromkeys(
+            frame for link in self._up.values() for frame in (link.parent, link.child)
+        )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All frames, parents before their children where it was told in this order."""
+        return tuple(self._frames)
+
+    def vehicle_frame(self) -> str | None:
+        """The frame of the vehicle: one of `VEHICLE_FRAMES`, or None if there is none."""
+        return next((frame for frame in VEHICLE_FRAMES if frame in self._frames), None)
+
+    def root(self, frame: str) -> str:
+        """The frame above which there is none."""
+        return (self._chain(frame) or [frame])[-1]
+
+    def transform(self, parent: str, child: str) -> gtsam.Pose3 | None:
+        """`T_parent_child`, composed over any number of links up and down; None: no connection."""
+        to_parent, to_child = self._chain(parent), self._chain(child)
+        common = next((frame for frame in to_child if frame in to_parent), None)
+        if common is None:
+            return None
+        T_common_child = self._compose(to_child[: to_child.index(common)])
+        T_common_parent = self._compose(to_parent[: to_parent.index(common)])
+        return T_common_parent.between(T_common_child)
+
+    def _chain(self, frame: str) -> list[str]:
+        """The frame, its parent, that one's parent, ...; empty if the frame is not known."""
+        if frame not in self._frames:
+            return []
+        chain = [frame]
+        while (link := self._up.get(chain[-1])) and link.parent not in chain:
+            chain.append(link.parent)
+        return chain
+
+    def _compose(self, chain: list[str]) -> gtsam.Pose3:
+        T = gtsam.Pose3()
+        for frame in chain:
+            T = self._up[frame].T_parent_child.compose(T)
+        return T
+
+
+def clean_frame(frame_id: str) -> str:
+    """A frame's name without the slash that ROS 1 allowed in front."""
+    return frame_id.lstrip("/")
+
+
+def message_transforms(message: Any) -> Iterator[tuple[int, FrameTransform]]:
+    """Stamps and links of a `tf2_msgs/TFMessage`; those that are no pose are left out."""
+    for transform in message.transforms:
+        T = pose_from_ros(transform.transform.translation, transform.transform.rotation)
+        if T is None:
+            continue
+        stamp = transform.header.stamp
+        parent = clean_frame(transform.header.frame_id)
+        child = clean_frame(transform.child_frame_id)
+        yield stamp.sec * 1_000_000_000 + stamp.nanosec, FrameTransform(parent, child, T)
+
+
+def pose_from_ros(translation: Any, rotation: Any) -> gtsam.Pose3 | None:
+    """A pose from what has x, y, z and what has x, y, z, w; None if these are no pose."""
+    q = np.array([rotation.w, rotation.x, rotation.y, rotation.z], dtype=np.float64)
+    t = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(t).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        return None
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(*(q / norm)), t)
+
+
+def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
+    """The fixed joints of a URDF. What hangs on a joint that moves has no mounting to tell.
+
+    Raises:
+        ConfigError: the file is missing, not a URDF, or a xacro that was not expanded.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file. Give --urdf the vehicle's URDF") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not text in UTF-8, as a URDF is") from None
+    except OSError as e:
+        raise ConfigError(f"{path}: cannot be read: {e.strerror or e}") from None
+    # Entities can unfold to gigabytes, and no URDF has them.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ConfigError(f"{path}: has a DOCTYPE, which no URDF needs. Remove it")
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError, RecursionError) as e:
+        raise ConfigError(f"{path}: is not valid XML: {e}") from None
+    if root.tag != "robot":
+        raise ConfigError(f"{path}: its root is <{root.tag}>, that of a URDF is <robot>")
+    if "${" in text or "$(" in text or "<xacro:" in text:
+        raise ConfigError(
+            f"{path}: is a xacro. Expand it first: 'xacro {path.name} > vehicle.urdf'"
+        )
+    return tuple(_joint(joint, path) for joint in root.iter("joint") if _is_fixed(joint))
+
+
+def _is_fixed(joint: ET.Element) -> bool:
+    # Transmissions name joints too, without telling how they are.
+    return joint.get("type") == "fixed"
+
+
+def _joint(joint: ET.Element, path: Path) -> FrameTransform:
+    where = f"{path}: joint '{joint.get('name', '')}'"
+    names = [(found.get("link") or "") for tag in ("parent", "child") for found in joint.iter(tag)]
+    if len(names) != 2 or not all(names):
+        raise ConfigError(f"{where}: needs one <parent link=...> and one <child link=...>")
+    origin = joint.find("origin")
+    xyz = _triple(origin, "xyz", where)
+    roll, pitch, yaw = _triple(origin, "rpy", where)
+    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(xyz))
+    return FrameTransform(clean_frame(names[0]), clean_frame(names[1]), T)
+
+
+def _triple(origin: ET.Element | None, name: str, where: str) -> tuple[float, float, float]:
+    text = "0 0 0" if origin is None else origin.get(name, "0 0 0")
+    try:
+        x, y, z = (float(value) for value in text.split())
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ConfigError(f"{where}: {name}='{text[:60]}' is not three finite numbers")
+    return x, y, z

@@ -1,0 +1,523 @@
+"""From messages to what tells the vehicle's motion (`products.MotionData`).
+
+A collector per topic takes messages as they come, in any order, and makes the product at the end:
+sorted by stamp, each stamp once, without what is no measurement. What it leaves out it counts.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from caliv_graph.products import (
+    Array,
+    GivenPoses,
+    GnssFixes,
+    ImuSamples,
+    IntArray,
+    TwistSamples,
+)
+from caliv_graph.readers.frames import (
+    TF_TYPES,
+    VEHICLE_FRAMES,
+    FrameTransform,
+    FrameTree,
+    message_transforms,
+)
+
+_IMU = "sensor_msgs/msg/Imu"
+_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TWIST = "geometry_msgs/msg/TwistStamped"
+_TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+_POSE = "geometry_msgs/msg/PoseStamped"
+_POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+MOTION_TYPES: Mapping[str, tuple[str, ...]] = {
+    "imu": (_IMU,),
+    "gnss": (_NAVSATFIX,),
+    "twist": (_TWIST_WITH_COVARIANCE, _TWIST, _ODOMETRY),
+    "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES),
+}
+"""Types that will do for each key of `topics`, the most telling first."""
+
+_NORM_TOLERANCE = 1e-2
+"""Of a quaternion: single precision is off by less."""
+
+GRAVITY_M_S2 = 9.81
+
+_GRAVITY_TOLERANCE = 0.15
+"""Part of gravity by which the median specific force may be off: driving does less, and a unit
+that is not m/s^2 does more."""
+
+_FAST_RAD_S = 6.0
+"""No road vehicle turns as fast for a twentieth of a drive; in degrees per second it seems to."""
+
+_FIXED_AXES = ("map", "odom", "world", "earth", "enu", "utm")
+"""Frames whose axes do not turn with the vehicle: a velocity stated in them is not in its axes."""
+
+
+@dataclass(frozen=True)
+class ImuCheck:
+    """Whether the units of an IMU are what the message type says.
+
+    Attributes:
+        specific_force_m_s2: median of its norm, as if in m/s^2.
+        angular_rate_rad_s: 95th percentile of its norm, as if in rad/s.
+        gravity_problem: what is wrong with the specific force; empty: nothing.
+        rate_problem: what is wrong with the angular rate; empty: nothing.
+    """
+
+    specific_force_m_s2: float
+    angular_rate_rad_s: float
+    gravity_problem: str
+    rate_problem: str
+
+
+_Reason = tuple[str, Callable[[Array], Any]]
+"""Why rows are left out, and a test (n, k) -> (n,) that is true of those that stay."""
+
+
+class Collector(Protocol):
+    """Takes the messages of one topic."""
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message; `stamp_ns` is its header's stamp, or else the time of recording."""
+
+    def notes(self) -> list[str]:
+        """What was left out, or is odd, after the product was made: sentences without a subject."""
+
+
+class _Rows:
+    """Rows of numbers with stamps, a few bytes each however long the drive."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._stamps = array("q")
+        self._values = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp_ns: int, values: Iterable[float]) -> None:
+        self._stamps.append(stamp_ns)
+        self._values.extend(values)
+
+    def sorted(self) -> tuple[IntArray, Array]:
+        """Stamps (n,) strictly increasing and their rows (n, width); of equal stamps the first."""
+        stamps = np.array(self._stamps, dtype=np.int64)
+        values = np.array(self._values, dtype=np.float64).reshape(-1, self._width)
+        stamps, first = np.unique(stamps, return_index=True)
+        return stamps, values[first]
+
+
+class _Losses:
+    """Counts what is left out of a topic."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._others: list[str] = []
+
+    def keep(self, kept: Any, why: str) -> npt.NDArray[np.bool_]:
+        """Counts what is not kept; returns `kept`."""
+        self._counts[why] += int(np.count_nonzero(~kept))
+        return np.asarray(kept)
+
+    def say(self, sentence: str) -> None:
+        self._others.append(sentence)
+
+    def notes(self, total: int) -> list[str]:
+        lost = [f"{count} {why}" for why, count in self._counts.items() if count]
+        return [f"of {total} messages not used: {', '.join(lost)}"] * bool(lost) + self._others
+
+
+class ImuCollector:
+    """`sensor_msgs/Imu`."""
+
+    def __init__(self) -> None:
+        self._rows = _Rows(37)
+        self._losses = _Losses()
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message."""
+        w, f, q = message.angular_velocity, message.linear_acceleration, message.orientation
+        self._rows.add(
+            stamp_ns,
+            (
+                *(w.x, w.y, w.z, f.x, f.y, f.z, q.x, q.y, q.z, q.w),
+                *message.orientation_covariance.tolist(),
+                *message.angular_velocity_covariance.tolist(),
+                *message.linear_acceleration_covariance.tolist(),
+            ),
+        )
+
+    def finish(self) -> ImuSamples | None:
+        """The samples; None if there are none."""
+        self._losses = _Losses()
+        stamps, rows = self._rows.sorted()
+        kept = self._losses.keep(np.isfinite(rows[:, :6]).all(axis=1), "with NaN or infinity")
+        stamps, rows = stamps[kept], rows[kept]
+        if not len(stamps):
+            return None
+        orientation, cov = self._orientation(rows)
+        return ImuSamples(
+            stamps_ns=stamps,
+            angular_velocity=rows[:, :3],
+            specific_force=rows[:, 3:6],
+            orientation_xyzw=orientation,
+            orientation_cov=cov,
+            angular_velocity_cov=_common(_covariances(rows[:, 19:28])),
+            specific_force_cov=_common(_covariances(rows[:, 28:37])),
+        )
+
+    def _orientation(self, rows: Array) -> tuple[Array | None, Array | None]:
+        q, stated = rows[:, 6:10].copy(), rows[:, 10:19]
+        has_any = stated[:, 0] != -1.0
+        norms = np.linalg.norm(q, axis=1)
+        is_rotation = np.abs(norms - 1.0) <= _NORM_TOLERANCE  # False for NaN
+        broken = int(np.count_nonzero(has_any & ~is_rotation))
+        if broken:
+            self._losses.say(
+                f"the orientation of {broken} of {len(q)} messages is no unit quaternion, and is "
+                "not used"
+            )
+        good = has_any & is_rotation
+        if not good.any():
+            return None, None
+        first = q[good][0]
+        if np.count_nonzero(good) > 1 and abs(first[3]) == 1.0 and (q[good] == first).all():
+            # What a driver without a filter leaves in the message.
+            self._losses.say("the orientation is the identity in all messages, and is not used")
+            return None, None
+        q[good] /= norms[good, None]
+        q[~good] = np.nan
+        cov = _covariances(stated)
+        cov[~good] = np.nan
+        return q, _or_none(cov)
+
+    def notes(self) -> list[str]:
+        """What was left out."""
+        return self._losses.notes(len(self._rows))
+
+
+class GnssCollector:
+    """`sensor_msgs/NavSatFix`."""
+
+    def __init__(self) -> None:
+        self._rows = _Rows(14)
+        self._losses = _Losses()
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message."""
+        self._rows.add(
+            stamp_ns,
+            (
+                *(message.latitude, message.longitude, message.altitude),
+                *(message.status.status, message.position_covariance_type),
+                *message.position_covariance.tolist(),
+            ),
+        )
+
+    def finish(self) -> GnssFixes | None:
+        """The fixes; None if there are none."""
+        self._losses = _Losses()
+        stamps, rows = self._rows.sorted()
+        reasons: tuple[_Reason, ...] = (
+            ("without a fix (status < 0)", lambda r: r[:, 3] >= 0),
+            ("without latitude, longitude or altitude", lambda r: np.isfinite(r[:, :3]).all(1)),
+            (
+                "at latitude and longitude 0 or out of their range",
+                lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
+            ),
+        )
+        for why, test in reasons:
+            kept = self._losses.keep(test(rows), why)
+            stamps, rows = stamps[kept], rows[kept]
+        if not len(stamps):
+            return None
+        cov = _covariances(rows[:, 5:14])
+        cov[rows[:, 4] == 0] = np.nan  # COVARIANCE_TYPE_UNKNOWN
+        return GnssFixes(stamps, rows[:, 0], rows[:, 1], rows[:, 2], _or_none(cov))
+
+    @property
+    def fixes(self) -> int:
+        """Messages with a fix."""
+        found = self.finish()
+        return 0 if found is None else len(found.stamps_ns)
+
+    def notes(self) -> list[str]:
+        """What was left out."""
+        return self._losses.notes(len(self._rows))
+
+
+class TwistCollector:
+    """`TwistStamped`, `TwistWithCovarianceStamped`, or the twist of an `Odometry`.
+
+    The twist of an odometry is in its child frame, which is taken for the vehicle's, as is the
+    frame of the others.
+    """
+
+    _LINEAR: ClassVar[list[int]] = [0, 1, 2, 6, 7, 8, 12, 13, 14]
+
+    def __init__(self) -> None:
+        self._rows = _Rows(12)
+        self._losses = _Losses()
+        self._frames: set[str] = set()
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message."""
+        twist = message.twist
+        cov = np.zeros(9)
+        if hasattr(twist, "covariance"):
+            cov, twist = twist.covariance[self._LINEAR], twist.twist
+        self._frames.add(getattr(message, "child_frame_id", message.header.frame_id))
+        v = twist.linear
+        self._rows.add(stamp_ns, (v.x, v.y, v.z, *cov.tolist()))
+
+    def finish(self) -> TwistSamples | None:
+        """The velocities; None if there are none."""
+        self._losses = _Losses()
+        stamps, rows = self._rows.sorted()
+        kept = self._losses.keep(np.isfinite(rows[:, :3]).all(axis=1), "with NaN or infinity")
+        for frame in sorted(self._frames):
+            if frame.strip("/").lower() in _FIXED_AXES:
+                self._losses.say(
+                    f"its velocity is stated in the frame '{frame}', but is taken to be in the "
+                    "vehicle's axes: check it"
+                )
+        stamps, rows = stamps[kept], rows[kept]
+        if not len(stamps):
+            return None
+        return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
+
+    def notes(self) -> list[str]:
+        """What was left out."""
+        return self._losses.notes(len(self._rows))
+
+
+class PoseCollector:
+    """`Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`: the vehicle in the map.
+
+    The header's frame is taken for the map, the child frame of an odometry for the vehicle.
+    """
+
+    def __init__(self) -> None:
+        self._rows = _Rows(43)
+        self._losses = _Losses()
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message."""
+        pose = message.pose
+        cov = np.zeros(36)
+        if hasattr(pose, "covariance"):
+            cov, pose = pose.covariance, pose.pose
+        t, q = pose.position, pose.orientation
+        self._rows.add(stamp_ns, (t.x, t.y, t.z, q.x, q.y, q.z, q.w, *cov.tolist()))
+
+    def finish(self) -> GivenPoses | None:
+        """The poses; None if there are none."""
+        self._losses = _Losses()
+        stamps, rows = self._rows.sorted()
+        reasons: tuple[_Reason, ...] = (
+            ("with NaN or infinity", lambda r: np.isfinite(r[:, :7]).all(1)),
+            (
+                "whose orientation is no unit quaternion",
+                lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
+            ),
+        )
+        for why, test in reasons:
+            kept = self._losses.keep(test(rows), why)
+            stamps, rows = stamps[kept], rows[kept]
+        if not len(stamps):
+            return None
+        poses = _poses(rows[:, :3], rows[:, 3:7])
+        cov = _or_none(_covariances(rows[:, 7:]))
+        if cov is not None:
+            R = Rotation.from_quat(rows[:, 3:7]).as_matrix()
+            cov = right_perturbations(R, cov)
+        return GivenPoses(stamps, poses, cov)
+
+    def notes(self) -> list[str]:
+        """What was left out."""
+        return self._losses.notes(len(self._rows))
+
+
+class TfCollector:
+    """`/tf` and `/tf_static`: the vehicle in the frame at the root of its chain.
+
+    With map -> odom -> base_link this is base_link in map, at the stamps of the link of the chain
+    that comes most often; the others are interpolated between their stamps.
+    """
+
+    def __init__(self) -> None:
+        self._moving: dict[tuple[str, str], _Rows] = {}
+        self._static: dict[str, FrameTransform] = {}
+        self._losses = _Losses()
+        self._messages = 0
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        """Takes one message of `/tf`."""
+        self._messages += 1
+        for own_stamp_ns, link in message_transforms(message):
+            rows = self._moving.setdefault((link.parent, link.child), _Rows(7))
+            q: Any = link.T_parent_child.rotation().toQuaternion()
+            rows.add(
+                own_stamp_ns or stamp_ns,
+                (*link.T_parent_child.translation(), q.x(), q.y(), q.z(), q.w()),
+            )
+
+    def add_static(self, message: Any) -> None:
+        """Takes one message of `/tf_static`."""
+        for _, link in message_transforms(message):
+            self._static[link.child] = link
+
+    def finish(self) -> GivenPoses | None:
+        """The poses; None if no vehicle frame moves in another."""
+        self._losses = _Losses()
+        rows = {child: value for (_, child), value in self._moving.items()}
+        still = [link for link in self._static.values() if link.child not in rows]
+        moving = [FrameTransform(*names, gtsam.Pose3()) for names in self._moving]
+        tree = FrameTree([*still, *moving])
+        up = {link.child: link for link in (*still, *moving)}
+        for vehicle in VEHICLE_FRAMES:
+            chain = _chain_to(tree.root(vehicle), vehicle, up) if vehicle in tree.frames else []
+            if any(link.child in rows for link in chain):
+                break
+        else:
+            self._losses.say(
+                f"none of the frames {', '.join(VEHICLE_FRAMES)} moves in another; frames: "
+                f"{', '.join(tree.frames[:12])}"
+            )
+            return None
+        self._losses.say(
+            "poses are those of the chain "
+            + " -> ".join([chain[0].parent, *(link.child for link in chain)])
+        )
+        sampled = {link.child: rows[link.child].sorted() for link in chain if link.child in rows}
+        stamps = max((stamps for stamps, _ in sampled.values()), key=len)
+        # A frame that was sent once, as a latched map -> odom is, holds throughout.
+        several = [s for s, _ in sampled.values() if len(s) > 1]
+        if several:
+            inside = (stamps >= max(s[0] for s in several)) & (
+                stamps <= min(s[-1] for s in several)
+            )
+            stamps = stamps[inside]
+        if not len(stamps):
+            self._losses.say("its links have no time in common")
+            return None
+        R, t = Rotation.identity(len(stamps)), np.zeros((len(stamps), 3))
+        for link in chain:
+            if link.child in sampled:
+                R_link, t_link = _interpolated(*sampled[link.child], stamps)
+            else:
+                # Copies: scipy refuses the views of GTSAM's memory, which are read-only.
+                R_link = Rotation.from_matrix(np.array(link.T_parent_child.rotation().matrix()))
+                t_link = np.array(link.T_parent_child.translation())
+            R, t = R * R_link, t + R.apply(t_link)
+        return GivenPoses(stamps, _poses(t, R.as_quat()))
+
+    def notes(self) -> list[str]:
+        """What was left out, and which frames were taken."""
+        return self._losses.notes(self._messages)
+
+
+def check_imu(samples: ImuSamples) -> ImuCheck:
+    """Looks whether the units are m/s^2 and rad/s, and gravity is in the specific force."""
+    force = float(np.median(np.linalg.norm(samples.specific_force, axis=1)))
+    rate = float(np.percentile(np.linalg.norm(samples.angular_velocity, axis=1), 95))
+    gravity_problem = ""
+    if abs(force / GRAVITY_M_S2 - 1.0) > _GRAVITY_TOLERANCE:
+        gravity_problem = (
+            f"the median specific force is {force:.3g} m/s^2, expected about {GRAVITY_M_S2:g}: "
+        )
+        if abs(force - 1.0) <= _GRAVITY_TOLERANCE:
+            gravity_problem += f"it looks like units of g. Multiply it by {GRAVITY_M_S2:g}"
+        elif force < 0.5 * GRAVITY_M_S2:
+            gravity_problem += "gravity seems to be removed from it. Record the raw data"
+        else:
+            gravity_problem += "its unit is not m/s^2. Convert it"
+    rate_problem = ""
+    if rate > _FAST_RAD_S:
+        rate_problem = (
+            f"a twentieth of the angular rates exceeds {rate:.3g} rad/s, too fast for a vehicle: "
+            "it looks like degrees per second"
+        )
+    return ImuCheck(force, rate, gravity_problem, rate_problem)
+
+
+def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
+    """Covariances of poses from ROS's convention into ours.
+
+    ROS: x, y, z, then rotation about the fixed axes, all in the parent's axes. Ours: right
+    perturbation, rotation then translation. `cov_ros = B cov B^T`, `B = [[0, R], [R, 0]]`.
+
+    Args:
+        R_map_vehicle: (n, 3, 3).
+        cov_ros: (n, 6, 6) m^2, m rad, rad^2.
+
+    Returns:
+        (n, 6, 6) rad^2, rad m, m^2.
+    """
+    B = np.zeros((len(R_map_vehicle), 6, 6))
+    B[:, :3, 3:] = R_map_vehicle
+    B[:, 3:, :3] = R_map_vehicle
+    return np.asarray(B.transpose(0, 2, 1) @ cov_ros @ B)
+
+
+def _covariances(flat: Array) -> Array:
+    """(n, k, k) of (n, k * k), symmetric; NaN where a message states none.
+
+    All zeros is how ROS says unknown, a negative value what some drivers say. A single zero on the
+    diagonal cannot be meant either: nothing is measured without any error.
+    """
+    size = round(flat.shape[1] ** 0.5)
+    cov = flat.reshape(-1, size, size)
+    cov = (cov + cov.transpose(0, 2, 1)) / 2.0
+    known = np.isfinite(cov).all(axis=(1, 2)) & (np.einsum("nii->ni", cov) > 0.0).all(axis=1)
+    cov[~known] = np.nan
+    return np.asarray(cov)
+
+
+def _or_none(cov: Array) -> Array | None:
+    return None if np.isnan(cov).all() else cov
+
+
+def _common(cov: Array) -> Array | None:
+    """One covariance for all samples: the median of each element."""
+    known = cov[np.isfinite(cov).all(axis=(1, 2))]
+    return np.asarray(np.median(known, axis=0)) if len(known) else None
+
+
+def _poses(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:
+    q = q_xyzw / np.linalg.norm(q_xyzw, axis=1, keepdims=True)
+    return tuple(
+        gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), ti)
+        for ti, (x, y, z, w) in zip(t, q, strict=True)
+    )
+
+
+def _chain_to(root: str, frame: str, up: Mapping[str, FrameTransform]) -> list[FrameTransform]:
+    """Links from the root down to a frame."""
+    chain: list[FrameTransform] = []
+    while frame != root:
+        chain.append(up[frame])
+        frame = up[frame].parent
+    return chain[::-1]
+
+
+def _interpolated(stamps: IntArray, rows: Array, at_ns: IntArray) -> tuple[Rotation, Array]:
+    """Rotation and translation (n, 3) of a link at other stamps, none outside its own."""
+    if len(stamps) == 1:
+        return Rotation.from_quat(rows[0, 3:]), rows[0, :3]
+    # Seconds from the first: floats cannot tell nanoseconds apart in numbers this large.
+    own_s, at_s = (stamps - stamps[0]) * 1e-9, (at_ns - stamps[0]) * 1e-9
+    t = np.stack([np.interp(at_s, own_s, rows[:, axis]) for axis in range(3)], axis=1)
+    return Slerp(own_s, Rotation.from_quat(rows[:, 3:]))(at_s), t

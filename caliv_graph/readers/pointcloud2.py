@@ -1,0 +1,253 @@
+"""Decoding clouds: `sensor_msgs/PointCloud2` and Livox `CustomMsg`, all points at once.
+
+Times of points come in several conventions. They are told apart by name, type and range: whatever
+the name, they must lie near the cloud's stamp, or they are not believed.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import Array
+from caliv_graph.readers.bag import DamagedMessageError
+from caliv_graph.readers.returns import is_return
+
+POINTCLOUD2 = "sensor_msgs/msg/PointCloud2"
+
+LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+
+CLOUD_TYPES = (POINTCLOUD2, *LIVOX_TYPES)
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""numpy's names of the types of `sensor_msgs/PointField`."""
+
+_TYPE_NAMES = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16"} | {
+    "i4": "int32",
+    "u4": "uint32",
+    "f4": "float32",
+    "f8": "float64",
+}
+
+_TIME_FIELDS = (
+    "t",
+    "time",
+    "timestamp",
+    "time_stamp",
+    "offset_time",
+    "time_offset",
+    "time_offset_ns",
+)
+"""Names of per-point times: of Ouster, Velodyne, Hesai and Robosense, Autoware, Livox, others."""
+
+_MOST_S = 1.0
+"""Seconds. A sweep takes no longer, and its stamp is no farther from its points; what does not fit
+is not what it seems to be."""
+
+_ABSOLUTE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+class UnusableCloudsError(Exception):
+    """The clouds of a topic have no x, y, z that could be read."""
+
+
+@dataclass(frozen=True)
+class TimeField:
+    """What the times of a cloud's points were taken from.
+
+    Attributes:
+        name: of the field.
+        type: of the field, such as uint32.
+        unit: such as `ns after the stamp`.
+    """
+
+    name: str
+    type: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class DecodedCloud:
+    """The returns of one cloud.
+
+    Attributes:
+        points_lidar: (N, 3) metres, all finite, none of them zero.
+        times_s: (N,) seconds after the stamp, or None.
+        time_field: what `times_s` was taken from; None: there was nothing to take it from.
+        time_problem: why the times that the cloud has were not believed; empty: there are none, or
+            they were.
+    """
+
+    points_lidar: Array
+    times_s: Array | None
+    time_field: TimeField | None = None
+    time_problem: str = ""
+
+
+def decode_pointcloud2(
+    message: Any, stamp_ns: int, min_range: float, max_range: float
+) -> DecodedCloud:
+    """Decodes a `sensor_msgs/PointCloud2`: any order of fields, padding and endianness.
+
+    Args:
+        message: with the fields of that type.
+        stamp_ns: stamp of the cloud, which times are related to.
+        min_range: metres; nearer returns are dropped.
+        max_range: metres; farther returns are dropped.
+
+    Raises:
+        DamagedMessageError: the data do not fit the fields.
+        UnusableCloudsError: x, y or z is missing or no floating-point number.
+    """
+    fields = {field.name: field for field in reversed(message.fields)}
+    shown = ", ".join(f"{f.name} {_type_name(f)}" for f in message.fields) or "none"
+    if any(axis not in fields or fields[axis].datatype not in (7, 8) for axis in "xyz"):
+        raise UnusableCloudsError(
+            f"x, y, z as float32 or float64 are needed, its fields are {shown}"
+        )
+    points = np.empty((message.height * message.width, 3))
+    for column, axis in enumerate("xyz"):
+        points[:, column] = _column(message, fields[axis])
+    kept = is_return(points, min_range, max_range)
+    times = [
+        (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name])[kept])
+        for name in _TIME_FIELDS
+        if name in fields and fields[name].datatype in _TYPES
+    ]
+    return _with_times(points[kept], times, stamp_ns)
+
+
+def decode_livox(
+    raw: bytes, is_ros1: bool, stamp_ns: int, min_range: float, max_range: float
+) -> DecodedCloud:
+    """Decodes a Livox `CustomMsg` from its bytes: as objects, 30,000 points would take 0.3 s.
+
+    `std_msgs/Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd;
+    CustomPoint[] points`, of `uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line`.
+
+    Args:
+        raw: the serialised message.
+        is_ros1: whether as in ROS 1; else CDR, which aligns each value to its size.
+        stamp_ns: stamp of the cloud, which times are related to.
+        min_range: metres; nearer returns are dropped.
+        max_range: metres; farther returns are dropped.
+
+    Raises:
+        DamagedMessageError: its size does not fit the number of its points.
+    """
+    order = "<" if is_ros1 or raw[1:2] == b"\x01" else ">"
+    try:
+        if is_ros1:
+            (frame_size,) = struct.unpack_from("<I", raw, 12)
+            start, stride = 16 + frame_size, 19
+        else:
+            (frame_size,) = struct.unpack_from(f"{order}I", raw, 12)
+            # Aligned to 8, counted from the end of the four bytes that every CDR message has.
+            start, stride = 4 + -(-(12 + frame_size) // 8) * 8, 20
+        announced, count = struct.unpack_from(f"{order}8xI4xI", raw, start)
+    except struct.error:
+        raise DamagedMessageError("is cut off in its header") from None
+    start += 20
+    # CDR pads between the points, but not after the last.
+    size = start + (stride * count - (stride - 19) if count else 0)
+    if count != announced or not size <= len(raw) <= size + 3:
+        raise DamagedMessageError(
+            f"has {len(raw)} bytes, expected {size} of a CustomMsg with {announced} points"
+        )
+
+    def column(offset: int, kind: str) -> npt.NDArray[Any]:
+        return np.ndarray((count,), order + kind, raw, start + offset, (stride,))
+
+    if not count:
+        return DecodedCloud(np.empty((0, 3)), None)
+    points = np.stack([column(offset, "f4") for offset in (4, 8, 12)], axis=1).astype(np.float64)
+    kept = is_return(points, min_range, max_range)
+    field = TimeField("offset_time", "uint32", "")
+    return _with_times(points[kept], [(field, column(0, "u4")[kept])], stamp_ns)
+
+
+def _type_name(field: Any) -> str:
+    return _TYPE_NAMES.get(_TYPES.get(field.datatype, ""), f"type {field.datatype}")
+
+
+def _column(message: Any, field: Any) -> npt.NDArray[Any]:
+    """The values of a field, (N,), in the order of the points."""
+    order = ">" if message.is_bigendian else "<"
+    width, height, step = message.width, message.height, message.point_step
+    # Unorganised clouds are sent with any row_step, 0 too; there is no second row.
+    row = message.row_step if height > 1 else width * step
+    itemsize = np.dtype(_TYPES[field.datatype]).itemsize
+    if field.offset + itemsize > step or (height > 1 and row < width * step):
+        raise DamagedMessageError(
+            f"has point_step {step} and row_step {row} bytes, too few for its fields"
+        )
+    if height and width and (height - 1) * row + width * step > len(message.data):
+        raise DamagedMessageError(
+            f"has {len(message.data)} bytes of data, expected {(height - 1) * row + width * step}"
+        )
+    if not height * width:
+        return np.empty(0, order + _TYPES[field.datatype])
+    values: npt.NDArray[Any] = np.ndarray(
+        (height, width), order + _TYPES[field.datatype], message.data, field.offset, (row, step)
+    )
+    return values.ravel()
+
+
+def _with_times(
+    points_lidar: Array, candidates: Sequence[tuple[TimeField, npt.NDArray[Any]]], stamp_ns: int
+) -> DecodedCloud:
+    """Adds the first times that are plausible."""
+    if not len(points_lidar):
+        return DecodedCloud(points_lidar, np.empty(0) if candidates else None)
+    problem = ""
+    for field, values in candidates:
+        readings = list(_readings(field, values, stamp_ns))
+        for unit, times_s in readings:
+            if np.isfinite(times_s).all() and np.abs(times_s).max() <= _MOST_S:
+                found = TimeField(field.name, field.type, unit)
+                return DecodedCloud(points_lidar, times_s, found)
+        problem = problem or _problem(field, readings)
+    return DecodedCloud(points_lidar, None, time_problem=problem)
+
+
+def _readings(
+    field: TimeField, values: npt.NDArray[Any], stamp_ns: int
+) -> Iterable[tuple[str, Array]]:
+    """What the values may mean, the most common first: unit, and seconds after the stamp, (N,)."""
+    if field.type in ("uint32", "int32"):
+        yield "ns after the stamp", values * 1e-9
+    elif field.type == "float32":
+        yield "s after the stamp", values.astype(np.float64)
+    elif field.type == "float64":
+        values = values.astype(np.float64)
+        after = ("s after the stamp", values)
+        if field.name not in ("timestamp", "time_stamp"):
+            yield after
+        seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+        for unit, scale in _ABSOLUTE.items():
+            # The stamp's whole seconds first: both numbers are too large for a difference in ns.
+            yield f"{unit}, absolute", (values - seconds / scale) * scale - nanoseconds * 1e-9
+        if field.name in ("timestamp", "time_stamp"):
+            yield after
+
+
+def _problem(field: TimeField, readings: Sequence[tuple[str, Array]]) -> str:
+    """Why none of the readings is plausible, in the words of the most common."""
+    where = f"field '{field.name}' ({field.type})"
+    if not readings:
+        return f"{where} is of a type that no known convention has"
+    unit, times_s = readings[0]
+    finite = times_s[np.isfinite(times_s)]
+    if len(finite) < len(times_s):
+        return f"{where} holds values that are not finite"
+    first, last = float(finite.min()), float(finite.max())
+    return (
+        f"{where}, read as {unit}, spans {first:.4g} to {last:.4g} s from the stamp, more than "
+        f"{_MOST_S:g} s"
+    )

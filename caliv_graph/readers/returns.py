@@ -1,0 +1,27 @@
+"""Which points of a cloud are returns."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.products import Array
+
+
+def is_return(points_lidar: Array, min_range: float, max_range: float) -> npt.NDArray[np.bool_]:
+    """Which points are returns within the ranges.
+
+    NaN compares false, infinity exceeds any `max_range`, and (0, 0, 0) is a beam without a return
+    even where `min_range` is 0.
+
+    Args:
+        points_lidar: (N, 3) metres, lidar frame.
+        min_range: metres.
+        max_range: metres.
+
+    Returns:
+        (N,) of bool.
+    """
+    squared_range = np.einsum("ij,ij->i", points_lidar, points_lidar)
+    within = (squared_range >= min_range**2) & (squared_range <= max_range**2)
+    return np.asarray(within & (squared_range > 0.0))

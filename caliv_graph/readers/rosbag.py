@@ -1,0 +1,522 @@
+"""Reading a bag as a drive (`products.Recording`): clouds of the LiDARs, and the motion data.
+
+One pass over the bag reads all stamps and all motion data; of clouds only the header. Clouds are
+decoded in `scans`, only those that are wanted, and only from the parts of the bag that hold them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import textwrap
+from array import array
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caliv_graph.config import LidarConfig, TopicsConfig
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import RecordingError
+from caliv_graph.products import LidarScan, MotionData
+from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
+from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
+from caliv_graph.readers.frames import TF_TYPES, clean_frame
+from caliv_graph.readers.motion import (
+    MOTION_TYPES,
+    Collector,
+    GnssCollector,
+    ImuCheck,
+    ImuCollector,
+    PoseCollector,
+    TfCollector,
+    TwistCollector,
+    check_imu,
+)
+from caliv_graph.readers.pointcloud2 import (
+    CLOUD_TYPES,
+    LIVOX_TYPES,
+    DecodedCloud,
+    TimeField,
+    UnusableCloudsError,
+    decode_livox,
+    decode_pointcloud2,
+)
+
+_KINDS = {"imu": "IMU", "gnss": "GNSS receiver", "twist": "velocity", "pose": "pose of the vehicle"}
+
+_COLLECTORS: Mapping[str, type[Collector]] = {
+    "imu": ImuCollector,
+    "gnss": GnssCollector,
+    "twist": TwistCollector,
+    "pose": PoseCollector,
+}
+
+_STATIC_TOPIC = "/tf_static"
+
+_JOIN_NS = NANOSECONDS_PER_SECOND // 2
+"""Clouds that are wanted and recorded no farther apart than this are read in one go: to read on
+costs less than to begin anew."""
+
+
+_LONG_GAP_S = {"imu": 0.1, "gnss": 2.0, "twist": 1.0, "pose": 1.0}
+"""Seconds without a message that are told. Integration over gaps of an IMU errs soon."""
+
+
+@dataclass(frozen=True)
+class TimesSeen:
+    """The times of the points of one LiDAR, over the clouds decoded so far.
+
+    Attributes:
+        field: what they were taken from; None: there are none.
+        first_s: earliest, seconds after the stamp.
+        last_s: latest, seconds after the stamp.
+        clouds: clouds that have them.
+        problems: clouds whose times were not believed.
+        problem: why, of the first such cloud.
+    """
+
+    field: TimeField | None = None
+    first_s: float = 0.0
+    last_s: float = 0.0
+    clouds: int = 0
+    problems: int = 0
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What the first pass over the bag found.
+
+    Attributes:
+        clocks: by topic.
+        frame_ids: of the first message of each topic.
+        scans: per LiDAR the record time by stamp, in the order of the stamps.
+        collectors: by kind of motion data and topic.
+        damaged: messages that are not what their type says, by topic.
+    """
+
+    clocks: Mapping[str, Clock]
+    frame_ids: Mapping[str, str]
+    scans: Mapping[str, Mapping[int, int]]
+    collectors: Mapping[tuple[str, str], Collector]
+    damaged: Mapping[str, int]
+
+
+class RosbagRecording:
+    """A drive in a bag (products.Recording)."""
+
+    def __init__(
+        self,
+        path: Path,
+        lidars: Mapping[str, LidarConfig],
+        topics: TopicsConfig,
+        also: Iterable[str] = (),
+    ) -> None:
+        """Opens the bag and checks that it has the topics; reads its index only.
+
+        Args:
+            path: the bag.
+            lidars: LiDARs of the config by the user's name.
+            topics: what tells the motion.
+            also: further topics of motion data to look at, which `motion` does not use.
+
+        Raises:
+            RecordingError: the bag is missing or damaged; a topic is missing, of the wrong type, or
+                has no clouds.
+        """
+        self._bag = Bag(path)
+        self._lidars = dict(lidars)
+        self._topics: dict[str, Topic] = {}
+        self._warnings: list[str] = []
+        for name, lidar in self._lidars.items():
+            topic = self._topic(lidar.topic, f"lidars.{name}.topic", "LiDAR clouds", CLOUD_TYPES)
+            if not topic.messages:
+                raise RecordingError(
+                    f"{path}: topic '{topic.name}' (LiDAR '{name}') has no clouds. Record it, or "
+                    "take the LiDAR out of the config"
+                )
+            self._topics[name] = topic
+        self._used: dict[str, str] = {
+            kind: self._topic(topic, f"topics.{kind}", _KINDS[kind], MOTION_TYPES[kind]).name
+            for kind, topic in topics.model_dump().items()
+            if topic is not None
+        }
+        self._motion_topics = dict.fromkeys((kind, topic) for kind, topic in self._used.items())
+        for name in also:
+            for kind, types in MOTION_TYPES.items():
+                if self._bag.topics[name].type in types:
+                    self._motion_topics.setdefault((kind, name))
+        self._indexed: _Index | None = None
+        self._motion: MotionData | None = None
+        self._times: dict[str, TimesSeen] = {name: TimesSeen() for name in self._lidars}
+        self._damaged_clouds: dict[str, set[int]] = {name: set() for name in self._lidars}
+        self._damage = ""
+        self._looked_at: dict[str, set[int]] = {name: set() for name in self._lidars}
+
+    @property
+    def name(self) -> str:
+        """The path as given."""
+        return self._bag.name
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """LiDARs of the config, in the config's order."""
+        return tuple(self._lidars)
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """All topics of the bag by name."""
+        return self._bag.topics
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last record time of the bag, nanoseconds."""
+        return self._bag.span_ns
+
+    def lidar_topic(self, lidar: str) -> str:
+        """The topic of the clouds of a LiDAR."""
+        return self._topics[lidar].name
+
+    def clocks(self) -> Mapping[str, Clock]:
+        """What the stamps of each topic that was read are like."""
+        return self._index().clocks
+
+    def frame_ids(self) -> Mapping[str, str]:
+        """The frame in the header of the first message of each topic that was read."""
+        return self._index().frame_ids
+
+    def times_seen(self, lidar: str) -> TimesSeen:
+        """The times of the points in the clouds decoded so far."""
+        return self._times[lidar]
+
+    def imu_checks(self) -> Mapping[str, ImuCheck]:
+        """The units of each IMU that has samples, by topic."""
+        found = {}
+        for (_, topic), collector in self._index().collectors.items():
+            samples = collector.finish() if isinstance(collector, ImuCollector) else None
+            if samples is not None:
+                found[topic] = check_imu(samples)
+        return found
+
+    def gnss_fixes(self) -> Mapping[str, int]:
+        """Messages with a fix of each GNSS receiver, by topic."""
+        return {
+            topic: collector.fixes
+            for (_, topic), collector in self._index().collectors.items()
+            if isinstance(collector, GnssCollector)
+        }
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """Stamps of the clouds of one LiDAR, ascending, each once.
+
+        Raises:
+            RecordingError: the bag is damaged.
+        """
+        return list(self._index().scans[lidar])
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in the order of their stamps, one at a time.
+
+        NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
+        than its `max_range`. A cloud that is damaged is left out and counted in `warnings`. Clouds
+        recorded out of order are kept until their turn.
+
+        Args:
+            lidar: its name.
+            wanted: stamps of the clouds that are asked for, None: all. The others are not decoded,
+                and parts of the bag without any of them are not read.
+
+        Raises:
+            RecordingError: the bag is damaged, or the clouds have no x, y, z.
+        """
+        topic = self._topics[lidar].name
+        queue = _Queue(
+            {
+                stamp_ns: record_ns
+                for stamp_ns, record_ns in self._index().scans[lidar].items()
+                if wanted is None or stamp_ns in wanted
+            }
+        )
+        for start_ns, stop_ns in _windows(queue.records_ns.values()):
+            for _, record_ns, raw in self._bag.messages([topic], start_ns, stop_ns):
+                try:
+                    stamp_ns = self._bag.header(raw).stamp_ns or record_ns
+                except DamagedMessageError:
+                    continue  # counted by the first pass
+                for found_ns, found in queue.take(stamp_ns, record_ns, raw):
+                    scan = self._scan(lidar, found_ns, found)
+                    if scan is not None:
+                        yield scan
+                    del scan, found  # not kept alive while the next one is read
+
+    def motion(self) -> MotionData:
+        """What the bag tells of the vehicle's motion, of the topics that the config names.
+
+        Raises:
+            RecordingError: the bag is damaged; the specific force of the IMU is not in m/s^2, or
+                gravity was removed from it.
+        """
+        if self._motion is None:
+            self._motion = self._read_motion()
+        return self._motion
+
+    def warnings(self) -> Sequence[str]:
+        """What was left out so far, and why, a line each."""
+        # Each once: what was asked for twice was read twice.
+        return list(dict.fromkeys([*self._warnings, *self._cloud_warnings()]))
+
+    def _topic(self, name: str, key: str, what: str, types: Sequence[str]) -> Topic:
+        """The topic of the bag that a key of the config names.
+
+        Raises:
+            RecordingError: it is not there, or its type will not do.
+        """
+        there = self._bag.topics
+        fitting = [topic.name for topic in there.values() if topic.type in types]
+        topic = there.get(name) or there.get(f"/{name.strip('/')}")
+        will_do = f"Topics that would do: {_enumerate(fitting)}"
+        if topic is None:
+            near = difflib.get_close_matches(name, fitting or list(there), n=1, cutoff=0.5)
+            hint = f"Did you mean '{near[0]}'? " if near else ""
+            raise RecordingError(
+                f"{self._bag.name}: has no topic '{name}' ({key}). {hint}{will_do}"
+            )
+        if topic.type not in types:
+            raise RecordingError(
+                f"{self._bag.name}: topic '{name}' ({key}) is of type {topic.type}; for "
+                f"{what} it takes {', '.join(types)}. {will_do}"
+            )
+        return topic
+
+    def _index(self) -> _Index:
+        if self._indexed is None:
+            self._indexed = self._read_index()
+        return self._indexed
+
+    def _read_index(self) -> _Index:
+        collectors = {
+            (kind, topic): _collector(kind, self._bag.topics[topic])
+            for kind, topic in self._motion_topics
+        }
+        taking: dict[str, list[Collector]] = {}
+        for (_, topic), collector in collectors.items():
+            taking.setdefault(topic, []).append(collector)
+        topics = dict.fromkeys([*(topic.name for topic in self._topics.values()), *taking])
+        trees = [c for c in collectors.values() if isinstance(c, TfCollector)]
+        header_ns = {topic: array("q") for topic in topics}
+        records_ns = {topic: array("q") for topic in topics}
+        frame_ids: dict[str, str] = {}
+        damaged: Counter[str] = Counter()
+        also = {_STATIC_TOPIC} & set(self._bag.topics) if trees else set()
+        for topic, record_ns, raw in self._bag.messages({*topics, *also}):
+            try:
+                message = self._bag.decode(topic, raw) if topic in taking or topic in also else None
+                header = self._header(topic, raw, message)
+            except DamagedMessageError:
+                damaged[topic] += 1
+                continue
+            if topic in also:
+                for tree in trees:
+                    tree.add_static(message)
+                if topic not in topics:
+                    continue
+            frame_ids.setdefault(topic, clean_frame(header.frame_id))
+            header_ns[topic].append(header.stamp_ns)
+            records_ns[topic].append(record_ns)
+            for collector in taking.get(topic, ()):
+                collector.add(header.stamp_ns or record_ns, message)
+        stamps = {
+            topic: (np.array(header_ns[topic], np.int64), np.array(records_ns[topic], np.int64))
+            for topic in topics
+        }
+        index = _Index(
+            clocks={topic: read_clock(*both) for topic, both in stamps.items()},
+            frame_ids=frame_ids,
+            scans={name: _by_stamp(*stamps[topic.name]) for name, topic in self._topics.items()},
+            collectors=collectors,
+            damaged=damaged,
+        )
+        self._warnings += [
+            f"{self._bag.name}: {topic} should have {self._bag.topics[topic].messages} messages, "
+            f"but {len(stamps[topic][0]) + damaged[topic]} were found: the bag seems to be damaged"
+            for topic in topics
+            if len(stamps[topic][0]) + damaged[topic] != self._bag.topics[topic].messages
+        ]
+        # A message of /tf has no stamp of its own, and several senders in no order.
+        clocks = {t: c for t, c in index.clocks.items() if self._bag.topics[t].type not in TF_TYPES}
+        self._warnings += clock_warnings(self._bag.name, clocks)
+        self._warnings += [
+            f"{self._bag.name}: {count} messages of {topic} are damaged and not used"
+            for topic, count in damaged.items()
+        ]
+        return index
+
+    def _header(self, topic: str, raw: bytes, message: Any) -> Header:
+        if self._bag.topics[topic].type not in TF_TYPES:
+            return self._bag.header(raw)
+        if not message.transforms:
+            return Header(0, "")
+        first = message.transforms[0].header
+        stamp_ns = first.stamp.sec * NANOSECONDS_PER_SECOND + first.stamp.nanosec
+        return Header(stamp_ns, first.frame_id)
+
+    def _read_motion(self) -> MotionData:
+        index = self._index()
+        found: dict[str, Any] = {}
+        for kind, topic in self._used.items():
+            collector: Any = index.collectors[kind, topic]
+            found[kind] = collector.finish()
+            where = f"{self._bag.name}: topics.{kind} '{topic}'"
+            self._warnings += [f"{where}: {note}" for note in collector.notes()]
+            gaps_s = [(b - a) / NANOSECONDS_PER_SECOND for a, b in index.clocks[topic].gaps]
+            long_s = [gap_s for gap_s in gaps_s if gap_s > _LONG_GAP_S[kind]]
+            if long_s:
+                self._warnings.append(
+                    f"{where}: {len(long_s)} gaps longer than {_LONG_GAP_S[kind]:g} s, the longest "
+                    f"{max(long_s):.3g} s"
+                )
+            if found[kind] is None:
+                self._warnings.append(f"{where}: tells nothing that could be used")
+        motion = MotionData(
+            self._bag.name,
+            poses=found.get("pose"),
+            imu=found.get("imu"),
+            gnss=found.get("gnss"),
+            twist=found.get("twist"),
+        )
+        if motion.imu is not None:
+            where = f"{self._bag.name}: topics.imu '{self._used['imu']}'"
+            check = check_imu(motion.imu)
+            if check.gravity_problem:
+                raise RecordingError(
+                    f"{where}: {check.gravity_problem}, or take the IMU out of the config"
+                )
+            if check.rate_problem:
+                self._warnings.append(f"{where}: {check.rate_problem}")
+        return motion
+
+    def _scan(self, lidar: str, stamp_ns: int, raw: bytes) -> LidarScan | None:
+        config = self._lidars[lidar]
+        topic = self._topics[lidar]
+        source = f"{topic.name} at {_seconds(stamp_ns)} s"
+        limits = (stamp_ns, config.min_range, config.max_range)
+        try:
+            if topic.type in LIVOX_TYPES:
+                cloud = decode_livox(raw, self._bag.is_ros1, *limits)
+            else:
+                cloud = decode_pointcloud2(self._bag.decode(topic.name, raw), *limits)
+        except UnusableCloudsError as e:
+            raise RecordingError(
+                f"{self._bag.name}: clouds of {source}: {e}. Set lidars.{lidar}.topic to clouds "
+                "with coordinates"
+            ) from None
+        except DamagedMessageError as e:
+            self._damage = self._damage or f"{source} {e}"
+            self._damaged_clouds[lidar].add(stamp_ns)
+            return None
+        if stamp_ns not in self._looked_at[lidar]:
+            self._looked_at[lidar].add(stamp_ns)
+            self._times[lidar] = _also_seen(self._times[lidar], cloud)
+        return LidarScan(
+            lidar=lidar,
+            stamp_ns=stamp_ns,
+            points_lidar=cloud.points_lidar,
+            source=f"{self._bag.name}: {source}",
+            point_times_s=cloud.times_s,
+        )
+
+    def _cloud_warnings(self) -> list[str]:
+        lines = []
+        for lidar, damaged in self._damaged_clouds.items():
+            if damaged:
+                lines.append(
+                    f"{self._bag.name}: {len(damaged)} clouds of LiDAR '{lidar}' are damaged and "
+                    f"not used; {self._damage}"
+                )
+        for lidar, times in self._times.items():
+            where = f"{self._bag.name}: LiDAR '{lidar}'"
+            if times.problems:
+                lines.append(
+                    f"{where}: the times of the points of {times.problems} clouds are not used: "
+                    f"{times.problem}"
+                )
+            elif times.field and times.first_s == times.last_s == 0.0:
+                lines.append(
+                    f"{where}: field '{times.field.name}' is 0 for all points: its clouds carry no "
+                    "times"
+                )
+        return lines
+
+
+class _Queue:
+    """The clouds that are asked for, and those of them that were read before their turn."""
+
+    def __init__(self, records_ns: Mapping[int, int]) -> None:
+        """Takes the record time by stamp, in the order of the stamps."""
+        self.records_ns = records_ns
+        self._order = iter(records_ns)
+        self._next = next(self._order, None)
+        self._early: dict[int, bytes] = {}
+
+    def take(self, stamp_ns: int, record_ns: int, raw: bytes) -> Iterator[tuple[int, bytes]]:
+        """Takes what was read; yields stamps and clouds whose turn has come."""
+        # Of two messages with one stamp, the other is none of ours.
+        if self.records_ns.get(stamp_ns) != record_ns:
+            return
+        self._early[stamp_ns] = raw
+        while self._next is not None and self._next in self._early:
+            turn, self._next = self._next, next(self._order, None)
+            yield turn, self._early.pop(turn)
+
+
+def _collector(kind: str, topic: Topic) -> Collector:
+    return TfCollector() if topic.type in TF_TYPES else _COLLECTORS[kind]()
+
+
+def _by_stamp(header_ns: Any, record_ns: Any) -> dict[int, int]:
+    """Record time by stamp, in the order of the stamps; of equal stamps the first recorded."""
+    stamps, first = np.unique(effective_stamps(header_ns, record_ns), return_index=True)
+    return dict(zip(stamps.tolist(), record_ns[first].tolist(), strict=True))
+
+
+def _windows(records_ns: Iterable[int]) -> list[tuple[int, int]]:
+    """Spans of record time, start and stop, that hold all of them and little else."""
+    times = np.unique(np.fromiter(records_ns, np.int64))
+    if not len(times):
+        return []
+    breaks = np.flatnonzero(np.diff(times) > _JOIN_NS)
+    starts, stops = times[np.r_[0, breaks + 1]], times[np.r_[breaks, len(times) - 1]]
+    return [(int(a), int(b) + 1) for a, b in zip(starts, stops, strict=True)]
+
+
+def _also_seen(seen: TimesSeen, cloud: DecodedCloud) -> TimesSeen:
+    times_s = cloud.times_s
+    if cloud.time_problem:
+        return TimesSeen(
+            seen.field,
+            seen.first_s,
+            seen.last_s,
+            seen.clouds,
+            seen.problems + 1,
+            seen.problem or cloud.time_problem,
+        )
+    if times_s is None or cloud.time_field is None or not len(times_s):
+        return seen
+    first_s, last_s = float(times_s.min()), float(times_s.max())
+    if seen.field is not None:
+        first_s, last_s = min(first_s, seen.first_s), max(last_s, seen.last_s)
+    return TimesSeen(
+        cloud.time_field, first_s, last_s, seen.clouds + 1, seen.problems, seen.problem
+    )
+
+
+def _seconds(stamp_ns: int) -> str:
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+    return f"{seconds}.{nanoseconds:09d}"
+
+
+def _enumerate(names: Iterable[str]) -> str:
+    return textwrap.shorten(", ".join(names), 300, placeholder=" ...") or "none"

@@ -1,0 +1,321 @@
+"""What a bag holds: topics, rates, gaps, clocks, time fields, units; who sees the target when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import RecordingError
+from caliv_graph.products import Recording, TargetObservation
+from caliv_graph.progress import Progress
+from caliv_graph.readers.clock import Clock
+from caliv_graph.readers.rosbag import RosbagRecording
+from caliv_graph.report.inspection import (
+    DriveSummary,
+    Inspection,
+    Points,
+    Sighting,
+    TargetSummary,
+    add_targets,
+    centre_of,
+    inspect_recording,
+    nearest_and_farthest,
+    runs_of,
+    summarise_drive,
+    summarise_points,
+)
+
+_SAMPLED_CLOUDS = 20
+"""Clouds per LiDAR that are looked into, spread over the drive: a bag can hold many thousands."""
+
+_GAPS_SHOWN = 20
+"""Longest gaps that are listed per topic."""
+
+_RUN_FACTOR = 1.75
+"""Scans of a target no more intervals apart than this belong to one run: one that is lost, two."""
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic.
+
+    Attributes:
+        type: of its messages.
+        messages: how many there are.
+        rate_hz: of the median interval between stamps; of a topic that was not read, the mean over
+            the bag; None with fewer than two messages.
+        read: whether it was read; if not, all below is unknown.
+        frame_id: frame in the header of its first message.
+        gaps: number of intervals that are too long for the rate.
+        longest_gaps_s: (from, to) of the longest, in the order of time, in seconds from the bag's
+            first record time.
+        header_minus_record_s: (min, median, max); None if no message has a stamp.
+        unset: messages without a stamp.
+        backwards: messages stamped before the one recorded before them.
+        duplicates: messages with the stamp of another.
+    """
+
+    type: str
+    messages: int
+    rate_hz: float | None
+    read: bool = False
+    frame_id: str = ""
+    gaps: int = 0
+    longest_gaps_s: tuple[tuple[float, float], ...] = ()
+    header_minus_record_s: tuple[float, float, float] | None = None
+    unset: int = 0
+    backwards: int = 0
+    duplicates: int = 0
+
+
+@dataclass(frozen=True)
+class PointTimes:
+    """The times of a LiDAR's points.
+
+    Attributes:
+        field: its name.
+        type: its type.
+        unit: what it was found to hold.
+        first_s: earliest, seconds after the stamp.
+        last_s: latest, seconds after the stamp.
+    """
+
+    field: str
+    type: str
+    unit: str
+    first_s: float
+    last_s: float
+
+
+@dataclass(frozen=True)
+class BagLidarSummary:
+    """The clouds of one LiDAR.
+
+    Attributes:
+        topic: of its clouds.
+        frame_id: frame in the header of its first cloud.
+        clouds: how many there are.
+        rate_hz: of the median interval; None with fewer than two clouds.
+        sampled: clouds looked into for what follows.
+        points: points per cloud, without NaN and zero returns and those outside the ranges; None
+            if no cloud could be read.
+        times: times of the points; None if they have none that could be believed.
+        times_problem: why times were not believed; empty: nothing was wrong.
+    """
+
+    topic: str
+    frame_id: str
+    clouds: int
+    rate_hz: float | None
+    sampled: int
+    points: Points | None
+    times: PointTimes | None
+    times_problem: str
+
+
+@dataclass(frozen=True)
+class ImuSummary:
+    """The units of one IMU.
+
+    Attributes:
+        specific_force_m_s2: median of its norm.
+        angular_rate_rad_s: 95th percentile of its norm.
+        problems: what is wrong with them.
+    """
+
+    specific_force_m_s2: float
+    angular_rate_rad_s: float
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BagInspection:
+    """What a bag holds.
+
+    Attributes:
+        data: the bag.
+        start_ns: first record time.
+        duration_s: from the first to the last record time.
+        topics: all of them.
+        lidars: per LiDAR.
+        imus: per topic of IMU samples that was read.
+        gnss_fixes: messages with a fix, per topic of GNSS messages that was read.
+        drive: the motion by given poses; None if there are none.
+        targets: who sees what when; None if nobody was asked to look.
+    """
+
+    data: str
+    start_ns: int
+    duration_s: float
+    topics: dict[str, TopicSummary]
+    lidars: dict[str, BagLidarSummary]
+    imus: dict[str, ImuSummary]
+    gnss_fixes: dict[str, int]
+    drive: DriveSummary | None
+    targets: tuple[TargetSummary, ...] | None = None
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        return asdict(self)
+
+
+def inspect_any(recording: Recording, progress: Progress) -> Inspection | BagInspection:
+    """What a recording of any format holds.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
+    if isinstance(recording, RosbagRecording):
+        return inspect_bag(recording, progress)
+    return inspect_recording(recording, progress)
+
+
+def add_any_targets(
+    inspection: Inspection | BagInspection, observations: Iterable[TargetObservation]
+) -> Inspection | BagInspection:
+    """Adds which LiDAR sees the target when.
+
+    Args:
+        inspection: of the recording.
+        observations: the targets found in it.
+    """
+    if isinstance(inspection, Inspection):
+        return add_targets(inspection, observations)
+    targets = tuple(
+        TargetSummary(
+            name=observation.name,
+            centre_map_m=centre_of(observation),
+            lidars={
+                lidar: _summarise_sighting(observation, lidar, summary.rate_hz, inspection.start_ns)
+                for lidar, summary in inspection.lidars.items()
+            },
+        )
+        for observation in observations
+    )
+    return replace(inspection, targets=targets)
+
+
+def inspect_bag(recording: RosbagRecording, progress: Progress) -> BagInspection:
+    """Reads a bag once, and some clouds of each LiDAR.
+
+    Raises:
+        RecordingError: the bag is damaged, or clouds have no x, y, z.
+    """
+    start_ns, stop_ns = recording.span_ns
+    with progress.stage("reading the stamps", 1) as advance:
+        clocks = recording.clocks()
+        advance()
+    duration_s = (stop_ns - start_ns) / NANOSECONDS_PER_SECOND
+    topics = {
+        name: _summarise_topic(recording, name, clocks.get(name), start_ns, duration_s)
+        for name in recording.topics
+    }
+    samples = {lidar: _sample(recording, lidar) for lidar in recording.lidars}
+    lidars = {}
+    with progress.stage("reading the clouds", sum(map(len, samples.values()))) as advance:
+        for lidar, wanted in samples.items():
+            counts = []
+            for scan in recording.scans(lidar, wanted):
+                counts.append(len(scan.points_lidar))
+                advance()
+            lidars[lidar] = _summarise_lidar(recording, lidar, counts, topics)
+    return BagInspection(
+        data=recording.name,
+        start_ns=start_ns,
+        duration_s=duration_s,
+        topics=topics,
+        lidars=lidars,
+        imus={
+            topic: ImuSummary(
+                specific_force_m_s2=check.specific_force_m_s2,
+                angular_rate_rad_s=check.angular_rate_rad_s,
+                problems=tuple(p for p in (check.gravity_problem, check.rate_problem) if p),
+            )
+            for topic, check in recording.imu_checks().items()
+        },
+        gnss_fixes=dict(recording.gnss_fixes()),
+        drive=_drive(recording),
+    )
+
+
+def _drive(recording: RosbagRecording) -> DriveSummary | None:
+    try:
+        poses = recording.motion().poses
+    except RecordingError:
+        return None  # an IMU in wrong units, of which the inspection tells
+    return None if poses is None else summarise_drive(poses)
+
+
+def _sample(recording: RosbagRecording, lidar: str) -> frozenset[int]:
+    stamps = recording.scan_stamps_ns(lidar)
+    count = min(_SAMPLED_CLOUDS, len(stamps))
+    steps = max(count - 1, 1)
+    return frozenset(stamps[i * (len(stamps) - 1) // steps] for i in range(count))
+
+
+def _summarise_topic(
+    recording: RosbagRecording, name: str, clock: Clock | None, start_ns: int, duration_s: float
+) -> TopicSummary:
+    topic = recording.topics[name]
+    if clock is None:
+        rate_hz = (topic.messages - 1) / duration_s if topic.messages > 1 and duration_s else None
+        return TopicSummary(topic.type, topic.messages, rate_hz)
+    longest = sorted(clock.gaps, key=lambda gap: gap[0] - gap[1])[:_GAPS_SHOWN]
+    return TopicSummary(
+        type=topic.type,
+        messages=clock.messages,
+        rate_hz=clock.rate_hz,
+        read=True,
+        frame_id=recording.frame_ids().get(name, ""),
+        gaps=len(clock.gaps),
+        longest_gaps_s=tuple(_span_s(gap, start_ns) for gap in sorted(longest)),
+        header_minus_record_s=clock.offset_s,
+        unset=clock.unset,
+        backwards=clock.backwards,
+        duplicates=clock.duplicates,
+    )
+
+
+def _summarise_lidar(
+    recording: RosbagRecording, lidar: str, counts: list[int], topics: dict[str, TopicSummary]
+) -> BagLidarSummary:
+    name = recording.lidar_topic(lidar)
+    seen = recording.times_seen(lidar)
+    times = None
+    if seen.field is not None:
+        field = seen.field
+        times = PointTimes(field.name, field.type, field.unit, seen.first_s, seen.last_s)
+    return BagLidarSummary(
+        topic=name,
+        frame_id=topics[name].frame_id,
+        clouds=len(recording.scan_stamps_ns(lidar)),
+        rate_hz=topics[name].rate_hz,
+        sampled=len(counts),
+        points=summarise_points(counts) if counts else None,
+        times=times,
+        times_problem=seen.problem,
+    )
+
+
+def _summarise_sighting(
+    observation: TargetObservation, lidar: str, rate_hz: float | None, start_ns: int
+) -> Sighting:
+    clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
+    if not clouds:
+        return Sighting(scans=0, frames=(), points=None, range_m=None, times_s=())
+    step_ns = round(_RUN_FACTOR * NANOSECONDS_PER_SECOND / rate_hz) if rate_hz else 0
+    runs = runs_of([cloud.stamp_ns for cloud in clouds], step_ns)
+    return Sighting(
+        scans=len(clouds),
+        frames=(),
+        points=summarise_points([len(cloud.points_lidar) for cloud in clouds]),
+        range_m=nearest_and_farthest([cloud.points_lidar for cloud in clouds]),
+        times_s=tuple(_span_s(run, start_ns) for run in runs),
+    )
+
+
+def _span_s(span_ns: tuple[int, int], start_ns: int) -> tuple[float, float]:
+    first, last = ((stamp_ns - start_ns) / NANOSECONDS_PER_SECOND for stamp_ns in span_ns)
+    return first, last

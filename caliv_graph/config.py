@@ -147,6 +147,15 @@ class ImuConfig(_Section):
     """Mounting of the IMU."""
 
     T_vehicle_imu: Mounting = Mounting(xyz=(0.0, 0.0, 0.0))
+    gravity_m_s2: Positive | None = Field(
+        None, description="m/s^2, local gravity; absent: by latitude and altitude"
+    )
+    yaw_bias: bool = Field(
+        False, description="estimate a constant yaw error of the IMU's orientation"
+    )
+    yaw_bias_sigma_deg: Positive = Field(
+        5.0, description="degrees, how large that yaw error may be, 1 sigma"
+    )
 
 
 class GnssConfig(_Section):
@@ -178,6 +187,12 @@ class NoiseConfig(_Section):
     gyroscope_density_rad_s_sqrthz: Positive | None = None
     accelerometer_bias_walk_m_s3_sqrthz: Positive | None = None
     gyroscope_bias_walk_rad_s2_sqrthz: Positive | None = None
+    accelerometer_bias_m_s2: Positive = Field(
+        0.1, description="m/s^2, constant bias of the accelerometer, per axis"
+    )
+    gyroscope_bias_rad_s: Positive = Field(
+        0.01, description="rad/s, constant bias of the gyroscope, per axis"
+    )
     gnss_horizontal_m: Positive | None = None
     gnss_vertical_m: Positive | None = None
     velocity_m_s: Positive | None = None
@@ -228,6 +243,9 @@ class ExtractionConfig(_Section):
     )
     min_scans: Annotated[int, Field(ge=2)] = Field(
         8, description="a LiDAR with fewer scans of the target does not see it"
+    )
+    max_scans: Annotated[int, Field(ge=10)] = Field(
+        120, description="scans of one LiDAR used at most, evenly spread over those with the target"
     )
 
 

@@ -5,7 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Recording, Trajectory
+from caliv_graph.products import MotionData, Recording, Trajectory
+
+
+def given_trajectory(motion: MotionData) -> Trajectory:
+    """The given vehicle poses of a drive, as a trajectory.
+
+    Raises:
+        TrajectoryError: it has fewer than two poses.
+    """
+    poses = motion.poses
+    if poses is None:
+        raise TrajectoryError(f"{motion.name}: has no vehicle poses")
+    if len(poses.stamps_ns) < 2:
+        raise TrajectoryError(
+            f"{motion.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"
+        )
+    return Trajectory(poses.stamps_ns, poses.T_map_vehicle)
 
 
 def given_trajectories(recordings: Sequence[Recording]) -> tuple[Trajectory, ...]:
@@ -15,14 +31,4 @@ def given_trajectories(recordings: Sequence[Recording]) -> tuple[Trajectory, ...
         TrajectoryError: a recording has fewer than two poses.
         RecordingError: its poses could not be read.
     """
-    out = []
-    for recording in recordings:
-        poses = recording.motion().poses
-        if poses is None:
-            raise TrajectoryError(f"{recording.name}: has no vehicle poses")
-        if len(poses.stamps_ns) < 2:
-            raise TrajectoryError(
-                f"{recording.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"
-            )
-        out.append(Trajectory(poses.stamps_ns, poses.T_map_vehicle))
-    return tuple(out)
+    return tuple(given_trajectory(recording.motion()) for recording in recordings)

@@ -1,0 +1,165 @@
+"""The measurement factors of the trajectory, one function per kind.
+
+Variables beside node i: I_i = T_map_imu (right perturbation), V_i velocity of the IMU's origin in
+the map. A measurement between two nodes is carried to the nearest by the IMU (`DeadReckoning`);
+over at most half a node spacing the IMU's own noise is far below the measurement's.
+All Jacobians are analytic; the tests check them numerically.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from caliv_graph.products import Array
+
+NoiseModel = gtsam.noiseModel.Base
+
+
+def _skew(v: Array) -> Array:
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def position_factor(
+    key_imu: int,
+    key_velocity: int,
+    position_map: Array,
+    offset_imu: Array,
+    delay_s: float,
+    gravity_m_s2: float,
+    noise: NoiseModel,
+) -> gtsam.NoiseModelFactor:
+    """A position of the GNSS antenna, `delay_s` after the node.
+
+    `r = p + V dt + g dt^2 / 2 + R q - z`, q what the IMU moved by since the node, plus the lever
+    arm as it is turned then, both in the IMU's frame at the node.
+
+    Args:
+        key_imu: of I_i.
+        key_velocity: of V_i.
+        position_map: (3,) measured, metres.
+        offset_imu: (3,) q, metres.
+        delay_s: of the measurement after the node; negative: before it; zero: GTSAM's own factor.
+        gravity_m_s2: along -z of the map.
+        noise: of r, 3 dimensions, map axes.
+    """
+    if delay_s == 0.0:
+        return gtsam.GPSFactorArm(key_imu, position_map, offset_imu, noise)
+    shift = np.array([0.0, 0.0, -0.5 * gravity_m_s2 * delay_s**2]) - position_map
+    skew_offset = -_skew(offset_imu)
+    by_velocity = delay_s * np.eye(3)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        T = values.atPose3(key_imu)
+        R = T.rotation().matrix()
+        if jacobians is not None:
+            J = np.empty((3, 6))
+            J[:, :3] = R @ skew_offset
+            J[:, 3:] = R
+            jacobians[0] = J
+            jacobians[1] = by_velocity
+        velocity = values.atVector(key_velocity)
+        return np.asarray(T.translation() + delay_s * velocity + R @ offset_imu + shift)
+
+    return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
+
+
+def velocity_factor(
+    key_imu: int, key_velocity: int, velocity_imu: Array, gained_map: Array, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """A velocity of the IMU's origin in its own axes, carried to the node.
+
+    `r = R^T (V + u) - z`, u the velocity that gravity adds until the measurement.
+
+    Args:
+        key_imu: of I_i.
+        key_velocity: of V_i.
+        velocity_imu: (3,) z in m/s.
+        gained_map: (3,) u in m/s.
+        noise: of r, 3 dimensions, imu axes.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        back = values.atPose3(key_imu).rotation().matrix().T
+        predicted = back @ (values.atVector(key_velocity) + gained_map)
+        if jacobians is not None:
+            J = np.zeros((3, 6))
+            J[:, :3] = _skew(predicted)
+            jacobians[0] = J
+            jacobians[1] = back
+        return np.asarray(predicted - velocity_imu)
+
+    return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
+
+
+def biased_orientation_factor(
+    key_imu: int, key_yaw_bias: int, R_map_imu: gtsam.Rot3, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """An orientation whose source is turned about the map's z axis by a constant, b.
+
+    `r = Log(Z^T Rz(b) R)`: the source says the true orientation turned by b.
+
+    Args:
+        key_imu: of I_i.
+        key_yaw_bias: of b, a vector of 1, radians.
+        R_map_imu: measured, Z.
+        noise: of r, 3 dimensions, imu axes.
+    """
+    Z_inverse = R_map_imu.inverse()
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(key_imu).rotation()
+        bias = float(values.atVector(key_yaw_bias)[0])
+        r = gtsam.Rot3.Logmap(Z_inverse.compose(gtsam.Rot3.Rz(bias)).compose(R))
+        if jacobians is not None:
+            D = np.asarray(gtsam.Rot3.LogmapDerivative(r))
+            J = np.zeros((3, 6))
+            J[:, :3] = D
+            jacobians[0] = J
+            jacobians[1] = D @ R.matrix().T[:, 2:]
+        return np.asarray(r)
+
+    return gtsam.CustomFactor(noise, [key_imu, key_yaw_bias], error)
+
+
+def orientation_factor(
+    key_imu: int, R_map_imu: gtsam.Rot3, noise: NoiseModel
+) -> gtsam.NoiseModelFactor:
+    """An orientation, `r = Log(Z^T R)`; GTSAM's own factor.
+
+    Args:
+        key_imu: of I_i.
+        R_map_imu: measured, Z.
+        noise: of r, 3 dimensions, imu axes.
+    """
+    return gtsam.PoseRotationPrior3D(key_imu, R_map_imu, noise)
+
+
+def marginal_factor(
+    keys: list[int], information: Array, poses: tuple[gtsam.Pose3, ...]
+) -> gtsam.LinearContainerFactor:
+    """A Gaussian on several poses at once as one native factor of a nonlinear graph.
+
+    Args:
+        keys: m, of the poses.
+        information: (6 m, 6 m) joint, right perturbations of `poses`, rotation then translation.
+        poses: m, the mean.
+    """
+    m = len(keys)
+    blocks = information.reshape(m, 6, m, 6).swapaxes(1, 2)
+    zero, graph = np.zeros(6), gtsam.GaussianFactorGraph()
+    nothing = np.zeros((6, 6))
+    # HessianFactor takes three keys at most from Python: a sum over pairs, merged by GTSAM.
+    for i in range(m):
+        graph.add(gtsam.HessianFactor(keys[i], blocks[i, i], zero, 0.0))
+        for j in range(i + 1, m):
+            graph.add(
+                gtsam.HessianFactor(
+                    keys[i], keys[j], nothing, blocks[i, j], zero, nothing, zero, 0.0
+                )
+            )
+    point = gtsam.Values()
+    for key, pose in zip(keys, poses, strict=True):
+        point.insert(key, pose)
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(graph), point)

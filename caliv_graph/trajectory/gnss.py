@@ -1,0 +1,77 @@
+"""GNSS fixes as positions in the map: ENU axes, origin at the first fix."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pymap3d
+
+from caliv_graph.config import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, GnssFixes, IntArray
+from caliv_graph.trajectory.noise import gnss_covariances
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Positions of the GNSS antenna.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        position_map: (n, 3) metres, ENU about the first fix.
+        cov_map: (n, 3, 3) m^2.
+        origin_deg_m: latitude, longitude (degrees) and altitude (m) of the map's origin.
+        source: where the covariances are from.
+    """
+
+    stamps_ns: IntArray
+    position_map: Array
+    cov_map: Array
+    origin_deg_m: tuple[float, float, float]
+    source: str
+
+
+def positions_in_map(
+    gnss: GnssFixes, config: Config, name: str
+) -> tuple[Positions, tuple[str, ...]]:
+    """Converts fixes; those that are not finite or not on Earth are left out and told.
+
+    Raises:
+        TrajectoryError: no fix is usable.
+    """
+    usable = np.isfinite(gnss.latitude_deg) & np.isfinite(gnss.longitude_deg)
+    usable &= np.isfinite(gnss.altitude_m)
+    usable &= (np.abs(gnss.latitude_deg) <= 90.0) & (np.abs(gnss.longitude_deg) <= 360.0)
+    lost = int((~usable).sum())
+    warnings = (f"{name}: {lost} of {len(usable)} GNSS fixes are not usable",) if lost else ()
+    if not usable.any():
+        raise TrajectoryError(
+            f"{name}: none of {len(usable)} GNSS fixes has finite latitude, longitude and altitude"
+        )
+    cov, source = gnss_covariances(gnss, config)
+    latitude, longitude = gnss.latitude_deg[usable], gnss.longitude_deg[usable]
+    altitude = gnss.altitude_m[usable]
+    origin = (float(latitude[0]), float(longitude[0]), float(altitude[0]))
+    enu = pymap3d.geodetic2enu(latitude, longitude, altitude, *origin)
+    return (
+        Positions(
+            np.asarray(gnss.stamps_ns, dtype=np.int64)[usable],
+            np.stack([np.asarray(axis, dtype=np.float64) for axis in enu], axis=1),
+            cov[usable],
+            origin,
+            source,
+        ),
+        warnings,
+    )
+
+
+def normal_gravity(latitude_deg: float, altitude_m: float) -> float:
+    """Gravity on the WGS84 ellipsoid (Somigliana), less its decrease with height, in m/s^2.
+
+    True gravity differs by up to 0.001 m/s^2: less than any accelerometer's bias here.
+    """
+    s = math.sin(math.radians(latitude_deg)) ** 2
+    surface = 9.7803253359 * (1.0 + 0.00193185265241 * s) / math.sqrt(1.0 - 0.00669437999013 * s)
+    return surface - 3.086e-6 * altitude_m

@@ -1,0 +1,320 @@
+"""The IMU between any two instants: cleaned samples, dead reckoning, preintegrated factors.
+
+A sample is the value at its stamp; between two samples both readings go over linearly into each
+other. Steps are integrated with the reading at their middle, and the specific force turned by half
+of the step's rotation: a zero-order hold would lag by half a sample, which in a turn is a heading
+error that no bias explains.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, ImuSamples, IntArray
+from caliv_graph.trajectory.noise import ImuNoise
+
+GAP_S = 0.1
+"""A longer time without a sample is a gap."""
+
+LONGEST_BRIDGE_S = 2.0
+"""A longer gap splits the recording: what the vehicle did in it is anyone's guess."""
+
+LEAST_FORCE_M_S2, MOST_FORCE_M_S2 = 5.0, 15.0
+"""Of the median specific force."""
+
+# What the readings may have done in a gap, off the straight line between its ends, 1 sigma: the
+# steering and braking of a calibration drive.
+BRIDGE_GYRO_RAD_S = 0.3
+BRIDGE_FORCE_M_S2 = 1.5
+
+BRIDGE_STEP_NS = 20_000_000
+"""Steps into which a gap is cut."""
+
+INTEGRATION_DENSITY_M = 1e-5
+"""m/sqrt(s), of the position alone. GTSAM's covariance of a single step is singular without."""
+
+
+def exp_so3(rotation_vectors: Array) -> Array:
+    """(n, 3, 3) rotations of (n, 3) rotation vectors."""
+    return np.asarray(Rotation.from_rotvec(rotation_vectors).as_matrix()).reshape(-1, 3, 3)
+
+
+def log_so3(R: Array) -> Array:
+    """(n, 3) rotation vectors of (n, 3, 3) rotations."""
+    return np.asarray(Rotation.from_matrix(R).as_rotvec()).reshape(-1, 3)
+
+
+def interpolate(at_ns: IntArray, stamps_ns: IntArray, values: Array) -> Array:
+    """Columns of (n, d) values, linear in time, at (m,) stamps; the ends are held."""
+    origin = stamps_ns[0]
+    x, xp = (at_ns - origin).astype(np.float64), (stamps_ns - origin).astype(np.float64)
+    return np.stack([np.interp(x, xp, column) for column in values.T], axis=1)
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Finite samples without a gap that could not be bridged.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        gyro: (n, 3) rad/s, imu frame.
+        force: (n, 3) m/s^2, imu frame.
+        gaps_ns: (g, 2) bridged gaps, first and last stamp.
+    """
+
+    stamps_ns: IntArray
+    gyro: Array
+    force: Array
+    gaps_ns: IntArray
+
+    @property
+    def begin_ns(self) -> int:
+        """First stamp."""
+        return int(self.stamps_ns[0])
+
+    @property
+    def end_ns(self) -> int:
+        """Last stamp."""
+        return int(self.stamps_ns[-1])
+
+
+def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...]]:
+    """Drops unusable samples and picks the longest piece without a long gap.
+
+    Args:
+        imu: as read.
+        name: of the recording, for messages.
+
+    Returns:
+        The samples, and what was left out or bridged, a line each.
+
+    Raises:
+        TrajectoryError: too little is left.
+    """
+    finite = np.asarray(np.isfinite(imu.angular_velocity).all(axis=1))
+    finite_force = np.asarray(np.isfinite(imu.specific_force).all(axis=1))
+    for what, usable in (("angular velocity", finite), ("linear acceleration", finite_force)):
+        if len(usable) and not usable.any():
+            raise TrajectoryError(
+                f"{name}: no IMU message has a finite {what}: the trajectory needs gyroscope and "
+                "accelerometer. Choose another topics.imu"
+            )
+    finite &= finite_force
+    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[finite]
+    warnings = []
+    if not finite.all():
+        warnings.append(
+            f"{name}: {int((~finite).sum())} of {len(finite)} IMU messages are not finite, left out"
+        )
+    if len(stamps) < 2:
+        raise TrajectoryError(
+            f"{name}: {len(stamps)} usable IMU message(s), needs at least 2. See topics.imu"
+        )
+    steps = np.diff(stamps)
+    if (steps <= 0).any():
+        at = int(np.argmax(steps <= 0))
+        raise TrajectoryError(
+            f"{name}: IMU stamps do not increase: {stamps[at]} ns, then {stamps[at + 1]} ns"
+        )
+    gyro, force = imu.angular_velocity[finite], imu.specific_force[finite]
+    felt = float(np.median(np.linalg.norm(force, axis=1)))
+    if not LEAST_FORCE_M_S2 < felt < MOST_FORCE_M_S2:
+        raise TrajectoryError(
+            f"{name}: the IMU's median linear acceleration is {felt:.2f} m/s^2, at rest it should "
+            "be 9.8: gravity is taken out, or the unit is not m/s^2. Choose another topics.imu"
+        )
+    longest = max(GAP_S, 3e-9 * float(np.median(steps)))
+    cuts = np.flatnonzero(steps > 1e9 * max(LONGEST_BRIDGE_S, longest)) + 1
+    bounds = [0, *cuts.tolist(), len(stamps)]
+    pieces = [(int(stamps[b - 1] - stamps[a]), a, b) for a, b in itertools.pairwise(bounds)]
+    duration_ns, a, b = max(pieces)
+    if len(pieces) > 1:
+        warnings.append(
+            f"{name}: {len(cuts)} gap(s) of more than {max(LONGEST_BRIDGE_S, longest):g} s in the "
+            f"IMU, the longest {steps.max() * 1e-9:.1f} s: only the longest piece is used, "
+            f"{duration_ns * 1e-9:.1f} s of {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
+        )
+    stamps, gyro, force = stamps[a:b], gyro[a:b], force[a:b]
+    if b - a < 2:
+        raise TrajectoryError(f"{name}: the IMU's messages are all more than 2 s apart")
+    at_gap = np.flatnonzero(np.diff(stamps) > 1e9 * longest)
+    gaps = np.stack([stamps[at_gap], stamps[at_gap + 1]], axis=1).reshape(-1, 2)
+    if len(gaps):
+        lost_s = float((gaps[:, 1] - gaps[:, 0]).sum()) * 1e-9
+        warnings.append(
+            f"{name}: {len(gaps)} gap(s) in the IMU, {lost_s:.2f} s together: bridged, poses "
+            "there are less certain"
+        )
+    return Inertial(stamps, gyro, force, gaps), tuple(warnings)
+
+
+def _prefix_products(R: Array) -> Array:
+    """(n + 1, 3, 3): identity, R_0, R_0 R_1, ...; by doubling, so that numpy does the loop."""
+    out = np.concatenate([np.eye(3)[None], R])
+    shift = 1
+    while shift < len(out):
+        out[shift:] = out[:-shift] @ out[shift:]
+        shift *= 2
+    return np.asarray(out)
+
+
+@dataclass(frozen=True)
+class DeadReckoning:
+    """Motion by the IMU alone, in the frame that the IMU had at its first sample, without gravity.
+
+    Relative motion between any two instants, forward or backward in time, is a difference of what
+    is kept here. With bias b removed: `R' = R skew(w)`, `v' = R f`, `p' = v`.
+
+    Attributes:
+        stamps_ns: (n,) of the samples.
+        gyro: (n, 3) rad/s, bias removed.
+        force: (n, 3) m/s^2, bias removed.
+    """
+
+    stamps_ns: IntArray
+    gyro: Array
+    force: Array
+
+    def _step(self, k: IntArray, tau: Array) -> tuple[Array, Array, Array]:
+        """Rotation, velocity and displacement from sample k, in its frame, (m,) seconds on."""
+        dt = (self.stamps_ns[k + 1] - self.stamps_ns[k])[:, None] * 1e-9
+        tau = tau[:, None]
+        w0, f0 = self.gyro[k], self.force[k]
+        w_rate, f_rate = (self.gyro[k + 1] - w0) / dt, (self.force[k + 1] - f0) / dt
+        turn = w0 * tau + 0.5 * w_rate * tau**2
+        # f(s) = f0 + f_rate s, turned by w s: to second order in the step.
+        bend = np.cross(w0 + 0.5 * w_rate * tau, f0 + 0.5 * f_rate * tau)
+        velocity = f0 * tau + (0.5 * f_rate + 0.5 * bend) * tau**2
+        displacement = 0.5 * f0 * tau**2 + (f_rate + bend) * tau**3 / 6.0
+        return exp_so3(turn), velocity, displacement
+
+    @cached_property
+    def _cumulative(self) -> tuple[Array, Array, Array]:
+        k = np.arange(len(self.stamps_ns) - 1)
+        dt: Array = np.diff(self.stamps_ns) * np.float64(1e-9)
+        dR, dv, dp = self._step(k, dt)
+        R = _prefix_products(dR)
+        v = np.zeros((len(dt) + 1, 3))
+        np.cumsum(np.einsum("nij,nj->ni", R[:-1], dv), axis=0, out=v[1:])
+        p = np.zeros_like(v)
+        np.cumsum(v[:-1] * dt[:, None] + np.einsum("nij,nj->ni", R[:-1], dp), axis=0, out=p[1:])
+        return R, v, p
+
+    def _at(self, stamps_ns: IntArray) -> tuple[Array, Array, Array]:
+        R, v, p = self._cumulative
+        k = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, "right") - 1, 0, len(R) - 2)
+        # Beyond the ends the first and last readings are extrapolated by their own line.
+        tau: Array = np.asarray(stamps_ns - self.stamps_ns[k], dtype=np.float64) * 1e-9
+        dR, dv, dp = self._step(k, tau)
+        v_at = v[k] + np.einsum("nij,nj->ni", R[k], dv)
+        p_at = p[k] + v[k] * tau[:, None] + np.einsum("nij,nj->ni", R[k], dp)
+        return R[k] @ dR, v_at, p_at
+
+    def between(self, from_ns: IntArray, to_ns: IntArray) -> tuple[Array, Array, Array]:
+        """Relative motion from (m,) to (m,) instants.
+
+        Returns:
+            Rotation (m, 3, 3), velocity change (m, 3) and displacement (m, 3), in the IMU's frame
+            at `from_ns`: `R_to = R dR`, `v_to = v + g dt + R dv`,
+            `p_to = p + v dt + g dt^2 / 2 + R dp`.
+        """
+        R0, v0, p0 = self._at(from_ns)
+        R1, v1, p1 = self._at(to_ns)
+        dt = ((to_ns - from_ns) * 1e-9)[:, None]
+        back = np.swapaxes(R0, 1, 2)
+        return (
+            back @ R1,
+            np.einsum("nij,nj->ni", back, v1 - v0),
+            np.einsum("nij,nj->ni", back, p1 - p0 - v0 * dt),
+        )
+
+    def rates(self, stamps_ns: IntArray, half_window_ns: int = 0) -> Array:
+        """(m, 3) rad/s in the IMU's frame, averaged over a window about each instant."""
+        if half_window_ns == 0:
+            return interpolate(stamps_ns, self.stamps_ns, self.gyro)
+        # The window shrinks on both sides alike at the ends: it stays about the instant.
+        room = np.minimum(stamps_ns - self.stamps_ns[0], self.stamps_ns[-1] - stamps_ns)
+        half = np.minimum(np.maximum(room, 1_000_000), half_window_ns)
+        R, _, _ = self.between(stamps_ns - half, stamps_ns + half)
+        return np.asarray(log_so3(R) / (2e-9 * half)[:, None])
+
+
+def preintegrate(
+    inertial: Inertial,
+    nodes_ns: IntArray,
+    biases: Sequence[gtsam.imuBias.ConstantBias],
+    noise: ImuNoise,
+    gravity_m_s2: float,
+) -> list[gtsam.PreintegratedCombinedMeasurements]:
+    """Preintegrated measurements from each node to the next, starting and ending exactly there.
+
+    Args:
+        inertial: samples.
+        nodes_ns: (n,) strictly increasing, within the samples; ends of bridged gaps among them.
+        biases: n, linearisation point of each interval at its first node.
+        noise: of the IMU.
+        gravity_m_s2: along -z of the map.
+
+    Returns:
+        n - 1 measurements of the imu frame itself.
+    """
+    plain = _parameters(noise, gravity_m_s2, 0.0)
+    fill = [
+        np.arange(a + BRIDGE_STEP_NS, b, BRIDGE_STEP_NS, dtype=np.int64)
+        for a, b in inertial.gaps_ns.tolist()
+    ]
+    inner = inertial.stamps_ns[
+        (inertial.stamps_ns > nodes_ns[0]) & (inertial.stamps_ns < nodes_ns[-1])
+    ]
+    edges = np.unique(np.concatenate([inner, nodes_ns, *fill]))
+    edges = edges[(edges >= nodes_ns[0]) & (edges <= nodes_ns[-1])]
+    gyro = interpolate(edges, inertial.stamps_ns, inertial.gyro)
+    force = interpolate(edges, inertial.stamps_ns, inertial.force)
+    dt = np.diff(edges) * 1e-9
+    middle_gyro = 0.5 * (gyro[1:] + gyro[:-1])
+    middle_force = 0.5 * (force[1:] + force[:-1])
+    half_turn = exp_so3(0.5 * middle_gyro * dt[:, None])
+    middle_force = np.einsum("nij,nj->ni", half_turn, middle_force)
+    first = np.searchsorted(edges, nodes_ns)
+    bridge_of = _bridged(inertial, nodes_ns)
+    out = []
+    for i in range(len(nodes_ns) - 1):
+        gap_s = bridge_of[i]
+        parameters = plain if gap_s == 0.0 else _parameters(noise, gravity_m_s2, gap_s)
+        measured = gtsam.PreintegratedCombinedMeasurements(parameters, biases[i])
+        for k in range(first[i], first[i + 1]):
+            measured.integrateMeasurement(middle_force[k], middle_gyro[k], float(dt[k]))
+        out.append(measured)
+    return out
+
+
+def _bridged(inertial: Inertial, nodes_ns: IntArray) -> Array:
+    """(n - 1,) length in seconds of the gap that an interval lies in, 0: none."""
+    out = np.zeros(len(nodes_ns) - 1)
+    for a, b in inertial.gaps_ns.tolist():
+        inside = (nodes_ns[:-1] >= a) & (nodes_ns[1:] <= b)
+        out[inside] = (b - a) * 1e-9
+    return out
+
+
+def _parameters(
+    noise: ImuNoise, gravity_m_s2: float, gap_s: float
+) -> gtsam.PreintegrationCombinedParams:
+    """GTSAM wants squared densities. In a gap, an error that lasts as long as the gap does."""
+    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity_m_s2)
+    gyro = noise.gyro_density + BRIDGE_GYRO_RAD_S**2 * gap_s * np.eye(3)
+    force = noise.force_density + BRIDGE_FORCE_M_S2**2 * gap_s * np.eye(3)
+    parameters.setGyroscopeCovariance(gyro)
+    parameters.setAccelerometerCovariance(force)
+    parameters.setIntegrationCovariance(INTEGRATION_DENSITY_M**2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(noise.gyro_walk**2 * np.eye(3))
+    parameters.setBiasAccCovariance(noise.force_walk**2 * np.eye(3))
+    return parameters

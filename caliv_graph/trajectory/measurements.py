@@ -1,0 +1,226 @@
+"""Measurements carried to the nearest node of the trajectory by the IMU.
+
+Orientations at 100 Hz are a measurement each: those around a node are turned to it by the
+gyroscope and averaged with their weights, which over half a node spacing loses nothing that could
+be measured. Velocities the same. GNSS fixes stay single, since each may be an outlier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.products import Array, ImuSamples, IntArray, TwistSamples
+from caliv_graph.trajectory.gnss import Positions
+from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.noise import BoolArray, ImuNoise
+
+
+@dataclass(frozen=True)
+class NodeOrientations:
+    """One orientation per node that has any.
+
+    Attributes:
+        nodes: (m,) indices.
+        R_map_imu: (m, 3, 3).
+        cov: (m, 3, 3) rad^2, right perturbation (imu axes).
+    """
+
+    nodes: IntArray
+    R_map_imu: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
+class NodeVelocities:
+    """One velocity of the IMU's origin per node that has any; see `velocity_factor`.
+
+    Attributes:
+        nodes: (m,) indices.
+        velocity_imu: (m, 3) m/s in the IMU's axes at the node.
+        delay_s: (m,) mean time of the measurements after the node.
+        cov: (m, 3, 3) (m/s)^2, the same axes.
+    """
+
+    nodes: IntArray
+    velocity_imu: Array
+    delay_s: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
+class NodePositions:
+    """Fixes and what the IMU says lies between each and its node; see `position_factor`.
+
+    Attributes:
+        nodes: (m,) indices, one per fix.
+        fixes: (m,) index of each into the positions it was made from.
+        position_map: (m, 3) metres, of the antenna.
+        offset_imu: (m, 3) metres in the IMU's axes at the node.
+        delay_s: (m,) of the fix after the node.
+        cov_map: (m, 3, 3) m^2.
+    """
+
+    nodes: IntArray
+    fixes: IntArray
+    position_map: Array
+    offset_imu: Array
+    delay_s: Array
+    cov_map: Array
+
+
+def nearest_node(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
+    """(m,) index of the node nearest to each stamp."""
+    middles = nodes_ns[:-1] + np.diff(nodes_ns) // 2
+    return np.asarray(np.searchsorted(middles, stamps_ns, "right"), dtype=np.int64)
+
+
+def _turned(R: Array, cov: Array) -> Array:
+    """`R cov R^T` of (m, 3, 3) each."""
+    return np.asarray(R @ cov @ np.swapaxes(R, 1, 2))
+
+
+def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray, Array, Array]:
+    """Means of (m, 3) values by group, weighted by their (m, 3, 3) covariances.
+
+    Returns:
+        Groups (g,), means (g, 3) and covariances of the means (g, 3, 3).
+    """
+    groups, at = np.unique(group, return_inverse=True)
+    weight = np.linalg.inv(cov)
+    information = np.zeros((len(groups), 3, 3))
+    np.add.at(information, at, weight)
+    moment = np.zeros((len(groups), 3))
+    np.add.at(moment, at, np.einsum("nij,nj->ni", weight, values))
+    mean_cov = np.linalg.inv(information)
+    return np.asarray(groups), np.einsum("nij,nj->ni", mean_cov, moment), np.asarray(mean_cov)
+
+
+def orientations_at_nodes(
+    imu: ImuSamples, cov: Array, nodes_ns: IntArray, dead: DeadReckoning, noise: ImuNoise
+) -> NodeOrientations | None:
+    """Fuses the IMU's orientations around each node; None if there are none.
+
+    Args:
+        imu: as read; rows of NaN have no orientation.
+        cov: (n, 3, 3) rad^2 of each.
+        nodes_ns: stamps of the nodes.
+        dead: the IMU without bias.
+        noise: of the IMU.
+    """
+    if imu.orientation_xyzw is None:
+        return None
+    usable = usable_orientations(imu)
+    usable &= (imu.stamps_ns >= nodes_ns[0]) & (imu.stamps_ns <= nodes_ns[-1])
+    if not usable.any():
+        return None
+    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[usable]
+    R = rotations_of(imu.orientation_xyzw[usable])
+    node = nearest_node(nodes_ns, stamps)
+    at_node = nodes_ns[node]
+    dR, _, _ = dead.between(stamps, at_node)
+    R_node = R @ dR
+    late_s = np.abs(stamps - at_node) * 1e-9
+    cov_node = _turned(np.swapaxes(dR, 1, 2), cov[usable])
+    cov_node = cov_node + late_s[:, None, None] * noise.gyro_density
+    # Averaged about the sample nearest to the node: the differences are small.
+    order = np.lexsort((late_s, node))
+    _, first = np.unique(node[order], return_index=True)
+    reference = np.zeros(len(nodes_ns), dtype=np.int64)
+    reference[node[order][first]] = order[first]
+    R_reference = R_node[reference[node]]
+    differences = log_so3(np.swapaxes(R_reference, 1, 2) @ R_node)
+    nodes, mean, mean_cov = _weighted_mean(node, differences, cov_node)
+    return NodeOrientations(nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov)
+
+
+def usable_orientations(imu: ImuSamples) -> BoolArray:
+    """(n,) bool: which messages carry an orientation."""
+    if imu.orientation_xyzw is None:
+        return np.zeros(len(imu.stamps_ns), dtype=bool)
+    norms = np.linalg.norm(imu.orientation_xyzw, axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(norms - 1.0) < 0.1)
+
+
+def rotations_of(xyzw: Array) -> Array:
+    """(n, 3, 3) of (n, 4) quaternions x y z w."""
+    x, y, z, w = (xyzw / np.linalg.norm(xyzw, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def velocities_at_nodes(
+    twist: TwistSamples,
+    cov: Array,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    noise: ImuNoise,
+    T_vehicle_imu: gtsam.Pose3,
+) -> NodeVelocities | None:
+    """Fuses the velocities around each node; None if there are none.
+
+    The vehicle's origin moves differently from the IMU's while the vehicle turns: its rate is
+    taken from the gyroscope, noise included.
+    """
+    usable = np.isfinite(twist.velocity).all(axis=1)
+    usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
+    if not usable.any():
+        return None
+    stamps = np.asarray(twist.stamps_ns, dtype=np.int64)[usable]
+    T_imu_vehicle = T_vehicle_imu.inverse()
+    R_imu_vehicle = T_imu_vehicle.rotation().matrix()
+    arm = T_imu_vehicle.translation()
+    rates = interpolate(stamps, dead.stamps_ns, dead.gyro)
+    at_imu = twist.velocity[usable] @ R_imu_vehicle.T - np.cross(rates, arm)
+    sample_s = float(np.median(np.diff(dead.stamps_ns))) * 1e-9
+    arm_cross = np.cross(np.eye(3), arm)
+    arm_cov = arm_cross.T @ (noise.gyro_density / sample_s) @ arm_cross
+    cov_imu = R_imu_vehicle @ cov[usable] @ R_imu_vehicle.T + arm_cov
+    node = nearest_node(nodes_ns, stamps)
+    at_node = nodes_ns[node]
+    dR, dv, _ = dead.between(at_node, stamps)
+    delay_s = (stamps - at_node) * 1e-9
+    carried = np.einsum("nij,nj->ni", dR, at_imu) - dv
+    cov_node = _turned(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
+    nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
+    weight = 1.0 / np.trace(cov_node, axis1=1, axis2=2)
+    total = np.bincount(node, weight, len(nodes_ns))[nodes]
+    delay = np.bincount(node, weight * delay_s, len(nodes_ns))[nodes] / total
+    return NodeVelocities(nodes, mean, delay, mean_cov)
+
+
+def positions_at_nodes(
+    positions: Positions, nodes_ns: IntArray, dead: DeadReckoning, arm_imu: Array
+) -> NodePositions | None:
+    """Fixes within the trajectory and their nodes; None if there are none.
+
+    Args:
+        positions: of the antenna.
+        nodes_ns: stamps of the nodes.
+        dead: the IMU without bias.
+        arm_imu: (3,) antenna in the imu frame.
+    """
+    stamps = positions.stamps_ns
+    fixes = np.flatnonzero((stamps >= nodes_ns[0]) & (stamps <= nodes_ns[-1]))
+    if not len(fixes):
+        return None
+    node = nearest_node(nodes_ns, stamps[fixes])
+    at_node = nodes_ns[node]
+    dR, _, dp = dead.between(at_node, stamps[fixes])
+    return NodePositions(
+        node,
+        fixes,
+        positions.position_map[fixes],
+        dp + dR @ arm_imu,
+        np.asarray((stamps[fixes] - at_node) * 1e-9),
+        positions.cov_map[fixes],
+    )

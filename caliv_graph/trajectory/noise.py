@@ -1,0 +1,163 @@
+"""How much each sensor is trusted: the config's figures, else the messages', else the paper's.
+
+A covariance of a message counts as stated if it is finite and its diagonal is positive: zeros and
+NaN are how drivers say that they do not know.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.config import Config
+from caliv_graph.products import Array, GnssFixes, ImuSamples, TwistSamples
+
+BoolArray = npt.NDArray[np.bool_]
+
+# Table I of the paper, 1 sigma per sample.
+PAPER_FORCE_M_S2 = 0.05
+PAPER_GYRO_RAD_S = 0.005
+PAPER_GNSS_HORIZONTAL_M = 0.0167
+"""1.5e-7 degrees of latitude; along the parallel they would be shorter by its cosine."""
+PAPER_GNSS_VERTICAL_M = 0.02
+PAPER_ORIENTATION_RAD = 0.005
+PAPER_VELOCITY_M_S = 0.1
+
+# What the paper does not state: ordinary automotive MEMS.
+DEFAULT_FORCE_WALK_M_S3 = 5e-4
+DEFAULT_GYRO_WALK_RAD_S2 = 1e-5
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Noise of the IMU, imu frame.
+
+    Attributes:
+        gyro_density: (3, 3) (rad/s)^2/Hz, white noise of the gyroscope.
+        force_density: (3, 3) (m/s^2)^2/Hz, white noise of the accelerometer.
+        gyro_walk: rad/s^2/sqrt(Hz), random walk of the gyroscope's bias.
+        force_walk: m/s^3/sqrt(Hz), random walk of the accelerometer's bias.
+        gyro_bias: rad/s, 1 sigma of the gyroscope's bias at the start.
+        force_bias: m/s^2, 1 sigma of the accelerometer's bias at the start.
+        sources: quantity -> where its figure is from.
+    """
+
+    gyro_density: Array
+    force_density: Array
+    gyro_walk: float
+    force_walk: float
+    gyro_bias: float
+    force_bias: float
+    sources: dict[str, str]
+
+
+def stated(cov: Array) -> BoolArray:
+    """Which covariances of (n, d, d) state something; (n,) bool."""
+    finite = np.all(np.isfinite(cov), axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        positive = np.all(np.diagonal(cov, axis1=1, axis2=2) > 0.0, axis=1)
+    out: BoolArray = np.asarray(finite & positive)
+    if out.any():
+        out[out] = np.linalg.eigvalsh(cov[out])[:, 0] > 0.0
+    return out
+
+
+def _per_message(
+    count: int, configured: Array | None, messages: Array | None, table: Array
+) -> tuple[Array, str]:
+    """(n, d, d) covariances and where they are from; the first of the three that says something."""
+    d = len(table)
+    if configured is not None:
+        return np.broadcast_to(configured, (count, d, d)).copy(), "config"
+    out = np.broadcast_to(table, (count, d, d)).copy()
+    if messages is None:
+        return out, "the paper's table"
+    said = stated(messages)
+    out[said] = messages[said]
+    if said.all():
+        return out, "messages"
+    if not said.any():
+        return out, "the paper's table"
+    # A message that states nothing is no better than its fellows that do.
+    out[~said] = np.median(messages[said], axis=0)
+    return out, "messages, their median where one states none"
+
+
+def imu_noise(imu: ImuSamples, config: Config) -> ImuNoise:
+    """Densities and bias figures of an IMU; per-sample figures are over sqrt(rate)."""
+    noise = config.noise
+    dt = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
+    sources = {}
+
+    def density(name: str, configured: float | None, message: Array | None, table: float) -> Array:
+        if configured is not None:
+            sources[name] = "config"
+            return configured**2 * np.eye(3)
+        if message is not None and stated(message[None])[0]:
+            sources[name] = "messages"
+            return np.asarray(message * dt)
+        sources[name] = "the paper's table"
+        return table**2 * dt * np.eye(3)
+
+    gyro = density(
+        "gyroscope",
+        noise.gyroscope_density_rad_s_sqrthz,
+        imu.angular_velocity_cov,
+        PAPER_GYRO_RAD_S,
+    )
+    force = density(
+        "accelerometer",
+        noise.accelerometer_density_m_s2_sqrthz,
+        imu.specific_force_cov,
+        PAPER_FORCE_M_S2,
+    )
+    return ImuNoise(
+        gyro_density=gyro,
+        force_density=force,
+        gyro_walk=noise.gyroscope_bias_walk_rad_s2_sqrthz or DEFAULT_GYRO_WALK_RAD_S2,
+        force_walk=noise.accelerometer_bias_walk_m_s3_sqrthz or DEFAULT_FORCE_WALK_M_S3,
+        gyro_bias=noise.gyroscope_bias_rad_s,
+        force_bias=noise.accelerometer_bias_m_s2,
+        sources=sources,
+    )
+
+
+def orientation_covariances(imu: ImuSamples, config: Config) -> tuple[Array, str]:
+    """(n, 3, 3) rad^2 of the IMU's orientations, about the imu's axes, and the figures' source."""
+    sigma_deg = config.noise.orientation_deg
+    configured = None if sigma_deg is None else math.radians(sigma_deg) ** 2 * np.eye(3)
+    return _per_message(
+        len(imu.stamps_ns), configured, imu.orientation_cov, PAPER_ORIENTATION_RAD**2 * np.eye(3)
+    )
+
+
+def gnss_covariances(gnss: GnssFixes, config: Config) -> tuple[Array, str]:
+    """(n, 3, 3) m^2 ENU of the fixes, and the figures' source."""
+    table = np.array([PAPER_GNSS_HORIZONTAL_M] * 2 + [PAPER_GNSS_VERTICAL_M])
+    horizontal, vertical = config.noise.gnss_horizontal_m, config.noise.gnss_vertical_m
+    cov, source = _per_message(len(gnss.stamps_ns), None, gnss.cov_enu, np.diag(table**2))
+    if horizontal is not None:
+        cov[:, :2, :] = 0.0
+        cov[:, :, :2] = 0.0
+        cov[:, 0, 0] = cov[:, 1, 1] = horizontal**2
+    if vertical is not None:
+        cov[:, 2, :] = 0.0
+        cov[:, :, 2] = 0.0
+        cov[:, 2, 2] = vertical**2
+    if horizontal is not None and vertical is not None:
+        source = "config"
+    elif horizontal is not None or vertical is not None:
+        source = f"config, and {source}"
+    return cov, source
+
+
+def velocity_covariances(twist: TwistSamples, config: Config) -> tuple[Array, str]:
+    """(n, 3, 3) (m/s)^2 of the velocities, vehicle axes, and the figures' source."""
+    sigma = config.noise.velocity_m_s
+    configured = None if sigma is None else sigma**2 * np.eye(3)
+    return _per_message(
+        len(twist.stamps_ns), configured, twist.velocity_cov, PAPER_VELOCITY_M_S**2 * np.eye(3)
+    )

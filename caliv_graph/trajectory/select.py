@@ -1,0 +1,155 @@
+"""The trajectory of each drive: smoothed from raw sensors, or the poses that came with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from caliv_graph.config import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
+from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.smoothing import smooth_trajectory
+
+
+class VehicleTrajectory(Protocol):
+    """What a trajectory offers, wherever it is from."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses at the wanted stamps (smoothed), or at the stamps of the given poses."""
+
+    @property
+    def lost_ns(self) -> tuple[int, ...]:
+        """Wanted stamps outside the span."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know, a line each."""
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp at which there is a pose."""
+
+    def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
+        """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) at any times within the span."""
+
+
+@dataclass(frozen=True)
+class GivenTrajectory:
+    """Given poses; between two of them the vehicle turns and moves evenly.
+
+    Attributes:
+        trajectory: the poses, at their own stamps.
+        lost_ns: wanted stamps outside their span.
+        warnings: a line each.
+    """
+
+    trajectory: Trajectory
+    lost_ns: tuple[int, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp at which there is a pose."""
+        return int(self.trajectory.stamps_ns[0]), int(self.trajectory.stamps_ns[-1])
+
+    @cached_property
+    def _knots(self) -> tuple[Array, Slerp, Array]:
+        begin, _ = self.span_ns
+        seconds: Array = np.asarray(self.trajectory.stamps_ns - begin, np.float64) * 1e-9
+        R, t = stack(self.trajectory.T_map_vehicle)
+        return seconds, Slerp(seconds, Rotation.from_matrix(R)), t
+
+    def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
+        """Vehicle poses at any times within the span.
+
+        Args:
+            stamps_ns: (m,) in any order.
+
+        Returns:
+            R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) in metres.
+
+        Raises:
+            TrajectoryError: a stamp is outside the span.
+        """
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        begin, end = self.span_ns
+        outside = (stamps < begin) | (stamps > end)
+        if outside.any():
+            at = int(stamps[np.argmax(outside)])
+            raise TrajectoryError(
+                f"trajectory: stamp {at} ns is outside the given poses, {begin} to {end} ns"
+            )
+        seconds, turns, t = self._knots
+        s = (stamps - begin) * 1e-9
+        position = np.stack([np.interp(s, seconds, axis) for axis in t.T], axis=1)
+        return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
+
+
+def wanted_stamps(recording: Recording) -> IntArray:
+    """(m,) stamps of the clouds of all LiDARs, ascending."""
+    stamps = [np.asarray(recording.scan_stamps_ns(name), np.int64) for name in recording.lidars]
+    return np.unique(np.concatenate([*stamps, np.zeros(0, dtype=np.int64)]))
+
+
+def smooth_trajectories(
+    recordings: Sequence[Recording],
+    config: Config,
+    wanted: Sequence[Sequence[int] | IntArray] | None = None,
+    motions: Mapping[int, MotionData] | None = None,
+) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
+    """The trajectory of each drive.
+
+    Given poses are taken if `topics.pose` asks for them or nothing else is there; otherwise raw
+    sensors are smoothed.
+
+    Args:
+        recordings: opened drives.
+        config: topics, mountings, noise.
+        wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
+        motions: what the recordings hold, by their index, if it has been read already.
+
+    Raises:
+        TrajectoryError: the motion of a drive cannot be had from what was recorded.
+        RecordingError: it could not be read.
+    """
+    out: list[SmoothedTrajectory | GivenTrajectory] = []
+    for index, recording in enumerate(recordings):
+        motion = motions[index] if motions is not None else recording.motion()
+        stamps = wanted_stamps(recording) if wanted is None else np.unique(wanted[index])
+        if takes_given_poses(motion, config):
+            out.append(_given(motion, stamps))
+        else:
+            out.append(smooth_trajectory(motion, config, stamps))
+    return tuple(out)
+
+
+def takes_given_poses(motion: MotionData, config: Config) -> bool:
+    """Whether a drive's given poses stand for its trajectory."""
+    return config.topics.pose is not None or (motion.poses is not None and motion.imu is None)
+
+
+def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
+    trajectory = given_trajectory(motion)
+    given = GivenTrajectory(trajectory)
+    begin, end = given.span_ns
+    lost = stamps[(stamps < begin) | (stamps > end)]
+    if not len(lost):
+        return given
+    if len(lost) == len(stamps):
+        raise TrajectoryError(
+            f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
+            f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s. Do their clocks agree?"
+        )
+    line = (
+        f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
+    )
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line,))

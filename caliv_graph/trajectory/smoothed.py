@@ -1,0 +1,232 @@
+"""What a smoothed drive offers: poses at any time, and their joint information."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, IntArray, Trajectory
+from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.factors import marginal_factor
+from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+
+MERGE_NS = 1_000
+"""Stamps nearer to each other share a node: a vehicle moves by less than 0.05 mm."""
+
+
+@dataclass(frozen=True)
+class States:
+    """An estimate of all nodes.
+
+    Attributes:
+        R_map_imu: (n, 3, 3).
+        p_map_imu: (n, 3) metres.
+        velocity_map: (n, 3) m/s of the IMU's origin.
+        force_bias: (n, 3) m/s^2, imu frame.
+        gyro_bias: (n, 3) rad/s, imu frame.
+        yaw_bias_rad: of the orientation source; 0 if not estimated.
+    """
+
+    R_map_imu: Array
+    p_map_imu: Array
+    velocity_map: Array
+    force_bias: Array
+    gyro_bias: Array
+    yaw_bias_rad: float = 0.0
+
+    def first(self, n: int) -> States:
+        """The first n nodes."""
+        return replace(
+            self,
+            R_map_imu=self.R_map_imu[:n],
+            p_map_imu=self.p_map_imu[:n],
+            velocity_map=self.velocity_map[:n],
+            force_bias=self.force_bias[:n],
+            gyro_bias=self.gyro_bias[:n],
+        )
+
+
+def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> DeadReckoning:
+    """Dead reckoning with the biases found, linear between nodes."""
+    at = inertial.stamps_ns
+    return DeadReckoning(
+        at,
+        inertial.gyro - interpolate(at, nodes_ns, states.gyro_bias),
+        inertial.force - interpolate(at, nodes_ns, states.force_bias),
+    )
+
+
+@dataclass(frozen=True)
+class SmoothedTrajectory:
+    """The vehicle's motion over one drive, as a Gaussian.
+
+    Attributes:
+        trajectory: poses, covariances, velocities at the wanted stamps within the span.
+        lost_ns: wanted stamps outside the span: the IMU says nothing about them.
+        warnings: what was left out or looks wrong, a line each.
+        noise_sources: sensor -> where its noise figures are from.
+        nodes_ns: (n,) stamps of the nodes.
+        states: estimates at the nodes.
+        T_vehicle_imu: mounting that was used.
+        gravity_m_s2: that was used, along -z of the map.
+        yaw_bias: (value, sigma) in radians of the orientation source, if estimated.
+        gnss_rejected: (k,) stamps of fixes that were dropped as outliers.
+        origin_deg_m: latitude, longitude and altitude of the map's origin, None without GNSS.
+        graph: the factors, over T_map_imu (i), velocity (v), bias (b), yaw bias (y).
+        values: the estimate that belongs to it.
+        chain: its information at the estimate.
+        inertial: the IMU samples used.
+    """
+
+    trajectory: Trajectory
+    lost_ns: tuple[int, ...]
+    warnings: tuple[str, ...]
+    noise_sources: Mapping[str, str]
+    nodes_ns: IntArray
+    states: States
+    T_vehicle_imu: gtsam.Pose3
+    gravity_m_s2: float
+    yaw_bias: tuple[float, float] | None
+    gnss_rejected: IntArray
+    origin_deg_m: tuple[float, float, float] | None
+    graph: gtsam.NonlinearFactorGraph = field(repr=False)
+    values: gtsam.Values = field(repr=False)
+    chain: Chain = field(repr=False)
+    inertial: Inertial = field(repr=False)
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp at which there is a pose."""
+        return int(self.nodes_ns[0]), int(self.nodes_ns[-1])
+
+    @cached_property
+    def _dead(self) -> DeadReckoning:
+        return without_bias(self.inertial, self.nodes_ns, self.states)
+
+    def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
+        """Vehicle poses at any times within the span: the estimate, carried on by the IMU.
+
+        Args:
+            stamps_ns: (m,) in any order.
+
+        Returns:
+            R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) in metres.
+
+        Raises:
+            TrajectoryError: a stamp is outside the span.
+        """
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        R, p, _ = self._imu_states(stamps)
+        R_iv, t_iv = stack([self.T_vehicle_imu.inverse()])
+        return R @ R_iv[0], p + R @ t_iv[0]
+
+    def _imu_states(self, stamps: IntArray) -> tuple[Array, Array, Array]:
+        """R_map_imu, its origin and its velocity in the map."""
+        begin, end = self.span_ns
+        outside = (stamps < begin) | (stamps > end)
+        if outside.any():
+            at = int(stamps[np.argmax(outside)])
+            raise TrajectoryError(
+                f"trajectory: stamp {at} ns is outside its span, {begin} to {end} ns"
+            )
+        i = np.clip(np.searchsorted(self.nodes_ns, stamps, "right") - 1, 0, len(self.nodes_ns) - 2)
+        R, p, v = self._carried(i, stamps)
+        miss_R, miss_p, miss_v = self._misses
+        # What the IMU misses the next node by is spread over the interval: linearly in rotation, a
+        # cubic in position, so that position and velocity agree at both nodes.
+        T = (self.nodes_ns[i + 1] - self.nodes_ns[i])[:, None] * 1e-9
+        s = (stamps - self.nodes_ns[i])[:, None] * 1e-9 / T
+        R = R @ exp_so3(s * miss_R[i])
+        p = p + s**2 * (3.0 - 2.0 * s) * miss_p[i] + T * s**2 * (s - 1.0) * miss_v[i]
+        v = v + 6.0 * s * (1.0 - s) / T * miss_p[i] + s * (3.0 * s - 2.0) * miss_v[i]
+        return R, p, v
+
+    def _carried(self, i: IntArray, stamps: IntArray) -> tuple[Array, Array, Array]:
+        dR, dv, dp = self._dead.between(self.nodes_ns[i], stamps)
+        dt = (stamps - self.nodes_ns[i])[:, None] * 1e-9
+        g = np.array([0.0, 0.0, -self.gravity_m_s2])
+        R, v = self.states.R_map_imu[i], self.states.velocity_map[i]
+        moved = self.states.p_map_imu[i] + v * dt + 0.5 * g * dt**2
+        p = moved + np.einsum("nij,nj->ni", R, dp)
+        return R @ dR, p, v + g * dt + np.einsum("nij,nj->ni", R, dv)
+
+    @cached_property
+    def _misses(self) -> tuple[Array, Array, Array]:
+        i = np.arange(len(self.nodes_ns) - 1)
+        R, p, v = self._carried(i, self.nodes_ns[1:])
+        return (
+            log_so3(np.swapaxes(R, 1, 2) @ self.states.R_map_imu[1:]),
+            self.states.p_map_imu[1:] - p,
+            self.states.velocity_map[1:] - v,
+        )
+
+    def velocities_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
+        """Velocity (m, 3) m/s of the vehicle's origin and angular velocity (m, 3) rad/s.
+
+        Both in vehicle axes. The gyroscope is averaged over 0.1 s.
+        """
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        R, _, v = self._imu_states(stamps)
+        rates = self._dead.rates(stamps, 50_000_000)
+        R_vi = self.T_vehicle_imu.rotation().matrix()
+        arm = self.T_vehicle_imu.inverse().translation()
+        at_origin = np.einsum("nji,nj->ni", R, v) + np.cross(rates, arm)
+        return at_origin @ R_vi.T, rates @ R_vi.T
+
+    def _node_indices(self, stamps_ns: Sequence[int] | IntArray) -> IntArray:
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        right = np.clip(np.searchsorted(self.nodes_ns, stamps), 1, len(self.nodes_ns) - 1)
+        left_nearer = stamps - self.nodes_ns[right - 1] < self.nodes_ns[right] - stamps
+        i = right - left_nearer
+        missing = np.abs(self.nodes_ns[i] - stamps) > MERGE_NS
+        if missing.any():
+            raise KeyError(int(stamps[np.argmax(missing)]))
+        if (np.diff(i) <= 0).any():
+            raise ValueError("stamps must increase, with a node for each")
+        return np.asarray(i, dtype=np.int64)
+
+    def joint_information(
+        self, stamps_ns: Sequence[int] | IntArray
+    ) -> tuple[Array, tuple[gtsam.Pose3, ...]]:
+        """The Gaussian that all motion data put on the vehicle's poses at some stamps together.
+
+        Args:
+            stamps_ns: (m,) increasing, of those that the trajectory was asked for.
+
+        Returns:
+            Information (6 m, 6 m), right perturbations, rotation then translation, rad and m,
+            velocities, biases and all other poses eliminated; and its mean, m T_map_vehicle.
+
+        Raises:
+            KeyError: a stamp has no node.
+        """
+        i = self._node_indices(stamps_ns)
+        m = len(i)
+        information = self.chain.pose_information(i).reshape(m, POSE, m, POSE)
+        # d_imu = Ad(T_imu_vehicle) d_vehicle, as T_map_vehicle = T_map_imu T_imu_vehicle.
+        Ad = np.asarray(self.T_vehicle_imu.AdjointMap())
+        inverse = np.linalg.inv(Ad)
+        turned = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
+        information = turned.reshape(POSE * m, POSE * m)
+        return 0.5 * (information + information.T), self.node_poses(i)
+
+    def joint_factor(
+        self, keys: Sequence[int], stamps_ns: Sequence[int] | IntArray
+    ) -> gtsam.LinearContainerFactor:
+        """`joint_information` as one native factor on `keys`, for another graph."""
+        information, poses = self.joint_information(stamps_ns)
+        return marginal_factor(list(keys), information, poses)
+
+    def node_poses(self, i: IntArray) -> tuple[gtsam.Pose3, ...]:
+        """T_map_vehicle of nodes by their indices."""
+        T_iv = self.T_vehicle_imu.inverse()
+        return tuple(
+            gtsam.Pose3(gtsam.Rot3(R), p).compose(T_iv)
+            for R, p in zip(self.states.R_map_imu[i], self.states.p_map_imu[i], strict=True)
+        )

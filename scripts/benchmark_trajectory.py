@@ -1,0 +1,199 @@
+"""How much better the smoothed trajectory is than a UKF on the same sensors, and how honest.
+
+Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_trajectory.py
+
+Simulates IMU, GNSS, velocity and orientation of `paper_arc` and `figure_eight` with seeds 0 to 19
+(`--seeds`), smooths and filters them with the true noise figures and the same prior on biases and
+start, and compares both with the truth at the LiDAR's stamps, the first 2 s left out. RMSE are of
+the length of the error vector. NEES is e^T C^-1 e of each pose with the covariance that the
+smoother states, 6 if that is right; its interval is for as many independent poses as there are
+seeds. Joint NEES is that of all poses of a drive together, per degree of freedom, 1 if right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: the matrices are small
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # for the filter beside this script, run from anywhere
+
+import numpy as np  # noqa: E402
+import pymap3d  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+from scipy.stats import chi2  # noqa: E402
+
+from caliv_graph.config import Config, parse_config  # noqa: E402
+from caliv_graph.geometry.se3 import stack  # noqa: E402
+from caliv_graph.products import Array, IntArray, MotionData  # noqa: E402
+from caliv_graph.simulation import simulate_drive  # noqa: E402
+from caliv_graph.simulation.recording import SimulatedTruth  # noqa: E402
+from caliv_graph.simulation.scenario import Scenario, load_scenario  # noqa: E402
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory  # noqa: E402
+from caliv_graph.trajectory.smoothing import smooth_trajectory  # noqa: E402
+from scripts._ukf import filter_trajectory  # noqa: E402
+
+SCENARIOS = ("paper_arc", "figure_eight")
+LEFT_OUT_S = 2.0
+JOINT_STRIDE = 5
+"""Every so many poses enter the joint NEES: that of all of a long drive takes seconds."""
+
+TARGET_POSITION, TARGET_ROTATION = 1.5, 1.3
+
+
+@dataclass(frozen=True)
+class Run:
+    """Mean squares of one seed.
+
+    Attributes:
+        smoothed: of position error (m^2) and rotation error (rad^2) of the smoother.
+        filtered: the same of the filter.
+        nees: mean over the poses, of the smoother.
+        nees_filtered: the same of the filter: it is no straw man if that is right as well.
+        joint_nees: of all poses together.
+        joint_dof: its degrees of freedom.
+        seconds: that smoothing took.
+    """
+
+    smoothed: tuple[float, float]
+    filtered: tuple[float, float]
+    nees: float
+    nees_filtered: float
+    joint_nees: float
+    joint_dof: int
+    seconds: float
+
+
+def config_of(scenario: Scenario) -> Config:
+    """What a user would know: mountings; the noise is in the messages or the paper's."""
+    imu = scenario.imu.mounting
+    raw = {
+        "lidars": {
+            name: {"topic": f"/{name}", "initial": lidar.mounting.model_dump()}
+            for name, lidar in scenario.lidars.items()
+        },
+        "imu": {"T_vehicle_imu": imu.model_dump()},
+        "gnss": {"lever_arm": scenario.gnss.lever_arm},
+    }
+    return parse_config(raw, scenario.name, REPOSITORY)
+
+
+def errors(
+    truth: SimulatedTruth, motion: MotionData, stamps_ns: IntArray, R: Array, t: Array
+) -> tuple[Array, Array]:
+    """(n, 3) rotation errors (rad) and (n, 3) position errors (m), both in vehicle axes.
+
+    The trajectory's map begins at the first fix, the truth's at the datum.
+    """
+    assert motion.gnss is not None
+    gnss = motion.gnss
+    first = pymap3d.geodetic2enu(
+        gnss.latitude_deg[:1], gnss.longitude_deg[:1], gnss.altitude_m[:1], *truth.datum
+    )
+    R_true, t_true = stack(truth.T_map_vehicle(stamps_ns))
+    difference = t + np.concatenate(first) - t_true
+    turn = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ R).as_rotvec()
+    return np.asarray(turn), np.einsum("nji,nj->ni", R, difference)
+
+
+def mean_squares(turn: Array, shift: Array) -> tuple[float, float]:
+    """Of position and rotation."""
+    return float((shift**2).sum(axis=1).mean()), float((turn**2).sum(axis=1).mean())
+
+
+def mean_nees(turn: Array, shift: Array, cov: Array) -> float:
+    """Mean over the poses of e^T C^-1 e."""
+    e = np.hstack([turn, shift])
+    return float(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e).mean())
+
+
+def joint_nees(
+    smoothed: SmoothedTrajectory, stamps_ns: IntArray, turn: Array, shift: Array
+) -> tuple[float, int]:
+    """NEES of several poses together, and its degrees of freedom."""
+    information, _ = smoothed.joint_information(stamps_ns)
+    e = np.hstack([turn, shift]).ravel()
+    return float(e @ information @ e), len(e)
+
+
+def run(scenario: Scenario, seed: int) -> Run:
+    """Both estimates of one simulated drive."""
+    recording = simulate_drive(scenario, seed)
+    motion, config = recording.motion(), config_of(scenario)
+    stamps = np.unique(np.concatenate([recording.scan_stamps_ns(n) for n in recording.lidars]))
+    begin = time.perf_counter()
+    smoothed = smooth_trajectory(motion, config, stamps)
+    seconds = time.perf_counter() - begin
+    at = smoothed.trajectory.stamps_ns
+    late = at > at[0] + int(1e9 * LEFT_OUT_S)
+    cov = smoothed.trajectory.cov
+    assert cov is not None
+    R, t = stack(smoothed.trajectory.T_map_vehicle)
+    turn, shift = errors(recording.truth, motion, at[late], R[late], t[late])
+    some = slice(None, None, JOINT_STRIDE)
+    joint, dof = joint_nees(smoothed, at[late][some], turn[some], shift[some])
+    R_ukf, t_ukf, cov_ukf = filter_trajectory(motion, config, at)
+    filtered = errors(recording.truth, motion, at[late], R_ukf[late], t_ukf[late])
+    return Run(
+        mean_squares(turn, shift),
+        mean_squares(*filtered),
+        mean_nees(turn, shift, cov[late]),
+        mean_nees(*filtered, cov_ukf[late]),
+        joint,
+        dof,
+        seconds,
+    )
+
+
+def interval(dof: int, divisor: int) -> tuple[float, float]:
+    """95% interval of a chi-square of `dof` degrees of freedom over a divisor."""
+    return float(chi2.ppf(0.025, dof)) / divisor, float(chi2.ppf(0.975, dof)) / divisor
+
+
+def table(name: str, runs: list[Run]) -> str:
+    """The lines of one scenario."""
+    smoothed: Array = np.sqrt(np.array([r.smoothed for r in runs]).mean(axis=0))
+    filtered: Array = np.sqrt(np.array([r.filtered for r in runs]).mean(axis=0))
+    ratio = filtered / smoothed
+    n = len(runs)
+    nees = float(np.mean([r.nees for r in runs]))
+    low, high = interval(6 * n, n)
+    dof = sum(r.joint_dof for r in runs)
+    joint = sum(r.joint_nees for r in runs) / dof
+    joint_low, joint_high = interval(dof, dof)
+    met = ratio[0] >= TARGET_POSITION and ratio[1] >= TARGET_ROTATION and low <= nees <= high
+    return "\n".join(
+        [
+            f"{name}: {n} seeds, {np.median([r.seconds for r in runs]):.2f} s to smooth one",
+            "              position (mm)   orientation (mrad)",
+            f"  UKF         {1e3 * filtered[0]:13.2f} {1e3 * filtered[1]:20.3f}",
+            f"  smoothed    {1e3 * smoothed[0]:13.2f} {1e3 * smoothed[1]:20.3f}",
+            f"  ratio       {ratio[0]:13.2f} {ratio[1]:20.2f}"
+            f"   (wanted: {TARGET_POSITION} and {TARGET_ROTATION})",
+            f"  NEES        {nees:13.2f}   95% interval {low:.2f} to {high:.2f}"
+            f" (UKF: {np.mean([r.nees_filtered for r in runs]):.2f})",
+            f"  joint NEES  {joint:13.3f}   95% interval {joint_low:.3f} to {joint_high:.3f}, "
+            f"{dof} degrees of freedom",
+            f"  {'as wanted' if met else 'NOT as wanted'}",
+        ]
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=20, help="number of seeds, from 0")
+    parser.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), help="by name")
+    arguments = parser.parse_args()
+    for name in arguments.scenarios:
+        scenario = load_scenario(REPOSITORY / f"configs/scenarios/{name}.yaml")
+        print(table(name, [run(scenario, seed) for seed in range(arguments.seeds)]), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

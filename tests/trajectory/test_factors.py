@@ -1,0 +1,101 @@
+"""Factors of the trajectory: residuals by hand, Jacobians against numerical derivatives."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.trajectory.factors import (
+    biased_orientation_factor,
+    marginal_factor,
+    orientation_factor,
+    position_factor,
+    velocity_factor,
+)
+
+POSE, VELOCITY, BIAS = 0, 1, 2
+UNIT = gtsam.noiseModel.Unit.Create(3)
+
+
+def values() -> gtsam.Values:
+    out = gtsam.Values()
+    out.insert(POSE, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.2, 2.0), np.array([4.0, -3.0, 1.0])))
+    out.insert(VELOCITY, np.array([2.0, 1.0, -0.5]))
+    out.insert(BIAS, np.array([0.1]))
+    return out
+
+
+def check_jacobians(factor: gtsam.NoiseModelFactor, at: gtsam.Values) -> None:
+    """Linearised against central differences on the manifold."""
+    A, b = factor.linearize(at).jacobian()
+    np.testing.assert_allclose(b, -factor.unwhitenedError(at), atol=1e-12)
+    column = 0
+    for key in factor.keys():  # noqa: SIM118  # GTSAM's keys, not a dictionary's
+        dim = {POSE: 6, VELOCITY: 3, BIAS: 1}[key]
+        for j in range(dim):
+            step = 1e-6 * np.eye(dim)[j]
+            ends = []
+            for sign in (1.0, -1.0):
+                delta = gtsam.VectorValues()
+                delta.insert(key, sign * step)
+                ends.append(factor.unwhitenedError(at.retract(delta)))
+            numerical = (ends[0] - ends[1]) / 2e-6
+            np.testing.assert_allclose(A[:, column], numerical, atol=1e-7)
+            column += 1
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, -0.03])
+def test_position(delay_s: float) -> None:
+    z, q = np.array([1.0, 2.0, 3.0]), np.array([0.5, -0.2, 1.8])
+    factor = position_factor(POSE, VELOCITY, z, q, delay_s, 9.8, UNIT)
+    at = values()
+    T = at.atPose3(POSE)
+    fallen = np.array([0.0, 0.0, -0.5 * 9.8 * delay_s**2])
+    expected = T.transformFrom(q) + delay_s * at.atVector(VELOCITY) + fallen - z
+    np.testing.assert_allclose(factor.unwhitenedError(at), expected, atol=1e-12)
+    check_jacobians(factor, at)
+
+
+def test_velocity() -> None:
+    z, u = np.array([1.0, 0.2, 0.1]), np.array([0.0, 0.0, -0.3])
+    factor = velocity_factor(POSE, VELOCITY, z, u, UNIT)
+    at = values()
+    R = at.atPose3(POSE).rotation()
+    expected = R.unrotate(at.atVector(VELOCITY) + u) - z
+    np.testing.assert_allclose(factor.unwhitenedError(at), expected, atol=1e-12)
+    check_jacobians(factor, at)
+
+
+def test_orientation_with_a_yaw_bias() -> None:
+    at = values()
+    R = at.atPose3(POSE).rotation()
+    # A source turned by 0.1 says the true orientation turned by 0.1 about the map's z.
+    exact = biased_orientation_factor(POSE, BIAS, gtsam.Rot3.Rz(0.1).compose(R), UNIT)
+    np.testing.assert_allclose(exact.unwhitenedError(at), 0.0, atol=1e-12)
+    check_jacobians(
+        biased_orientation_factor(POSE, BIAS, gtsam.Rot3.RzRyRx(0.4, 0.1, 2.3), UNIT), at
+    )
+
+
+def test_orientation_residual_is_in_the_axes_of_the_imu() -> None:
+    at = values()
+    d = np.array([0.01, -0.02, 0.03])
+    measured = at.atPose3(POSE).rotation().compose(gtsam.Rot3.Expmap(-d))
+    factor = orientation_factor(POSE, measured, UNIT)
+    np.testing.assert_allclose(factor.unwhitenedError(at), d, atol=1e-12)
+
+
+def test_a_marginal_factor_is_its_gaussian() -> None:
+    rng = np.random.default_rng(0)
+    poses = tuple(gtsam.Pose3.Expmap(rng.standard_normal(6)) for _ in range(4))
+    A = rng.standard_normal((24, 24))
+    information = A @ A.T
+    factor = marginal_factor([10, 11, 12, 13], information, poses)
+
+    d = 1e-3 * rng.standard_normal((4, 6))
+    moved = gtsam.Values()
+    for key, pose, step in zip([10, 11, 12, 13], poses, d, strict=True):
+        moved.insert(key, pose.retract(step))
+
+    assert factor.error(moved) == pytest.approx(0.5 * d.ravel() @ information @ d.ravel())

@@ -1,0 +1,88 @@
+"""A vehicle frame that does not point where the vehicle goes is told; a true one is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from caliv_graph.products import MotionData
+from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
+from caliv_graph.trajectory.smoothing import smooth_trajectory
+from tests.trajectory.motions import (
+    Course,
+    Sensors,
+    arc_drive,
+    config_for,
+    eight_drive,
+    mounted_askew,
+    record,
+    stamps,
+)
+
+EIGHT, ARC = Course(eight_drive(31.0)), Course(arc_drive())
+TWO_DEGREES = math.radians(2.0)
+
+
+def compared(
+    course: Course, sensors: Sensors, seed: int, twist: bool
+) -> HeadingDisagreement | None:
+    motion: MotionData = record(course, sensors, seed)
+    if not twist:
+        motion = replace(motion, twist=None)
+    wanted = stamps(course.duration_s, 10.0)
+    return heading_disagreement(smooth_trajectory(motion, config_for(sensors), wanted), motion)
+
+
+@pytest.mark.parametrize("twist", [True, False], ids=["measured-lateral", "no-slip"])
+def test_an_orientation_source_that_is_turned_is_told(twist: bool) -> None:
+    found = compared(EIGHT, replace(mounted_askew(), yaw_bias_rad=TWO_DEGREES), 1, twist)
+    assert found is not None
+    assert found.measured == twist
+    assert abs(found.yaw_rad - TWO_DEGREES) < 4.0 * found.sigma_rad
+    assert "heading is turned by +" in found.warning
+    assert "imu.yaw_bias" in found.warning
+    if not twist:
+        assert found.axle_m == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("twist", [True, False], ids=["measured-lateral", "no-slip"])
+@pytest.mark.parametrize("course", [EIGHT, ARC], ids=["eight", "arc"])
+def test_a_true_heading_is_not(course: Course, twist: bool) -> None:
+    for seed in range(3):
+        found = compared(course, mounted_askew(), seed, twist)
+        assert found is not None
+        assert not found.warning
+        assert abs(found.yaw_rad) < 4.0 * found.sigma_rad
+
+
+def test_on_an_arc_a_frame_off_the_axle_looks_like_a_turned_one() -> None:
+    found = compared(ARC, replace(mounted_askew(), yaw_bias_rad=TWO_DEGREES), 1, False)
+    assert found is not None
+    assert math.isnan(found.axle_m)
+    # 2 degrees on a radius of 9.16 m, to the right: 0.32 m.
+    assert "0.3" in found.warning.split("vehicle frame is ")[1][:4]
+
+
+def test_a_vehicle_that_stands_shows_nothing() -> None:
+    assert compared(Course(arc_drive(4.0)), Sensors(), 0, True) is None
+
+
+@pytest.mark.parametrize("twist", [True, False], ids=["measured-lateral", "no-slip"])
+def test_a_compass_that_counts_from_north_is_told(twist: bool) -> None:
+    sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
+    found = compared(EIGHT, sensors, 1, twist)
+    assert found is not None
+    # Velocities pull the trajectory half-way: then the number says less, the warning the same.
+    assert found.yaw_rad > math.radians(20.0 if twist else 60.0)
+    assert found.warning
+
+
+def test_driving_backwards_is_no_disagreement() -> None:
+    forward = eight_drive(31.0)
+    backward = replace(forward, speed=replace(forward.speed, speed_m_s=-2.0))
+    found = compared(Course(backward), Sensors(), 1, False)
+    assert found is not None
+    assert not found.warning
+    assert abs(found.yaw_rad) < 4.0 * found.sigma_rad

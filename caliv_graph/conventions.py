@@ -67,3 +67,23 @@ def key_sensor(index: int) -> int:
 def key_target(index: int) -> int:
     """Key of T_target_map of the target placement at `index`."""
     return int(gtsam.symbol("c", index))
+
+
+def key_offset(index: int) -> int:
+    """Key of the time offset of the LiDAR at `index` in the order of the problem, (1,) seconds."""
+    return int(gtsam.symbol("o", index))
+
+
+def key_ground(drive: int) -> int:
+    """Key of the ground's plane in a drive: slopes along map x and y, and height, (3,)."""
+    return int(gtsam.symbol("g", drive))
+
+
+def key_height(drive: int) -> int:
+    """Key of the error of the vehicle's height above ground in a drive, (1,) metres."""
+    return int(gtsam.symbol("h", drive))
+
+
+def key_parallel(drive: int) -> int:
+    """Key of the tilt of the ground in the vehicle frame in a drive: its normal's x and y, (2,)."""
+    return int(gtsam.symbol("p", drive))

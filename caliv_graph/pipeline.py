@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import gtsam
@@ -28,7 +28,7 @@ from caliv_graph.products import (
 from caliv_graph.progress import Progress
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.targets import extract_targets
-from caliv_graph.trajectory.given import given_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.uncertainty.observability import assess
 
 
@@ -62,8 +62,14 @@ def calibrate(
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
-    trajectories = given_trajectories(recordings)
-    observations = extract_targets(recordings, trajectories, config, progress)
+    motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    with progress.stage("smoothing the trajectory", None):
+        nowhere: list[list[int]] = [[] for _ in recordings]
+        rough = smooth_trajectories(recordings, config, nowhere, motions)
+    observations = extract_targets(recordings, rough, config, progress)
+    with progress.stage("smoothing the trajectory at the target's scans", None):
+        stamps = _stamps_used(recordings, observations)
+        trajectories = smooth_trajectories(recordings, config, stamps, motions)
     solution = estimate(observations, trajectories, config, progress)
     uncertainty = assess(
         solution.information_data,
@@ -73,17 +79,31 @@ def calibrate(
     )
     calibration = assemble(solution, uncertainty, config, recordings)
     return CalibrationRun(
-        calibration, solution, observations, _warnings(recordings, observations, solution)
+        calibration,
+        solution,
+        observations,
+        _warnings(recordings, trajectories, observations, solution),
     )
+
+
+def _stamps_used(
+    recordings: Sequence[Recording], observations: Sequence[TargetObservation]
+) -> list[list[int]]:
+    """Per drive the stamps of the scans that see a target."""
+    seen = {(cloud.drive, cloud.stamp_ns) for o in observations for cloud in o.clouds}
+    return [sorted(stamp for d, stamp in seen if d == drive) for drive in range(len(recordings))]
 
 
 def _warnings(
     recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
     observations: Sequence[TargetObservation],
     solution: Solution,
 ) -> tuple[str, ...]:
     out = [w for r in recordings for w in r.warnings()]
+    out += [w for t in trajectories for w in t.warnings]
     out += [w for o in observations for w in o.warnings]
+    out += solution.warnings
     for registration in solution.registrations:
         if not registration.converged:
             turn, shift = registration.last_step
@@ -129,6 +149,7 @@ def assemble(
             determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
             scans_used=used.get(name, 0),
             saw_target=used.get(name, 0) > 0,
+            time_offset=solution.time_offsets.get(name),
         )
     complete = not uncertainty.undetermined and all(
         all(lidar.determined.values()) for lidar in lidars.values()
@@ -170,7 +191,6 @@ def _provenance(
     config: Config, recordings: Sequence[Recording], solution: Solution
 ) -> dict[str, object]:
     """Versions, what was asked, and what the solve found out about its input."""
-    noise = solution.pose_noise
     # Where the drive lies on this machine is no part of what was asked.
     asked = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
     return {
@@ -179,13 +199,7 @@ def _provenance(
         "mode": solution.mode,
         "robust_kernel": config.robust.kernel,
         "recordings": [Path(r.name).absolute().name for r in recordings],
-        "pose_noise": {
-            "white_rotation_rad": noise.white_rotation_rad,
-            "white_position_m": noise.white_position_m,
-            "drift_rotation_rad": noise.drift_rotation_rad,
-            "drift_position_m": noise.drift_position_m,
-            "drift_time_s": noise.drift_time_s,
-        },
+        **({} if solution.pose_noise is None else {"pose_noise": asdict(solution.pose_noise)}),
         "registration_scale": solution.registration_scale,
         "iterations": solution.iterations,
         "converged": solution.converged,

@@ -192,10 +192,17 @@ class Trajectory:
     Attributes:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n poses.
+        cov: (n, 6, 6) marginal covariance of each pose, right perturbation (vehicle frame),
+            rotation then translation, rad and m; None: not known.
+        velocity_vehicle: (n, 3) m/s of the vehicle's origin in vehicle axes; None: not known.
+        angular_velocity_vehicle: (n, 3) rad/s in vehicle axes; None: not known.
     """
 
     stamps_ns: IntArray
     T_map_vehicle: tuple[gtsam.Pose3, ...]
+    cov: Array | None = None
+    velocity_vehicle: Array | None = None
+    angular_velocity_vehicle: Array | None = None
 
     def pose_at(self, stamp_ns: int) -> gtsam.Pose3:
         """The pose at a stamp of the trajectory.
@@ -248,6 +255,33 @@ class TargetObservation:
     centre_map: Array
     clouds: tuple[TargetCloud, ...]
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GroundObservation:
+    """The ground in one scan: points p of the lidar frame with `normal . p + distance = 0`.
+
+    Attributes:
+        lidar: name of the LiDAR.
+        drive: index of the drive.
+        stamp_ns: stamp of the scan.
+        normal_lidar: (3,) unit normal, upwards, lidar frame.
+        distance_m: of the LiDAR's origin above the plane, along the normal.
+        axes_lidar: (2, 3) unit vectors u and v, at right angles to the normal and to each other.
+        cov: (3, 3) of (a, b, distance), the normal being along `normal + a u + b v`; rad, rad, m.
+        centre_lidar: (3,) metres, centre of the points on the plane.
+        points: how many there are.
+    """
+
+    lidar: str
+    drive: int
+    stamp_ns: int
+    normal_lidar: Array
+    distance_m: float
+    axes_lidar: Array
+    cov: Array
+    centre_lidar: Array
+    points: int
 
 
 @dataclass(frozen=True)
@@ -316,7 +350,7 @@ class Solution:
         registrations: what the graph was built from, a registration per placement.
         cloud_weights: robust weight of each cloud, per placement, 1 full and 0 dropped.
         residuals: whitened pose-factor residuals, (J, 6) per placement.
-        pose_noise: error model of the given poses that was used.
+        pose_noise: error model of the given poses that was used; None: no poses were given.
         registration_scale: factor on the sigmas of the registration that the data called for.
         information_data: (6n, 6n) what the data alone say, no prior on the extrinsics.
         information_prior: (6n, 6n) of the initial guesses.
@@ -327,6 +361,9 @@ class Solution:
         graph: the factor graph.
         values: its values.
         stage_times_s: seconds per stage.
+        time_offsets: per LiDAR whose offset was estimated its value and sigma in seconds: header
+            stamp minus true acquisition time.
+        warnings: what a person should know, a line each.
     """
 
     mode: str
@@ -338,7 +375,7 @@ class Solution:
     registrations: tuple[Registration, ...]
     cloud_weights: tuple[Array, ...]
     residuals: tuple[Array, ...]
-    pose_noise: PoseNoise
+    pose_noise: PoseNoise | None
     registration_scale: float
     information_data: Array
     information_prior: Array
@@ -349,6 +386,8 @@ class Solution:
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     stage_times_s: Mapping[str, float] = field(default_factory=dict)
+    time_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -397,6 +436,8 @@ class LidarResult:
         determined: per axis of `conventions.AXES`, vehicle axes.
         scans_used: scans of a target that carried weight.
         saw_target: False if it took no part.
+        time_offset: (value, sigma) in seconds, header stamp minus true acquisition time; None: not
+            estimated.
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -404,6 +445,7 @@ class LidarResult:
     determined: Mapping[str, bool]
     scans_used: int
     saw_target: bool
+    time_offset: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -301,6 +301,10 @@ def _check_finite(calibration: Calibration) -> None:
 
 def _lidar_document(result: LidarResult) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(parent_axes_covariance(result.T_vehicle_lidar, result.cov)))
+    offset = {}
+    if result.time_offset is not None:
+        value_s, sigma_s = result.time_offset
+        offset["time_offset"] = {"value": float(value_s), "sigma": float(sigma_s)}
     return {
         "T_vehicle_lidar": _pose_document(result.T_vehicle_lidar),
         "covariance": _symmetric(result.cov),
@@ -309,6 +313,7 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
             "xyz": sigma[3:].tolist(),
         },
         "determined": {axis: bool(result.determined[axis]) for axis in AXES},
+        **offset,
         "saw_target": bool(result.saw_target),
         "scans_used": int(result.scans_used),
     }
@@ -381,6 +386,7 @@ def _dump(document: Mapping[str, Any]) -> str:
 
 def _read_lidar(node: Field, has_data: bool) -> LidarResult:
     determined = node.child("determined")
+    offset = node.get("time_offset", None)
     return LidarResult(
         T_vehicle_lidar=node.child("T_vehicle_lidar").pose(),
         cov=node.child("covariance").symmetric(6),
@@ -388,6 +394,9 @@ def _read_lidar(node: Field, has_data: bool) -> LidarResult:
         scans_used=int(node.get("scans_used", 0).number()),
         # What a LiDAR saw is in the data's information, also where the file is not one of ours.
         saw_target=node.get("saw_target", has_data).flag(),
+        time_offset=None
+        if offset.value is None
+        else (offset.child("value").number(), offset.child("sigma").number()),
     )
 
 

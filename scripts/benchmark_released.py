@@ -289,7 +289,7 @@ def authors_config(data: Path) -> Config:
             "original_config.yaml). Give --data the folder that holds it"
         )
     draft = draft_config(data, data / "config.yaml")
-    return parse_config(yaml.safe_load(draft.text), str(draft.source), data)
+    return parse_config(yaml.safe_load(draft.text), "the authors' config", data)
 
 
 def guessed(config: Config, true_config: Config, data: Path, seed: int, guess: int) -> Config:

@@ -13,7 +13,7 @@ the guesses (SPEC 3, `auto`).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -23,12 +23,14 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.graph import (
     CloudLinearisation,
+    DenseSystem,
     add_shape,
     cloud_graph,
     dense_system,
     initial_values,
     linearise_clouds,
     merged,
+    offset_graph,
     optimise,
     pose_graph,
     prior_graph,
@@ -45,7 +47,7 @@ from caliv_graph.calibration.noise import (
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
 from caliv_graph.calibration.robust import RobustWeights
 from caliv_graph.config import Config, RobustConfig
-from caliv_graph.conventions import key_mounting, key_target, key_vehicle
+from caliv_graph.conventions import key_mounting, key_offset, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import (
@@ -54,7 +56,6 @@ from caliv_graph.products import (
     Registration,
     Solution,
     TargetObservation,
-    Trajectory,
 )
 from caliv_graph.progress import Progress
 from caliv_graph.registration.mixture import ShapeQuadratic
@@ -64,6 +65,7 @@ from caliv_graph.registration.register import (
     left_step,
     register_jointly,
 )
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.observability import (
     respectful_covariance,
     respectful_step,
@@ -91,6 +93,9 @@ STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
 what 100 clouds of a chair can tell. Or else in joint standard deviations of the extrinsics."""
 
+OFFSET_TOLD_S = 0.005
+"""A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
+
 EXPLAINED = 0.75
 """Clouds of which the target explains at least this part of what it explains of the median cloud
 count in full."""
@@ -114,7 +119,7 @@ class _State:
 
 def estimate(
     observations: Sequence[TargetObservation],
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
 ) -> Solution:
@@ -156,7 +161,11 @@ def _estimate(
     times = {"registration": time.perf_counter() - begun}
     with progress.stage("solving the graph", None):
         solve = _solve_registered(problem, registrations, config)
-    times["graph"] = solve.graph_seconds
+        times["graph"] = solve.graph_seconds
+        problem, warnings = _with_determined_offsets(solve, registrations)
+        if warnings:
+            solve = _solve_registered(problem, registrations, config)
+            times["graph"] += solve.graph_seconds
 
     # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
     # shall depend on the data, not on the initial guess. And aligned clouds show normals that
@@ -181,7 +190,43 @@ def _estimate(
             solution = _refine(solve, states, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
-    return replace(solution, stage_times_s=times)
+    return replace(solution, stage_times_s=times, warnings=warnings)
+
+
+def _with_determined_offsets(
+    state: _State, registrations: Sequence[Registration]
+) -> tuple[Problem, tuple[str, ...]]:
+    """The problem without the time offsets that the drive does not determine, and their names.
+
+    At constant speed on an arc an offset of a LiDAR is the same as its own x and yaw: to free it
+    would lose what the drive does tell of them (SPEC 4).
+    """
+    problem = state.problem
+    if not problem.offsets:
+        return problem, ()
+    measured, information = _measured(registrations)
+    lines = linearise_clouds(problem, state.values)
+    weights = state.weights.values / state.scale**2
+    H = block_diag(*(information * weights[:, None, None]))
+    system = dense_system(problem, _steady_graph(state), state.values)
+    system = add_shape(system, lines, H, H @ _residuals(lines, measured).ravel())
+    Q = problem.to_vehicle_axes(state.values)
+    D = system.schur()[0] + Q.T @ _prior_information(problem) @ Q
+    cov = np.asarray(np.linalg.inv(D), np.float64)
+    kept, warnings = set(), []
+    for i, name in enumerate(problem.lidars):
+        if name not in problem.offsets:
+            continue
+        sigma = float(np.sqrt(system.covariance_of(key_offset(i), cov)[0, 0]))
+        if sigma < OFFSET_TOLD_S:
+            kept.add(name)
+        else:
+            warnings.append(
+                f"lidar '{name}': this drive does not tell its time offset (it would have a sigma "
+                f"of {1e3 * sigma:.0f} ms): taken as 0. Drive a figure-eight, or vary the speed"
+            )
+    twists = problem.twists if kept else None
+    return replace(problem, offsets=frozenset(kept), twists=twists), tuple(warnings)
 
 
 def _prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
@@ -250,7 +295,11 @@ def _reweight(
 ) -> None:
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
-    steady = merged(pose_graph(problem, state.noise), prior_graph(problem, problem.lidars))
+    steady = merged(
+        pose_graph(problem, state.noise),
+        offset_graph(problem),
+        prior_graph(problem, problem.lidars),
+    )
     scaled = information / state.scale**2
     for _ in range(rounds):
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
@@ -318,6 +367,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     state.values = gtsam.Values(state.values)
     state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
+    offsets = reduced.time_offsets(problem, cov)
     state.graph_seconds += time.perf_counter() - begun
     return _solution(
         state,
@@ -330,6 +380,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
         held=("x", "y", "z"),
         iterations=1,
         converged=True,
+        time_offsets=offsets,
     )
 
 
@@ -517,7 +568,11 @@ def _begin_shapes(state: _State, states: Sequence[JointRegistration]) -> None:
 def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
     """What stays the same while clouds are weighed anew: given poses and trusted mountings."""
     problem = state.problem
-    return merged(pose_graph(problem, state.noise), prior_graph(problem, sorted(problem.fixed)))
+    return merged(
+        pose_graph(problem, state.noise),
+        offset_graph(problem),
+        prior_graph(problem, sorted(problem.fixed)),
+    )
 
 
 def _refined_solution(
@@ -564,6 +619,7 @@ def _refined_solution(
         held=(),
         iterations=iterations,
         converged=converged,
+        time_offsets=reduced.time_offsets(problem, cov),
     )
 
 
@@ -584,6 +640,24 @@ class _Reduced:
     _G: Array
     _g: Array
     _values: gtsam.Values
+    _system: DenseSystem
+
+    def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
+        """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
+
+        Args:
+            problem: which they are.
+            cov: (6n, 6n) of the extrinsics, vehicle axes.
+        """
+        inverse = np.linalg.inv(self._to_axes)
+        tangent = inverse @ cov @ inverse.T
+        out = {}
+        for i, name in enumerate(problem.lidars):
+            if name in problem.offsets:
+                variance = self._system.covariance_of(key_offset(i), tangent)[0, 0]
+                value = float(self._values.atVector(key_offset(i))[0])
+                out[name] = (value, float(np.sqrt(variance)))
+        return out
 
     def step_with(self, prior: Array, offset: Array) -> Array:
         """The step (6n,) that data and guesses together call for.
@@ -614,7 +688,7 @@ def _reduce(
     Q = problem.to_vehicle_axes(values)
     inverse = np.linalg.inv(Q)
     D = inverse.T @ D @ inverse
-    return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values)
+    return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
 
 
 def _explained(registration: Registration) -> Array:
@@ -662,6 +736,7 @@ def _solution(
     held: tuple[str, ...],
     iterations: int,
     converged: bool,
+    time_offsets: Mapping[str, tuple[float, float]],
 ) -> Solution:
     """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds."""
     problem = state.problem
@@ -690,7 +765,7 @@ def _solution(
             for w, r in zip(np.split(state.weights.values, cuts), registrations, strict=True)
         ),
         residuals=tuple(np.split(white, cuts)),
-        pose_noise=state.noise,
+        pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         information_data=information_data,
         information_prior=_prior_information(problem),
@@ -698,6 +773,7 @@ def _solution(
         held=held,
         iterations=iterations,
         converged=converged,
+        time_offsets=time_offsets,
         graph=graph,
         values=state.values,
     )

@@ -40,21 +40,50 @@ def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Arr
     return product, jacobians
 
 
-def target_pose_factor(
-    keys: Sequence[int], T_target_lidar: gtsam.Pose3, information: Array
-) -> gtsam.CustomFactor:
-    """A registered cloud: `r = Log(C X E S_a Z^-1)`, at the target (SPEC 3).
+def predict_cloud(
+    keys: Sequence[int], values: gtsam.Values, twist: Array | None = None
+) -> tuple[gtsam.Pose3, list[Array]]:
+    """The pose that a cloud should have, `C X_i Exp(-o xi) E S_a`, and how it moves.
 
     Args:
-        keys: of C, X_i, E and, unless the LiDAR is the reference, S_a.
+        keys: of C, X_i, the time offset o of the LiDAR if `twist` is given, E and, unless the
+            LiDAR is the reference, S_a.
+        values: of all of them.
+        twist: (6,) xi, velocity of the vehicle at the stamp as a right perturbation per second:
+            stamps that are late by o were taken where the vehicle was o seconds before.
+
+    Returns:
+        T_target_lidar; and per key the (6, size) derivative of its left perturbation.
+    """
+    if twist is None:
+        return chain_jacobians([values.atPose3(key) for key in keys])
+    target, vehicle, offset, *mounting = keys
+    back = gtsam.Pose3.Expmap(-float(values.atVector(offset)[0]) * twist)
+    chain = [values.atPose3(target), values.atPose3(vehicle), back]
+    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in mounting])
+    moves[2] = moves[2] @ -twist[:, None]
+    return Z, moves
+
+
+def target_pose_factor(
+    keys: Sequence[int],
+    T_target_lidar: gtsam.Pose3,
+    information: Array,
+    twist: Array | None = None,
+) -> gtsam.CustomFactor:
+    """A registered cloud: `r = Log(Zhat Z^-1)`, at the target (SPEC 3).
+
+    Args:
+        keys: as in `predict_cloud`, which gives Zhat.
         T_target_lidar: the registered pose Z of the cloud.
         information: (6, 6) of the left perturbation of Z (target frame), rad and m.
+        twist: as in `predict_cloud`.
     """
     Z_inverse = T_target_lidar.inverse()
     order = list(keys)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        predicted, moves = chain_jacobians([values.atPose3(key) for key in order])
+        predicted, moves = predict_cloud(order, values, twist)
         r = gtsam.Pose3.Logmap(predicted.compose(Z_inverse))
         if jacobians is not None:
             J_left = left_jacobian_inverse(r)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -11,16 +11,20 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.calibration.factors import (
-    chain_jacobians,
     drift_factor,
     given_pose_factor,
     mounting_prior,
+    predict_cloud,
     target_pose_factor,
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_drift, key_mounting, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise
+from caliv_graph.trajectory.factors import marginal_factor
+
+OFFSET_SIGMA_S = 0.05
+"""How far off the clock of a LiDAR may be, 1 sigma: half a turn of one that turns at 10 Hz."""
 
 GAUGE = 1e-9
 """Relative ridge under which a dense system is solved: directions that nothing says anything
@@ -33,11 +37,24 @@ def drift_sigmas(noise: PoseNoise) -> Array:
 
 
 def pose_graph(problem: Problem, noise: PoseNoise) -> gtsam.NonlinearFactorGraph:
-    """The given poses with their white and slow errors."""
+    """What is known of the vehicle's poses without any LiDAR.
+
+    Given poses have white and slow errors; those of a smoothed trajectory a joint Gaussian.
+    """
     graph = gtsam.NonlinearFactorGraph()
-    times, drives = problem.times_s(), problem.drives()
+    times, drives, given = problem.times_s(), problem.drives(), problem.given()
     stationary = drift_sigmas(noise)
-    for i, T in enumerate(problem.T_map_vehicle):
+    for drive, information in problem.motion.items():
+        of_drive = np.flatnonzero(drives == drive).tolist()
+        graph.add(
+            marginal_factor(
+                [key_vehicle(i) for i in of_drive],
+                information,
+                tuple(problem.T_map_vehicle[i] for i in of_drive),
+            )
+        )
+    for i in np.flatnonzero(given).tolist():
+        T = problem.T_map_vehicle[i]
         graph.add(
             given_pose_factor(
                 key_vehicle(i),
@@ -72,13 +89,24 @@ def prior_graph(problem: Problem, lidars: Sequence[str]) -> gtsam.NonlinearFacto
     return graph
 
 
+def offset_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """How far off a LiDAR's clock may be, for those whose offset is free."""
+    graph = gtsam.NonlinearFactorGraph()
+    for key in problem.offset_keys():
+        sigma = gtsam.noiseModel.Isotropic.Sigma(1, OFFSET_SIGMA_S)
+        graph.add(gtsam.PriorFactorVector(key, np.zeros(1), sigma))
+    return graph
+
+
 def cloud_graph(
     problem: Problem, measured: Sequence[gtsam.Pose3], information: Array
 ) -> gtsam.NonlinearFactorGraph:
     """One pose factor per registered cloud; `information` (J, 6, 6) has the weights in it."""
     graph = gtsam.NonlinearFactorGraph()
     for j, Z in enumerate(measured):
-        graph.add(target_pose_factor(problem.cloud_keys(j), Z, information[j]))
+        graph.add(
+            target_pose_factor(problem.cloud_keys(j), Z, information[j], problem.cloud_twist(j))
+        )
     return graph
 
 
@@ -87,7 +115,10 @@ def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.V
     values = gtsam.Values()
     for i, T in enumerate(problem.T_map_vehicle):
         values.insert(key_vehicle(i), T)
-        values.insert(key_drift(i), np.zeros(6))
+    for key in problem.drift_keys():
+        values.insert(key, np.zeros(6))
+    for key in problem.offset_keys():
+        values.insert(key, np.zeros(1))
     E = problem.guesses[problem.reference]
     values.insert(key_mounting(), E)
     for name in problem.lidars:
@@ -108,7 +139,8 @@ def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
     out = gtsam.Values(values)
     for i, T in enumerate(problem.T_map_vehicle):
         out.update(key_vehicle(i), T)
-        out.update(key_drift(i), np.zeros(6))
+    for key in problem.drift_keys():
+        out.update(key, np.zeros(6))
     return out
 
 
@@ -161,7 +193,7 @@ class CloudLinearisation:
     Attributes:
         predicted: T_target_lidar of each cloud.
         keys: per cloud, in order of the product.
-        jacobians: per cloud and key, (6, 6): left perturbation of the prediction by a right
+        jacobians: per cloud and key, (6, size): left perturbation of the prediction by a right
             perturbation of the variable.
     """
 
@@ -175,7 +207,7 @@ def linearise_clouds(problem: Problem, values: gtsam.Values) -> CloudLinearisati
     predicted, keys, jacobians = [], [], []
     for j in range(problem.clouds):
         chain = problem.cloud_keys(j)
-        Z, moves = chain_jacobians([values.atPose3(key) for key in chain])
+        Z, moves = predict_cloud(chain, values, problem.cloud_twist(j))
         predicted.append(Z)
         keys.append(chain)
         jacobians.append(tuple(moves))
@@ -187,20 +219,40 @@ class DenseSystem:
     """A linearised graph as one quadratic, `d^T H d / 2 - b^T d`, the extrinsics last.
 
     Attributes:
-        keys: poses, targets and extrinsics, each with six coordinates, the extrinsics at the end.
-        H: (6 N, 6 N).
-        b: (6 N,).
+        keys: poses, targets, others (ground, time offsets), and the extrinsics at the end.
+        sizes: coordinates of each: six, but for the others.
+        H: (M, M), M the sum of `sizes`.
+        b: (M,).
         extrinsics: how many of `keys` are extrinsics.
     """
 
     keys: tuple[int, ...]
+    sizes: tuple[int, ...]
     H: Array
     b: Array
     extrinsics: int
 
     def offset(self, key: int) -> int:
         """First coordinate of a variable."""
-        return 6 * self.keys.index(key)
+        return sum(self.sizes[: self.keys.index(key)])
+
+    def covariance_of(self, key: int, cov_extrinsics: Array) -> Array:
+        """Marginal covariance of a variable that is no extrinsic.
+
+        Args:
+            key: of the variable.
+            cov_extrinsics: covariance of the extrinsics, tangents in the order of `keys`.
+        """
+        split = len(self.b) - 6 * self.extrinsics
+        start = self.offset(key)
+        which = slice(start, start + self.sizes[self.keys.index(key)])
+        rest = self.H[:split, :split].copy()
+        diagonal = np.arange(split)
+        rest[diagonal, diagonal] *= 1.0 + GAUGE
+        unit = np.eye(split)[:, which]
+        own = scipy.linalg.cho_solve(scipy.linalg.cho_factor(rest, lower=True), unit)
+        follows = own.T @ self.H[:split, split:]
+        return np.asarray(own[which] + follows @ cov_extrinsics @ follows.T)
 
     def schur(self) -> tuple[Array, Array, Array, Array]:
         """Eliminates everything but the extrinsics.
@@ -237,20 +289,25 @@ def dense_system(
     """Linearises `graph` at `values`, with the slow errors of the poses eliminated.
 
     They form chains, which GTSAM eliminates sparsely, and are linear: their values do not matter.
-    Variables that the graph does not touch get zero rows.
+    Variables of the problem that the graph does not touch get zero rows; others that it does touch
+    are taken along.
     """
     extrinsics = problem.extrinsic_keys()
-    keys = (*problem.pose_keys(), *problem.target_keys(), *extrinsics)
     drifts = set(problem.drift_keys())
     linear = graph.linearize(values)
     touched = set(graph.keyVector())
+    known = (*problem.pose_keys(), *problem.target_keys())
+    others = sorted(touched - drifts - {*known, *extrinsics})
+    keys = (*known, *others, *extrinsics)
+    zero = values.zeroVectors()
+    sizes = tuple(6 if key in known or key in extrinsics else zero.at(key).size for key in keys)
     chains = [key for key in problem.drift_keys() if key in touched]
     if chains:
         try:
             _, linear = linear.eliminatePartialMultifrontal(chains)
         except RuntimeError as e:
             raise SolveError(f"the given poses: {str(e).splitlines()[0]}") from None
-    size = 6 * len(keys)
+    size = sum(sizes)
     H, b = np.zeros((size, size)), np.zeros(size)
     order = [key for key in keys if key in touched and key not in drifts]
     if order:
@@ -259,12 +316,17 @@ def dense_system(
             ordering.push_back(key)
         H_part, b_part = linear.hessian(ordering)
         present = set(order)
+        starts = np.cumsum([0, *sizes])
         where = np.concatenate(
-            [np.arange(6 * i, 6 * i + 6) for i, key in enumerate(keys) if key in present]
+            [
+                np.arange(start, start + n)
+                for key, start, n in zip(keys, starts, sizes, strict=False)
+                if key in present
+            ]
         )
         H[np.ix_(where, where)] = H_part
         b[where] = np.asarray(b_part).ravel()
-    return DenseSystem(keys, H, b, len(extrinsics))
+    return DenseSystem(keys, sizes, H, b, len(extrinsics))
 
 
 def add_shape(
@@ -278,30 +340,28 @@ def add_shape(
         H_clouds: (6 J, 6 J).
         gradient: (6 J,).
     """
-    where = {key: i for i, key in enumerate(system.keys)}
-    rows, columns, blocks = [], [], []
+    starts = dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
+    rows, columns, entries = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
-            rows.append(j)
-            columns.append(where[key])
-            blocks.append(jacobian)
-    six = np.arange(6)
-    row = (6 * np.array(rows)[:, None, None] + six[None, :, None]).repeat(6, axis=2)
-    column = (6 * np.array(columns)[:, None, None] + six[None, None, :]).repeat(6, axis=1)
-    # Every cloud depends on four variables of hundreds.
+            row, column = np.indices(jacobian.shape)
+            rows.append((6 * j + row).ravel())
+            columns.append((starts[key] + column).ravel())
+            entries.append(jacobian.ravel())
+    # Every cloud depends on four or five variables of hundreds.
     J = scipy.sparse.csr_array(
-        (np.array(blocks).ravel(), (row.ravel(), column.ravel())),
+        (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(gradient), len(system.b)),
     )
     half = J.T @ H_clouds
-    return DenseSystem(
-        system.keys, system.H + (J.T @ half.T), system.b - J.T @ gradient, system.extrinsics
-    )
+    return replace(system, H=system.H + (J.T @ half.T), b=system.b - J.T @ gradient)
 
 
 def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:
-    """Moves the variables `keys` by the tangent d (6 N,)."""
-    delta = gtsam.VectorValues()
-    for i, key in enumerate(keys):
-        delta.insert(key, d[6 * i : 6 * i + 6])
+    """Moves the variables `keys` by their tangents, one after the other in d."""
+    zero, delta, start = values.zeroVectors(), gtsam.VectorValues(), 0
+    for key in keys:
+        size = zero.at(key).size
+        delta.insert(key, d[start : start + size])
+        start += size
     return values.retract(delta)

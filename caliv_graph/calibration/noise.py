@@ -104,7 +104,9 @@ def sound_clouds(
     rotation = noise.white_rotation_rad**2 + noise.drift_rotation_rad**2
     position = noise.white_position_m**2 + noise.drift_position_m**2
     spread = np.array([rotation] * 3 + [position] * 3)
-    V = R + np.einsum("jax,x,jbx->jab", B, spread, B)
+    given = problem.given()[problem.cloud_pose]
+    V = R + np.einsum("jax,x,jbx->jab", B * given[:, None, None], spread, B)
+    V += np.einsum("jax,jxy,jby->jab", B, _motion_covariance(problem, values, every), B)
     r = r.reshape(-1, 6)
     squared = np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0])
     return np.asarray(squared < GROSS * np.median(squared))
@@ -140,7 +142,11 @@ def fit_pose_noise(
     together = drives[:, None] == drives[None]
     same = ((apart < 1e-9) & together).astype(np.float64)
     slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
+    joint = _motion_covariance(problem, values, chosen, together=True)
+    known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
+    known = known.reshape(6 * len(chosen), 6 * len(chosen))
     # Rotation and position parts of what a pose error does to the clouds' residuals.
+    B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
     effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
     spread = [e @ e.T for e in effect]
     ones = np.ones((6, 6))
@@ -161,13 +167,14 @@ def fit_pose_noise(
             TYPICAL_SCALE,
         ]
     )
-    free = np.array([g is None for g in given])
+    # Without given poses there is nothing to be found out about their errors.
+    free = np.array([g is None for g in given]) & (problem.given().any() | (np.arange(5) == 4))
 
     def cost(x: Array) -> float:
         full = start.copy()
         full[free] = x
         scale = np.exp(2.0 * np.clip(full, np.log(FLOORS), np.log(CEILINGS)))
-        V = sum(s * p for s, p in zip(scale, parts, strict=True))
+        V = known + sum(s * p for s, p in zip(scale, parts, strict=True))
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:
@@ -236,14 +243,47 @@ def squares_without_own_pose(
     white = np.array([noise.white_rotation_rad] * 3 + [noise.white_position_m] * 3)
     B = _pose_effects(problem, lines, values, np.arange(problem.clouds))
     found = np.zeros((len(problem.poses), 6))
-    for i, given in enumerate(problem.T_map_vehicle):
+    for i in np.flatnonzero(problem.given()).tolist():
+        given = problem.T_map_vehicle[i]
         X = values.atPose3(key_vehicle(i))
         turn = gtsam.Rot3.Logmap(given.rotation().between(X.rotation()))
         error = np.concatenate([turn, X.translation() - given.translation()])
         found[i] = error - values.atVector(key_drift(i))
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
+    B = B * problem.given()[problem.cloud_pose][:, None, None]
     V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B)
     return np.asarray(np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0]))
+
+
+def _motion_covariance(
+    problem: Problem, values: gtsam.Values, chosen: IntArray, together: bool = False
+) -> Array:
+    """Covariance that motion data leave to the poses of the chosen clouds; zero for given poses.
+
+    Returns:
+        (m, 6, 6), or if `together` (m, m, 6, 6) of all of them, rotation in vehicle axes and
+        position in map axes.
+    """
+    m = len(chosen)
+    out = np.zeros((m, m, 6, 6) if together else (m, 6, 6))
+    pose = problem.cloud_pose[chosen]
+    for drive, information in problem.motion.items():
+        of_drive = np.flatnonzero(problem.drives() == drive)
+        axes = np.tile(np.eye(6), (len(of_drive), 1, 1))
+        for n, i in enumerate(of_drive.tolist()):
+            axes[n, 3:, 3:] = values.atPose3(key_vehicle(i)).rotation().matrix()
+        n = len(of_drive)
+        cov = np.linalg.inv(information).reshape(n, 6, n, 6).swapaxes(1, 2)
+        mine = np.flatnonzero(np.isin(pose, of_drive))
+        local = np.searchsorted(of_drive, pose[mine])
+        A = axes[local]
+        if together:
+            out[np.ix_(mine, mine)] = np.einsum(
+                "pax,pqxy,qby->pqab", A, cov[np.ix_(local, local)], A, optimize=True
+            )
+        else:
+            out[mine] = A @ cov[local, local] @ np.swapaxes(A, 1, 2)
+    return out
 
 
 def _pose_effects(
@@ -276,18 +316,18 @@ def _stacked(
         (6m,) residuals; (6m, p) Jacobians by extrinsics and targets; (m, 6, 6) by pose errors
         (rotation in vehicle axes, position in map axes); (m, 6, 6) registration covariances.
     """
-    columns = {
-        key: 6 * i for i, key in enumerate((*problem.extrinsic_keys(), *problem.target_keys()))
-    }
+    keys = (*problem.extrinsic_keys(), *problem.target_keys())
+    columns = {key: 6 * i for i, key in enumerate(keys)}
+    columns |= {key: 6 * len(keys) + i for i, key in enumerate(problem.offset_keys())}
     r = np.zeros(6 * len(chosen))
-    A = np.zeros((6 * len(chosen), 6 * len(columns)))
+    A = np.zeros((6 * len(chosen), 6 * len(keys) + len(problem.offset_keys())))
     B = _pose_effects(problem, lines, values, chosen)
     for row, j in enumerate(chosen):
         block = slice(6 * row, 6 * row + 6)
         r[block] = gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse()))
         for key, jacobian in zip(lines.keys[j], lines.jacobians[j], strict=True):
             if key in columns:
-                A[block, columns[key] : columns[key] + 6] = jacobian
+                A[block, columns[key] : columns[key] + jacobian.shape[1]] = jacobian
     return r, A, B, np.asarray(np.linalg.inv(information[chosen]), dtype=np.float64)
 
 

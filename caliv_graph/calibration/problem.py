@@ -3,27 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from caliv_graph.config import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
     key_drift,
     key_mounting,
+    key_offset,
     key_sensor,
     key_target,
     key_vehicle,
 )
 from caliv_graph.errors import SolveError
-from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes
-from caliv_graph.products import Array, IntArray, TargetObservation, Trajectory
+from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes, unstack
+from caliv_graph.products import Array, IntArray, TargetObservation
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
 """Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
 0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
+
+
+HEAVE_SIGMA_M = 0.005
+"""How far the body on its springs, and the LiDARs with it, is off its height at each stamp. The
+smoothed trajectory knows nothing of it; given poses are told apart from it by the data."""
+
+
+TWIST_WINDOW_NS = 50_000_000
+"""Half the time over which the vehicle's velocity is averaged."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +50,19 @@ class Problem:
         prior_sigmas: (6,) per LiDAR, vehicle axes.
         fixed: names of the LiDARs whose guess is trusted.
         poses: (drive, stamp_ns) of every pose used, ascending.
-        T_map_vehicle: the given pose of each, its map's origin moved to `origins_map`.
+        T_map_vehicle: the given or smoothed pose of each, its map's origin moved to `origins_map`.
         origins_map: (3,) per drive, metres: where the problem's map begins in the drive's. Poses in
             a national grid are thousands of kilometres from its origin; no matrix bears that.
         cloud_lidar: (J,) index into `lidars`.
         cloud_pose: (J,) index into `poses`.
         cloud_placement: (J,) index of the placement.
         placements: number of placements.
+        motion: per drive with a smoothed trajectory, what the motion data say about its poses: the
+            (6 m, 6 m) information on the m of them, in order, right perturbations, rotation then
+            translation. The poses of the other drives were given, with errors to be found out.
+        offsets: names of the LiDARs whose time offset is to be estimated.
+        twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
+            if no offset is.
     """
 
     lidars: tuple[str, ...]
@@ -58,6 +77,9 @@ class Problem:
     cloud_pose: IntArray
     cloud_placement: IntArray
     placements: int
+    motion: Mapping[int, Array] = field(default_factory=dict)
+    offsets: frozenset[str] = frozenset()
+    twists: Array | None = None
 
     @property
     def clouds(self) -> int:
@@ -80,26 +102,42 @@ class Problem:
         return tuple(key_vehicle(i) for i in range(len(self.poses)))
 
     def drift_keys(self) -> tuple[int, ...]:
-        """b_i of every pose used."""
-        return tuple(key_drift(i) for i in range(len(self.poses)))
+        """b_i of every given pose used."""
+        return tuple(key_drift(int(i)) for i in np.flatnonzero(self.given()))
 
     def target_keys(self) -> tuple[int, ...]:
         """C of every placement."""
         return tuple(key_target(m) for m in range(self.placements))
 
     def cloud_keys(self, j: int) -> tuple[int, ...]:
-        """Keys of C, X_i, E and S_a of cloud j, in the order of their product."""
+        """Keys of C, X_i, the time offset if it is free, E and S_a of cloud j, in that order."""
         lidar = self.lidars[self.cloud_lidar[j]]
+        offset = (key_offset(int(self.cloud_lidar[j])),) if lidar in self.offsets else ()
         return (
             key_target(int(self.cloud_placement[j])),
             key_vehicle(int(self.cloud_pose[j])),
+            *offset,
             *self.mounting_keys(lidar),
         )
+
+    def cloud_twist(self, j: int) -> Array | None:
+        """(6,) velocity at cloud j, if the time offset of its LiDAR is free."""
+        if self.twists is None or self.lidars[self.cloud_lidar[j]] not in self.offsets:
+            return None
+        return np.asarray(self.twists[self.cloud_pose[j]])
+
+    def offset_keys(self) -> tuple[int, ...]:
+        """Time offsets that are free."""
+        return tuple(key_offset(i) for i, name in enumerate(self.lidars) if name in self.offsets)
 
     def times_s(self) -> Array:
         """(n,) times of the poses in seconds; between drives they mean nothing."""
         first = self.poses[0][1]
         return np.array([(stamp - first) / NANOSECONDS_PER_SECOND for _, stamp in self.poses])
+
+    def given(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether each pose was given, not smoothed from motion data."""
+        return ~np.isin(self.drives(), list(self.motion))
 
     def drives(self) -> IntArray:
         """(n,) drive of each pose."""
@@ -138,7 +176,7 @@ def moved_map(T_map_vehicle: gtsam.Pose3, shift: Array) -> gtsam.Pose3:
 
 def pose_problem(
     observations: Sequence[TargetObservation],
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[VehicleTrajectory],
     config: Config,
 ) -> Problem:
     """Lists what takes part.
@@ -155,9 +193,16 @@ def pose_problem(
     reference = config.reference if config.reference in lidars else lidars[0]
     poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds}))
     index = {pose: i for i, pose in enumerate(poses)}
+    T_map_vehicle: list[gtsam.Pose3] = []
+    twists: list[Array] = []
+    for d in sorted({drive for drive, _ in poses}):
+        stamps = [stamp for drive, stamp in poses if drive == d]
+        T_map_vehicle += unstack(*trajectories[d].poses_at(stamps))
+        if config.solve.time_offset:
+            twists.append(_twists(trajectories[d], stamps))
     origins = {
-        d: np.asarray(trajectories[d].pose_at(stamp).translation(), np.float64)
-        for d, stamp in reversed(poses)
+        d: np.asarray(T.translation(), np.float64)
+        for (d, _), T in reversed(list(zip(poses, T_map_vehicle, strict=True)))
     }
     fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
     sigmas = {}
@@ -174,11 +219,46 @@ def pose_problem(
         fixed=fixed,
         poses=poses,
         T_map_vehicle=tuple(
-            moved_map(trajectories[d].pose_at(stamp), -origins[d]) for d, stamp in poses
+            moved_map(T, -origins[d]) for (d, _), T in zip(poses, T_map_vehicle, strict=True)
         ),
         origins_map=origins,
         cloud_lidar=np.array([lidars.index(c.lidar) for _, c in clouds]),
         cloud_pose=np.array([index[c.drive, c.stamp_ns] for _, c in clouds]),
         cloud_placement=np.array([m for m, _ in clouds]),
         placements=len(observations),
+        motion={
+            d: _with_heave(
+                trajectory.joint_information([stamp for drive, stamp in poses if drive == d])[0]
+            )
+            for d, trajectory in enumerate(trajectories)
+            if isinstance(trajectory, SmoothedTrajectory) and d in origins
+        },
+        offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
+        twists=np.concatenate(twists) if twists else None,
+    )
+
+
+def _with_heave(information: Array) -> Array:
+    """Information (6 m, 6 m) on poses when each is off by its own heave, along the vehicle's z."""
+    cov = np.linalg.inv(information)
+    z = np.arange(5, len(cov), 6)
+    cov[z, z] += HEAVE_SIGMA_M**2
+    with_heave = np.linalg.inv(cov)
+    return np.asarray(0.5 * (with_heave + with_heave.T))
+
+
+def _twists(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
+    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
+    begin, end = trajectory.span_ns
+    stamps = np.asarray(stamps_ns, dtype=np.int64)
+    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
+    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
+    first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
+    return np.array(
+        [
+            gtsam.Pose3.Logmap(a.between(b)) / max(seconds, 1e-9)
+            for a, b, seconds in zip(
+                first, second, (after - before) / NANOSECONDS_PER_SECOND, strict=True
+            )
+        ]
     )

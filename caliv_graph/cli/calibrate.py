@@ -122,8 +122,8 @@ def _unused_keys(config: Config) -> list[str]:
     lines = []
     if "ground" in config.model_fields_set and config.ground.use:
         lines.append("ground: has no effect yet; 'use: false' says that you know")
-    if config.solve.time_offset:
-        lines.append("solve.time_offset: has no effect yet; no time offsets are estimated")
+    if config.data.format == "rosbag":
+        return lines
     sections = {"topics": config.topics, "imu": config.imu, "gnss": config.gnss}
     return lines + [
         f"{name}: has no effect on a CaLiV folder, which brings its poses"

@@ -145,10 +145,13 @@ class JointRegistration:
         last_step: tuple[float, float],
     ) -> Registration:
         """The registration at (R, t)."""
+        # A cloud that no component explains has no information, but a matrix that can be inverted.
+        trace = float(np.median(np.trace(quadratic.blocks, axis1=1, axis2=2)))
+        ridge = (1e-9 * trace + 1e-9) * np.eye(6)
         return Registration(
             observation=self.observation,
             T_target_lidar=unstack(R, t),
-            information=quadratic.blocks,
+            information=quadratic.blocks + ridge,
             information_joint=quadratic.joint(),
             mixture=self.mixture,
             inlier_ratio=self.inlier_ratio,
@@ -189,6 +192,9 @@ def free_step(quadratic: ShapeQuadratic) -> Array:
     H4 = H.reshape(count, 6, count, 6)
     j = np.arange(count)
     H4[j, :, j, :] += DAMPING * quadratic.blocks
+    # A cloud that no component explains says nothing, and stays.
+    diagonal = np.arange(len(H))
+    H[diagonal, diagonal] += 1e-9 * max(float(np.trace(H)) / len(H), 1.0)
     d = -np.linalg.solve(H, quadratic.gradient.ravel()).reshape(count, 6)
     d -= d.mean(axis=0)  # the gauge
     largest = np.abs(d).max()

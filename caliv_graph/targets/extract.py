@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caliv_graph.config import Config, ExtractionConfig, TargetRegion
 from caliv_graph.errors import TargetError
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.geometry.se3 import pose_from_mounting, skew
 from caliv_graph.products import (
     Array,
     IntArray,
@@ -26,10 +27,11 @@ from caliv_graph.products import (
     Recording,
     TargetCloud,
     TargetObservation,
-    Trajectory,
 )
 from caliv_graph.progress import Progress
 from caliv_graph.targets.ground import fit_ground, height_above
+from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.select import VehicleTrajectory
 
 GUESS_SIGMAS = 2.0
 """Standard deviations of the initial guess that the region is widened by; a uniform error ends at
@@ -49,11 +51,39 @@ LINK_M = 0.3
 OUTSIDE_M = 0.2
 """An object this far outside the region counts for a third of one inside it."""
 
+MOST_CANDIDATES = 4
+"""Objects of one scan that are kept until it is known which of them stands still."""
+
+SEEDS = 24
+"""Candidates from which the object that stands still is sought."""
+
+STANDS_STILL_M = 0.35
+"""The middle of what one sees of a target wanders by this as one passes it."""
+
+GATE_STEPS = (1.0, 0.5, 0.2, 0.05, 0.0)
+"""Parts of what the guess may be off by that are allowed for while its error is being found."""
+
+PLACE_SIGMA_M = 0.1
+"""The same wandering, 1 sigma."""
+
 EDGE_RAD = math.radians(0.4)
 """A target within this angle of the edge of the field of view may be cut off by it."""
 
 FULL_TURN_GAP_RAD = math.radians(20.0)
 """A LiDAR whose azimuths leave no gap larger than this looks all around: it has no edge."""
+
+
+FEW_SCANS = 150
+"""Of so few scans all are read."""
+
+SAMPLED_SCANS = 8
+"""Scans that the field of view and the resolution are read off."""
+
+CELL_DEG = 5.0
+"""Cells of direction in which points are counted for the resolution."""
+
+LARGEST_TARGET_M2 = 3.0
+"""Area that a target shows a LiDAR at most: 1.5 m wide and 2 m high (SPEC 6)."""
 
 
 @dataclass
@@ -140,7 +170,7 @@ def _is_cut(target_lidar: Array, edges: tuple[float, float] | None, points: int)
 class RegionExtractor:
     """Cuts the target of one region out of scans, one at a time."""
 
-    def __init__(self, region: TargetRegion, config: Config, trajectory: Trajectory) -> None:
+    def __init__(self, region: TargetRegion, config: Config, trajectory: VehicleTrajectory) -> None:
         """Binds the region to a drive."""
         self._config = config
         self._trajectory = trajectory
@@ -149,8 +179,8 @@ class RegionExtractor:
         self.centre = 0.5 * (self._low + self._high)
         R, t = np.eye(3), np.zeros(3)
         if region.frame == "start":
-            start = trajectory.T_map_vehicle[0]
-            R, t = start.rotation().matrix(), start.translation()
+            begin, _ = trajectory.span_ns
+            R, t = (part[0] for part in trajectory.poses_at([begin]))
         self._R_map_region, self._t_map_region = R, t
         self._guess = {
             name: pose_from_mounting(lidar.initial) for name, lidar in config.lidars.items()
@@ -163,23 +193,39 @@ class RegionExtractor:
         return np.asarray(self._R_map_region @ self.centre + self._t_map_region)
 
     def extract(self, scan: LidarScan, drive: int) -> TargetCloud | None:
-        """The target's points in a scan, or None if it does not see the target."""
+        """The target's points in a scan, or None if it does not see the target.
+
+        Of several objects the largest that is best inside the region.
+        """
+        candidates = self.candidates(scan, drive)
+        return self.accept(candidates[0]) if candidates else None
+
+    def accept(self, candidate: Candidate) -> TargetCloud | None:
+        """The cloud of a candidate, unless the edge of the field of view cuts it off."""
+        tally = self.tallies[candidate.cloud.lidar]
+        if candidate.cut:
+            tally.rejected["cut off by the edge of the field of view"] += 1
+            return None
+        tally.kept += 1
+        return candidate.cloud
+
+    def candidates(self, scan: LidarScan, drive: int) -> list[Candidate]:
+        """The objects in a scan that may be the target, at most MOST_CANDIDATES, best first."""
         tally = self.tallies[scan.lidar]
         tally.scans += 1
         extraction = self._config.extraction
-        T_map_vehicle = self._trajectory.pose_at(scan.stamp_ns)
-        T = T_map_vehicle.compose(self._guess[scan.lidar])
-        R = self._R_map_region.T @ T.rotation().matrix()
-        t = self._R_map_region.T @ (T.translation() - self._t_map_region)
+        T_vehicle_lidar = self._guess[scan.lidar]
+        rotations, translations = self._lidar_poses(scan.lidar, [scan.stamp_ns])
+        R, t = rotations[0], translations[0]
         if len(scan.points_lidar) == 0:
             tally.rejected["empty within the range limits"] += 1
-            return None
+            return []
         range_m = float(np.linalg.norm(self.centre - t))
         margin = widened_margin_m(self._config, scan.lidar, range_m)
         points, near = self._near_region(scan.points_lidar, R, t, margin, tally)
         if len(near) < extraction.min_points:
             tally.rejected["outside the region"] += 1
-            return None
+            return []
         plane = fit_ground(points, extraction.ground_distance)
         if plane is None:
             # No ground inside the region: what there is, is the target or nothing.
@@ -188,21 +234,50 @@ class RegionExtractor:
             height = height_above(plane, points)
         above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
         points, near = points[above], near[above]
-        chosen = self._pick_object(points, range_m)
-        if chosen is None:
+        objects = self._objects(points, range_m)
+        if not objects:
             tally.rejected["nothing above the ground that is 0.2 to 2 m wide"] += 1
-            return None
-        near = near[chosen][_filtered(points[chosen], extraction)]
-        tally.most_points = max(tally.most_points, len(near))
-        if len(near) < extraction.min_points:
+            return []
+        edges = _azimuth_edges(scan.points_lidar)
+        out = []
+        for chosen in objects:
+            kept = near[chosen][_filtered(points[chosen], extraction)]
+            tally.most_points = max(tally.most_points, len(kept))
+            if len(kept) < extraction.min_points:
+                continue
+            times = None if scan.point_times_s is None else scan.point_times_s[kept]
+            compact = replace(scan, points_lidar=scan.points_lidar[kept], point_times_s=times)
+            target = deskew(compact, T_vehicle_lidar, self._trajectory).points_lidar
+            low, high = np.percentile(target, [2, 98], axis=0)
+            out.append(
+                Candidate(
+                    cloud=TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source),
+                    centre_lidar=0.5 * (low + high),
+                    R_region_lidar=R,
+                    t_region_lidar=t,
+                    cut=_is_cut(target, edges, len(scan.points_lidar)),
+                )
+            )
+        if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
-            return None
-        target = scan.points_lidar[near]
-        if _is_cut(target, _azimuth_edges(scan.points_lidar), len(scan.points_lidar)):
-            tally.rejected["cut off by the edge of the field of view"] += 1
-            return None
-        tally.kept += 1
-        return TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source)
+        return out
+
+    def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int]) -> tuple[Array, Array]:
+        """Rotations (m, 3, 3) and translations (m, 3) of T_region_lidar, at the guess."""
+        R_map_vehicle, t_map_vehicle = self._trajectory.poses_at(stamps_ns)
+        guess = self._guess[lidar]
+        R = self._R_map_region.T @ R_map_vehicle @ guess.rotation().matrix()
+        t = t_map_vehicle + R_map_vehicle @ guess.translation() - self._t_map_region
+        return R, t @ self._R_map_region
+
+    def directions(self, lidar: str, stamps_ns: Sequence[int]) -> Array:
+        """Where a LiDAR has the middle of the region, at the guess; (m, 3) metres, lidar frame."""
+        R, t = self._lidar_poses(lidar, stamps_ns)
+        return np.asarray(np.einsum("mji,mj->mi", R, self.centre - t))
+
+    def reach_m(self) -> float:
+        """Half the diagonal of the region, metres."""
+        return 0.5 * float(np.linalg.norm(self._high - self._low))
 
     def _near_region(
         self, points_lidar: Array, R: Array, t: Array, margin: float, tally: _Tally
@@ -214,7 +289,7 @@ class RegionExtractor:
         centre_lidar = R.T @ (self.centre - t)
         offset = points_lidar - centre_lidar
         distance2 = np.einsum("ni,ni->n", offset, offset)
-        radius = 0.5 * float(np.linalg.norm(self._high - self._low)) + margin
+        radius = self.reach_m() + margin
         near = np.flatnonzero(distance2 < radius**2)
         if len(near) == 0:
             near = np.array([distance2.argmin()])
@@ -225,13 +300,13 @@ class RegionExtractor:
         inside = distance <= margin
         return points[inside], near[inside]
 
-    def _pick_object(self, points: Array, range_m: float) -> IntArray | None:
-        """Indices of the object that is the target: of the right size, best inside the region."""
+    def _objects(self, points: Array, range_m: float) -> list[IntArray]:
+        """Indices of the objects of the right size, the best inside the region first."""
         if len(points) < 3:
-            return None
+            return []
         # Beams fan out: what is one object at 20 m has gaps that are two objects at 5 m.
         labels = _clusters(points, max(LINK_M, 0.02 * range_m))
-        best, best_score = None, 0.0
+        scored = []
         for label in np.unique(labels):
             member = np.flatnonzero(labels == label)
             extent = np.ptp(points[member, :2], axis=0).max()
@@ -239,10 +314,113 @@ class RegionExtractor:
                 continue
             centre = points[member].mean(axis=0)
             off = np.maximum(np.maximum(self._low - centre, centre - self._high), 0.0)
-            score = len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M)
-            if score > best_score:
-                best, best_score = member, score
-        return best
+            scored.append((len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M), member))
+        scored.sort(key=lambda pair: -pair[0])
+        return [member for _, member in scored[:MOST_CANDIDATES]]
+
+    def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
+        """One cloud per scan of a LiDAR: those of the object that stands still.
+
+        The guess is off, so that even what stands still wanders; but one error of the mounting,
+        small by its sigma, must explain it (least squares of its place and that error). Somebody
+        who walks past, or another object now and then, does not fit.
+
+        Args:
+            found: the candidates of each scan, best first.
+            lidar: its name.
+        """
+        scans = [candidates for candidates in found if candidates]
+        if not scans:
+            return []
+        sigma = self._config.lidars[lidar].sigma
+        prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
+        if self._config.lidars[lidar].fixed:
+            prior = np.full(6, 1e-3)
+        flat = [(i, c) for i, candidates in enumerate(scans) for c in candidates]
+        index = np.array([i for i, _ in flat])
+        track = _Track.of([c for _, c in flat], index, prior)
+        seeds = np.linspace(0, len(flat) - 1, min(len(flat), SEEDS)).round().astype(int)
+        # The best candidates first: among equals the larger object wins.
+        best: IntArray = max((track.follow(int(seed)) for seed in seeds), key=len)
+        lost = len(scans) - len(best)
+        if lost:
+            self.tallies[lidar].rejected["something else stood there"] += lost
+        clouds = [self.accept(flat[n][1]) for n in best.tolist()]
+        return [cloud for cloud in clouds if cloud is not None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An object in a scan that may be the target.
+
+    Attributes:
+        cloud: its points.
+        centre_lidar: (3,) metres, middle of its extent.
+        R_region_lidar: (3, 3) at the guess.
+        t_region_lidar: (3,) at the guess, metres.
+        cut: whether the edge of the field of view may cut it off.
+    """
+
+    cloud: TargetCloud
+    centre_lidar: Array
+    R_region_lidar: Array
+    t_region_lidar: Array
+    cut: bool
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Where the candidates of all scans of a LiDAR are, and how its mounting moves them.
+
+    Attributes:
+        scan: (n,) index of the scan of each candidate.
+        places: (n, 3) metres, region frame, at the guess.
+        moves: (n, 3, 6) derivative of the place by a right perturbation of the mounting.
+        reach_m: (n,) how far the guess may be off there.
+        prior: (6,) sigmas of the guess.
+    """
+
+    scan: IntArray
+    places: Array
+    moves: Array
+    reach_m: Array
+    prior: Array
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], scan: IntArray, prior: Array) -> _Track:
+        """Of candidates, and the scan of each."""
+        R = np.array([c.R_region_lidar for c in candidates])
+        centre = np.array([c.centre_lidar for c in candidates])
+        places = np.einsum("nij,nj->ni", R, centre) + [c.t_region_lidar for c in candidates]
+        moves = np.concatenate([-R @ skew(centre), R], axis=2)
+        reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centre, axis=1))
+        return cls(scan, places, moves, reach_m, prior)
+
+    def follow(self, seed: int) -> IntArray:
+        """Candidates, one per scan at most, of the object that candidate `seed` is of."""
+        place, error = self.places[seed], np.zeros(6)
+        gates = STANDS_STILL_M + np.outer(GATE_STEPS, self.reach_m + self.reach_m[seed])
+        members = np.array([seed])
+        for gate_m in gates:
+            off = np.linalg.norm(self.places + self.moves @ error - place, axis=1)
+            order = np.lexsort([off, self.scan])
+            first = order[np.unique(self.scan[order], return_index=True)[1]]
+            members = first[off[first] < gate_m[first]]
+            if len(members) < 2:
+                return np.asarray(members, np.int64)
+            place, error = self._fit(members)
+        return np.asarray(members, np.int64)
+
+    def _fit(self, members: IntArray) -> tuple[Array, Array]:
+        """The place (3,) of what the members are of, and the error (6,) of the guess."""
+        A = np.concatenate(
+            [np.tile(np.eye(3), (len(members), 1, 1)), -self.moves[members]], axis=2
+        ).reshape(-1, 9)
+        prior = np.hstack([np.zeros((6, 3)), np.diag(PLACE_SIGMA_M / self.prior)])
+        rows = np.vstack([A, prior])
+        right = np.concatenate([self.places[members].ravel(), np.zeros(6)])
+        x = np.linalg.lstsq(rows, right, rcond=None)[0]
+        return x[:3], x[3:]
 
 
 def _complain(region: str, config: Config, tallies: dict[str, _Tally]) -> str:
@@ -267,7 +445,7 @@ def _complain(region: str, config: Config, tallies: dict[str, _Tally]) -> str:
 
 def extract_targets(
     recordings: Sequence[Recording],
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
 ) -> tuple[TargetObservation, ...]:
@@ -275,7 +453,7 @@ def extract_targets(
 
     Args:
         recordings: the drives.
-        trajectories: one per drive, with a pose at every scan's stamp.
+        trajectories: one per drive; scans outside its span are left out.
         config: regions, initial guesses, ranges, filters.
         progress: told of every scan.
 
@@ -293,18 +471,23 @@ def extract_targets(
             "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
         )
     observations: list[TargetObservation] = []
-    total = sum(len(r.scan_stamps_ns(name)) for r in recordings for name in config.lidars)
+    wanted = [
+        {name: _wanted(r, t, name, config) for name in config.lidars}
+        for r, t in zip(recordings, trajectories, strict=True)
+    ]
+    total = sum(len(stamps) for drive in wanted for stamps in drive.values())
     with progress.stage("reading clouds", total) as advance:
         for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
             extractors = [RegionExtractor(r, config, trajectory) for r in config.target]
             clouds: list[list[TargetCloud]] = [[] for _ in extractors]
             for name in config.lidars:
-                for scan in recording.scans(name):
-                    for extractor, found in zip(extractors, clouds, strict=True):
-                        cloud = extractor.extract(scan, drive)
-                        if cloud is not None:
-                            found.append(cloud)
+                seen: list[list[list[Candidate]]] = [[] for _ in extractors]
+                for scan in recording.scans(name, wanted[drive][name]):
+                    for extractor, scans in zip(extractors, seen, strict=True):
+                        scans.append(extractor.candidates(scan, drive))
                     advance()
+                for extractor, scans, found in zip(extractors, seen, clouds, strict=True):
+                    found += extractor.choose(scans, name)
             for index, (extractor, found) in enumerate(zip(extractors, clouds, strict=True)):
                 label = "target" if len(extractors) == 1 else f"target {index + 1}"
                 if len(recordings) > 1:
@@ -315,6 +498,86 @@ def extract_targets(
     if not any(o.clouds for o in observations):
         raise TargetError(observations[0].warnings[-1])
     return tuple(observations)
+
+
+def _thinned(clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
+    """At most so many of the clouds, evenly spread."""
+    if len(clouds) <= most:
+        return clouds
+    return [clouds[i] for i in np.linspace(0, len(clouds) - 1, most).round().astype(int)]
+
+
+def _wanted(
+    recording: Recording, trajectory: VehicleTrajectory, lidar: str, config: Config
+) -> frozenset[int]:
+    """Stamps of the scans of a LiDAR that may see a target; the others are not decoded.
+
+    What a LiDAR's field of view and resolution are, a few of its scans tell.
+    """
+    begin, end = trajectory.span_ns
+    stamps = np.array([s for s in recording.scan_stamps_ns(lidar) if begin <= s <= end], np.int64)
+    if len(stamps) <= FEW_SCANS or config.target is None:
+        return frozenset(stamps.tolist())
+    some = stamps[np.linspace(0, len(stamps) - 1, SAMPLED_SCANS).astype(np.int64)]
+    seen = [scan.points_lidar for scan in recording.scans(lidar, frozenset(some.tolist()))]
+    seen = [points for points in seen if len(points)]
+    if not seen:
+        return frozenset(stamps.tolist())
+    view = _FieldOfView.of(seen)
+    possible = np.zeros(len(stamps), dtype=np.bool_)
+    for region in config.target:
+        extractor = RegionExtractor(region, config, trajectory)
+        towards = extractor.directions(lidar, stamps.tolist())
+        range_m = np.linalg.norm(towards, axis=1)
+        margin_m = extractor.reach_m() + np.array(
+            [widened_margin_m(config, lidar, r) for r in range_m.tolist()]
+        )
+        possible |= view.may_see(towards, margin_m, config.extraction.min_points)
+    return frozenset(stamps[possible].tolist())
+
+
+@dataclass(frozen=True)
+class _FieldOfView:
+    """Where a LiDAR looks, and how densely, as far as some of its scans tell.
+
+    Attributes:
+        edges: (centre, half width) of its azimuths in radians, or None if it looks all around.
+        density: points per steradian, at most.
+    """
+
+    edges: tuple[float, float] | None
+    density: float
+
+    @classmethod
+    def of(cls, clouds: Sequence[Array]) -> _FieldOfView:
+        """Of the points (N, 3) of some scans, lidar frame."""
+        directions = [c / np.maximum(np.linalg.norm(c, axis=1), 1e-9)[:, None] for c in clouds]
+        density = 0.0
+        for d in directions:
+            azimuth = np.floor(np.degrees(np.arctan2(d[:, 1], d[:, 0])) / CELL_DEG)
+            elevation = np.floor(np.degrees(np.arcsin(np.clip(d[:, 2], -1.0, 1.0))) / CELL_DEG)
+            cells = azimuth * 1000.0 + elevation
+            density = max(density, float(np.unique(cells, return_counts=True)[1].max()))
+        return cls(_azimuth_edges(np.concatenate(clouds)), density / math.radians(CELL_DEG) ** 2)
+
+    def may_see(self, towards: Array, margin_m: Array, min_points: int) -> npt.NDArray[np.bool_]:
+        """Whether something as large as a target may have enough points, (m,).
+
+        Args:
+            towards: (m, 3) middle of the region, lidar frame, metres.
+            margin_m: (m,) how far from there it may be.
+            min_points: that are enough.
+        """
+        range_m = np.linalg.norm(towards, axis=1)
+        nearest = np.maximum(range_m - margin_m, 0.1)
+        enough = self.density * LARGEST_TARGET_M2 / nearest**2 >= min_points
+        if self.edges is None:
+            return np.asarray(enough)
+        centre, half = self.edges
+        off = np.arctan2(towards[:, 1], towards[:, 0]) - centre
+        off = np.abs((off + math.pi) % (2.0 * math.pi) - math.pi)
+        widened = np.where(range_m > margin_m, np.arcsin(np.minimum(margin_m / range_m, 1.0)), 4.0)
+        return np.asarray(enough & (off <= half + widened))
 
 
 def _observation(
@@ -329,7 +592,7 @@ def _observation(
     kept = []
     for name, tally in extractor.tallies.items():
         if tally.kept >= config.extraction.min_scans:
-            kept += [c for c in found if c.lidar == name]
+            kept += _thinned([c for c in found if c.lidar == name], config.extraction.max_scans)
         elif not tally.scans:
             warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
         else:

@@ -332,6 +332,7 @@ def test_reduced_step_is_gauss_newton_s() -> None:
         mine = np.concatenate([rest, extrinsic])[6 * i : 6 * i + 6]
         np.testing.assert_allclose(mine, full.at(key), atol=1e-6)
         assert system.offset(key) == 6 * i
+        assert system.sizes[i] == 6
 
 
 def test_eliminating_the_slow_errors_loses_nothing() -> None:

@@ -16,6 +16,7 @@ from caliv_graph.conventions import key_mounting, key_sensor, key_target, key_ve
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import TargetCloud, TargetObservation, Trajectory
+from caliv_graph.trajectory.select import GivenTrajectory
 from tests.calibration.problems import make_case, moved
 from tests.samples import MOUNTINGS, pose
 
@@ -45,11 +46,13 @@ def observed(placement: int, *seen: tuple[str, int, int]) -> TargetObservation:
     )
 
 
-def drive(*stamps: int, x: float = 0.0) -> Trajectory:
+def drive(*stamps: int, x: float = 0.0) -> GivenTrajectory:
     """A pose per stamp, as many metres on as the stamp has nanoseconds."""
-    return Trajectory(
-        np.array(stamps, dtype=np.int64),
-        tuple(gtsam.Pose3(gtsam.Rot3(), np.array([x + s, 0.0, 0.0])) for s in stamps),
+    return GivenTrajectory(
+        Trajectory(
+            np.array(stamps, dtype=np.int64),
+            tuple(gtsam.Pose3(gtsam.Rot3(), np.array([x + s, 0.0, 0.0])) for s in stamps),
+        )
     )
 
 
@@ -122,7 +125,7 @@ def test_keys_are_in_the_order_of_the_product() -> None:
 def test_a_reference_that_saw_nothing_is_replaced_by_the_first_that_did() -> None:
     observations = [observed(0, ("rear", 0, 10), ("left", 0, 10))]
     config = config_of("front", "rear", "left", reference="front")
-    problem = pose_problem(observations, [drive(10)], config)
+    problem = pose_problem(observations, [drive(10, 20)], config)
     assert problem.lidars == ("rear", "left")
     assert problem.reference == "rear"
     assert problem.mounting_keys("rear") == (key_mounting(),)
@@ -132,7 +135,7 @@ def test_a_reference_that_saw_nothing_is_replaced_by_the_first_that_did() -> Non
 def test_a_trusted_lidar_takes_part_even_if_it_saw_nothing() -> None:
     observations = [observed(0, ("rear", 0, 10), ("left", 0, 10))]
     config = config_of("front", "rear", "left", reference="front", fixed=("front",))
-    problem = pose_problem(observations, [drive(10)], config)
+    problem = pose_problem(observations, [drive(10, 20)], config)
     assert problem.lidars == ("front", "rear", "left")
     assert problem.reference == "front"
     assert problem.fixed == {"front"}
@@ -144,7 +147,7 @@ def test_a_trusted_lidar_takes_part_even_if_it_saw_nothing() -> None:
 
 def test_nothing_seen_is_a_solve_error() -> None:
     with pytest.raises(SolveError, match="no cloud of a target to calibrate with"):
-        pose_problem([observed(0)], [drive(10)], config_of("front"))
+        pose_problem([observed(0)], [drive(10, 20)], config_of("front"))
 
 
 @pytest.mark.parametrize("reference", ["front", "rear", "left"])

@@ -36,6 +36,7 @@ from caliv_graph.simulation.scenario import (
 )
 from caliv_graph.simulation.worlds import GROUND, RayCaster, World, make_world
 from caliv_graph.targets.extract import RegionExtractor, extract_targets, widened_margin_m
+from caliv_graph.trajectory.select import GivenTrajectory
 
 FRONT = LidarModel(
     mounting=Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)),
@@ -107,8 +108,8 @@ def config_of(
     )
 
 
-def standing(T_map_vehicle: gtsam.Pose3 = T_MAP_VEHICLE, scans: int = 2) -> Trajectory:
-    return Trajectory(np.arange(scans, dtype=np.int64), (T_map_vehicle,) * scans)
+def standing(T_map_vehicle: gtsam.Pose3 = T_MAP_VEHICLE, scans: int = 2) -> GivenTrajectory:
+    return GivenTrajectory(Trajectory(np.arange(scans, dtype=np.int64), (T_map_vehicle,) * scans))
 
 
 def extracted(
@@ -527,7 +528,7 @@ def test_region_in_the_frame_of_the_first_pose() -> None:
     seen = scene(objects, T_map_vehicle=later)
     region = TargetRegion(min=(11, 0, -0.4), max=(13, 2, 1.1), frame="start")
     config = config_of(region)
-    trajectory = Trajectory(np.array([0, 7], dtype=np.int64), (start, later))
+    trajectory = GivenTrajectory(Trajectory(np.array([0, 7], dtype=np.int64), (start, later)))
     extractor = RegionExtractor(region, config, trajectory)
 
     cloud = extractor.extract(LidarScan("front", 7, seen.points_lidar, "7.pcd"), 0)

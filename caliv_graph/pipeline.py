@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from caliv_graph.products import (
     Array,
     Calibration,
     LidarResult,
+    MotionData,
     Recording,
     Solution,
     TargetObservation,
@@ -28,7 +29,9 @@ from caliv_graph.products import (
 from caliv_graph.progress import Progress
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.targets import extract_targets
+from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.observability import assess
 
 
@@ -82,8 +85,22 @@ def calibrate(
         calibration,
         solution,
         observations,
-        _warnings(recordings, trajectories, observations, solution),
+        (
+            *_warnings(recordings, trajectories, observations, solution),
+            *_headings(trajectories, motions),
+        ),
     )
+
+
+def _headings(
+    trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData]
+) -> Iterator[str]:
+    """A line for each drive whose orientation source does not point where the vehicle goes."""
+    for index, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, SmoothedTrajectory):
+            disagreement = heading_disagreement(trajectory, motions[index])
+            if disagreement is not None and disagreement.warning:
+                yield disagreement.warning
 
 
 def _stamps_used(

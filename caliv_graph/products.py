@@ -228,6 +228,8 @@ class TargetCloud:
         source: what to call the scan in messages.
         cut: True if the edge of the field of view may cut the target off: its points tell less
             about position than they seem to.
+        swept: the points as they were measured, each at its own time, if the LiDAR tells: they can
+            be brought together again once the mounting is known better.
     """
 
     lidar: str
@@ -236,6 +238,7 @@ class TargetCloud:
     points_lidar: Array
     source: str
     cut: bool = False
+    swept: LidarScan | None = None
 
 
 @dataclass(frozen=True)
@@ -271,6 +274,11 @@ class GroundObservation:
         cov: (3, 3) of (a, b, distance), the normal being along `normal + a u + b v`; rad, rad, m.
         centre_lidar: (3,) metres, centre of the points on the plane.
         points: how many there are.
+        R_vehicle_lidar: (3, 3) of the mounting that the motion was compensated with, a guess; None:
+            nothing was to be compensated.
+        by_mounting: (3, 3) what (a, b, distance) become more by if that is `R_vehicle_lidar Exp(w)`
+            instead, per radian of w; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
+            the ground rise by a centimetre during a sweep.
     """
 
     lidar: str
@@ -282,6 +290,8 @@ class GroundObservation:
     cov: Array
     centre_lidar: Array
     points: int
+    R_vehicle_lidar: Array | None = None
+    by_mounting: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ from caliv_graph.registration.register import (
     left_step,
     register_jointly,
 )
+from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.observability import (
     respectful_covariance,
@@ -140,12 +141,13 @@ def estimate(
     # The matrices are small: threads of a linear algebra library would mostly wait for each other,
     # for seconds where the machine has other work.
     with threadpool_limits(limits=1):
-        return _estimate(problem, used, config, progress)
+        return _estimate(problem, used, trajectories, config, progress)
 
 
 def _estimate(
     problem: Problem,
     observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
 ) -> Solution:
@@ -172,6 +174,8 @@ def _estimate(
     # single ones do not.
     begun = time.perf_counter()
     lines = linearise_clouds(problem, solve.values)
+    mountings = {name: problem.mounting(solve.values, name) for name in problem.lidars}
+    observations = [_deskewed(o, mountings, trajectories) for o in observations]
     states = [JointRegistration(observation, config) for observation in observations]
     again = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
@@ -191,6 +195,25 @@ def _estimate(
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     return replace(solution, stage_times_s=times, warnings=warnings)
+
+
+def _deskewed(
+    observation: TargetObservation,
+    mountings: Mapping[str, gtsam.Pose3],
+    trajectories: Sequence[VehicleTrajectory],
+) -> TargetObservation:
+    """The clouds again, their sweeps put together with the mountings that have been found.
+
+    A guess that is off by 3 degrees puts what the vehicle moves by during a sweep, 0.1 to 0.2 m,
+    off by some millimetres, in all clouds alike.
+    """
+    clouds = []
+    for cloud in observation.clouds:
+        if cloud.swept is not None:
+            scan = deskew(cloud.swept, mountings[cloud.lidar], trajectories[cloud.drive])
+            cloud = replace(cloud, points_lidar=scan.points_lidar)
+        clouds.append(cloud)
+    return replace(observation, clouds=tuple(clouds))
 
 
 def _with_determined_offsets(

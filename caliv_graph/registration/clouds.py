@@ -22,9 +22,10 @@ MERGED_RADIUS_M = 0.03
 the noise."""
 
 WINDOW_RAD = math.radians(10.0)
-WINDOW_CLOUDS = 30
+WINDOW_POINTS = 9000
 """Clouds are merged with those of the same LiDAR that saw the target from about the same side, the
-nearest ones first: from farther around, other surfaces hide behind the same beam."""
+nearest ones first, until there are so many points: from farther around, other surfaces hide behind
+the same beam."""
 
 DEPTH_GATE_M = 0.06
 """Neighbours farther than this from the first plane are of another surface."""
@@ -60,6 +61,7 @@ class CloudStack:
         normals: (N, 3) unit vectors, lidar frame, towards the sensor.
         flatness: (N,) 0 to 1, how far the normal can be trusted: 0 where the neighbourhood is
             sparse or noisy (there the normal is the direction to the sensor).
+        whole: J clouds as they were before thinning, for the normals.
     """
 
     points: Array
@@ -68,6 +70,7 @@ class CloudStack:
     beams: Array
     normals: Array
     flatness: Array
+    whole: tuple[Array, ...]
 
     @property
     def count(self) -> int:
@@ -150,6 +153,7 @@ def stack_clouds(
         beams=beams,
         normals=_towards_sensor(np.concatenate(normals), flat, beams),
         flatness=flat,
+        whole=tuple(cloud.points_lidar for cloud in observation.clouds),
     )
 
 
@@ -176,12 +180,15 @@ def merged_normals(
     views = stack.sum_per_cloud(beams)
     views /= np.linalg.norm(views, axis=1)[:, None]
     ends = np.append(stack.starts[1:], len(points))
+    whole = [cloud @ R[j].T + t[j] for j, cloud in enumerate(stack.whole)]
+    sizes = np.array([len(cloud) for cloud in whole])
     normals, flatness = np.zeros_like(points), np.zeros(len(points))
     for j in range(stack.count):
         apart = np.where(lidar == lidar[j], np.arccos(np.clip(views @ views[j], -1.0, 1.0)), np.inf)
-        near = np.argsort(apart, kind="stable")[:WINDOW_CLOUDS]
-        near = near[apart[near] <= WINDOW_RAD]
-        around = np.concatenate([points[stack.starts[i] : ends[i]] for i in near])
+        near = np.argsort(apart, kind="stable")
+        before = np.cumsum(sizes[near]) - sizes[near]
+        near = near[(apart[near] <= WINDOW_RAD) & (before < WINDOW_POINTS)]
+        around = np.concatenate([whole[i] for i in near])
         own = slice(stack.starts[j], ends[j])
         normals[own], flatness[own] = _normals_across(
             points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, sigma_range_m

@@ -251,7 +251,14 @@ class RegionExtractor:
             low, high = np.percentile(target, [2, 98], axis=0)
             out.append(
                 Candidate(
-                    cloud=TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source),
+                    cloud=TargetCloud(
+                        scan.lidar,
+                        drive,
+                        scan.stamp_ns,
+                        target,
+                        scan.source,
+                        swept=None if times is None else compact,
+                    ),
                     centre_lidar=0.5 * (low + high),
                     R_region_lidar=R,
                     t_region_lidar=t,

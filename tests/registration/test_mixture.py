@@ -49,6 +49,7 @@ def stack_of(
         beams=-normals if beams is None else beams,
         normals=normals,
         flatness=np.ones(count) if flatness is None else flatness,
+        whole=(points,),
     )
 
 

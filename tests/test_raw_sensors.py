@@ -1,0 +1,168 @@
+"""From IMU, GNSS, velocity and bags' clouds to extrinsics, on a simulated drive with known truth.
+
+The drive has everything that goes wrong at once: somebody walks past the chair, the GNSS jumps, one
+LiDAR's stamps are 20 ms late, and every cloud is a sweep of 0.1 s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M, pose_problem
+from caliv_graph.config import Config, parse_config
+from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.products import Array
+from caliv_graph.progress import SilentProgress
+from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.scenario import Scenario, load_scenario
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.targets import extract_targets
+from caliv_graph.trajectory.select import smooth_trajectories
+from caliv_graph.uncertainty.evaluation import evaluate
+
+SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
+MM, MRAD = 1e-3, 1e-3
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A simulated drive and the config that calibrates it quickly: few scans, few components."""
+
+    recording: SimulatedRecording
+    config: Config
+
+
+def swept_and_noisy() -> Scenario:
+    """`noisy` with the sweeps of `distorted`."""
+    noisy = load_scenario(SCENARIOS / "noisy.yaml")
+    distorted = load_scenario(SCENARIOS / "distorted.yaml")
+    lidars = {
+        name: lidar.model_copy(update={"sweep": distorted.lidars[name].sweep})
+        for name, lidar in noisy.lidars.items()
+    }
+    return noisy.model_copy(update={"lidars": lidars})
+
+
+@cache
+def drive() -> Drive:
+    recording = simulate_drive(swept_and_noisy(), 3)
+    raw = config_of(recording, has_bag=True)
+    raw |= {"solve": {"time_offset": True}, "registration": {"components": 400, "max_points": 300}}
+    raw["extraction"] = {"max_scans": 40}
+    return Drive(recording, parse_config(raw, "config.yaml", Path("/nowhere")))
+
+
+@cache
+def run() -> CalibrationRun:
+    return calibrate([drive().recording], drive().config, SilentProgress())
+
+
+def test_extrinsics_are_found() -> None:
+    errors = evaluate(run().calibration, drive().recording.truth.T_vehicle_lidar)
+    (pair,) = errors["pairs"]
+    assert np.abs(pair["rotation_rad"]).max() < 1.5 * MRAD
+    # z to within what roll and pitch of LiDARs that never meet leave; x and y are determined.
+    assert np.abs(pair["translation_m"][:2]).max() < 10 * MM
+    for lidar in errors["lidars"].values():
+        assert np.abs(lidar["s2v"]["rotation_rad"]).max() < 1.5 * MRAD
+        assert np.abs(lidar["s2v"]["translation_m"][:2]).max() < 10 * MM
+        # Six degrees of freedom, of which the height is the guess's: 99.9 percent are below 22.
+        assert lidar["s2v"]["nees"] < 22.0
+
+
+def test_height_alone_is_not_determined() -> None:
+    calibration = run().calibration
+    assert calibration.status == "partial"
+    for lidar in calibration.lidars.values():
+        assert [axis for axis, told in lidar.determined.items() if not told] == ["z"]
+
+
+def test_a_late_clock_is_found() -> None:
+    for name, true_s in drive().recording.truth.time_offset_s.items():
+        found = run().calibration.lidars[name].time_offset
+        assert found is not None
+        value, sigma = found
+        assert value == pytest.approx(true_s, abs=2e-3)
+        assert abs(value - true_s) < 4.0 * sigma
+        assert 1e-4 < sigma < 2e-3
+
+
+def test_no_pose_noise_is_reported_where_no_poses_were_given() -> None:
+    assert run().solution.pose_noise is None
+    assert "pose_noise" not in run().calibration.provenance
+
+
+def centres_map(which: Drive) -> Array:
+    """Middle of every extracted cloud in the map, through the true poses and mountings."""
+    recording, config = which.recording, which.config
+    trajectories = smooth_trajectories([recording], config, [[]])
+    (observation,) = extract_targets([recording], trajectories, config, SilentProgress())
+    out = []
+    for cloud in observation.clouds:
+        late_ns = round(1e9 * recording.truth.time_offset_s[cloud.lidar])
+        (T_map_vehicle,) = recording.truth.T_map_vehicle(np.array([cloud.stamp_ns - late_ns]))
+        T = T_map_vehicle.compose(recording.truth.T_vehicle_lidar[cloud.lidar])
+        points = T.transformFrom(cloud.points_lidar.T).T
+        out.append(0.5 * (points.min(axis=0) + points.max(axis=0)))
+    return np.array(out)
+
+
+def test_the_walker_is_not_taken_for_the_chair() -> None:
+    centres = centres_map(drive())
+    assert len(centres) == 80
+    off = np.linalg.norm(centres[:, :2] - np.median(centres[:, :2], axis=0), axis=1)
+    # In a dozen of these scans the walker is the largest thing in the region, up to 3 m away.
+    assert (off < 0.25).mean() > 0.95
+    assert off.max() < 0.6
+
+
+def test_scans_that_cannot_see_the_target_are_not_decoded() -> None:
+    recording, config = drive().recording, drive().config
+    decoded: dict[str, int] = {}
+
+    class Counting:
+        """The recording, counting what it hands out."""
+
+        name = recording.name
+        lidars = recording.lidars
+        scan_stamps_ns = staticmethod(recording.scan_stamps_ns)
+        motion = staticmethod(recording.motion)
+        warnings = staticmethod(recording.warnings)
+
+        @staticmethod
+        def scans(lidar: str, wanted: object = None) -> object:
+            for scan in recording.scans(lidar, wanted):  # type: ignore[arg-type]
+                decoded[lidar] = decoded.get(lidar, 0) + 1
+                yield scan
+
+    trajectories = smooth_trajectories([recording], config, [[]])
+    extract_targets([Counting()], trajectories, config, SilentProgress())  # type: ignore[list-item]
+    for name in config.lidars:
+        assert 100 < decoded[name] < 0.8 * len(recording.scan_stamps_ns(name))
+
+
+def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
+    recording, config = drive().recording, drive().config
+    clouds = run().observations
+    stamps = sorted({c.stamp_ns for o in clouds for c in o.clouds})[:5]
+    trajectories = smooth_trajectories([recording], config, [stamps])
+    some = [c for c in clouds[0].clouds if c.stamp_ns in stamps]
+    observation = clouds[0].__class__(0, "target", np.zeros(3), tuple(some))
+    problem = pose_problem([observation], trajectories, config)
+    cov = np.linalg.inv(problem.motion[0])
+    without, poses = trajectories[0].joint_information(stamps)  # type: ignore[union-attr]
+    expected = np.linalg.inv(without)
+    z = np.arange(5, len(cov), 6)
+    expected[z, z] += HEAVE_SIGMA_M**2
+    np.testing.assert_allclose(cov, expected, rtol=1e-5, atol=1e-12)
+    assert not problem.given().any()
+    assert problem.drift_keys() == ()
+    shift = problem.origins_map[0]
+    for T, smoothed in zip(problem.T_map_vehicle, poses, strict=True):
+        assert T.equals(gtsam.Pose3(smoothed.rotation(), smoothed.translation() - shift), 1e-9)

@@ -529,7 +529,7 @@ def _refine(
     problem, config = state.problem, state.config
     prior = _prior_information(problem)
     steady = _steady_graph(state)
-    _begin_shapes(state, states)
+    _begin_shapes(state, states, normals=False)
     undetermined: int | None = None
     converged, iteration = False, 0
     while iteration < REFINEMENTS and not converged:
@@ -558,7 +558,7 @@ def _refine(
         change = state.weights.update(squared)
         _hand_weights(state, states)
         if iteration == SHAPES_BEGUN_AGAIN:
-            _begin_shapes(state, states)
+            _begin_shapes(state, states, normals=True)
         size = np.abs(step.reshape(-1, 6))
         sigmas = float(np.sqrt(step @ (reduced.D + prior) @ step))
         small = size[:, :3].max() < STEP_TOLERANCE[0] and size[:, 3:].max() < STEP_TOLERANCE[1]
@@ -575,15 +575,16 @@ def _refine(
     )
 
 
-def _begin_shapes(state: _State, states: Sequence[JointRegistration]) -> None:
-    """New normals and a new mixture, where the graph puts the clouds.
+def _begin_shapes(state: _State, states: Sequence[JointRegistration], normals: bool) -> None:
+    """A new mixture, and if asked for new normals, where the graph puts the clouds.
 
     EM ends near where it starts: what it starts from shall not depend on the way that the
     registration took from the initial guess.
     """
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, _per_placement(states, lines), strict=True):
-        shape.refine_normals(R, t)
+        if normals:
+            shape.refine_normals(R, t)
         shape.seed(R, t, FINE_SIGMA_M)
     _hand_weights(state, states)
 

@@ -30,6 +30,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.progress import Progress
 from caliv_graph.targets.ground import fit_ground, height_above
+from caliv_graph.targets.search import find_target
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -469,23 +470,19 @@ def extract_targets(
         the target in fewer than `extraction.min_scans` scans are left out with a warning.
 
     Raises:
-        TargetError: no LiDAR sees a target, or no region was given.
+        TargetError: no LiDAR sees a target, or none was found.
         RecordingError: a cloud could not be read.
     """
-    if config.target is None:
-        raise TargetError(
-            "target: no region given, and finding the target without one is not built yet. "
-            "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
-        )
+    regions, labels, hints = _regions(recordings, trajectories, config, progress)
     observations: list[TargetObservation] = []
     wanted = [
-        {name: _wanted(r, t, name, config) for name in config.lidars}
-        for r, t in zip(recordings, trajectories, strict=True)
+        {name: _wanted(r, t, name, config, of_drive) for name in config.lidars}
+        for r, t, of_drive in zip(recordings, trajectories, regions, strict=True)
     ]
     total = sum(len(stamps) for drive in wanted for stamps in drive.values())
     with progress.stage("reading clouds", total) as advance:
         for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
-            extractors = [RegionExtractor(r, config, trajectory) for r in config.target]
+            extractors = [RegionExtractor(r, config, trajectory) for r in regions[drive]]
             clouds: list[list[TargetCloud]] = [[] for _ in extractors]
             for name in config.lidars:
                 seen: list[list[list[Candidate]]] = [[] for _ in extractors]
@@ -496,15 +493,48 @@ def extract_targets(
                 for extractor, scans, found in zip(extractors, seen, clouds, strict=True):
                     found += extractor.choose(scans, name)
             for index, (extractor, found) in enumerate(zip(extractors, clouds, strict=True)):
-                label = "target" if len(extractors) == 1 else f"target {index + 1}"
+                label = labels[drive] if len(extractors) == 1 else f"target {index + 1}"
                 if len(recordings) > 1:
                     label += f" of {recording.name}"
                 observations.append(
-                    _observation(len(observations), label, extractor, found, config)
+                    _observation(len(observations), label, extractor, found, config, hints[drive])
                 )
     if not any(o.clouds for o in observations):
         raise TargetError(observations[0].warnings[-1])
     return tuple(observations)
+
+
+def _regions(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+) -> tuple[list[tuple[TargetRegion, ...]], list[str], list[tuple[str, ...]]]:
+    """Per drive the regions, given or found; what to call a target; and what to tell of it."""
+    count = len(recordings)
+    if config.target is not None:
+        return [config.target] * count, ["target"] * count, [()] * count
+    regions: list[tuple[TargetRegion, ...]] = []
+    labels: list[str] = []
+    hints: list[tuple[str, ...]] = []
+    for found in find_target(recordings, trajectories, config, progress):
+        x, y, _ = found.centre_map
+        label = f"target found at ({x:.1f}, {y:.1f}) m of the map"
+        regions.append((found.region,))
+        labels.append(label)
+        lines = [
+            f"{label}: lidar '{name}' does not see it in any of {found.looked_at[name]} scans "
+            "looked at"
+            for name, scans in found.scans.items()
+            if scans == 0 and found.looked_at[name]
+        ]
+        if found.others:
+            lines.append(
+                f"{label}: {found.extent_m:.1f} m wide, {found.height_m:.1f} m high; it might as "
+                f"well be {', '.join(found.others)}. Give a target region to choose"
+            )
+        hints.append(tuple(lines))
+    return regions, labels, hints
 
 
 def _thinned(clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
@@ -515,7 +545,11 @@ def _thinned(clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
 
 
 def _wanted(
-    recording: Recording, trajectory: VehicleTrajectory, lidar: str, config: Config
+    recording: Recording,
+    trajectory: VehicleTrajectory,
+    lidar: str,
+    config: Config,
+    regions: Sequence[TargetRegion],
 ) -> frozenset[int]:
     """Stamps of the scans of a LiDAR that may see a target; the others are not decoded.
 
@@ -523,7 +557,7 @@ def _wanted(
     """
     begin, end = trajectory.span_ns
     stamps = np.array([s for s in recording.scan_stamps_ns(lidar) if begin <= s <= end], np.int64)
-    if len(stamps) <= FEW_SCANS or config.target is None:
+    if len(stamps) <= FEW_SCANS:
         return frozenset(stamps.tolist())
     some = stamps[np.linspace(0, len(stamps) - 1, SAMPLED_SCANS).astype(np.int64)]
     seen = [scan.points_lidar for scan in recording.scans(lidar, frozenset(some.tolist()))]
@@ -532,7 +566,7 @@ def _wanted(
         return frozenset(stamps.tolist())
     view = _FieldOfView.of(seen)
     possible = np.zeros(len(stamps), dtype=np.bool_)
-    for region in config.target:
+    for region in regions:
         extractor = RegionExtractor(region, config, trajectory)
         towards = extractor.directions(lidar, stamps.tolist())
         range_m = np.linalg.norm(towards, axis=1)
@@ -593,9 +627,10 @@ def _observation(
     extractor: RegionExtractor,
     found: list[TargetCloud],
     config: Config,
+    hints: Sequence[str],
 ) -> TargetObservation:
     """Drops the LiDARs that saw too little, and says so."""
-    warnings = []
+    warnings = list(hints)
     kept = []
     for name, tally in extractor.tallies.items():
         if tally.kept >= config.extraction.min_scans:

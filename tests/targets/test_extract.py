@@ -603,9 +603,11 @@ def test_a_drive_that_misses_one_of_its_targets_keeps_the_other() -> None:
 # ------------------------------------------------------------------ what is said of failures
 
 
-def test_no_region_is_said_to_be_missing() -> None:
-    with pytest.raises(TargetError, match=r"no region given.*min: \[x, y, z\]"):
-        extracted_from({"front": []}, config_of())
+def test_without_a_region_the_target_is_searched_for() -> None:
+    # Scans without a point hold none, and the message says how to give one.
+    empty = [np.zeros((0, 3))] * 8
+    with pytest.raises(TargetError, match=r"none found.*target: \{min"):
+        extracted_from({"front": empty}, config_of())
 
 
 def test_a_region_that_nothing_enters_says_how_near_it_came() -> None:

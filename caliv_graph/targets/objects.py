@@ -1,0 +1,295 @@
+"""What stands on the ground in one scan: without the ground, in clusters, each described."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from caliv_graph.products import Array, IntArray
+from caliv_graph.targets.surface import GroundSurface, fit_surface
+
+MAX_RANGE_M = 30.0
+"""Objects farther away are not looked at: few points, and far from where the guess puts them."""
+
+BEYOND_M = 4.0
+"""Points up to this much farther are clustered too, to know what goes on beyond MAX_RANGE_M."""
+
+CLEARANCE_M = 0.12
+"""Points nearer to the ground surface than this are ground."""
+
+CEILING_M = 4.0
+"""Points higher above the ground than this hang over things; they belong to none."""
+
+VOXEL_M = 0.1
+"""Clustering looks at one point per voxel of this size."""
+
+LINK_M = 0.3
+"""Points nearer than this belong to one object, at least (as in `extract`)."""
+
+MAX_LINK_M = 1.0
+"""Points farther apart than this do not, however far the beams are apart."""
+
+LINK_BEAMS = 2.5
+"""Neighbours are linked across one beam that came back from elsewhere."""
+
+VERTICAL = 0.4
+"""Distances along z count by this: rings of a LiDAR are farther apart than its columns."""
+
+BIN_RAD = math.radians(2.0)
+"""Size of the bins of direction in which beams are counted."""
+
+MIN_POINTS = 6
+"""Fewer points are no object."""
+
+WIDE_M = 1.75
+"""Wider than a target by what noise and mixed returns add."""
+
+DIRECTIONS = np.linspace(0.0, math.pi, 12, endpoint=False)
+"""In which widths are measured: the largest is at most 1% larger than what they find."""
+
+TRIM = 0.02
+"""Part of the points at each end that a width leaves out: mixed returns trail behind edges."""
+
+OCCLUDED_M = 0.4
+"""What is nearer than the object by this is another object, in front of it."""
+
+BESIDE_RAD = math.radians(0.8)
+"""How far beside an object one looks for what may hide the rest of it."""
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """A cluster of points above the ground in one scan.
+
+    Lengths in metres, in level axes about the LiDAR: the map's, as far as the guess is right.
+
+    Attributes:
+        centre: (3,) middle of the points, lidar frame.
+        base: (3,) below it, on the ground, lidar frame.
+        range_m: horizontal distance of the nearest points.
+        extent_m: largest horizontal width.
+        bottom_m: of its lowest points above the ground; NaN where no ground was seen nearby.
+        top_m: of its highest points above the ground; NaN likewise.
+        points: how many.
+        azimuth: (2,) radians, from and to, lidar frame; from is in (-pi, pi].
+        highest_rad: elevation of its highest beam, lidar frame.
+        hidden: something nearer hides what is beside it, or it reaches beyond MAX_RANGE_M: it may
+            be larger than it looks.
+        outline: (m, 3) some of its points, lidar frame.
+    """
+
+    centre: Array
+    base: Array
+    range_m: float
+    extent_m: float
+    bottom_m: float
+    top_m: float
+    points: int
+    azimuth: tuple[float, float]
+    highest_rad: float
+    hidden: bool
+    outline: Array
+
+
+@dataclass(frozen=True)
+class SeenScan:
+    """What one scan shows.
+
+    Attributes:
+        objects: above the ground.
+        azimuths: (n,) bins of 0.5 degrees in which there are returns, ascending.
+        highest_rad: elevation of the highest beam that returned anything.
+        has_ground: whether ground was found.
+    """
+
+    objects: tuple[SeenObject, ...]
+    azimuths: IntArray
+    highest_rad: float
+    has_ground: bool
+
+
+AZIMUTH_BIN_RAD = math.radians(0.5)
+
+
+def see_objects(points_lidar: Array, R_map_lidar: Array) -> SeenScan:
+    """Takes a scan apart.
+
+    Args:
+        points_lidar: (N, 3) metres, lidar frame, all as of one time.
+        R_map_lidar: (3, 3) attitude of the LiDAR, as good as the guess.
+    """
+    azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
+    across = np.hypot(points_lidar[:, 0], points_lidar[:, 1])
+    elevation = np.arctan2(points_lidar[:, 2], across)
+    bins = np.unique(np.floor(azimuth / AZIMUTH_BIN_RAD).astype(np.int64))
+    highest = float(elevation.max(initial=-math.pi / 2.0))
+    range_m = np.hypot(across, points_lidar[:, 2])
+    near = np.flatnonzero(range_m < MAX_RANGE_M + BEYOND_M)
+    level = points_lidar[near] @ R_map_lidar.T
+    surface = fit_surface(level)
+    if surface is None:
+        return SeenScan((), bins, highest, False)
+    height = level[:, 2] - surface.height_at(level[:, :2])
+    above = (height > CLEARANCE_M) & (height < CEILING_M)
+    stands = _Standing(
+        index=near[above],
+        level=level[above],
+        height=height[above],
+        azimuth=azimuth[near[above]],
+        elevation=elevation[near[above]],
+        range_m=range_m[near[above]],
+    )
+    spacing = _beam_spacing(azimuth, elevation)(stands.azimuth, stands.elevation)
+    labels = _clusters(stands, spacing)
+    objects = _describe(stands, labels, points_lidar, R_map_lidar, surface, spacing)
+    return SeenScan(tuple(objects), bins, highest, True)
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """Points above the ground: index in the scan, and what is known of each."""
+
+    index: IntArray
+    level: Array
+    height: Array
+    azimuth: Array
+    elevation: Array
+    range_m: Array
+
+
+class _BeamSpacing:
+    """Angle between neighbouring beams, by direction: a LiDAR's rings may be uneven."""
+
+    def __init__(self, spacing: Array) -> None:
+        self._spacing = spacing
+
+    def __call__(self, azimuth: Array, elevation: Array) -> Array:
+        return self._spacing[_direction_bin(elevation), _direction_bin(azimuth)]
+
+
+def _direction_bin(angle: Array) -> IntArray:
+    bins: IntArray = np.floor((angle + math.pi) / BIN_RAD).astype(np.int64)
+    return bins % round(2.0 * math.pi / BIN_RAD)
+
+
+def _beam_spacing(azimuth: Array, elevation: Array) -> _BeamSpacing:
+    """Counts returns per direction. A bin half in the sky takes the count of its neighbours."""
+    n = round(2.0 * math.pi / BIN_RAD)
+    key = _direction_bin(elevation) * n + _direction_bin(azimuth)
+    count = np.bincount(key, minlength=n * n).reshape(n, n).astype(np.float64)
+    solid = np.cos((np.arange(n) + 0.5) * BIN_RAD - math.pi)[:, None]
+    density = maximum_filter(count / np.maximum(np.abs(solid), 0.1), size=3, mode="wrap")
+    return _BeamSpacing(BIN_RAD / np.sqrt(np.maximum(density, 0.25)))
+
+
+def _clusters(stands: _Standing, spacing: Array) -> IntArray:
+    """(n,) labels of connected components, on one point per voxel."""
+    if not len(stands.level):
+        return np.zeros(0, dtype=np.int64)
+    cell = np.floor(stands.level / VOXEL_M).astype(np.int64) + 4096
+    key = (cell[:, 0] * 8192 + cell[:, 1]) * 8192 + cell[:, 2]
+    _, first, member = np.unique(key, return_index=True, return_inverse=True)
+    points = stands.level[first] * np.array([1.0, 1.0, VERTICAL])
+    link = np.clip(LINK_BEAMS * spacing[first] * stands.range_m[first], LINK_M, MAX_LINK_M)
+    tree = cKDTree(points)
+    pairs = [tree.query_pairs(LINK_M, output_type="ndarray")]
+    sparse = np.flatnonzero(link > LINK_M)
+    if len(sparse):
+        found = tree.query_ball_point(points[sparse], link[sparse])
+        counts = np.array([len(f) for f in found])
+        to = np.concatenate([np.asarray(f, dtype=np.intp) for f in found])
+        pairs.append(np.column_stack([np.repeat(sparse, counts), to]))
+    edges = np.vstack(pairs)
+    graph = coo_array(
+        (np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])),
+        shape=(len(points), len(points)),
+    )
+    _, labels = connected_components(graph, directed=False)
+    of_point: IntArray = labels[member.ravel()].astype(np.int64)
+    return of_point
+
+
+def _describe(
+    stands: _Standing,
+    labels: IntArray,
+    points_lidar: Array,
+    R_map_lidar: Array,
+    surface: GroundSurface,
+    spacing: Array,
+) -> list[SeenObject]:
+    """The clusters of at least MIN_POINTS points within MAX_RANGE_M."""
+    order = np.argsort(labels, kind="stable")
+    splits = np.flatnonzero(np.diff(labels[order])) + 1
+    by_azimuth = np.argsort(stands.azimuth, kind="stable")
+    sorted_azimuth = stands.azimuth[by_azimuth]
+    out = []
+    for member in np.split(order, splits):
+        if len(member) < MIN_POINTS or stands.range_m[member].min() > MAX_RANGE_M:
+            continue
+        level = stands.level[member]
+        middle, extent = _middle_and_extent(level[:, :2])
+        turned = _unwrapped(stands.azimuth[member])
+        low, high = float(turned.min()), float(turned.max())
+        range_m = float(np.quantile(np.hypot(level[:, 0], level[:, 1]), 0.1))
+        hidden = bool(stands.range_m[member].max() > MAX_RANGE_M)
+        if not hidden and extent < WIDE_M:
+            beside = max(BESIDE_RAD, 2.0 * float(np.median(spacing[member])))
+            elevations = np.quantile(stands.elevation[member], [0.3, 1.0])
+            for side in (low - beside, high):
+                other = by_azimuth[_within(sorted_azimuth, side, side + beside)]
+                in_front = stands.range_m[other] < stands.range_m[member].min() - OCCLUDED_M
+                level_with = (stands.elevation[other] > elevations[0]) & (
+                    stands.elevation[other] < elevations[1] + 2.0 * beside
+                )
+                hidden = hidden or bool((in_front & level_with).sum() >= 2)
+        ground_z = float(surface.height_at(middle[None])[0])
+        known = bool(surface.is_seen_at(middle[None])[0])
+        height = np.quantile(stands.height[member], [TRIM, 1.0 - TRIM]) if known else [math.nan] * 2
+        centre = np.array([*middle, ground_z + 0.5 * float(stands.height[member].max())])
+        step = max(1, len(member) // 100)
+        out.append(
+            SeenObject(
+                centre=R_map_lidar.T @ centre,
+                base=R_map_lidar.T @ np.array([*middle, ground_z]),
+                range_m=range_m,
+                extent_m=extent,
+                bottom_m=float(height[0]),
+                top_m=float(height[1]),
+                points=len(member),
+                azimuth=(low, high),
+                highest_rad=float(stands.elevation[member].max()),
+                hidden=hidden,
+                outline=points_lidar[stands.index[member[::step]]],
+            )
+        )
+    return out
+
+
+def _middle_and_extent(xy: Array) -> tuple[Array, float]:
+    """Middle of the points (n, 2) and the largest of their widths, trimmed at both ends."""
+    axes = np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)])
+    low, high = np.quantile(xy @ axes, [TRIM, 1.0 - TRIM], axis=0)
+    quarter = len(DIRECTIONS) // 2
+    middle = 0.5 * (low + high)[[0, quarter]]
+    return np.asarray(middle), float((high - low).max())
+
+
+def _unwrapped(azimuth: Array) -> Array:
+    """Azimuths without the jump at pi, counted on from the first of them."""
+    reference = float(azimuth[0])
+    return np.asarray(reference + (azimuth - reference + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def _within(sorted_azimuth: Array, begin: float, end: float) -> IntArray:
+    """Indices of the sorted azimuths in [begin, end], across the jump at pi too."""
+    out = []
+    for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi):
+        first, last = np.searchsorted(sorted_azimuth, [begin + turn, end + turn])
+        out.append(np.arange(first, last))
+    return np.concatenate(out)

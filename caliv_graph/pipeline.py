@@ -29,6 +29,7 @@ from caliv_graph.products import (
 from caliv_graph.progress import Progress
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.targets import extract_targets
+from caliv_graph.targets.ground_planes import measure_grounds
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -70,10 +71,11 @@ def calibrate(
         nowhere: list[list[int]] = [[] for _ in recordings]
         rough = smooth_trajectories(recordings, config, nowhere, motions)
     observations = extract_targets(recordings, rough, config, progress)
+    grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_used(recordings, observations)
         trajectories = smooth_trajectories(recordings, config, stamps, motions)
-    solution = estimate(observations, trajectories, config, progress)
+    solution = estimate(observations, trajectories, config, progress, grounds)
     uncertainty = assess(
         solution.information_data,
         solution.information_prior,
@@ -87,6 +89,7 @@ def calibrate(
         observations,
         (
             *_warnings(recordings, trajectories, observations, solution),
+            *ground_warnings,
             *_headings(trajectories, motions),
         ),
     )

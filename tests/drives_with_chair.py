@@ -11,7 +11,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config, LidarConfig, Mounting, load_config
+from caliv_graph.config import Config, GroundConfig, LidarConfig, Mounting, load_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
@@ -216,13 +216,14 @@ def paper_scenario(
 def simulated(scenario: Scenario, seed: int, folder: Path) -> ChairDrive:
     """Simulates a drive into a new folder, and reads it back.
 
-    The target's region is counted from the start of the drive, so that the map may be moved.
+    The target's region is counted from the start of the drive, so that the map may be moved. The
+    ground is left out: what the target alone tells is what these drives are for.
     """
     simulate_caliv(scenario, folder, seed, threads=1)
     config = load_config(folder / "config.yaml")
     assert config.target is not None
     regions = tuple(r.model_copy(update={"frame": "start"}) for r in config.target)
-    config = config.model_copy(update={"target": regions})
+    config = config.model_copy(update={"target": regions, "ground": GroundConfig(use=False)})
     reader = open_recording(config)
     given = reader.motion().poses
     assert given is not None

@@ -76,8 +76,23 @@ def test_extrinsics_are_found() -> None:
         assert lidar["s2v"]["nees"] < 22.0
 
 
-def test_height_alone_is_not_determined() -> None:
+def test_the_ground_gives_the_height_and_ties_the_lidars_together() -> None:
     calibration = run().calibration
+    assert calibration.status == "ok"
+    (pair,) = evaluate(calibration, drive().recording.truth.T_vehicle_lidar)["pairs"]
+    assert np.abs(pair["rotation_rad"][:2]).max() < 0.15 * MRAD
+    assert abs(pair["translation_m"][2]) < 1.0 * MM
+    for name, lidar in calibration.lidars.items():
+        assert all(lidar.determined.values())
+        height_m = drive().recording.truth.T_vehicle_lidar[name].translation()[2]
+        # The vehicle's own height was drawn with 5 mm.
+        assert lidar.T_vehicle_lidar.translation()[2] == pytest.approx(height_m, abs=15 * MM)
+
+
+def test_without_its_height_above_ground_height_alone_is_not_determined() -> None:
+    ground = drive().config.ground.model_copy(update={"vehicle_height": None})
+    config = drive().config.model_copy(update={"ground": ground})
+    calibration = calibrate([drive().recording], config, SilentProgress()).calibration
     assert calibration.status == "partial"
     for lidar in calibration.lidars.values():
         assert [axis for axis, told in lidar.determined.items() if not told] == ["z"]
@@ -88,7 +103,8 @@ def test_a_late_clock_is_found() -> None:
         found = run().calibration.lidars[name].time_offset
         assert found is not None
         value, sigma = found
-        assert value == pytest.approx(true_s, abs=2e-3)
+        # With a third of the scans and of the components; all of them find it to 0.7 ms.
+        assert value == pytest.approx(true_s, abs=3e-3)
         assert abs(value - true_s) < 4.0 * sigma
         assert 1e-4 < sigma < 2e-3
 

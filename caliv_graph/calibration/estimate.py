@@ -37,6 +37,12 @@ from caliv_graph.calibration.graph import (
     retract,
     with_given_poses,
 )
+from caliv_graph.calibration.ground import (
+    GroundWeights,
+    ground_graph,
+    ground_values,
+    ground_weights,
+)
 from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
     first_pose_noise,
@@ -52,6 +58,7 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import (
     Array,
+    GroundObservation,
     PoseNoise,
     Registration,
     Solution,
@@ -115,6 +122,8 @@ class _State:
     noise: PoseNoise
     scale: float
     weights: RobustWeights
+    grounds: tuple[GroundObservation, ...] = ()
+    ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
 
 
@@ -123,6 +132,7 @@ def estimate(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
+    grounds: Sequence[GroundObservation] = (),
 ) -> Solution:
     """Registers, solves and refines, as `solve.mode` says.
 
@@ -131,6 +141,8 @@ def estimate(
         trajectories: one per drive.
         config: modes, kernels, priors.
         progress: told of every stage.
+        grounds: the ground under the vehicle, as the LiDARs saw it. The paper's procedure,
+            `staged`, does without.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
@@ -138,16 +150,19 @@ def estimate(
     used = [o for o in observations if len(o.clouds) >= 2]
     used = [replace(o, placement=m) for m, o in enumerate(used)]
     problem = pose_problem(used, trajectories, config)
+    if config.solve.mode == "staged":
+        grounds = ()
     # The matrices are small: threads of a linear algebra library would mostly wait for each other,
     # for seconds where the machine has other work.
     with threadpool_limits(limits=1):
-        return _estimate(problem, used, trajectories, config, progress)
+        return _estimate(problem, used, trajectories, tuple(grounds), config, progress)
 
 
 def _estimate(
     problem: Problem,
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
+    grounds: tuple[GroundObservation, ...],
     config: Config,
     progress: Progress,
 ) -> Solution:
@@ -162,11 +177,11 @@ def _estimate(
             advance()
     times = {"registration": time.perf_counter() - begun}
     with progress.stage("solving the graph", None):
-        solve = _solve_registered(problem, registrations, config)
+        solve = _solve_registered(problem, registrations, grounds, config)
         times["graph"] = solve.graph_seconds
         problem, warnings = _with_determined_offsets(solve, registrations)
         if warnings:
-            solve = _solve_registered(problem, registrations, config)
+            solve = _solve_registered(problem, registrations, grounds, config)
             times["graph"] += solve.graph_seconds
 
     # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
@@ -185,7 +200,7 @@ def _estimate(
             advance()
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
-    solve = _solve_registered(problem, again, config)
+    solve = _solve_registered(problem, again, grounds, config)
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
             solution = _staged(solve, again)
@@ -283,7 +298,10 @@ def _whitened(residuals: Array, information: Array) -> Array:
 
 
 def _solve_registered(
-    problem: Problem, registrations: Sequence[Registration], config: Config
+    problem: Problem,
+    registrations: Sequence[Registration],
+    grounds: tuple[GroundObservation, ...],
+    config: Config,
 ) -> _State:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data."""
     begun = time.perf_counter()
@@ -295,7 +313,9 @@ def _solve_registered(
         noise=first_pose_noise(config.noise),
         scale=TYPICAL_SCALE,
         weights=RobustWeights(config.robust, problem.clouds),
+        grounds=grounds,
     )
+    state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would take the slow error of the poses for outliers, and
     # the variances would then find none of it: solve plainly, and leave out what is far off.
     plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
@@ -318,15 +338,19 @@ def _reweight(
 ) -> None:
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
-    steady = merged(
-        pose_graph(problem, state.noise),
-        offset_graph(problem),
-        prior_graph(problem, problem.lidars),
-    )
     scaled = information / state.scale**2
     for _ in range(rounds):
+        steady = merged(
+            pose_graph(problem, state.noise),
+            offset_graph(problem),
+            _ground_graph(state),
+            prior_graph(problem, problem.lidars),
+        )
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
         state.values = optimise(merged(steady, clouds), state.values, 10)
+        if state.grounds:
+            # Not before: by a guess that is degrees off, the vehicle would stand on no plane.
+            state.ground_weights = ground_weights(problem, state.grounds, state.values)
         lines = linearise_clouds(problem, state.values)
         r = _residuals(lines, measured)
         change = state.weights.update(
@@ -590,13 +614,19 @@ def _begin_shapes(state: _State, states: Sequence[JointRegistration], normals: b
 
 
 def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
-    """What stays the same while clouds are weighed anew: given poses and trusted mountings."""
+    """What stays the same while clouds are weighed anew: poses, ground and trusted mountings."""
     problem = state.problem
     return merged(
         pose_graph(problem, state.noise),
         offset_graph(problem),
+        _ground_graph(state),
         prior_graph(problem, sorted(problem.fixed)),
     )
+
+
+def _ground_graph(state: _State) -> gtsam.NonlinearFactorGraph:
+    """What the ground says, as far as it is believed."""
+    return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
 
 
 def _refined_solution(

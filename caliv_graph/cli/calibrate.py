@@ -118,14 +118,11 @@ def _check_guesses(config: Config, path: Path) -> None:
 
 
 def _unused_keys(config: Config) -> list[str]:
-    """A line for each key that is set and has no effect, or not yet."""
-    lines = []
-    if "ground" in config.model_fields_set and config.ground.use:
-        lines.append("ground: has no effect yet; 'use: false' says that you know")
+    """A line for each key that is set and has no effect."""
     if config.data.format == "rosbag":
-        return lines
+        return []
     sections = {"topics": config.topics, "imu": config.imu, "gnss": config.gnss}
-    return lines + [
+    return [
         f"{name}: has no effect on a CaLiV folder, which brings its poses"
         for name, section in sections.items()
         if section != type(section)()

@@ -186,11 +186,7 @@ def test_the_folder_of_the_drive_is_not_replaced(pipeline: Pipeline, config: Pat
     [
         ({}, []),
         ({"ground": {"use": False}}, []),
-        ({"ground": {"use": True}}, ["ground: has no effect yet; 'use: false' says that you know"]),
-        (
-            {"ground": {"vehicle_height": 0.0}},
-            ["ground: has no effect yet; 'use: false' says that you know"],
-        ),
+        ({"ground": {"vehicle_height": 0.0}}, []),
         ({"solve": {"time_offset": True}}, []),
         (
             {"topics": {"imu": "/imu/data"}, "gnss": {"lever_arm": [0, 0, 1]}, "imu": {}},

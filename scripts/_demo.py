@@ -23,14 +23,13 @@ from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, Calibration, Direction
 from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.results import read_calibration, read_truth
-from caliv_graph.simulation import load_scenario, simulate_caliv
 from caliv_graph.simulation.writer import write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 COMMAND = Path(sys.executable).with_name("caliv-graph")
-SCENARIO = REPOSITORY / "configs/scenarios/demo_arc.yaml"
+SCENARIO = REPOSITORY / "configs/scenarios/figure_eight.yaml"
 RELEASED = REPOSITORY / "configs/caliv_released.yaml"
 SEED = 1
 WIDTH = 100
@@ -98,22 +97,16 @@ def _parse_arguments() -> argparse.Namespace:
 def _simulated_drive(out: Path) -> Drive:
     folder = out / "drive"
     _say(
-        "A drive to calibrate: two LiDARs, one looking ahead and one back, pass a chair on an arc. "
-        "It is simulated, so the true mountings are known. In Python:"
+        "A drive to calibrate: LiDARs that never see the same thing at the same time pass a chair, "
+        "and IMU, GNSS and wheel speed are recorded with their clouds in a ROS bag. It is "
+        "simulated, so the true mountings are known:"
     )
-    print(
-        "  >>> from pathlib import Path\n"
-        "  >>> from caliv_graph.simulation import load_scenario, simulate_caliv\n"
-        f'  >>> scenario = load_scenario(Path("{_shown(SCENARIO)}"))\n'
-        f'  >>> simulate_caliv(scenario, Path("{_shown(folder)}"), seed={SEED})'
-    )
-    drive = simulate_caliv(load_scenario(SCENARIO), folder, SEED, force=True)
-    clouds = ", ".join(f"{len(scans.points)} of '{name}'" for name, scans in drive.scans.items())
+    _run("simulate", SCENARIO, "--out", folder, "--seed", str(SEED), "--force")
     _say(
-        f"{drive.duration_s:.0f} s, clouds: {clouds}. {_shown(folder / 'config.yaml')} has initial "
-        "guesses that are off by up to 0.1 m and 3 degrees."
+        f"{_shown(folder / 'config.yaml')} has initial guesses that are off by up to 0.1 m and 3 "
+        "degrees, as a tape measure is."
     )
-    return Drive(folder / "caliv", folder / "config.yaml", folder / "truth.yaml")
+    return Drive(folder / "drive", folder / "config.yaml", folder / "truth.yaml")
 
 
 def _released_drive(out: Path) -> Drive:
@@ -144,7 +137,7 @@ def _released_drive(out: Path) -> Drive:
 def _calibrate_and_explain(drive: Drive, result: Path, released: bool) -> int:
     _say("What was recorded, and which LiDAR sees the target when:")
     _run("inspect", drive.data, "--config", drive.config)
-    _say("The main job, from clouds, vehicle poses and guesses to mountings:")
+    _say("The main job, from what was recorded and the guesses to mountings:")
     code = _run("calibrate", drive.config, "--out", result, "--force", may_fall_short=True)
     _say("Since the truth is known here, the errors:")
     _run("evaluate", result / "calibration.yaml", drive.truth)
@@ -189,6 +182,12 @@ def _explain(calibration: Calibration, config: Config, truth: Mapping[str, gtsam
             lidar["s2v"],
             sigmas_s2v(calibration, name),
             calibration.lidars[name].determined,
+        )
+    if not calibration.undetermined:
+        _say(
+            "Every direction was determined by the drive itself: the curvature of its path "
+            "changes, which tells x, y and yaw, and the ground under the wheels tells roll, pitch "
+            "and z."
         )
     if calibration.undetermined:
         print("\nWhat the drive could not tell, and why")

@@ -51,7 +51,7 @@ from caliv_graph.calibration.noise import (
     squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
-from caliv_graph.calibration.robust import RobustWeights
+from caliv_graph.calibration.robust import RobustWeights, explained_part
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_offset, key_target, key_vehicle
 from caliv_graph.errors import SolveError
@@ -103,10 +103,6 @@ what 100 clouds of a chair can tell. Or else in joint standard deviations of the
 
 OFFSET_TOLD_S = 0.005
 """A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
-
-EXPLAINED = 0.75
-"""Clouds of which the target explains at least this part of what it explains of the median cloud
-count in full."""
 
 COUPLED_STEPS = 4
 """Gauss-Newton steps with the joint information: the problem is nearly linear there."""
@@ -320,21 +316,26 @@ def _solve_registered(
     # the variances would then find none of it: solve plainly, and leave out what is far off.
     plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
     state.weights, kernel = plain, state.weights
-    _reweight(state, measured, information, 1)
+    explained = np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
+    _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
-    sound = sound_clouds(problem, measured, information, given, state.noise)
+    sound = sound_clouds(problem, measured, information, given, state.noise) & (explained > 0.5)
     state.noise, state.scale = fit_pose_noise(
         problem, measured, information, sound, given, config.noise
     )
     state.weights = kernel
     rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
-    _reweight(state, measured, information, rounds)
+    _reweight(state, measured, information, explained, rounds)
     state.graph_seconds += time.perf_counter() - begun
     return state
 
 
 def _reweight(
-    state: _State, measured: Sequence[gtsam.Pose3], information: Array, rounds: int
+    state: _State,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    explained: Array,
+    rounds: int,
 ) -> None:
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
@@ -354,7 +355,8 @@ def _reweight(
         lines = linearise_clouds(problem, state.values)
         r = _residuals(lines, measured)
         change = state.weights.update(
-            squares_without_own_pose(problem, lines, r, scaled, state.values, state.noise)
+            squares_without_own_pose(problem, lines, r, scaled, state.values, state.noise),
+            explained,
         )
         if change < WEIGHT_TOLERANCE and state.weights.settled:
             break
@@ -579,7 +581,8 @@ def _refine(
         new = linearise_clouds(problem, state.values)
         for shape, (R, t) in zip(states, _per_placement(states, new), strict=True):
             shape.maximise(R, t)
-        change = state.weights.update(squared)
+        explained = np.concatenate([explained_part(shape.inlier_ratio) for shape in states])
+        change = state.weights.update(squared, explained)
         _hand_weights(state, states)
         if iteration == SHAPES_BEGUN_AGAIN:
             _begin_shapes(state, states, normals=True)
@@ -745,15 +748,6 @@ def _reduce(
     return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
 
 
-def _explained(registration: Registration) -> Array:
-    """Part of each cloud's weight that is left (J,), given how much of it is target at all.
-
-    A cloud that lies where the target is not has no residual: all its points are outliers.
-    """
-    typical = max(float(np.median(registration.inlier_ratio)), 1e-6)
-    return np.minimum(1.0, registration.inlier_ratio / (EXPLAINED * typical))
-
-
 def _prior_information(problem: Problem) -> Array:
     """(6n, 6n) information of the guesses, vehicle axes."""
     return np.diag(np.concatenate([problem.prior_sigmas[n] for n in problem.lidars]) ** -2.0)
@@ -814,10 +808,7 @@ def _solution(
         },
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
-        cloud_weights=tuple(
-            w * _explained(r)
-            for w, r in zip(np.split(state.weights.values, cuts), registrations, strict=True)
-        ),
+        cloud_weights=tuple(np.split(state.weights.values, cuts)),
         residuals=tuple(np.split(white, cuts)),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,

@@ -23,6 +23,24 @@ MIN_WEIGHT = 1e-6
 """A dropped cloud keeps this weight, so that its information stays invertible."""
 
 
+EXPLAINED = (0.4, 0.8)
+"""A cloud of which the target explains less than the first part of what it explains of the median
+cloud has no say, and from the second on its full say."""
+
+
+def explained_part(inlier_ratio: Array) -> Array:
+    """Factors (J,) on the weights of clouds by how much of each is target at all.
+
+    A cloud that lies where the target is not has no residual: all its points are outliers.
+
+    Args:
+        inlier_ratio: (J,) part of each cloud's points that the mixture explains.
+    """
+    typical = max(float(np.median(inlier_ratio)), 1e-6)
+    none, full = EXPLAINED
+    return np.clip((inlier_ratio / typical - none) / (full - none), 0.0, 1.0)
+
+
 class RobustWeights:
     """Weights of the clouds under one kernel, round by round."""
 
@@ -38,10 +56,17 @@ class RobustWeights:
         """Whether the kernel has reached its final shape (only `tls` is graduated)."""
         return self._config.kernel != "tls" or self._annealed
 
-    def update(self, squared: Array) -> float:
-        """New weights from squared whitened residuals (J,); returns the largest change."""
+    def update(self, squared: Array, explained: Array | float = 1.0) -> float:
+        """New weights; returns the largest change.
+
+        Args:
+            squared: (J,) squared whitened residuals.
+            explained: (J,) factors for what the residuals do not show (`explained_part`).
+        """
         before = self.values
-        self.values = np.maximum(self._weights(squared), MIN_WEIGHT)
+        if self._config.kernel == "none":
+            explained = 1.0
+        self.values = np.maximum(self._weights(squared) * explained, MIN_WEIGHT)
         return float(np.abs(self.values - before).max())
 
     def _weights(self, squared: Array) -> Array:

@@ -80,6 +80,14 @@ FEW_SCANS = 150
 SAMPLED_SCANS = 8
 """Scans that the field of view and the resolution are read off."""
 
+DECODED_PER_SCAN_USED = 5
+"""Scans of a LiDAR that are decoded at most, for each that may be used in the end."""
+
+TOTAL_PER_LIDARS = 2.5
+"""Scans of one target that are used at most, in `extraction.max_scans`: with more LiDARs there are
+fewer of each, since what they tell of each other is in all of them, and the cost grows with the
+square."""
+
 CELL_DEG = 5.0
 """Cells of direction in which points are counted for the resolution."""
 
@@ -574,7 +582,12 @@ def _wanted(
             [widened_margin_m(config, lidar, r) for r in range_m.tolist()]
         )
         possible |= view.may_see(towards, margin_m, config.extraction.min_points)
-    return frozenset(stamps[possible].tolist())
+    stamps = stamps[possible]
+    # A long drive passes the target many times over: a part of it is enough.
+    most = DECODED_PER_SCAN_USED * config.extraction.max_scans
+    if len(stamps) > most:
+        stamps = stamps[np.linspace(0, len(stamps) - 1, most).round().astype(np.int64)]
+    return frozenset(stamps.tolist())
 
 
 @dataclass(frozen=True)
@@ -632,9 +645,12 @@ def _observation(
     """Drops the LiDARs that saw too little, and says so."""
     warnings = list(hints)
     kept = []
+    seeing = sum(t.kept >= config.extraction.min_scans for t in extractor.tallies.values())
+    most = config.extraction.max_scans
+    most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
     for name, tally in extractor.tallies.items():
         if tally.kept >= config.extraction.min_scans:
-            kept += _thinned([c for c in found if c.lidar == name], config.extraction.max_scans)
+            kept += _thinned([c for c in found if c.lidar == name], most)
         elif not tally.scans:
             warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
         else:

@@ -246,7 +246,8 @@ class ExtractionConfig(_Section):
     )
     max_scans: Annotated[int, Field(ge=10)] = Field(
         120,
-        description="scans of one LiDAR used at most, evenly spread; of three and more LiDARs fewer of each",
+        description="scans of one LiDAR used at most, evenly spread; of three and more LiDARs "
+        "fewer of each",
     )
 
 

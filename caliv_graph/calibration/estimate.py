@@ -581,8 +581,12 @@ def _refine(
         new = linearise_clouds(problem, state.values)
         for shape, (R, t) in zip(states, _per_placement(states, new), strict=True):
             shape.maximise(R, t)
-        explained = np.concatenate([explained_part(shape.inlier_ratio) for shape in states])
-        change = state.weights.update(squared, explained)
+        change = 0.0
+        if config.robust.kernel != "tls":
+            # Truncated weights stay as the annealed solve of the pose factors left them: a cloud
+            # that is dropped has no say in the shape that it would then be judged by.
+            explained = np.concatenate([explained_part(shape.inlier_ratio) for shape in states])
+            change = state.weights.update(squared, explained)
         _hand_weights(state, states)
         if iteration == SHAPES_BEGUN_AGAIN:
             _begin_shapes(state, states, normals=True)

@@ -245,7 +245,7 @@ class ExtractionConfig(_Section):
         8, description="a LiDAR with fewer scans of the target does not see it"
     )
     max_scans: Annotated[int, Field(ge=10)] = Field(
-        120,
+        80,
         description="scans of one LiDAR used at most, evenly spread; of three and more LiDARs "
         "fewer of each",
     )

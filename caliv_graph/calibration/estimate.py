@@ -30,6 +30,7 @@ from caliv_graph.calibration.graph import (
     initial_values,
     linearise_clouds,
     merged,
+    motion_graph,
     offset_graph,
     optimise,
     pose_graph,
@@ -118,6 +119,7 @@ class _State:
     noise: PoseNoise
     scale: float
     weights: RobustWeights
+    motion: gtsam.NonlinearFactorGraph
     grounds: tuple[GroundObservation, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
@@ -187,7 +189,7 @@ def _estimate(
     lines = linearise_clouds(problem, solve.values)
     mountings = {name: problem.mounting(solve.values, name) for name in problem.lidars}
     observations = [_deskewed(o, mountings, trajectories) for o in observations]
-    states = [JointRegistration(observation, config) for observation in observations]
+    states = [JointRegistration(o, config, normals=False) for o in observations]
     again = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
         for state, (R, t) in zip(states, _per_placement(states, lines), strict=True):
@@ -309,6 +311,7 @@ def _solve_registered(
         noise=first_pose_noise(config.noise),
         scale=TYPICAL_SCALE,
         weights=RobustWeights(config.robust, problem.clouds),
+        motion=motion_graph(problem),
         grounds=grounds,
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
@@ -342,7 +345,7 @@ def _reweight(
     scaled = information / state.scale**2
     for _ in range(rounds):
         steady = merged(
-            pose_graph(problem, state.noise),
+            pose_graph(problem, state.noise, state.motion),
             offset_graph(problem),
             _ground_graph(state),
             prior_graph(problem, problem.lidars),
@@ -624,7 +627,7 @@ def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
     """What stays the same while clouds are weighed anew: poses, ground and trusted mountings."""
     problem = state.problem
     return merged(
-        pose_graph(problem, state.noise),
+        pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
         _ground_graph(state),
         prior_graph(problem, sorted(problem.fixed)),

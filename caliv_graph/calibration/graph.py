@@ -36,14 +36,13 @@ def drift_sigmas(noise: PoseNoise) -> Array:
     return np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
 
 
-def pose_graph(problem: Problem, noise: PoseNoise) -> gtsam.NonlinearFactorGraph:
-    """What is known of the vehicle's poses without any LiDAR.
+def motion_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """What motion data say of the vehicle's poses: a joint Gaussian for each drive that has them.
 
-    Given poses have white and slow errors; those of a smoothed trajectory a joint Gaussian.
+    Hundreds of poses with all their correlations take a while to hand over: build it once.
     """
     graph = gtsam.NonlinearFactorGraph()
-    times, drives, given = problem.times_s(), problem.drives(), problem.given()
-    stationary = drift_sigmas(noise)
+    drives = problem.drives()
     for drive, information in problem.motion.items():
         of_drive = np.flatnonzero(drives == drive).tolist()
         graph.add(
@@ -53,6 +52,24 @@ def pose_graph(problem: Problem, noise: PoseNoise) -> gtsam.NonlinearFactorGraph
                 tuple(problem.T_map_vehicle[i] for i in of_drive),
             )
         )
+    return graph
+
+
+def pose_graph(
+    problem: Problem, noise: PoseNoise, motion: gtsam.NonlinearFactorGraph | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """What is known of the vehicle's poses without any LiDAR.
+
+    Given poses have white and slow errors; those of a smoothed trajectory a joint Gaussian.
+
+    Args:
+        problem: the poses.
+        noise: error model of the given ones.
+        motion: `motion_graph(problem)` if it is there already.
+    """
+    graph = merged(motion_graph(problem) if motion is None else motion)
+    times, drives, given = problem.times_s(), problem.drives(), problem.given()
+    stationary = drift_sigmas(noise)
     for i in np.flatnonzero(given).tolist():
         T = problem.T_map_vehicle[i]
         graph.add(

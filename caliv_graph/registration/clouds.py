@@ -108,23 +108,27 @@ def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
     return state
 
 
-def surface_normals(points: Array, sigma_range_m: float) -> tuple[Array, Array]:
+def surface_normals(
+    points: Array, sigma_range_m: float, around: Array | None = None
+) -> tuple[Array, Array]:
     """Surface normals of one cloud, towards the sensor.
 
     Args:
-        points: (N, 3) metres, lidar frame.
+        points: (N, 3) metres, lidar frame; where normals are wanted.
         sigma_range_m: noise along the beam; a neighbourhood no larger than it has no normal.
+        around: (M, 3) the whole cloud; None: `points` are it.
 
     Returns:
         (N, 3) unit normals and (N,) flatness between 0 and 1.
     """
+    around = points if around is None else around
     return _normals_across(
-        points, points, points, SINGLE_NEIGHBOURS, SINGLE_RADIUS_M, sigma_range_m
+        points, around, around, SINGLE_NEIGHBOURS, SINGLE_RADIUS_M, sigma_range_m
     )
 
 
 def stack_clouds(
-    observation: TargetObservation, max_points: int, sigma_range_m: float
+    observation: TargetObservation, max_points: int, sigma_range_m: float, normals: bool = True
 ) -> CloudStack:
     """Stacks the clouds of a placement, at most `max_points` points of each.
 
@@ -132,16 +136,20 @@ def stack_clouds(
         observation: the clouds, none of them empty.
         max_points: a larger cloud is thinned (`sampling_order`).
         sigma_range_m: noise along the beam, metres.
+        normals: False if `merged_normals` follows: all point to the sensor until then.
     """
-    points, normals, flatness = [], [], []
+    points, normal, flatness = [], [], []
     for cloud in observation.clouds:
-        n, flat = surface_normals(cloud.points_lidar, sigma_range_m)
-        keep: slice | IntArray = slice(None)
-        if len(cloud.points_lidar) > max_points:
-            keep = np.sort(np.argsort(sampling_order(cloud.points_lidar))[:max_points])
-        points.append(cloud.points_lidar[keep])
-        normals.append(n[keep])
-        flatness.append(flat[keep])
+        kept = cloud.points_lidar
+        if len(kept) > max_points:
+            kept = kept[np.sort(np.argsort(sampling_order(kept))[:max_points])]
+        points.append(kept)
+        if normals:
+            n, flat = surface_normals(kept, sigma_range_m, cloud.points_lidar)
+        else:
+            n, flat = np.zeros_like(kept), np.zeros(len(kept))
+        normal.append(n)
+        flatness.append(flat)
     sizes = np.array([len(p) for p in points])
     stacked = np.concatenate(points)
     flat = np.concatenate(flatness)
@@ -151,7 +159,7 @@ def stack_clouds(
         cloud=np.repeat(np.arange(len(points)), sizes),
         starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
         beams=beams,
-        normals=_towards_sensor(np.concatenate(normals), flat, beams),
+        normals=_towards_sensor(np.concatenate(normal), flat, beams),
         flatness=flat,
         whole=tuple(cloud.points_lidar for cloud in observation.clouds),
     )
@@ -226,7 +234,7 @@ def _normals_across(
     Args:
         points: (n, 3) where normals are wanted, seen from about the same side.
         around: (N, 3) points of the same surface, seen from there too; `points` among them.
-        beams: (n, 3) directions from the sensor to `points`, of any length.
+        beams: (m, 3) directions from the sensor to these points, of any length: their mean counts.
         neighbours: of each point at most.
         radius_m: of the neighbourhood across the beam.
         sigma_range_m: noise along the beam.

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+import scipy.linalg
 
 from caliv_graph.config import Config
 from caliv_graph.errors import RegistrationError
@@ -43,6 +44,10 @@ DAMPING = 1e-3
 """Levenberg-Marquardt, relative to each cloud's own information: what the shape does not tie
 together (two LiDARs that saw different skins) stays where the pre-alignment had it."""
 
+UNSEEN = 1e-6
+"""The same for directions in which a cloud has no information of its own, relative to the mean of
+all."""
+
 MAX_STEP = 0.1
 """Largest step of a cloud in one iteration, radians and metres."""
 
@@ -57,13 +62,20 @@ class JointRegistration:
     of the free M-step of the poses in `calibration`.
     """
 
-    def __init__(self, observation: TargetObservation, config: Config, rough: bool = False) -> None:
+    def __init__(
+        self,
+        observation: TargetObservation,
+        config: Config,
+        rough: bool = False,
+        normals: bool = True,
+    ) -> None:
         """Stacks the clouds of `observation`.
 
         Args:
             observation: the clouds.
             config: size of the mixture and of the clouds.
             rough: half the points and components, for a registration that another follows.
+            normals: False if `refine_normals` follows.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -77,6 +89,7 @@ class JointRegistration:
             observation,
             config.registration.max_points // (2 if rough else 1),
             config.noise.lidar_range_m,
+            normals,
         )
         self._sigma_range = config.noise.lidar_range_m
         self._components = config.registration.components // (2 if rough else 1)
@@ -186,16 +199,25 @@ def left_step(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 
 
 def free_step(quadratic: ShapeQuadratic) -> Array:
-    """M-step of the poses when nothing else is known of them; (J, 6) left perturbations."""
+    """M-step of the poses when nothing else is known of them.
+
+    Returns:
+        (J, 6) left perturbations; NaN if there is no solution.
+    """
     count = len(quadratic.blocks)
     H = quadratic.joint()
     H4 = H.reshape(count, 6, count, 6)
     j = np.arange(count)
     H4[j, :, j, :] += DAMPING * quadratic.blocks
-    # A cloud that no component explains says nothing, and stays.
+    # A cloud that no component explains says nothing, and stays; so does one along the plane that
+    # is all it sees.
     diagonal = np.arange(len(H))
-    H[diagonal, diagonal] += 1e-9 * max(float(np.trace(H)) / len(H), 1.0)
-    d = -np.linalg.solve(H, quadratic.gradient.ravel()).reshape(count, 6)
+    H[diagonal, diagonal] += UNSEEN * max(float(np.trace(H)) / len(H), 1.0)
+    try:
+        factor = scipy.linalg.cho_factor(H, lower=True, overwrite_a=True, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        return np.full((count, 6), np.nan)
+    d = -scipy.linalg.cho_solve(factor, quadratic.gradient.ravel()).reshape(count, 6)
     d -= d.mean(axis=0)  # the gauge
     largest = np.abs(d).max()
     return np.asarray(d * min(1.0, MAX_STEP / largest) if largest > 0 else d)

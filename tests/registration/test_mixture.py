@@ -220,20 +220,17 @@ def directions(rng: np.random.Generator, count: int) -> Array:
     return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
 
-def weight_matrices(case: Case) -> Array:
-    """(N, 4, 3, 3) inverse covariance of each pair's component times its responsibility."""
+def whitened_normals(case: Case) -> Array:
+    """(N, 4, 3) normal of each pair's component, by the root of its weight across the surface."""
     _, _, _, mixture, who = case
-    out = np.empty((*who.component.shape, 3, 3))
+    out = np.empty((*who.component.shape, 3))
     for n, (ks, alphas) in enumerate(zip(who.component, who.alpha, strict=True)):
         for i, (k, a) in enumerate(zip(ks, alphas, strict=True)):
-            normal = np.outer(mixture.normals_target[k], mixture.normals_target[k])
-            cov = mixture.var_normal[k] * normal
-            cov += mixture.var_tangent[k] * (np.eye(3) - normal)
-            out[n, i] = a * np.linalg.inv(cov)
+            out[n, i] = np.sqrt(a / mixture.var_normal[k]) * mixture.normals_target[k]
     return out
 
 
-def whitened(case: Case, W: Array, d: Array) -> Array:
+def whitened(case: Case, d: Array) -> Array:
     """Residuals whose halved square is the negative log-likelihood, means at their best."""
     stack, R, t, mixture, who = case
     R, t = left_step(R, t, d.reshape(-1, 6))
@@ -241,20 +238,18 @@ def whitened(case: Case, W: Array, d: Array) -> Array:
     mu = np.zeros((len(mixture.weights), 3))
     for k in range(len(mu)):
         n, i = np.nonzero(who.component == k)
-        force = np.einsum("mij,mj->i", W[n, i], y[n])
-        mu[k] = np.linalg.solve(W[n, i].sum(axis=0), force)
-    root = np.linalg.cholesky(W)
-    return np.asarray(np.einsum("nkji,nkj->nki", root, y[:, None] - mu[who.component])).ravel()
+        mu[k] = np.average(y[n], axis=0, weights=who.alpha[n, i])
+    offset = y[:, None] - mu[who.component]
+    return np.asarray(np.einsum("nki,nki->nk", whitened_normals(case), offset)).ravel()
 
 
 def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
     case = random_case()
-    W = weight_matrices(case)
     quadratic = shape_quadratic(*case)
     step = 1e-5
     numerical = np.array(
         [
-            0.25 * (np.sum(whitened(case, W, d) ** 2) - np.sum(whitened(case, W, -d) ** 2)) / step
+            0.25 * (np.sum(whitened(case, d) ** 2) - np.sum(whitened(case, -d) ** 2)) / step
             for d in step * np.eye(18)
         ]
     )
@@ -265,10 +260,9 @@ def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
 
 def test_joint_is_the_square_of_the_numerical_jacobian() -> None:
     case = random_case(1)
-    W = weight_matrices(case)
     step = 1e-5
     J = np.array(
-        [(whitened(case, W, d) - whitened(case, W, -d)) / (2.0 * step) for d in step * np.eye(18)]
+        [(whitened(case, d) - whitened(case, -d)) / (2.0 * step) for d in step * np.eye(18)]
     ).T
     expected = J.T @ J
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -279,7 +273,8 @@ def test_blocks_are_the_information_given_the_shape() -> None:
     # SPEC 3: the sum of alpha J^T W J, J = [-skew(y), I]; -skew(y) by the cross product.
     case = random_case(2)
     stack, R, t, _, _ = case
-    W = weight_matrices(case).sum(axis=1)
+    root = whitened_normals(case)
+    W = np.einsum("nki,nkj->nij", root, root)
     expected = np.zeros((3, 6, 6))
     for n, j in enumerate(stack.cloud):
         y = R[j] @ stack.points[n] + t[j]
@@ -289,14 +284,17 @@ def test_blocks_are_the_information_given_the_shape() -> None:
     assert blocks == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
-def test_isotropic_components_have_the_paper_s_information() -> None:
-    # With equal variances W = alpha / s^2: translation information is the count over s^2.
+def test_where_points_lie_along_a_surface_says_nothing() -> None:
     stack, R, t, mixture, who = random_case(3)
-    even = replace(mixture, var_normal=np.full(8, 0.02**2), var_tangent=np.full(8, 0.02**2))
-    blocks = shape_quadratic(stack, R, t, even, who).blocks
-    mass = stack.sum_per_cloud(who.alpha.sum(axis=1))
-    for j in range(3):
-        assert blocks[j, 3:, 3:] == pytest.approx(np.eye(3) * mass[j] / 0.02**2)
+    flat = replace(mixture, normals_target=np.tile([0.0, 0.0, 1.0], (8, 1)))
+    quadratic = shape_quadratic(stack, R, t, flat, who)
+    # Shifts in the plane and a turn in it: yaw, x, y.
+    for kept, lost in ((slice(0, 2), slice(2, 5)), (slice(5, 6), slice(2, 5))):
+        assert np.abs(quadratic.blocks[:, kept, kept]).min() > 0.0
+        assert quadratic.blocks[:, lost] == pytest.approx(0.0, abs=1e-6)
+    assert quadratic.gradient[:, 2:5] == pytest.approx(0.0, abs=1e-9)
+    weight = (who.alpha / mixture.var_normal[who.component]).sum(axis=1)
+    assert quadratic.blocks[:, 5, 5] == pytest.approx(stack.sum_per_cloud(weight))
 
 
 def common(quadratic: ShapeQuadratic) -> Array:

@@ -337,12 +337,6 @@ def test_information_is_that_of_the_error() -> None:
     assert chi2_per_dof(e, information) < 2.0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="what is common to all draws is not in the information: at 10 mm of noise, which is a "
-    "third of a chair's thickness, a cloud is off by up to 3 mm and 2.5 mrad in all draws alike, "
-    "and the normalised square of its error is 4 times what it should be",
-)
 def test_information_is_that_of_the_error_at_the_noise_of_the_paper() -> None:
     e, information = against_a_known_shape(0.01)
     assert chi2_per_dof(e, information) < 2.0
@@ -427,8 +421,8 @@ def test_a_free_step_goes_to_the_minimum_less_the_common_motion() -> None:
     minima = 0.01 * rng.normal(size=(4, 6))
     root = rng.normal(size=(4, 6, 12))
     step = free_step(quadratic_of(minima, root @ np.swapaxes(root, 1, 2)))
-    # Levenberg-Marquardt takes a thousandth of it.
-    assert step == pytest.approx((minima - minima.mean(axis=0)) / 1.001, abs=1e-9)
+    # Levenberg-Marquardt takes a thousandth of it, and UNSEEN a hundredth of that.
+    assert step == pytest.approx((minima - minima.mean(axis=0)) / 1.001, abs=1e-6)
 
 
 def test_a_free_step_is_never_long() -> None:

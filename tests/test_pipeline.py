@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.config import RobustConfig, RobustKernel, SolveConfig, load_config
+from caliv_graph.config import Mounting, RobustConfig, RobustKernel, SolveConfig, load_config
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import CalibrationRun, calibrate
@@ -121,6 +121,25 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> list[Tried]:
         try_out(simulated(scenario, seed, tmp_path_factory.mktemp("noisy") / "drive"))
         for seed in NOISY_SEEDS
     ]
+
+
+def test_a_trusted_mounting_is_determined_and_so_is_the_other_by_it(tmp_path: Path) -> None:
+    scenario = paper_scenario(rate_hz=2.5)
+    drive = simulated(scenario, 1, tmp_path / "drive")
+    truth = drive.truth["rear"]
+    initial = Mounting(
+        xyz=tuple(truth.translation().tolist()),
+        rpy_deg=tuple(np.degrees(truth.rotation().rpy()).tolist()),
+    )
+    rear = drive.config.lidars["rear"].model_copy(update={"initial": initial, "fixed": True})
+    lidars = {**drive.config.lidars, "rear": rear}
+    tried = try_out(replace(drive, config=drive.config.model_copy(update={"lidars": lidars})))
+    assert tried.run.calibration.status == "ok"
+    assert not tried.lost("front")
+    assert not tried.lost("rear")
+    assert np.abs(tried.s2v("rear")) == pytest.approx(np.zeros(6), abs=1e-4)
+    assert np.abs(tried.s2v("front"))[:3].max() < 2.0 * MRAD
+    assert np.abs(tried.s2v("front"))[3:].max() < 10.0 * MM
 
 
 # ------------------------------------------------------------------ the paper's arc

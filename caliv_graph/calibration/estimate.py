@@ -247,7 +247,7 @@ def _with_determined_offsets(
     system = dense_system(problem, _steady_graph(state), state.values)
     system = add_shape(system, lines, H, H @ _residuals(lines, measured).ravel())
     Q = problem.to_vehicle_axes(state.values)
-    D = system.schur()[0] + Q.T @ _prior_information(problem) @ Q
+    D = system.schur()[0] + Q.T @ problem.guess_information() @ Q
     cov = np.asarray(np.linalg.inv(D), np.float64)
     kept, warnings = set(), []
     for i, name in enumerate(problem.lidars):
@@ -390,7 +390,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     H = block_diag(*[r.information_joint for r in registrations])
     H *= np.outer(root, root) / state.scale**2
     steady = _steady_graph(state)
-    prior = _prior_information(problem)
+    prior = problem.guess_information()
 
     def reduce() -> _Reduced:
         lines = linearise_clouds(problem, state.values)
@@ -556,7 +556,7 @@ def _refine(
 ) -> Solution:
     """Expectation-maximisation whose M-step is the graph solve."""
     problem, config = state.problem, state.config
-    prior = _prior_information(problem)
+    prior = problem.guess_information()
     steady = _steady_graph(state)
     _begin_shapes(state, states, normals=False)
     undetermined: int | None = None
@@ -755,11 +755,6 @@ def _reduce(
     return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
 
 
-def _prior_information(problem: Problem) -> Array:
-    """(6n, 6n) information of the guesses, vehicle axes."""
-    return np.diag(np.concatenate([problem.prior_sigmas[n] for n in problem.lidars]) ** -2.0)
-
-
 def _offset(state: _State) -> Array:
     """(6n,) where the estimate is from the guesses, vehicle axes."""
     problem = state.problem
@@ -820,7 +815,7 @@ def _solution(
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         information_data=information_data,
-        information_prior=_prior_information(problem),
+        information_prior=problem.guess_information(),
         cov=cov,
         held=held,
         iterations=iterations,

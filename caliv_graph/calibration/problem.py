@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.config import Config
+from caliv_graph.config import Config, MountingSigma
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
     key_drift,
@@ -28,6 +28,9 @@ from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
 """Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
 0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
+
+USUAL_SIGMAS = np.array([*MountingSigma().rpy_rad(), *MountingSigma().xyz_m()])
+"""(6,) What a guess is worth where nothing is said: the config's defaults."""
 
 
 HEAVE_SIGMA_M = 0.005
@@ -129,6 +132,15 @@ class Problem:
     def offset_keys(self) -> tuple[int, ...]:
         """Time offsets that are free."""
         return tuple(key_offset(i) for i, name in enumerate(self.lidars) if name in self.offsets)
+
+    def guess_information(self) -> Array:
+        """(6n, 6n) what the guesses say, vehicle axes; the trusted ones as if they were not.
+
+        The trust is among the data (`prior_graph`), and a direction is determined if the data know
+        it better than a guess: against its own 0.1 mm a trusted mounting would not be.
+        """
+        sigmas = [USUAL_SIGMAS if n in self.fixed else self.prior_sigmas[n] for n in self.lidars]
+        return np.diag(np.concatenate(sigmas) ** -2.0)
 
     def times_s(self) -> Array:
         """(n,) times of the poses in seconds; between drives they mean nothing."""

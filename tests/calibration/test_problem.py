@@ -143,6 +143,9 @@ def test_a_trusted_lidar_takes_part_even_if_it_saw_nothing() -> None:
     # To a tenth of a millimetre and a hundredth of a milliradian.
     np.testing.assert_allclose(TRUSTED_SIGMAS, [1e-5] * 3 + [1e-4] * 3)
     assert problem.prior_sigmas["rear"][3] == 0.1
+    # What the data tell is compared with a guess, not with the trust, which is among the data.
+    usual = np.diag(problem.guess_information())[:6] ** -0.5
+    assert usual == pytest.approx([np.radians(1.73)] * 3 + [0.058] * 3, rel=0.01)
 
 
 def test_nothing_seen_is_a_solve_error() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -12,7 +13,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray
 from caliv_graph.simulation.scenario import CropModel, EdgeModel, LidarModel
-from caliv_graph.simulation.worlds import NO_OBJECT, RayCaster, World
+from caliv_graph.simulation.worlds import GROUND, NO_OBJECT, RayCaster, World
 
 BoolArray = npt.NDArray[np.bool_]
 SingleArray = npt.NDArray[np.float32]
@@ -105,6 +106,8 @@ class SimulatedLidar:
 
     Attributes:
         T_vehicle_lidar: its true mounting.
+        channels: beams above one another.
+        columns: beams of a channel.
         column_times_s: see `column_times`.
     """
 
@@ -132,9 +135,10 @@ class SimulatedLidar:
         # Of its own, so that a LiDAR with edge effects has the range noise of one without.
         self._edge_rng = rng.spawn(1)[0]
         directions = beam_directions(model)
-        self._columns = directions.shape[1]
-        self.column_times_s = column_times(model, self._columns)
+        self.channels, self.columns = directions.shape[:2]
+        self.column_times_s = column_times(model, self.columns)
         self._directions_lidar = directions.reshape(-1, 3)
+        self._ground_index = world.names.index(GROUND)
         self._spheres_map: list[tuple[Array, float]] = []
         always = np.full(directions.shape[:2], crop is None)
         if crop is not None:
@@ -172,7 +176,7 @@ class SimulatedLidar:
 
     def columns_of(self, returns: LidarReturns) -> IntArray:
         """(n,) column of each return."""
-        columns: IntArray = returns.beams % self._columns
+        columns: IntArray = returns.beams % self.columns
         return columns
 
     def sweep(self, R_map_vehicle: Array, t_map_vehicle: Array, times_s: Array) -> LidarReturns:
@@ -184,13 +188,86 @@ class SimulatedLidar:
             t_map_vehicle: (columns, 3) or (1, 3) metres.
             times_s: (columns,) or (1,) seconds since the start of the drive.
         """
-        R_map_lidar = R_map_vehicle @ self.T_vehicle_lidar.rotation().matrix()
-        t_map_lidar = t_map_vehicle + R_map_vehicle @ self.T_vehicle_lidar.translation()
         # Drawn for all beams, so that cropping leaves the noise of the beams that it keeps alone.
         noise_m = self._draw_noise()
-        beams = np.flatnonzero(self._kept(R_map_lidar, t_map_lidar))
+        edges = None if self._model.edges is None else self._draw_edges()
+        towards = self.beams_towards(R_map_vehicle, t_map_vehicle, self._spheres_map)
+        beams = np.flatnonzero(self._always | towards)
+        return self._returns(
+            beams,
+            R_map_vehicle,
+            t_map_vehicle,
+            times_s,
+            noise_m[beams],
+            None if edges is None else (edges[0][beams], edges[1][beams]),
+        )
 
-        column = np.zeros(1, np.int64) if len(R_map_lidar) == 1 else beams % self._columns
+    def sweep_of(
+        self,
+        beams: IntArray,
+        R_map_vehicle: Array,
+        t_map_vehicle: Array,
+        times_s: Array,
+        rng: np.random.Generator,
+        wave: Array | None = None,
+    ) -> LidarReturns:
+        """Like `sweep`, of some beams alone; nothing is drawn for the others.
+
+        Args:
+            beams: (n,) ascending numbers of beams; the crop does not matter.
+            R_map_vehicle: see `sweep`.
+            t_map_vehicle: see `sweep`.
+            times_s: see `sweep`.
+            rng: source of the noise.
+            wave: (3,) slopes along map x and y, and metres at the foot of the LiDAR, by which the
+                ground is higher than the world has it; None: it is not.
+        """
+        n = len(beams)
+        noise_m = self._model.range_sigma_m * rng.standard_normal(n)
+        edges = None if self._model.edges is None else _edge_draws(rng, n)
+        return self._returns(beams, R_map_vehicle, t_map_vehicle, times_s, noise_m, edges, wave)
+
+    def beams_towards(
+        self, R_map_vehicle: Array, t_map_vehicle: Array, spheres_map: Sequence[tuple[Array, float]]
+    ) -> BoolArray:
+        """(beams,) which of them pass through one of the spheres.
+
+        Args:
+            R_map_vehicle: see `sweep`.
+            t_map_vehicle: see `sweep`.
+            spheres_map: centre (3,) in the map and radius of each, metres.
+        """
+        R_map_lidar, t_map_lidar = self._poses(R_map_vehicle, t_map_vehicle)
+        kept = np.zeros(len(self._directions_lidar), np.bool_)
+        for centre_map, radius_m in spheres_map:
+            centres_lidar = np.einsum("cji,cj->ci", R_map_lidar, centre_map - t_map_lidar)
+            if len(centres_lidar) == 1:
+                kept |= beams_through_sphere(self._directions_lidar, centres_lidar[0], radius_m)
+            else:
+                grid = self._directions_lidar.reshape(-1, self.columns, 3)
+                kept |= beams_through_sphere(grid, centres_lidar, radius_m).reshape(-1)
+        return kept
+
+    def _poses(self, R_map_vehicle: Array, t_map_vehicle: Array) -> tuple[Array, Array]:
+        """R_map_lidar and t_map_lidar of vehicle poses."""
+        return (
+            R_map_vehicle @ self.T_vehicle_lidar.rotation().matrix(),
+            t_map_vehicle + R_map_vehicle @ self.T_vehicle_lidar.translation(),
+        )
+
+    def _returns(
+        self,
+        beams: IntArray,
+        R_map_vehicle: Array,
+        t_map_vehicle: Array,
+        times_s: Array,
+        noise_m: Array,
+        edges: tuple[SingleArray, SingleArray] | None,
+        wave: Array | None = None,
+    ) -> LidarReturns:
+        """What some beams report, given what was drawn for each of them."""
+        R_map_lidar, t_map_lidar = self._poses(R_map_vehicle, t_map_vehicle)
+        column = np.zeros(1, np.int64) if len(R_map_lidar) == 1 else beams % self.columns
         origin_map, times_s = t_map_lidar[column], times_s[column]
 
         def turned(directions_lidar: Array) -> Array:
@@ -207,8 +284,8 @@ class SimulatedLidar:
             origin_map, directions_map, times_s
         )
         vehicle_m = self._vehicle_m[beams]
-        if self._model.edges is not None:
-            normal, uniform = (draws[beams] for draws in self._draw_edges())
+        if self._model.edges is not None and edges is not None:
+            normal, uniform = edges
             beside_map = turned(_beside(directions_lidar, self._model.edges, normal))
             aside_m, _ = self._caster.cast(origin_map, beside_map, times_s)
             # Infinite or no number where nothing was hit, or the beam grazes: no such face.
@@ -218,10 +295,18 @@ class SimulatedLidar:
             distance_m, objects = _at_edges(
                 self._model.edges, distance_m, objects, aside_m, same_face_m, uniform
             )
+        if wave is not None:
+            ground = objects == self._ground_index
+            distance_m[ground] = _on_wave(
+                wave,
+                distance_m[ground],
+                directions_map[ground],
+                (origin_map - t_map_lidar.mean(axis=0))[ground if len(column) > 1 else slice(None)],
+            )
         on_vehicle = vehicle_m < distance_m
         distance_m[on_vehicle] = vehicle_m[on_vehicle]
         objects[on_vehicle] = self._vehicle_index
-        measured_m = distance_m + noise_m[beams]
+        measured_m = distance_m + noise_m
         # Infinite where nothing was hit.
         reported = (measured_m >= self._model.min_range_m) & (measured_m <= self._model.max_range_m)
         return LidarReturns(
@@ -235,24 +320,30 @@ class SimulatedLidar:
 
     def _draw_edges(self) -> tuple[SingleArray, SingleArray]:
         """(beams, 2) normal and (beams, 3) uniform draws."""
-        n = len(self._directions_lidar)
-        # Single precision in half the time; nothing depends on more.
-        return (
-            self._edge_rng.standard_normal((n, 2), dtype=np.float32),
-            self._edge_rng.random((n, 3), dtype=np.float32),
-        )
+        return _edge_draws(self._edge_rng, len(self._directions_lidar))
 
-    def _kept(self, R_map_lidar: Array, t_map_lidar: Array) -> BoolArray:
-        """(beams,) those that are cast."""
-        kept = self._always.copy()
-        for centre_map, radius_m in self._spheres_map:
-            centres_lidar = np.einsum("cji,cj->ci", R_map_lidar, centre_map - t_map_lidar)
-            if len(centres_lidar) == 1:
-                kept |= beams_through_sphere(self._directions_lidar, centres_lidar[0], radius_m)
-            else:
-                grid = self._directions_lidar.reshape(-1, self._columns, 3)
-                kept |= beams_through_sphere(grid, centres_lidar, radius_m).reshape(-1)
-        return kept
+
+def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Array) -> Array:
+    """(n,) how far beams go to ground that is higher by a plane; exact where it is level.
+
+    Args:
+        wave: see `SimulatedLidar.sweep_of`.
+        distance_m: (n,) metres to where they meet the ground.
+        directions_map: (n, 3) of length 1.
+        origins: (n, 3) or (1, 3) metres, map axes, from the LiDAR's mean place.
+    """
+    xy = origins[:, :2] + distance_m[:, None] * directions_map[:, :2]
+    higher_m = xy @ wave[:2] + wave[2]
+    # How fast a beam comes down upon the raised ground.
+    falls = directions_map[:, 2] - directions_map[:, :2] @ wave[:2]
+    meets = falls < -1e-4
+    longer_m: Array = distance_m + higher_m / np.where(meets, falls, -1.0)
+    return np.where(meets, longer_m, np.inf)
+
+
+def _edge_draws(rng: np.random.Generator, n: int) -> tuple[SingleArray, SingleArray]:
+    # Single precision in half the time; nothing depends on more.
+    return rng.standard_normal((n, 2), dtype=np.float32), rng.random((n, 3), dtype=np.float32)
 
 
 def _beside(directions: Array, edges: EdgeModel, draws: SingleArray) -> Array:

@@ -34,17 +34,19 @@ class Stream(enum.IntEnum):
     GNSS = 7
     GNSS_OUTLIERS = 8
     VELOCITY = 9
+    THINNED_LIDAR = 10
+    GROUND_WAVES = 11
 
 
-def random_stream(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
-    """The generator of one stream; `index` tells LiDARs apart.
+def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:
+    """The generator of one stream; `index` tells LiDARs apart, and clouds if each has its own.
 
     Raises:
         ConfigError: the seed is negative.
     """
     if seed < 0:
         raise ConfigError(f"seed: must be 0 or a positive whole number, not {seed}")
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, index)))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, *(index or (0,)))))
 
 
 def vehicle_heights(model: SuspensionModel, count: int, rng: np.random.Generator) -> Array:

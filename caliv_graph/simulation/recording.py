@@ -265,19 +265,32 @@ class SimulatedRecording:
         self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int
     ) -> tuple[LidarReturns, Array | None]:
         """A cloud and its times after the stamp, which is counted from the start of the drive."""
-        after_s = simulated.column_times_s
-        taken_ns = (
-            stamp_ns
-            + np.rint(after_s * NANOSECONDS_PER_SECOND).astype(np.int64)
-            - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
-        )
-        heave_m = self.truth.heave_m[stamp_ns // HEAVE_PERIOD_NS]
-        states = self.truth.drive.states(taken_ns, self.truth.level_z_map + heave_m)
+        taken_ns, states = self._moments(simulated, model, stamp_ns)
         returns = simulated.sweep(
             states.R_map_vehicle, states.position_map, taken_ns / NANOSECONDS_PER_SECOND
         )
-        times_s = None if model.sweep is None else after_s[simulated.columns_of(returns)]
-        return returns, times_s
+        return returns, self._point_times_s(simulated, model, returns)
+
+    def _moments(
+        self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int
+    ) -> tuple[IntArray, VehicleStates]:
+        """When the columns of a cloud are truly taken, since the start of the drive, and where."""
+        taken_ns = (
+            stamp_ns
+            + np.rint(simulated.column_times_s * NANOSECONDS_PER_SECOND).astype(np.int64)
+            - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
+        )
+        heave_m = self.truth.heave_m[stamp_ns // HEAVE_PERIOD_NS]
+        return taken_ns, self.truth.drive.states(taken_ns, self.truth.level_z_map + heave_m)
+
+    def _point_times_s(
+        self, simulated: SimulatedLidar, model: LidarModel, returns: LidarReturns
+    ) -> Array | None:
+        """(n,) times of the points of a cloud after its stamp; None: all are of the stamp."""
+        if model.sweep is None:
+            return None
+        times_s: Array = simulated.column_times_s[simulated.columns_of(returns)]
+        return times_s
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in order of their stamps; each is what it is without the others.

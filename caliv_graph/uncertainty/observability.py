@@ -33,6 +33,13 @@ NOTABLE = 0.2
 RIGID_MISFIT = 0.2
 """Relative misfit up to which LiDARs count as moving together."""
 
+STOOD_TWISTS = 5
+"""Undetermined motions of all LiDARs as one from which nothing is known to the vehicle: driving
+straight ahead loses four."""
+
+STOOD_COSINE = 0.98
+"""Of the angle between the undetermined subspace and such a motion, up to which it is in it."""
+
 AXIS_SHARE = 0.05
 LIDAR_SHARE = 0.01
 """An axis is undetermined if it has this share of its LiDAR's part of the undetermined subspace,
@@ -178,6 +185,11 @@ def _directions(
         return ()
     names = list(T_vehicle_lidar)
     unit = scaling(len(names))
+    stood = (
+        _standing_text(split.vectors[:, mask], T_vehicle_lidar)
+        if mask is split.undetermined
+        else ""
+    )
     out = []
     for column in simplified(split.vectors[:, mask]).T:
         vector = unit * column
@@ -189,6 +201,9 @@ def _directions(
         scale = 1.0 / float(np.abs(vector).max())
         sign = math.copysign(1.0, vector[int(np.abs(column).argmax())])
         text, together = describe(parts, T_vehicle_lidar)
+        advice = remedy(parts, T_vehicle_lidar, weak=mask is split.weak)
+        if stood and together:
+            text, advice = stood, REMEDY_STOOD
         out.append(
             Direction(
                 {n: sign * scale * v for n, v in parts.items()},
@@ -196,6 +211,7 @@ def _directions(
                 sigma_prior / scale,
                 text,
                 together,
+                advice,
             )
         )
     return tuple(out)
@@ -262,6 +278,85 @@ def describe(
         return _describe_apart(parts), False
     whole = "all LiDARs" if len(names) > 1 else f"lidar '{names[0]}'"
     return _describe_twist(twist, whole, len(names) > 1), True
+
+
+REMEDY_STOOD = "drive past the target on a path whose curvature changes, such as a figure-eight"
+REMEDY_HEIGHT = (
+    "measure the height of the vehicle frame above the ground as well as you can and state it "
+    "(ground.vehicle_height, ground.sigma), or cross a ramp while the target is in view"
+)
+REMEDY_TURN_CENTRE = (
+    "change the curvature while the target is in view: drive an S-curve or a figure-eight, or add "
+    "a drive that turns the other way"
+)
+REMEDY_STRAIGHT = (
+    "turn while the target is in view: an arc adds y and roll, an S-curve or a figure-eight x as "
+    "well"
+)
+REMEDY_TILT = "turn while the target is in view, so that the heading changes; use the ground"
+REMEDY_APART = (
+    "let these LiDARs see the same side of the target, at any time: pass it in both directions, "
+    "as in a figure-eight, or add a second target"
+)
+REMEDY_MORE = (
+    "pass the target again, closer and at other places, so that each LiDAR sees it in more scans; "
+    "better poses of the vehicle (IMU, GNSS) help as well"
+)
+REMEDY_SYMMETRY = (
+    "take a target that no turn maps onto itself, such as a chair, and let these LiDARs see the "
+    "same side of it: pass it in both directions, or add a second target"
+)
+
+
+def remedy(
+    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool = False
+) -> str:
+    """What would determine a direction: a manoeuvre, or a setting.
+
+    Args:
+        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
+        T_vehicle_lidar: where the LiDARs sit.
+        weak: the data do tell it, but not well.
+    """
+    twist = rigid_twist(parts, T_vehicle_lidar)
+    if twist is None and weak:
+        return REMEDY_MORE
+    if twist is None:
+        size = np.max([np.abs(part / UNIT) for part in parts.values()], axis=0)
+        return REMEDY_SYMMETRY if size.argmax() == AXES.index("yaw") else REMEDY_APART
+    scaled = np.abs(twist / UNIT)
+    big = {a for a, s in zip(AXES, scaled / scaled.max(), strict=True) if s > NOTABLE}
+    if big == {"z"}:
+        return REMEDY_HEIGHT
+    if "yaw" in big and big <= {"yaw", "x", "y"}:
+        return REMEDY_TURN_CENTRE
+    if big & {"x", "y"}:
+        return REMEDY_STRAIGHT
+    return REMEDY_TILT if big <= {"roll", "pitch"} else REMEDY_STOOD
+
+
+def _standing_text(basis: Array, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> str:
+    """How to say that nothing is known to the vehicle; empty if something is.
+
+    Args:
+        basis: (6n, k) orthonormal, scaled, of what is undetermined.
+        T_vehicle_lidar: where the LiDARs sit.
+    """
+    rows = []
+    for T in T_vehicle_lidar.values():
+        arm = -skew(T.translation())
+        rows.append(np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]]) / UNIT[:, None])
+    twists, back = np.linalg.qr(np.concatenate(rows))
+    _, cosines, within = np.linalg.svd(basis.T @ twists)
+    lost = int((cosines > STOOD_COSINE).sum())
+    if lost < STOOD_TWISTS:
+        return ""
+    if lost == len(AXES):
+        return "everything to the vehicle: it never moved"
+    # What is told: the motion that is left, as a twist.
+    told = np.abs(np.linalg.solve(back, within[-1]) / UNIT)
+    height = told.argmax() == AXES.index("z")
+    return f"everything to the vehicle but {'its height' if height else 'one part'}: it never moved"
 
 
 def _describe_twist(twist: Array, whole: str, several: bool) -> str:

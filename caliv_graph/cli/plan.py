@@ -1,0 +1,94 @@
+"""`caliv-graph plan`: what a drive will tell, before it is driven."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from caliv_graph.cli import streams
+from caliv_graph.cli.exits import UNMET
+
+
+def plan(
+    scenarios: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCENARIO.yaml",
+            help="The drive: vehicle, LiDARs, target. Several: drives of one vehicle, to be solved "
+            "together.",
+        ),
+    ],
+    sigma: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sigma",
+            metavar="KEY=VALUE",
+            help="Largest sigma wanted: s2v_ or s2s_, then roll_deg, pitch_deg, yaw_deg, x_m, y_m "
+            "or z_m, as in 'limits' of a config. Repeat it for more.",
+        ),
+    ] = None,
+    ground: Annotated[
+        Literal["none", "plane", "height"],
+        typer.Option(
+            "--ground",
+            help="What is made of the ground: nothing, a plane, or one below the vehicle at a "
+            "known height.",
+        ),
+    ] = "height",
+    poses: Annotated[
+        bool,
+        typer.Option("--poses", help="The recording has poses (a CaLiV folder), no raw sensors."),
+    ] = False,
+    time_offset: Annotated[
+        bool, typer.Option("--time-offset", help="A time offset of each LiDAR is estimated too.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Write the suggested drive as a scenario."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older FILE.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Predict what a planned drive will tell: sigma per LiDAR and axis, and what stays open.
+
+    From geometry and noise figures alone: nothing is simulated, and what stands in the way of a
+    view is not looked at. A few manoeuvres (arc, S-curve, figure-eight, over a ramp where the
+    ground tells no height) and target placements are tried as well, and the one that tells enough
+    in the least space is named.
+
+    Exit code 3: a sigma asked for will not be reached, or a LiDAR never sees the target.
+
+    Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
+    """
+    from caliv_graph.errors import OutputError
+    from caliv_graph.files import atomic_write, check_output_file
+    from caliv_graph.planning.predict import Assumptions, predict
+    from caliv_graph.planning.suggest import is_met, parse_goals, shortfall, suggest
+    from caliv_graph.report.outlook import plan_document, plan_table
+    from caliv_graph.simulation.scenario import dump_scenario, load_scenario
+
+    goals = parse_goals(sigma or ())
+    if out is not None:
+        check_output_file(out, force)
+    first, *others = [load_scenario(path) for path in scenarios]
+    assumptions = Assumptions(
+        ground=ground, source="poses" if poses else None, time_offset=time_offset
+    )
+    prediction = predict(first, others, assumptions)
+    met = is_met(shortfall(prediction, goals), goals)
+    suggestion = suggest(first, goals, assumptions)
+    if out is not None:
+        if suggestion is None:
+            raise OutputError(f"{out}: not written: in no manoeuvre tried a LiDAR sees the target")
+        atomic_write(out, dump_scenario(suggestion.scenario), force)
+    if as_json:
+        streams.show_json(plan_document(prediction, goals, met, suggestion))
+    else:
+        streams.show(plan_table(prediction, goals, met, suggestion))
+        if out is not None:
+            streams.say(f"Written to {out}")
+    streams.warn(prediction.warnings)
+    if (goals and not met) or prediction.outlook.unseeing:
+        raise typer.Exit(UNMET)

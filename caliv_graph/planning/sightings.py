@@ -1,0 +1,341 @@
+"""Which LiDAR of a planned drive sees which target when, and how well: geometry alone, no rays.
+
+What stands in the way (other objects, the vehicle's own body) is not looked at.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from caliv_graph.config import ExtractionConfig
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.products import Array, IntArray
+from caliv_graph.simulation.drives import Drive
+from caliv_graph.simulation.motion import sample_stamps
+from caliv_graph.simulation.scenario import LidarModel, ObjectModel, Scenario, WorldModel
+from caliv_graph.simulation.terrain import Terrain, make_terrain
+from caliv_graph.simulation.worlds import make_world
+from caliv_graph.targets.extract import TOTAL_PER_LIDARS
+
+SEEN_PART = 0.87
+"""Part of the surface that faces a LiDAR that returns points: the rest hides behind itself. 480
+points of a chair at 10 m, of the paper's LiDAR."""
+
+INDEPENDENT_PART = 0.58
+"""Part of it that counts as independent evidence: 300 points of a chair at 10 m (SPEC 8)."""
+
+LEVER_PART = 0.59
+"""Points tell of a rotation by the part of their lever along the normal: 0.2 m of a chair's 0.34 m
+about each axis, with which SPEC 8's lower bounds come out."""
+
+ROTATION_FLOOR_RAD = 1e-3
+POSITION_FLOOR_M = 5e-4
+"""Registration of a cloud is never better (SPEC 8)."""
+
+FACING_STEPS = 12
+"""Directions from which the area that a target shows is averaged."""
+
+GROUND_REACH_M = 15.0
+GROUND_LEAST_POINTS = 60
+"""Ground is looked for so far away, and taken from so many points (`targets.ground_planes`)."""
+
+GROUND_COLUMNS = 24
+
+ROUND_SHAPES = ("pole", "cylinder")
+"""Shapes that look the same after any turn about the vertical."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A target at one place, for as long as it stands there.
+
+    Attributes:
+        name: of the object, with a number from the second place on.
+        centre_map: (3,) metres, middle of what is not ground.
+        half_size_m: (3,) of its box, map axes.
+        area_m2: of its surface that faces a LiDAR, on average over directions.
+        levers_m: (3,) root mean square distance of its surface from the axes through its centre.
+        is_round: it looks the same after any turn about the vertical.
+        begin_s: since the start of the drive.
+        end_s: likewise.
+    """
+
+    name: str
+    centre_map: Array
+    half_size_m: Array
+    area_m2: float
+    levers_m: Array
+    is_round: bool
+    begin_s: float = 0.0
+    end_s: float = math.inf
+
+    def information(self, points: Array, range_sigma_m: float) -> Array:
+        """(m, 6, 6) what the registration of clouds tells of their poses.
+
+        About the target's centre: left perturbations in the target's frame (map axes), rotation
+        then translation. Sigmas fall with the root of the number of points, down to a floor.
+
+        Args:
+            points: (m,) independent points of each cloud.
+            range_sigma_m: noise along the beam.
+        """
+        with np.errstate(divide="ignore"):
+            sigma = range_sigma_m / np.sqrt(points)
+        rotation = np.hypot(sigma[:, None] / (LEVER_PART * self.levers_m), ROTATION_FLOOR_RAD)
+        diagonal = np.empty((len(points), 6))
+        diagonal[:, :3] = rotation**-2.0
+        diagonal[:, 3:] = (np.hypot(sigma, POSITION_FLOOR_M) ** -2.0)[:, None]
+        if self.is_round:
+            diagonal[:, 2] = 0.0
+        return np.asarray(diagonal[:, :, None] * np.eye(6))
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One LiDAR and one placement of a target.
+
+    Attributes:
+        lidar: its name.
+        placement: name of the placement.
+        scans: clouds that the LiDAR takes in all.
+        stamps_ns: (m,) when the clouds in which it sees the target were taken.
+        range_m: (m,) to the target's centre.
+        points: (m,) about how many points of the target.
+        towards_deg: (m,) azimuth in the map from the target to the LiDAR: the side it sees.
+        used: (u,) indices of the clouds that `calibrate` would use.
+    """
+
+    lidar: str
+    placement: str
+    scans: int
+    stamps_ns: IntArray
+    range_m: Array
+    points: Array
+    towards_deg: Array
+    used: IntArray
+
+
+def placements(scenario: Scenario) -> tuple[Placement, ...]:
+    """The targets of a scenario, one for each place that they stand at."""
+    terrain = make_terrain(scenario.world.ground)
+    out = []
+    for name in scenario.world.targets:
+        out += _placements_of(name, scenario.world.objects[name], scenario, terrain)
+    return tuple(out)
+
+
+def _placements_of(
+    name: str, model: ObjectModel, scenario: Scenario, terrain: Terrain | None
+) -> list[Placement]:
+    low, high, area_m2, levers_m = _shape_of(model.model_copy(update=_AT_ORIGIN))
+    places = [(model.xy_m, model.yaw_deg)]
+    begins, ends = [0.0], []
+    for move in getattr(model, "moves", ()):
+        places.append((move.xy_m, move.yaw_deg))
+        ends.append(move.begin_s)
+        begins.append(move.end_s)
+    ends.append(math.inf)
+    out = []
+    for number, ((xy_m, yaw_deg), begin_s, end_s) in enumerate(
+        zip(places, begins, ends, strict=True), start=1
+    ):
+        yaw = math.radians(yaw_deg)
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        ground_m = scenario.world.ground.height_m
+        if terrain is not None:
+            ground_m += terrain.height_at(xy_m)
+        half = 0.5 * (high - low)
+        middle = 0.5 * (low + high)
+        out.append(
+            Placement(
+                name=name if number == 1 else f"{name} {number}",
+                centre_map=np.array([*(np.array(xy_m) + turn @ middle[:2]), ground_m + middle[2]]),
+                half_size_m=np.array([*(np.abs(turn) @ half[:2]), half[2]]),
+                area_m2=area_m2,
+                levers_m=np.sqrt([*(turn**2 @ levers_m[:2] ** 2), levers_m[2] ** 2]),
+                is_round=model.shape in ROUND_SHAPES,
+                begin_s=begin_s,
+                end_s=end_s,
+            )
+        )
+    return out
+
+
+_AT_ORIGIN = {"xy_m": (0.0, 0.0), "yaw_deg": 0.0, "moves": ()}
+
+
+@lru_cache(maxsize=64)
+def _shape_of(model: ObjectModel) -> tuple[Array, Array, float, Array]:
+    """Lower and upper corner, area that faces a LiDAR, and levers of an object at the origin."""
+    at_origin = {key: v for key, v in _AT_ORIGIN.items() if key in type(model).model_fields}
+    world = make_world(
+        WorldModel(objects={"it": model.model_copy(update=at_origin)}, targets=("it",))
+    )
+    mesh = world.meshes["it"]
+    a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
+    normals = 0.5 * np.cross(b - a, c - a)
+    azimuth = np.linspace(0.0, 2.0 * math.pi, FACING_STEPS, endpoint=False)
+    directions = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(FACING_STEPS)])
+    area_m2 = float(np.maximum(normals @ directions.T, 0.0).sum() / FACING_STEPS)
+    weight = np.linalg.norm(normals, axis=1)
+    weight /= weight.sum()
+    middle = (a + b + c) / 3.0
+    square = weight @ (middle - weight @ middle) ** 2
+    levers_m = np.sqrt(square.sum() - square)
+    low, high = world.bounds("it")
+    return low, high, area_m2, levers_m
+
+
+def scan_stamps(scenario: Scenario, lidar: str, duration_s: float) -> IntArray:
+    """(n,) when the clouds of a LiDAR are taken, since the start of the drive.
+
+    The true times: a time offset of the stamps is taken off.
+    """
+    model = scenario.lidars[lidar]
+    at_start = model.sweep is None or model.sweep.stamp_at == "start"
+    stamps = sample_stamps(
+        f"lidars.{lidar}",
+        model.rate_hz,
+        model.phase_s,
+        duration_s,
+        model.sweep_s if at_start else 0.0,
+    )
+    taken = stamps - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
+    return np.asarray(taken[taken >= 0])
+
+
+def sight(
+    drive: Drive,
+    scenario: Scenario,
+    lidar: str,
+    placement: Placement,
+    extraction: ExtractionConfig,
+) -> Sighting:
+    """The clouds of a LiDAR in which it sees a target; `used` is left empty.
+
+    Args:
+        drive: the drive.
+        scenario: what the LiDAR is like.
+        lidar: its name.
+        placement: the target.
+        extraction: how many points it takes.
+    """
+    model = scenario.lidars[lidar]
+    stamps = scan_stamps(scenario, lidar, drive.duration_s)
+    states = drive.states(stamps, scenario.world.ground.height_m)
+    # A grid over the target's box: what of it is within the field of view? Clouds that the sides
+    # of it cut off are left out, as in `targets.extract`.
+    offsets = np.stack(
+        np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [-0.9, -0.45, 0.0, 0.45, 0.9]), axis=-1
+    ).reshape(-1, 3)
+    # The corners of the box are farther out than the object is.
+    grid = placement.centre_map + offsets * placement.half_size_m * [0.7, 0.7, 1.0]
+    T = pose_from_mounting(model.mounting)
+    back = np.swapaxes(states.R_map_vehicle, 1, 2)
+    in_vehicle = np.einsum("nij,nkj->nki", back, grid[None] - states.position_map[:, None])
+    in_lidar = (in_vehicle - T.translation()) @ T.rotation().matrix()
+    whole, inside = _within(model, in_lidar)
+    towards = states.position_map + states.R_map_vehicle @ T.translation() - placement.centre_map
+    range_m = np.linalg.norm(towards, axis=1)
+    level = np.einsum("nij,nj->ni", back, -towards) @ T.rotation().matrix()
+    elevation = np.arcsin(np.clip(level[:, 2] / range_m, -1.0, 1.0))
+    facing = placement.area_m2 * inside / (range_m**2 * _solid_angle(model, elevation))
+    time_s = stamps / NANOSECONDS_PER_SECOND
+    seen = whole & (SEEN_PART * facing >= extraction.min_points)
+    seen &= (time_s >= placement.begin_s) & (time_s <= placement.end_s)
+    return Sighting(
+        lidar=lidar,
+        placement=placement.name,
+        scans=len(stamps),
+        stamps_ns=stamps[seen],
+        range_m=range_m[seen],
+        points=SEEN_PART * facing[seen],
+        towards_deg=np.degrees(np.arctan2(towards[seen, 1], towards[seen, 0])),
+        used=np.zeros(0, dtype=np.int64),
+    )
+
+
+def thinned(count: int, seeing: int, extraction: ExtractionConfig) -> IntArray:
+    """Which of the clouds that see a target are used, as `targets.extract` chooses them.
+
+    Args:
+        count: clouds of one LiDAR that see it.
+        seeing: LiDARs that see it often enough.
+        extraction: how many are used.
+    """
+    if count < extraction.min_scans:
+        return np.zeros(0, dtype=np.int64)
+    most = extraction.max_scans
+    most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
+    if count <= most:
+        return np.arange(count, dtype=np.int64)
+    return np.linspace(0, count - 1, most).round().astype(np.int64)
+
+
+def sees_ground(model: LidarModel) -> bool:
+    """Whether a LiDAR that stands level has enough points on the ground about it."""
+    T = pose_from_mounting(model.mounting)
+    elevation = np.radians(_elevations_deg(model))[:, None]
+    low, high = np.radians(model.horizontal_fov_deg)
+    azimuth = low + (high - low) * (np.arange(GROUND_COLUMNS) + 0.5) / GROUND_COLUMNS
+    beams = np.stack(
+        np.broadcast_arrays(
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ),
+        axis=-1,
+    )
+    down = -(beams @ T.rotation().matrix()[2])
+    height_m = float(T.translation()[2])
+    if height_m <= 0.0:
+        return False
+    with np.errstate(divide="ignore"):
+        distance_m = np.where(down > 0.0, height_m / np.maximum(down, 1e-9), np.inf)
+    hit = (distance_m * np.sqrt(1.0 - np.minimum(down, 1.0) ** 2) < GROUND_REACH_M) & (
+        distance_m > model.min_range_m
+    )
+    columns = (high - low) / math.radians(model.horizontal_resolution_deg)
+    return bool(hit.sum() * columns / GROUND_COLUMNS >= GROUND_LEAST_POINTS)
+
+
+def _elevations_deg(model: LidarModel) -> Array:
+    if model.elevations_deg is not None:
+        return np.array(model.elevations_deg)
+    return np.linspace(*model.vertical_fov_deg, model.channels)
+
+
+def _within(model: LidarModel, points_lidar: Array) -> tuple[npt.NDArray[np.bool_], Array]:
+    """What of (m, k, 3) points is in the field of view and the range of a LiDAR.
+
+    Returns:
+        (m,) whether all k of them are between the sides of the field of view, and (m,) the part of
+        them that is in it altogether.
+    """
+    range_m = np.linalg.norm(points_lidar, axis=-1)
+    azimuth = np.degrees(np.arctan2(points_lidar[..., 1], points_lidar[..., 0]))
+    elevation = np.degrees(np.arcsin(np.clip(points_lidar[..., 2] / range_m, -1.0, 1.0)))
+    low, high = model.horizontal_fov_deg
+    elevations = _elevations_deg(model)
+    between = (azimuth - low) % 360.0 <= high - low
+    inside = (
+        between
+        & (elevation >= elevations[0])
+        & (elevation <= elevations[-1])
+        & (range_m >= model.min_range_m)
+        & (range_m <= model.max_range_m)
+    )
+    return np.asarray(between.all(axis=-1)), np.asarray(inside.mean(axis=-1))
+
+
+def _solid_angle(model: LidarModel, elevation: Array) -> Array:
+    """(n,) steradians for each beam near some elevations (n,), radians."""
+    elevations = np.radians(_elevations_deg(model))
+    spacing = np.interp(elevation, 0.5 * (elevations[1:] + elevations[:-1]), np.diff(elevations))
+    return np.asarray(spacing * math.radians(model.horizontal_resolution_deg) * np.cos(elevation))

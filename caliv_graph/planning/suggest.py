@@ -1,0 +1,300 @@
+"""Which drive would tell enough, in the least space: a small set of manoeuvres, tried out.
+
+Each manoeuvre is driven with the scenario's own vehicle and sensors past its first target, which is
+put at a few places beside the path. They are tried in the order of the space they take, and the
+first that is good enough is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from caliv_graph.config import LIMIT_KEY
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import CalivError, ConfigError
+from caliv_graph.planning.predict import Assumptions, Prediction, predict, sigma_of, space
+from caliv_graph.simulation.drives import Drive, make_drive
+from caliv_graph.simulation.scenario import (
+    ArcDrive,
+    DriveModel,
+    FigureEightDrive,
+    RampModel,
+    Scenario,
+    SCurveDrive,
+)
+
+USUAL_RADIUS_M = 9.16
+USUAL_SPEED_M_S = 2.0
+"""Of a vehicle whose scenario stands or goes straight ahead (SPEC 7)."""
+
+ARC_RAD = math.radians(210.0)
+"""Turned by an arc: so far that LiDARs to the front and to the rear see the target."""
+
+S_RAD = math.radians(120.0)
+"""Turned by each half of an S-curve."""
+
+BESIDE_M = (4.0, 6.0)
+"""Distances of the target from the path."""
+
+ALONG = (0.35, 0.5, 0.65)
+"""Parts of the way at which the target may stand beside the path."""
+
+CLEAR_M = 3.0
+"""The target is never nearer to any part of the path: the vehicle has to get past."""
+
+STRIDE = 4
+QUICK_TOLERANCE = 0.1
+"""A first look takes every fourth cloud for four, and is right to this part."""
+
+RAMP_HEIGHT_M = 0.25
+RAMP_FLANK_M = 4.0
+"""A ramp such as a kerb lane or two boards on bricks: 7.8 degrees at most."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A drive that would tell enough, or comes nearest to it.
+
+    Attributes:
+        manoeuvre: what to drive, in words.
+        scenario: the same, ready to be simulated or planned.
+        prediction: what it will tell.
+        met: whether it is good enough.
+        worst: largest ratio of a predicted sigma to the one asked for; 1 or less is met. Without
+            any asked for, the number of directions it leaves undetermined.
+    """
+
+    manoeuvre: str
+    scenario: Scenario
+    prediction: Prediction
+    met: bool
+    worst: float
+
+
+def parse_goals(items: Sequence[str]) -> dict[str, float]:
+    """Largest sigmas as they are written on a command line.
+
+    Args:
+        items: `s2v_yaw_deg=0.05` and the like.
+
+    Raises:
+        ConfigError: one of them is not that.
+    """
+    goals: dict[str, float] = {}
+    for item in items:
+        key, equals, text = item.partition("=")
+        if not equals or not LIMIT_KEY.match(key):
+            raise ConfigError(
+                f"--sigma {item}: expected KEY=VALUE, KEY being s2s_ or s2v_, then roll_deg, "
+                "pitch_deg, yaw_deg, x_m, y_m or z_m: s2v_yaw_deg=0.05"
+            )
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and value > 0.0):
+            raise ConfigError(f"--sigma {item}: '{text}' is not a number above zero")
+        if key in goals:
+            raise ConfigError(f"--sigma {item}: {key} is given twice")
+        goals[key] = value
+    return goals
+
+
+def shortfall(prediction: Prediction, goals: Mapping[str, float]) -> float:
+    """How far a prediction is from what is asked for.
+
+    Args:
+        prediction: of a drive.
+        goals: limits as in a config (`s2v_yaw_deg`) -> largest sigma; empty: that nothing be left
+            undetermined.
+
+    Returns:
+        The largest ratio of a sigma to its limit, infinite if a LiDAR sees no target; without goals
+        the number of undetermined directions.
+    """
+    if prediction.outlook.unseeing:
+        return math.inf
+    if not goals:
+        return float(len(prediction.undetermined))
+    return max(
+        value / limit
+        for key, limit in goals.items()
+        for value in (sigma_of(prediction, key) or {"": 0.0}).values()
+    )
+
+
+def is_met(worst: float, goals: Mapping[str, float]) -> bool:
+    """Whether `shortfall` says that all is well."""
+    return worst <= 1.0 if goals else worst == 0.0
+
+
+def suggest(
+    scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
+) -> Suggestion | None:
+    """The manoeuvre that is good enough in the least space, or the one that comes nearest.
+
+    Args:
+        scenario: vehicle, sensors, and the target to place (the first).
+        goals: as for `shortfall`.
+        assumptions: how drives will be recorded and calibrated.
+
+    Returns:
+        None if in none of them any LiDAR sees the target.
+    """
+    best: Suggestion | None = None
+    tried = sorted(candidates(scenario, with_ramp=assumptions.ground != "height"), key=_cost)
+    for manoeuvre, candidate in tried:
+        quick = _tried(manoeuvre, candidate, goals, replace(assumptions, stride=STRIDE))
+        if quick is None:
+            continue
+        if quick.met or (goals and quick.worst <= 1.0 + QUICK_TOLERANCE):
+            found = _tried(manoeuvre, candidate, goals, assumptions)
+            if found is not None and found.met:
+                return found
+        if best is None or quick.worst < best.worst:
+            best = quick
+    return best and _tried(best.manoeuvre, best.scenario, goals, assumptions)
+
+
+def _tried(
+    manoeuvre: str, scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
+) -> Suggestion | None:
+    """A candidate and what it tells; None if nobody sees the target."""
+    try:
+        prediction = predict(scenario, assumptions=assumptions)
+    except CalivError:
+        return None
+    worst = shortfall(prediction, goals)
+    return Suggestion(manoeuvre, scenario, prediction, is_met(worst, goals), worst)
+
+
+def _cost(candidate: tuple[str, Scenario]) -> tuple[float, float]:
+    """Area of the rectangle that it takes, then its duration."""
+    scenario = candidate[1]
+    drive = make_drive(scenario.drive)
+    x, y = space([(scenario, drive)])
+    return (round(x * y, 1), drive.duration_s)
+
+
+def candidates(scenario: Scenario, with_ramp: bool = False) -> Iterator[tuple[str, Scenario]]:
+    """The manoeuvres and target placements that are tried, in words and as scenarios.
+
+    Args:
+        scenario: vehicle, sensors, and the target to place (the first).
+        with_ramp: also over a ramp, which tells the height where the ground does not.
+
+    Raises:
+        ConfigError: the scenario has no target.
+    """
+    if not scenario.world.targets:
+        raise ConfigError(f"scenario '{scenario.name}': world.targets names no target to place")
+    for words, model in _manoeuvres(scenario):
+        drive = make_drive(model)
+        ramps: list[tuple[str, tuple[RampModel, ...]]] = [("", ())]
+        if with_ramp and not isinstance(model, ArcDrive):
+            ramps.append((" over a ramp", (_ramp(drive),)))
+        for over, ramp in ramps:
+            for beside_m, xy_m in _places(drive):
+                text = f"{words}{over}, target {beside_m:.0f} m beside the path at {_place(xy_m)}"
+                yield text, _placed(scenario, model, ramp, xy_m)
+
+
+def _place(xy_m: tuple[float, float]) -> str:
+    return f"({xy_m[0]:.1f}, {xy_m[1]:.1f}) m from the start, x ahead and y left"
+
+
+def _manoeuvres(scenario: Scenario) -> Iterator[tuple[str, DriveModel]]:
+    given = scenario.drive
+    radius_m = float(getattr(given, "radius_m", USUAL_RADIUS_M))
+    speed = float(getattr(given, "speed_m_s", USUAL_SPEED_M_S))
+    kept: dict[str, Any] = {
+        "start_xy_m": (0.0, 0.0),
+        "start_yaw_deg": 0.0,
+        "speed_m_s": speed,
+        "radius_m": radius_m,
+        "turn": getattr(given, "turn", "right"),
+    }
+    for name in ("standstill_s", "ramp_s", "wheelbase_m"):
+        if hasattr(given, name):
+            kept[name] = getattr(given, name)
+    still = ArcDrive(duration_s=1e3, **kept)
+    rest_s = still.standstill_s + still.ramp_s
+    arc_s = rest_s + ARC_RAD * radius_m / speed
+    s_s = rest_s + 2.0 * S_RAD * radius_m / speed
+    yield (
+        f"arc of radius {radius_m:.1f} m by {math.degrees(ARC_RAD):.0f} degrees, {arc_s:.0f} s",
+        ArcDrive(duration_s=round(arc_s, 1), **kept),
+    )
+    yield (
+        f"S-curve of radius {radius_m:.1f} m, {math.degrees(S_RAD):.0f} degrees each way, "
+        f"{s_s:.0f} s",
+        SCurveDrive(duration_s=round(s_s, 1), **kept),
+    )
+    eight = FigureEightDrive(**kept)
+    eight_s = make_drive(eight).duration_s
+    yield f"figure-eight of radius {radius_m:.1f} m, {eight_s:.0f} s", eight
+
+
+def _path(drive: Drive, count: int = 400) -> tuple[Any, Any]:
+    """(n, 2) places and (n,) headings along the way, evenly in time."""
+    stamps = np.linspace(0.0, drive.duration_s * NANOSECONDS_PER_SECOND, count).astype(np.int64)
+    motion = drive.motion(stamps)
+    return motion.xy_map, motion.heading_rad
+
+
+def _places(drive: Drive) -> Iterator[tuple[float, tuple[float, float]]]:
+    """Places of the target beside the path that leave room to get past."""
+    xy, heading = _path(drive)
+    seen: set[tuple[float, float]] = set()
+    for part in ALONG:
+        at = int(part * (len(xy) - 1))
+        left = np.array([-math.sin(heading[at]), math.cos(heading[at])])
+        for beside_m in BESIDE_M:
+            for side in (-1.0, 1.0):
+                place = xy[at] + side * beside_m * left
+                if np.linalg.norm(xy - place, axis=1).min() < CLEAR_M:
+                    continue
+                key = (round(float(place[0]), 1), round(float(place[1]), 1))
+                if key not in seen:
+                    seen.add(key)
+                    yield beside_m, key
+
+
+def _ramp(drive: Drive) -> RampModel:
+    """A ramp across the way at a third of it."""
+    xy, heading = _path(drive)
+    at = len(xy) // 3
+    return RampModel(
+        xy_m=(round(float(xy[at, 0]), 1), round(float(xy[at, 1]), 1)),
+        yaw_deg=round(math.degrees(heading[at]), 0),
+        height_m=RAMP_HEIGHT_M,
+        flank_m=RAMP_FLANK_M,
+        top_m=1.0,
+    )
+
+
+def _placed(
+    scenario: Scenario, drive: DriveModel, ramps: Sequence[RampModel], xy_m: tuple[float, float]
+) -> Scenario:
+    """The scenario with another drive and its first target elsewhere; nothing else stands there."""
+    name = scenario.world.targets[0]
+    target = scenario.world.objects[name].model_copy(update={"xy_m": xy_m})
+    if hasattr(target, "moves"):
+        target = target.model_copy(update={"moves": ()})
+    world = scenario.world.model_copy(
+        update={
+            "objects": {name: target},
+            "targets": (name,),
+            "walkers": {},
+            "ground": scenario.world.ground.model_copy(update={"ramps": tuple(ramps)}),
+        }
+    )
+    gnss = scenario.gnss.model_copy(update={"outages": (), "jumps": ()})
+    return scenario.model_copy(
+        update={"name": "suggestion", "drive": drive, "world": world, "gnss": gnss}
+    )

@@ -1,0 +1,206 @@
+"""`plan` at the command line: JSON, words, exit codes, the file it writes."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from caliv_graph.cli.main import app, run
+from caliv_graph.simulation.scenario import load_scenario
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
+ARC = SCENARIOS / "paper_arc.yaml"
+
+
+def plan(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["plan", *map(str, arguments)])
+
+
+def document(*arguments: object) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(plan(*arguments, "--json").stdout)
+    return found
+
+
+def changed(tmp_path: Path, name: str = "scenario.yaml", **changes: object) -> Path:
+    raw = yaml.safe_load(ARC.read_text())
+    raw.update(changes)
+    path = tmp_path / name
+    path.write_text(yaml.safe_dump(raw))
+    return path
+
+
+def test_an_arc_as_json() -> None:
+    found = document(ARC)
+
+    front = found["lidars"]["front"]
+    assert front["determined"] == {
+        "roll": True,
+        "pitch": True,
+        "yaw": False,
+        "x": False,
+        "y": True,
+        "z": True,
+    }
+    assert front["sigma_vehicle_axes"]["xyz"] == pytest.approx([0.040, 0.0092, 0.005], rel=0.05)
+    lost = found["observability"]["undetermined"]
+    assert [d["text"] for d in lost] == [
+        "rotation of all LiDARs about the turn centre: x and yaw together, 9.16 m per rad"
+    ]
+    assert "figure-eight" in lost[0]["remedy"]
+    assert found["sensor_to_sensor"][0]["determined"]["yaw"] is True
+    seen = {s["lidar"]: s for s in found["sightings"]}
+    # The front LiDAR sees the chair first, the rear one in the end, neither all the time.
+    assert seen["front"]["seconds"][0][0] == 0.0
+    assert seen["front"]["seconds"][-1][1] < seen["rear"]["seconds"][0][0]
+    assert seen["rear"]["seconds"][-1][1] == pytest.approx(17.0)
+    assert found["met"] is False
+    assert found["suggestion"]["met"] is True
+    assert found["suggestion"]["drive"]["kind"] == "s_curve"
+    assert found["status"] == "partial"
+
+
+def test_an_arc_in_words() -> None:
+    result = plan(ARC)
+
+    assert result.exit_code == 0
+    assert "Remedy: change the curvature while the target is in view" in result.stdout
+    row = next(line for line in result.stdout.splitlines() if line.startswith("front  ("))
+    # What the guess decides is in brackets.
+    assert row.split()[1] == "(40)"
+    assert row.split()[-1] == "(4.3)"
+    assert result.stderr == ""
+
+
+def test_it_takes_less_than_two_seconds_after_its_start() -> None:
+    plan(ARC)  # imports
+    begun = time.process_time()
+
+    plan(SCENARIOS / "tri_lidar.yaml", "--sigma", "s2v_yaw_deg=0.0001")
+
+    # The worst case: every candidate is tried.
+    assert time.process_time() - begun < 2.0
+
+
+def test_sigmas_asked_for_and_not_kept_are_exit_3() -> None:
+    result = plan(ARC, "--sigma", "s2v_yaw_deg=0.05", "--sigma", "s2s_x_m=0.01")
+
+    assert result.exit_code == 3
+    assert "It does not keep what was asked for: s2v_yaw_deg 0.05, s2s_x_m 0.01." in result.stdout
+    assert "In the least space" in result.stdout
+    kept = plan(SCENARIOS / "figure_eight.yaml", "--sigma", "s2v_yaw_deg=0.05")
+    assert kept.exit_code == 0
+    assert "It keeps what was asked for" in kept.stdout
+
+
+def test_what_is_made_of_the_ground() -> None:
+    texts = {
+        ground: [
+            d["text"]
+            for d in document(SCENARIOS / "figure_eight.yaml", "--ground", ground)["observability"][
+                "undetermined"
+            ]
+        ]
+        for ground in ("none", "plane", "height")
+    }
+
+    assert texts == {
+        "none": ["height of all LiDARs together"],
+        "plane": ["height of all LiDARs together"],
+        "height": [],
+    }
+
+
+def test_two_drives_together(tmp_path: Path) -> None:
+    drive = yaml.safe_load(ARC.read_text())["drive"] | {"turn": "left"}
+    world = yaml.safe_load(ARC.read_text())["world"]
+    world["objects"]["chair"]["xy_m"] = [15.16, 9.16]
+    left = changed(tmp_path, name="left.yaml", drive=drive, world=world)
+
+    found = document(ARC, left)
+
+    assert found["observability"]["undetermined"] == []
+    assert len(found["drives"]) == 2
+
+
+def test_time_offsets_on_request() -> None:
+    found = document(SCENARIOS / "figure_eight.yaml", "--time-offset")
+
+    assert found["lidars"]["front"]["time_offset"]["sigma"] < 0.001
+    assert "time_offset" not in document(ARC)["lidars"]["front"]
+
+
+def test_a_standing_vehicle() -> None:
+    result = plan(SCENARIOS / "static.yaml", "--ground", "none")
+
+    assert result.exit_code == 0
+    # Six directions, one sentence.
+    assert result.stdout.count("everything to the vehicle: it never moved") == 1
+    assert "figure-eight" in result.stdout
+
+
+def test_the_suggestion_as_a_scenario(tmp_path: Path) -> None:
+    out = tmp_path / "suggested.yaml"
+
+    first = plan(ARC, "--out", out)
+
+    assert first.exit_code == 0
+    assert load_scenario(out).drive.kind == "s_curve"
+    again = document(out)
+    assert again["observability"]["undetermined"] == []
+    before = out.read_text()
+    assert run(["plan", str(ARC), "--out", str(out)]) == 2
+    assert out.read_text() == before
+    assert plan(ARC, "--out", out, "--force").exit_code == 0
+
+
+def test_a_lidar_that_sees_nothing_is_exit_3(tmp_path: Path) -> None:
+    lidars = yaml.safe_load(ARC.read_text())["lidars"]
+    lidars["blind"] = dict(lidars["front"], max_range_m=3.0)
+    path = changed(tmp_path, lidars=lidars)
+
+    result = plan(path, "--json")
+
+    assert result.exit_code == 3
+    assert "lidar 'blind' never sees a target" in result.stderr
+    assert json.loads(result.stdout)["lidars"]["blind"]["sees_target"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["missing.yaml"], "missing.yaml: no such file"),
+        ([SCENARIOS / "no_target.yaml"], "world.targets names no target"),
+        ([ARC, "--sigma", "yaw=1"], "--sigma yaw=1: expected KEY=VALUE"),
+        ([ARC, "--ground", "swamp"], "--ground"),
+        ([], "SCENARIO"),
+    ],
+    ids=["no file", "no target", "no limit", "no such ground", "nothing"],
+)
+def test_bad_input_is_one_line_and_exit_2(
+    arguments: list[object], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = run(["plan", *map(str, arguments)])
+
+    shown = capsys.readouterr()
+    assert code == 2
+    assert shown.out == ""
+    assert len(shown.err.splitlines()) == 1
+    assert said in shown.err
+
+
+def test_a_target_nobody_sees_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    world = yaml.safe_load(ARC.read_text())["world"]
+    world["objects"]["chair"]["xy_m"] = [150.0, 0.0]
+
+    code = run(["plan", str(changed(tmp_path, world=world))])
+
+    shown = capsys.readouterr()
+    assert code == 2
+    assert "no LiDAR sees a target" in shown.err
+    assert len(shown.err.splitlines()) == 1

@@ -1,0 +1,55 @@
+"""`caliv-graph compare`: has a mount moved between two calibrations?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caliv_graph.cli import streams
+
+
+def compare(
+    first: Annotated[
+        Path, typer.Argument(metavar="A.yaml", help="The earlier result of 'calibrate'.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="B.yaml", help="The later one.")],
+    p_value: Annotated[
+        float,
+        typer.Option(
+            "--p-value",
+            min=1e-12,
+            max=0.5,
+            help="Chance of a false alarm if nothing has moved, over all tests together.",
+        ),
+    ] = 0.01,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document: metres and radians.")
+    ] = False,
+) -> None:
+    """Tell whether a LiDAR's mount has moved between two calibrations of one vehicle.
+
+    Tested are each LiDAR against the vehicle and each pair of LiDARs: a chi-square on the joint
+    covariance of what the two drives themselves say. A guess that both started from plays no part:
+    along a direction that either drive did not determine, nothing can be said. The verdict allows
+    for the number of tests.
+
+    Example: caliv-graph compare spring/calibration.yaml autumn/calibration.yaml
+    """
+    from caliv_graph.fusion.compare import compare as compare_calibrations
+    from caliv_graph.report.comparison import comparison_document, comparison_table
+    from caliv_graph.results import read_calibration
+
+    labels = (str(first), str(second))
+    calibrations = read_calibration(first), read_calibration(second)
+    comparison = compare_calibrations(*calibrations, labels, p_value)
+    if as_json:
+        streams.show_json(comparison_document(comparison, labels, p_value))
+    else:
+        streams.show(comparison_table(comparison, labels, p_value))
+    streams.warn(
+        f"{label}: is inconsistent in itself: what its data say cannot be relied on"
+        for label, calibration in zip(labels, calibrations, strict=True)
+        if calibration.status == "inconsistent"
+    )

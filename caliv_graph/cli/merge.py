@@ -1,0 +1,79 @@
+"""`caliv-graph merge`: several calibrations of one vehicle into one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caliv_graph.cli import streams
+from caliv_graph.cli.exits import INCONSISTENT
+
+
+def merge(
+    calibrations: Annotated[
+        list[Path],
+        typer.Argument(metavar="A.yaml B.yaml ...", help="Results of 'calibrate', of one vehicle."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The merged calibration.")],
+    p_value: Annotated[
+        float,
+        typer.Option(
+            "--p-value",
+            min=1e-12,
+            max=0.5,
+            help="Chance that calibrations of mounts that stayed are said to disagree.",
+        ),
+    ] = 0.01,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older file.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print one JSON document, the file's content and more."),
+    ] = False,
+) -> None:
+    """Merge several calibrations of one vehicle into one.
+
+    What the drives' data say is summed, and the initial guess, which they share, counts once: the
+    result is that of all drives solved together, without solving again. A drive must not count
+    twice. The files may have different LiDARs and references; those of the first come first.
+
+    Exit code 4: the result is written, but the calibrations contradict each other.
+
+    Example: caliv-graph merge monday/calibration.yaml friday/calibration.yaml --out vehicle.yaml
+    """
+    from caliv_graph.errors import ConfigError
+    from caliv_graph.files import check_output_file
+    from caliv_graph.fusion.merge import merge as merge_calibrations
+    from caliv_graph.report.comparison import agreement_document, merger_table
+    from caliv_graph.results import (
+        calibration_document,
+        read_calibration,
+        without_infinities,
+        write_calibration,
+    )
+
+    if len(calibrations) < 2:
+        raise ConfigError(f"{calibrations[0]}: is one calibration; to merge takes two or more")
+    seen: set[Path] = set()
+    for path in calibrations:
+        if path.resolve() in seen:
+            raise ConfigError(f"{path}: given twice; a calibration counts once")
+        seen.add(path.resolve())
+    check_output_file(out, force)
+    merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)
+    write_calibration(merger.calibration, out, force)
+    if as_json:
+        extra = {
+            "out": str(out),
+            "agreement": agreement_document(merger, p_value),
+            "warnings": list(merger.warnings),
+        }
+        document = calibration_document(merger.calibration)
+        streams.show_json(without_infinities({**document, **extra}))
+    else:
+        streams.show(merger_table(merger, p_value))
+        streams.say(f"Written to {out}")
+    streams.warn(merger.warnings)
+    if merger.calibration.status == "inconsistent":
+        raise typer.Exit(INCONSISTENT)

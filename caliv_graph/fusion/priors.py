@@ -1,0 +1,106 @@
+"""A calibration as native GTSAM factors, for localisers that carry the mountings as variables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.errors import ExportError
+from caliv_graph.products import Array, Calibration
+from caliv_graph.trajectory.factors import marginal_factor
+
+MountingKey = Callable[[str], int]
+"""Key of the variable `T_vehicle_lidar` of a LiDAR, by its name."""
+
+DEFAULT_LETTER = "m"
+"""Letter of the keys if the user names none; X, V, B, G, E, Y are taken in LIO-SAM and GLIM."""
+
+_LEAST_EIGENVALUE = 1e-10
+"""Of a covariance scaled to ones on its diagonal. Files keep twelve digits: what is known better
+than this against the rest is told no better."""
+
+
+def lettered_keys(calibration: Calibration, letter: str = DEFAULT_LETTER) -> MountingKey:
+    """Keys `letter` 0, 1, ... in the order of the calibration's LiDARs.
+
+    Args:
+        calibration: names the LiDARs.
+        letter: one character.
+
+    Raises:
+        ExportError: it is not one ASCII letter, which is what GTSAM's symbols have.
+    """
+    if not (len(letter) == 1 and letter.isascii() and letter.isalpha()):
+        raise ExportError(f"letter {letter!r}: expected one letter, a to z or A to Z")
+    names = list(calibration.lidars)
+    return lambda name: int(gtsam.symbol(letter, names.index(name)))
+
+
+def prior_factors(
+    calibration: Calibration,
+    key: MountingKey,
+    joint: bool = True,
+    lidars: Sequence[str] | None = None,
+) -> gtsam.NonlinearFactorGraph:
+    """The calibrated mountings as priors on variables of a localiser's graph.
+
+    All factors are native and can be serialised. Along what the drive did not determine they carry
+    the initial guess with its sigma, as the calibration's covariance does.
+
+    Args:
+        calibration: the result.
+        key: of the variable `T_vehicle_lidar` of each LiDAR.
+        joint: one `LinearContainerFactor` over all of them, which keeps that the LiDARs are known
+            better against each other than against the vehicle. It is a quadratic about the
+            calibrated mountings, good for movements of some degrees. Else a `PriorFactorPose3`
+            each, which forgets it: a localiser then thinks the LiDARs apart to be known worse.
+        lidars: which ones; absent: all.
+
+    Raises:
+        ExportError: a LiDAR is unknown, keys collide, or a sigma is zero.
+    """
+    names = list(calibration.lidars) if lidars is None else list(lidars)
+    unknown = [name for name in names if name not in calibration.lidars]
+    if unknown or not names:
+        raise ExportError(
+            f"lidar {', '.join(map(repr, unknown)) or '(none)'}: is not in the calibration, which "
+            f"has {', '.join(calibration.lidars)}"
+        )
+    keys = [key(name) for name in names]
+    if len(set(keys)) < len(keys):
+        raise ExportError(
+            f"keys of {', '.join(names)} are not different: a variable each is needed"
+        )
+    order = list(calibration.lidars)
+    rows = [6 * order.index(name) + axis for name in names for axis in range(6)]
+    cov = calibration.cov_joint[np.ix_(rows, rows)]
+    poses = tuple(calibration.lidars[name].T_vehicle_lidar for name in names)
+    graph = gtsam.NonlinearFactorGraph()
+    if joint:
+        graph.add(marginal_factor(keys, _information(cov), poses))
+        return graph
+    for i, (number, pose) in enumerate(zip(keys, poses, strict=True)):
+        block = cov[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        noise = gtsam.noiseModel.Gaussian.Information(_information(block))
+        graph.add(gtsam.PriorFactorPose3(number, pose, noise))
+    return graph
+
+
+def mounting_values(calibration: Calibration, key: MountingKey) -> gtsam.Values:
+    """The calibrated mountings as values of the variables that `prior_factors` is about."""
+    values = gtsam.Values()
+    for name, lidar in calibration.lidars.items():
+        values.insert(key(name), lidar.T_vehicle_lidar)
+    return values
+
+
+def _information(cov: Array) -> Array:
+    """Inverse of a covariance whose numbers differ by orders of magnitude."""
+    sigma = np.sqrt(np.diag(cov))
+    if not np.all(sigma > 0.0):
+        raise ExportError("joint.covariance: has a sigma of zero, and no information to hand on")
+    values, vectors = np.linalg.eigh(cov / np.outer(sigma, sigma))
+    half = vectors / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)) / sigma[:, None]
+    return np.asarray(half @ half.T)

@@ -1,0 +1,176 @@
+"""Calibrations against each other, as tables and as plain values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from caliv_graph.conventions import AXES
+from caliv_graph.fusion.compare import Comparison, Movement
+from caliv_graph.fusion.merge import Merger
+from caliv_graph.report.tables import (
+    _SHOWN_AXES,
+    _decimals,
+    _fixed,
+    _headings,
+    _sentences,
+    _table,
+    _titled,
+    calibration_table,
+)
+
+_UNTOLD = "-"
+
+
+def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: float) -> Group:
+    """Movements with their sigmas, and the verdict.
+
+    Args:
+        comparison: what was found.
+        labels: of the earlier and the later calibration.
+        p_value: the limit that was applied.
+    """
+    table = _table("", *_headings("mm", "mrad"), "chi2\ndof", "p\ncorrected", "moved")
+    for movement in comparison.movements:
+        table.add_row(Text(_name(movement)), *_cells(movement), *_verdict(movement))
+    parts = _titled(
+        f"Movement from {labels[0]} to {labels[1]}, and 1 sigma, in vehicle axes", table
+    )[1:]
+    if not all(all(m.told) for m in comparison.movements):
+        parts.append(
+            Text(f"{_UNTOLD}: not determined by both: nothing can be said.", style="yellow")
+        )
+    for label, texts in zip(labels, comparison.undetermined, strict=True):
+        parts += _sentences(f"What {label} could not tell:", texts)
+    parts += _sentences(
+        "Not compared:", (f"LiDAR '{n}': {why}" for n, why in comparison.not_compared.items())
+    )
+    style = "bold red" if comparison.moved else "bold green" if _any(comparison) else "bold yellow"
+    together = (
+        f" (all at once: chi2 {comparison.chi2:.1f} of {comparison.dof} dof, p "
+        f"{comparison.p_value:.3g}; limit {p_value:g} after correction for {_tests(comparison)} "
+        "tests)"
+        if comparison.dof
+        else ""
+    )
+    parts += ["", Text.assemble((comparison.conclusion, style), together)]
+    return Group(*parts)
+
+
+def merger_table(merger: Merger, p_value: float) -> RenderableType:
+    """The merged calibration, and whether its parts agree."""
+    table = _table("", "tests", "smallest p\ncorrected", "verdict")
+    for label, comparison in merger.agreement.items():
+        tested = [m.p_corrected for m in comparison.movements if m.dof]
+        table.add_row(
+            Text(label),
+            str(_tests(comparison)),
+            f"{min(tested):.3g}" if tested else _UNTOLD,
+            Text("disagrees", style="bold red")
+            if comparison.moved
+            else Text("agrees" if tested else "nothing to compare"),
+        )
+    parts: list[RenderableType] = [calibration_table(merger.calibration)]
+    parts += _titled(f"Each against the others together (limit {p_value:g} over all)", table)
+    return Group(*parts)
+
+
+def comparison_document(
+    comparison: Comparison, labels: tuple[str, str], p_value: float
+) -> dict[str, Any]:
+    """A comparison in plain values: metres, radians; null where nothing can be said."""
+    return {
+        "first": labels[0],
+        "second": labels[1],
+        "moved": comparison.moved,
+        "conclusion": comparison.conclusion,
+        "p_value_limit": p_value,
+        "tests": _tests(comparison),
+        "lidars": {name: {"s2v": _movement_document(m)} for name, m in comparison.lidars.items()},
+        "pairs": [
+            {"from": m.lidars[0], "to": m.lidars[1], **_movement_document(m)}
+            for m in comparison.pairs
+        ],
+        "joint": {
+            "chi2": comparison.chi2 if comparison.dof else None,
+            "dof": comparison.dof,
+            "p_value": comparison.p_value if comparison.dof else None,
+        },
+        "undetermined": {
+            label: list(texts)
+            for label, texts in zip(("first", "second"), comparison.undetermined, strict=True)
+        },
+        "not_compared": dict(comparison.not_compared),
+    }
+
+
+def agreement_document(merger: Merger, p_value: float) -> dict[str, Any]:
+    """Per calibration, how it compares with the others together."""
+    others = ("the others", "this")
+    return {
+        label: comparison_document(comparison, others, p_value)
+        for label, comparison in merger.agreement.items()
+    }
+
+
+def _movement_document(movement: Movement) -> dict[str, Any]:
+    def told(values: Any, axes: slice) -> list[float | None]:
+        pairs = zip(values[axes], movement.told[axes], strict=True)
+        return [float(value) if known else None for value, known in pairs]
+
+    rotation, translation = slice(0, 3), slice(3, 6)
+    tested = movement.dof > 0
+    return {
+        "rotation_rad": told(movement.movement, rotation),
+        "translation_m": told(movement.movement, translation),
+        "sigma_rotation_rad": told(movement.sigma, rotation),
+        "sigma_translation_m": told(movement.sigma, translation),
+        "determined": dict(zip(AXES, movement.told, strict=True)),
+        "chi2": movement.chi2 if tested else None,
+        "dof": movement.dof,
+        "p_value": movement.p_value if tested else None,
+        "p_rotation": told(movement.p_axes, rotation),
+        "p_translation": told(movement.p_axes, translation),
+        "p_corrected": movement.p_corrected if tested else None,
+        "moved": movement.moved if tested else None,
+    }
+
+
+def _name(movement: Movement) -> str:
+    if len(movement.lidars) == 1:
+        return f"S2V {movement.lidars[0]}"
+    return "S2S {} to {}".format(*movement.lidars)
+
+
+def _cells(movement: Movement) -> list[Text]:
+    cells = []
+    for axis in _SHOWN_AXES:
+        i = AXES.index(axis)
+        if not movement.told[i]:
+            cells.append(Text(_UNTOLD, style="yellow"))
+            continue
+        value, sigma = 1e3 * movement.movement[i], 1e3 * movement.sigma[i]
+        decimals = _decimals(sigma, 2)
+        cells.append(Text(f"{_fixed(value, decimals)}\n±{sigma:.{decimals}f}"))
+    return cells
+
+
+def _verdict(movement: Movement) -> list[Text]:
+    if not movement.dof:
+        return [Text(_UNTOLD), Text(_UNTOLD), Text("cannot\nbe said", style="yellow")]
+    moved = Text("yes", style="bold red") if movement.moved else Text("no")
+    return [
+        Text(f"{movement.chi2:.1f}\n{movement.dof}"),
+        Text(f"{movement.p_value:.2g}\n{movement.p_corrected:.2g}"),
+        moved,
+    ]
+
+
+def _any(comparison: Comparison) -> bool:
+    return any(m.dof for m in comparison.movements)
+
+
+def _tests(comparison: Comparison) -> int:
+    return sum(len(m.tests) for m in comparison.movements)

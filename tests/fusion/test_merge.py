@@ -1,0 +1,363 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config import Config, parse_config
+from caliv_graph.errors import ConfigError
+from caliv_graph.fusion.merge import Merger, merge, starting_from, with_earlier
+from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.products import Array, Calibration, Guess
+from caliv_graph.results import read_calibration, write_calibration
+from tests.fusion.drives import TRUTH, arc_information, draw, drive, information, shift
+
+NAMES = ("front", "rear")
+
+
+def merged(*calibrations: Calibration) -> Calibration:
+    return merger(*calibrations).calibration
+
+
+def merger(*calibrations: Calibration) -> Merger:
+    return merge({f"{letter}.yaml": c for letter, c in zip("abc", calibrations, strict=False)})
+
+
+def in_vehicle_axes(calibration: Calibration, matrix: Array) -> Array:
+    n = len(calibration.lidars)
+    axes = np.zeros((6 * n, 6 * n))
+    for i, lidar in enumerate(calibration.lidars.values()):
+        axes[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = right_to_vehicle_axes(lidar.T_vehicle_lidar)
+    return np.asarray(axes @ matrix @ axes.T)
+
+
+def errors(calibration: Calibration) -> Array:
+    return np.concatenate(
+        [
+            vehicle_axes_difference(lidar.T_vehicle_lidar, TRUTH[name])
+            for name, lidar in calibration.lidars.items()
+        ]
+    )
+
+
+def test_two_drives_by_hand() -> None:
+    """Informations add up, and the estimate is their weighted mean; the guess has no weight."""
+    rng = np.random.default_rng(1)
+    D = [information(NAMES, 1), information(NAMES, 2)]
+    e = [draw(d, rng) for d in D]
+    parts = [
+        drive(d, source=s, error=err, guess_error=np.full(12, 0.02))
+        for d, s, err in zip(D, "ab", e, strict=True)
+    ]
+
+    result = merged(*parts)
+
+    total = D[0] + D[1]
+    mean = np.linalg.solve(total, D[0] @ e[0] + D[1] @ e[1])
+    # To first order: the errors are of milliradians.
+    assert errors(result) == pytest.approx(mean, abs=2e-5)
+    scale = 1e-2 * np.sqrt(np.outer(np.diag(total), np.diag(total)))
+    assert (np.abs(in_vehicle_axes(result, result.information_data) - total) < scale).all()
+    cov = in_vehicle_axes(result, result.cov_joint)
+    sigma = np.sqrt(np.diag(np.linalg.inv(total)))
+    assert np.sqrt(np.diag(cov)) == pytest.approx(sigma, rel=1e-2)
+    assert result.status == "ok"
+    assert result.lidars["front"].scans_used == 100
+
+
+def test_left_and_right_arc_determine_what_neither_does() -> None:
+    """SPEC 4: a left arc and a right arc as two drives."""
+    right, left = arc_information(NAMES, 1), arc_information(NAMES, 2, left=True)
+    guess = shift(NAMES, "front", x=0.05, yaw=0.01) + shift(NAMES, "rear", x=0.02, yaw=-0.02)
+    parts = [
+        drive(right, source="a", guess_error=guess),
+        drive(left, source="b", guess_error=guess),
+    ]
+    assert all(not part.lidars["front"].determined["yaw"] for part in parts)
+    assert all(np.abs(errors(part)).max() > 0.01 for part in parts)
+
+    result = merged(*parts)
+
+    assert result.status == "ok"
+    assert result.undetermined == ()
+    assert all(all(lidar.determined.values()) for lidar in result.lidars.values())
+    assert errors(result) == pytest.approx(np.zeros(12), abs=1e-4)
+
+
+def test_the_guess_counts_once() -> None:
+    """Two arcs of one radius: along what they leave open, the sigma is that of one guess."""
+    D = arc_information(NAMES)
+    guess = shift(NAMES, "front", x=0.05) + shift(NAMES, "rear", yaw=0.01)
+    parts = [drive(D, source=s, guess_error=guess) for s in "ab"]
+
+    result = merged(*parts)
+
+    assert result.status == "partial"
+    (direction,) = result.undetermined
+    assert "turn centre" in direction.text
+    sigma = np.sqrt(np.diag(in_vehicle_axes(result, result.cov_joint)))
+    alone = np.sqrt(np.diag(in_vehicle_axes(parts[0], parts[0].cov_joint)))
+    # x and yaw are the guess's; the others are known better by what two drives say.
+    assert sigma[[2, 3]] == pytest.approx(alone[[2, 3]], rel=0.05)
+    assert (sigma[[0, 1, 5]] < 0.75 * alone[[0, 1, 5]]).all()
+    assert errors(result) == pytest.approx(errors(parts[0]), abs=1e-5)
+
+
+def test_order_and_reference_do_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    D = [information(("front", "rear"), 1), information(("left", "rear"), 2)]
+    parts = [
+        drive(D[0], ("front", "rear"), source="a", error=draw(D[0], rng), reference="front"),
+        drive(D[1], ("left", "rear"), source="b", error=draw(D[1], rng), reference="rear"),
+    ]
+
+    there, back = merged(*parts), merged(*reversed(parts))
+
+    assert (list(there.lidars), there.reference) == (["front", "rear", "left"], "front")
+    assert (list(back.lidars), back.reference) == (["left", "rear", "front"], "rear")
+    for name in there.lidars:
+        ours, theirs = there.lidars[name], back.lidars[name]
+        assert ours.T_vehicle_lidar.equals(theirs.T_vehicle_lidar, 1e-8)
+        assert ours.cov == pytest.approx(theirs.cov, rel=1e-5, abs=1e-14)
+    # Front and left never saw the same drive; the rear, which saw both, ties them together.
+    assert np.abs(there.cov_joint[:6, 12:]).max() > 0.0
+
+
+def test_a_lidar_that_no_drive_saw_stays_at_its_guess() -> None:
+    D = information(NAMES)
+    D[:6], D[:, :6] = 0.0, 0.0
+    guess = shift(NAMES, "front", x=0.03, pitch=0.01)
+    parts = [drive(D, source=s, guess_error=guess) for s in "ab"]
+
+    result = merged(*parts)
+
+    front = result.lidars["front"]
+    assert not front.saw_target
+    assert not any(front.determined.values())
+    assert vehicle_axes_difference(front.T_vehicle_lidar, TRUTH["front"]) == pytest.approx(
+        guess[:6], abs=1e-9
+    )
+    sigma = np.sqrt(np.diag(in_vehicle_axes(result, result.cov_joint)))[:6]
+    guessed = front.guess
+    assert guessed is not None
+    assert sigma == pytest.approx(guessed.sigmas, rel=1e-6)
+
+
+def test_drives_count_once() -> None:
+    D = information(NAMES)
+    first = drive(D, source="a")
+
+    with pytest.raises(ConfigError, match=r"b\.yaml: stems from the same drive as a\.yaml"):
+        merged(first, drive(D, source="a"))
+    with pytest.raises(ConfigError, match=r"c\.yaml: stems from the same drive as a\.yaml"):
+        merged(first, drive(D, source="b"), merged(drive(D, source="c"), first))
+
+
+def test_files_that_name_no_drive_are_told_apart_by_what_they_say(tmp_path: Path) -> None:
+    first = drive(information(NAMES), source="a")
+    nameless = [replace(first, provenance={})]
+    nameless += [replace(drive(information(NAMES, 2), source="a"), provenance={})]
+
+    assert merged(*nameless).status == "ok"
+    with pytest.raises(ConfigError, match="stems from the same drive"):
+        merged(nameless[0], nameless[0])
+
+
+def test_calibrations_that_disagree_are_merged_and_said_to() -> None:
+    D = information(NAMES)
+    moved_on = drive(D, source="b", error=shift(NAMES, "front", pitch=0.02))
+
+    found = merger(drive(D, source="a"), moved_on)
+
+    assert found.calibration.status == "inconsistent"
+    (warning,) = found.warnings
+    assert warning.startswith("b.yaml: disagrees with the other: ")
+    assert "pitch" in warning
+    assert "mrad" in warning
+
+
+def test_of_three_the_odd_one_is_named() -> None:
+    D = information(NAMES)
+    parts = [drive(D, source=s) for s in "ac"]
+    odd = drive(D, source="b", error=shift(NAMES, "rear", y=0.2))
+
+    found = merger(parts[0], odd, parts[1])
+
+    assert found.calibration.status == "inconsistent"
+    certain = min(
+        found.agreement, key=lambda label: min(m.p_value for m in found.agreement[label].movements)
+    )
+    assert certain == "b.yaml"
+
+
+def test_three_drives_by_two_ways_are_the_same() -> None:
+    rng = np.random.default_rng(8)
+    D = [information(NAMES, seed) for seed in (1, 2, 3)]
+    parts = [drive(d, source=s, error=draw(d, rng)) for d, s in zip(D, "abc", strict=True)]
+
+    at_once, in_steps = merged(*parts), merged(merged(parts[0], parts[1]), parts[2])
+
+    assert errors(in_steps) == pytest.approx(errors(at_once), abs=1e-7)
+    assert in_steps.cov_joint == pytest.approx(at_once.cov_joint, rel=1e-3, abs=1e-13)
+    assert in_steps.provenance["drive_sha256"] == ["a", "b", "c"]
+
+
+def test_a_trusted_mounting_stays() -> None:
+    D = information(NAMES)
+
+    def trusting(source: str, error: Array) -> Calibration:
+        calibration = drive(D, source=source, error=error)
+        trusted = Guess(TRUTH["rear"], np.array([1e-5] * 3 + [1e-4] * 3), fixed=True)
+        rear = replace(calibration.lidars["rear"], guess=trusted)
+        return replace(calibration, lidars={**calibration.lidars, "rear": rear})
+
+    result = merged(
+        trusting("a", shift(NAMES, "rear", x=0.003)), trusting("b", shift(NAMES, "rear", x=0.002))
+    )
+
+    assert result.lidars["rear"].T_vehicle_lidar.equals(TRUTH["rear"], 1e-4)
+    assert all(result.lidars["rear"].determined.values())
+
+
+def test_a_merged_file_reads_back(tmp_path: Path) -> None:
+    D = information(NAMES)
+    result = merged(drive(D, source="a"), drive(D, source="b", error=np.full(12, 1e-3)))
+
+    write_calibration(result, tmp_path / "merged.yaml")
+    back = read_calibration(tmp_path / "merged.yaml")
+
+    assert back.gradient_data == pytest.approx(result.gradient_data, rel=1e-9, abs=1e-9)
+    assert back.information_data == pytest.approx(result.information_data, rel=1e-9)
+    guess, written = back.lidars["front"].guess, result.lidars["front"].guess
+    assert guess is not None
+    assert written is not None
+    assert guess.T_vehicle_lidar.equals(written.T_vehicle_lidar, 1e-9)
+    assert guess.sigmas == pytest.approx(written.sigmas, rel=1e-9)
+    with pytest.raises(ConfigError, match="same drive"):
+        merged(back, drive(D, source="b"))
+
+
+# ---------------------------------------------------------------- --prior
+
+
+def two_drives() -> tuple[Calibration, Calibration]:
+    rng = np.random.default_rng(21)
+    D = [arc_information(NAMES, 1), arc_information(NAMES, 2, left=True)]
+    guess = shift(NAMES, "front", x=0.01)
+    first, second = (
+        drive(d, source=s, error=draw(d, rng), guess_error=guess)
+        for d, s in zip(D, "ab", strict=True)
+    )
+    return first, second
+
+
+def test_an_earlier_calibration_adds_what_its_data_say() -> None:
+    before, alone = two_drives()
+
+    result, warnings = with_earlier(alone, before)
+
+    expected = merged(alone, before)
+    assert warnings == ()
+    assert errors(result) == pytest.approx(errors(expected), abs=1e-7)
+    assert result.cov_joint == pytest.approx(expected.cov_joint, rel=1e-4, abs=1e-13)
+    assert (result.status, result.undetermined) == ("ok", ())
+    # Its own data's information stays its own.
+    own = in_vehicle_axes(alone, alone.information_data)
+    assert in_vehicle_axes(result, result.information_data) == pytest.approx(
+        own, abs=2e-2 * own.max()
+    )
+
+
+def test_what_came_with_a_prior_counts_once(tmp_path: Path) -> None:
+    before, alone = two_drives()
+    result, _ = with_earlier(alone, before)
+    write_calibration(result, tmp_path / "b.yaml")
+    result = read_calibration(tmp_path / "b.yaml")
+    third = drive(information(NAMES, 5), source="c")
+
+    with_both, without = merged(before, result), merged(before, alone)
+    carried = merged(third, result)
+
+    assert with_both.cov_joint == pytest.approx(without.cov_joint, rel=1e-3, abs=1e-12)
+    assert errors(with_both) == pytest.approx(errors(without), abs=1e-6)
+    assert carried.provenance["drive_sha256"] == ["c", "b", "a"]
+    expected = merged(third, alone, before)
+    assert errors(carried) == pytest.approx(errors(expected), abs=1e-6)
+
+
+def test_a_prior_of_which_a_part_would_count_twice() -> None:
+    before, alone = two_drives()
+    third = drive(information(NAMES, 5), source="c")
+    result, _ = with_earlier(alone, merged(before, third))
+
+    with pytest.raises(ConfigError, match=r"a\.yaml: was made with --prior, of whose drives one"):
+        merged(result, third)
+
+
+def test_a_mount_that_moved_since_the_prior() -> None:
+    D = information(NAMES)
+    before = drive(D, source="a")
+    now = drive(D, source="b", error=shift(NAMES, "rear", yaw=0.02))
+
+    result, warnings = with_earlier(now, before)
+
+    assert result.status == "inconsistent"
+    (warning,) = warnings
+    assert "--prior and this drive disagree" in warning
+    assert "LiDAR 'rear' has moved" in warning
+
+
+def test_a_lidar_unseen_now_follows_those_that_were() -> None:
+    """The earlier drive tied it to the one that is seen again."""
+    before = drive(information(NAMES, 1), source="a", error=shift(NAMES, "front", x=0.001))
+    D = information(NAMES, 2)
+    D[:6], D[:, :6] = 0.0, 0.0
+    now = drive(D, source="b", guess_error=shift(NAMES, "front", x=0.05))
+
+    result, _ = with_earlier(now, before)
+
+    front = result.lidars["front"]
+    assert not front.saw_target
+    assert not any(front.determined.values())
+    assert vehicle_axes_difference(front.T_vehicle_lidar, TRUTH["front"]) == pytest.approx(
+        shift(NAMES, "front", x=0.001)[:6], abs=3e-3
+    )
+
+
+def config(**sections: object) -> Config:
+    lidars = {
+        name: {"topic": name, "initial": {"xyz": [1.0, 2.0, 3.0], "rpy_deg": [1.0, 2.0, 3.0]}}
+        for name in ("front", "roof")
+    }
+    return parse_config({"lidars": lidars, **sections}, "config.yaml", Path())
+
+
+def test_the_solve_starts_from_the_earlier_mountings() -> None:
+    before, _ = two_drives()
+
+    started = starting_from(config(), before, ["b"])
+
+    front = started.lidars["front"]
+    T = before.lidars["front"].T_vehicle_lidar
+    assert front.initial.xyz == pytest.approx(T.translation())
+    angles = np.radians(front.initial.rpy_deg)
+    assert gtsam.Rot3.RzRyRx(*angles).equals(T.rotation(), 1e-12)
+    assert front.sigma == config().lidars["front"].sigma
+    assert started.lidars["roof"] == config().lidars["roof"]
+
+
+def test_priors_that_are_none() -> None:
+    before, _ = two_drives()
+
+    with pytest.raises(ConfigError, match="--prior: is a result of the drive that is to be"):
+        starting_from(config(), before, ["c", "a"])
+    with pytest.raises(ConfigError, match=r"--prior: solve\.mode staged"):
+        starting_from(config(solve={"mode": "staged"}), before, ["b"])
+    other = drive(information(("left",)), ("left",), source="c")
+    with pytest.raises(
+        ConfigError, match=r"--prior: has none of the LiDARs of the config \(front,"
+    ):
+        starting_from(config(), other, ["b"])

@@ -16,12 +16,12 @@ from typing import Any
 from caliv_graph.errors import OutputError
 
 
-def atomic_write(path: Path, text: str, force: bool = False) -> None:
-    """Writes a text file in one step: a reader sees the old one or the new one.
+def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
+    """Writes a file in one step: a reader sees the old one or the new one.
 
     Args:
         path: the file; folders that it needs are made.
-        text: its content, written as UTF-8.
+        content: what is in it; text is written as UTF-8.
         force: replace an older one.
 
     Raises:
@@ -32,8 +32,8 @@ def atomic_write(path: Path, text: str, force: bool = False) -> None:
     with _errors_named(path), _new_parents(target):
         scratch = _beside(target)
         try:
-            with scratch.open("x", encoding="utf-8") as file:
-                file.write(text)
+            with scratch.open("xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
                 _flush_to_disk(file)
             scratch.replace(target)
         finally:

@@ -1,0 +1,204 @@
+"""Changing numbers in a file of somebody else's, every other byte of which stays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from caliv_graph.errors import ExportError
+from caliv_graph.export.request import Base
+from caliv_graph.export.wording import number
+
+_BOM = "\ufeff"
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A piece of text that takes the place of another.
+
+    Attributes:
+        start: index of the first character replaced.
+        stop: index after the last one; `start` if nothing is replaced.
+        text: what stands there then.
+    """
+
+    start: int
+    stop: int
+    text: str
+
+
+def read_base(path: Path) -> Base:
+    """Reads a file that is to be changed.
+
+    Raises:
+        ExportError: it is missing, or not text in UTF-8.
+    """
+    try:
+        # Not read_text: it would change the ends of lines.
+        return Base(path, path.read_bytes().decode("utf-8"))
+    except FileNotFoundError:
+        raise ExportError(f"{path}: no such file. Give --base an existing one, or none") from None
+    except UnicodeDecodeError:
+        raise ExportError(f"{path}: is not text in UTF-8") from None
+    except OSError as e:
+        raise ExportError(f"{path}: cannot be read: {e.strerror or e}") from None
+
+
+def spliced(text: str, edits: Sequence[Edit]) -> str:
+    """A text with all edits done; they must not overlap."""
+    out, at = [], 0
+    for edit in sorted(edits, key=lambda e: e.start):
+        out += [text[at : edit.start], edit.text]
+        at = edit.stop
+    return "".join([*out, text[at:]])
+
+
+def with_comment(comment: str, text: str) -> str:
+    """A text with a comment on top, with the ends of lines that the text has."""
+    comment = comment.replace("\n", line_end(text))
+    # A byte order mark stands first, or is none.
+    return _BOM + comment + text[1:] if text.startswith(_BOM) else comment + text
+
+
+def line_end(text: str) -> str:
+    """How the lines of a text end."""
+    return "\r\n" if "\r\n" in text else "\n"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A key of a YAML file and its value.
+
+    Attributes:
+        path: the keys above it and its own.
+        key: the node of the key.
+        value: the node of its value.
+    """
+
+    path: tuple[str, ...]
+    key: yaml.ScalarNode
+    value: yaml.Node
+
+
+class YamlFile:
+    """A YAML file whose numbers can be replaced in place."""
+
+    def __init__(self, base: Base) -> None:
+        """Parses a file.
+
+        Raises:
+            ExportError: it is not YAML, or holds no keys.
+        """
+        self._base = base
+        try:
+            root = yaml.compose(base.text, Loader=yaml.SafeLoader)
+        except yaml.MarkedYAMLError as e:
+            line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
+            raise ExportError(f"{base.path}: not valid YAML{line}: {e.problem}") from None
+        except (yaml.YAMLError, RecursionError) as e:
+            first = (str(e).splitlines() or ["nested too deeply"])[0]
+            raise ExportError(f"{base.path}: not valid YAML: {first}") from None
+        if not isinstance(root, yaml.MappingNode):
+            raise ExportError(f"{base.path}: holds no keys with values. Give another --base")
+        self._root = root
+        self._edits: list[Edit] = []
+
+    @property
+    def entries(self) -> Iterator[Entry]:
+        """All keys at all depths, those above before those below."""
+        yield from _entries(self._root, (), set())
+
+    def entry(self, key: str) -> Entry | None:
+        """The one entry with this key, at any depth; None: there is none.
+
+        Raises:
+            ExportError: there are several.
+        """
+        found = [entry for entry in self.entries if entry.path[-1] == key]
+        if len(found) > 1:
+            lines = ", ".join(str(entry.key.start_mark.line + 1) for entry in found)
+            raise ExportError(
+                f"{self._base.path}: '{key}' stands in lines {lines}: which one is meant? Leave one"
+            )
+        return found[0] if found else None
+
+    def set_numbers(self, entry: Entry, values: Sequence[float]) -> None:
+        """Replaces the numbers of a list, each in its place."""
+        node = entry.value
+        items = node.value if isinstance(node, yaml.SequenceNode) else []
+        if len(items) == len(values) and all(isinstance(item, yaml.ScalarNode) for item in items):
+            for item, value in zip(items, values, strict=True):
+                self._replace(item, number(value))
+            return
+        if isinstance(node, yaml.SequenceNode) and not node.flow_style:
+            raise ExportError(
+                f"{self._where(entry)}: expected a list of {len(values)} numbers. Mend --base"
+            )
+        self._replace(node, f"[{', '.join(map(number, values))}]")
+
+    def set_scalars(self, entry: Entry, values: Mapping[str, float]) -> None:
+        """Replaces the numbers at the keys of a mapping.
+
+        Raises:
+            ExportError: it is no mapping, or lacks one of the keys.
+        """
+        for key, value in values.items():
+            node = self.below(entry).get(key)
+            if not isinstance(node, yaml.ScalarNode):
+                raise ExportError(
+                    f"{self._where(entry)}: has no number '{key}'. Add '{key}: 0.0' to --base"
+                )
+            self._replace(node, number(value))
+
+    def set_text(self, node: yaml.Node, text: str) -> None:
+        """Replaces a scalar by another, quoted one."""
+        self._replace(node, f'"{text}"')
+
+    def below(self, entry: Entry) -> dict[str, yaml.Node]:
+        """The values of a mapping by their keys."""
+        if not isinstance(entry.value, yaml.MappingNode):
+            return {}
+        return {str(key.value): value for key, value in entry.value.value}
+
+    def scalar(self, node: yaml.Node | None) -> float | None:
+        """A finite number, or None if it is none."""
+        if not isinstance(node, yaml.ScalarNode):
+            return None
+        try:
+            value = float(node.value)
+        except ValueError:
+            return None
+        return value if math.isfinite(value) else None
+
+    def edited(self) -> str:
+        """The file with all replacements."""
+        return spliced(self._base.text, self._edits)
+
+    def _replace(self, node: yaml.Node, text: str) -> None:
+        # The end of a plain scalar may lie behind the blanks that follow it.
+        start, stop = node.start_mark.index, node.end_mark.index
+        piece = self._base.text[start:stop]
+        self._edits.append(Edit(start, start + len(piece.rstrip()), text))
+
+    def _where(self, entry: Entry) -> str:
+        return f"{self._base.path}: {'.'.join(entry.path)} in line {entry.key.start_mark.line + 1}"
+
+
+def _entries(node: yaml.Node, path: tuple[str, ...], seen: set[int]) -> Iterator[Entry]:
+    # An alias is the node it stands for, which could be changed only once.
+    if id(node) in seen:
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                own = (*path, str(key.value))
+                yield Entry(own, key, value)
+                yield from _entries(value, own, seen)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            yield from _entries(item, (*path, str(index)), seen)

@@ -1,0 +1,40 @@
+"""FAST-LIO: `mapping.extrinsic_T` and `mapping.extrinsic_R`.
+
+The LiDAR's pose in the IMU's frame (hku-mars/FAST_LIO, README): `p_imu = R p_lidar + T`.
+"""
+
+from __future__ import annotations
+
+from caliv_graph.export.parameters import Parameters, parameter_export
+from caliv_graph.export.request import Export, Request
+
+
+def export(request: Request) -> Export:
+    """Parameters of FAST-LIO for ROS 2 (or, by `form`, ROS 1), or `--base` with them changed.
+
+    Raises:
+        ExportError: the IMU's mounting is not known, or `--base` lacks the parameters.
+    """
+    lidar, chosen = request.one_lidar("fast-lio")
+    T_lidar_imu, unsaid = request.T_lidar_imu(lidar, "fast-lio")
+    T_imu_lidar = T_lidar_imu.inverse()
+    values = {
+        "extrinsic_T": T_imu_lidar.translation().tolist(),
+        "extrinsic_R": T_imu_lidar.rotation().matrix().ravel().tolist(),
+    }
+    return parameter_export(
+        request,
+        Parameters(
+            consumer="fast-lio",
+            lidar=lidar,
+            parent="imu",
+            child=lidar,
+            T_parent_child=T_imu_lidar,
+            meaning="extrinsic_T and extrinsic_R (row-major): p_imu = R p_lidar + T.",
+            ros1=values,
+            ros2=values,
+            above_ros1=("mapping",),
+            above_ros2=("/**", "ros__parameters", "mapping"),
+        ),
+        (*chosen, *unsaid),
+    )

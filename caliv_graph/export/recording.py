@@ -1,0 +1,71 @@
+"""Names of frames, housings and the sensor kit from a recording and its /tf_static."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from caliv_graph.errors import ExportError
+from caliv_graph.readers.bag import Bag, DamagedMessageError
+from caliv_graph.readers.frames import FrameTransform, clean_frame, message_transforms
+
+
+@dataclass(frozen=True)
+class RecordedFrames:
+    """What a recording says of frames.
+
+    Attributes:
+        clouds: per LiDAR the frame of its clouds.
+        links: of /tf_static.
+        start_ns: when the recording began.
+    """
+
+    clouds: Mapping[str, str]
+    links: tuple[FrameTransform, ...]
+    start_ns: int
+
+    def housing(self, lidar: str) -> FrameTransform | None:
+        """`T_housing_lidar`, where the frame of a LiDAR's clouds hangs on `<sensor>_base_link`."""
+        frame = self.clouds.get(lidar)
+        for link in reversed(self.links):
+            if link.child == frame:
+                is_housing = link.parent.endswith("_base_link")
+                return link if is_housing else None
+        return None
+
+
+def read_frames(path: Path, topics: Mapping[str, str]) -> RecordedFrames:
+    """Reads what a recording says of frames.
+
+    Args:
+        path: a bag.
+        topics: per LiDAR the topic of its clouds.
+
+    Raises:
+        RecordingError: it is no bag, or damaged.
+        ExportError: it has no /tf_static and none of the clouds.
+    """
+    bag = Bag(path)
+    links: list[FrameTransform] = []
+    static = [name for name in bag.topics if name.rpartition("/")[2] == "tf_static"]
+    for topic, _, raw in bag.messages(static):
+        try:
+            links += [link for _, link in message_transforms(bag.decode(topic, raw))]
+        except DamagedMessageError:
+            continue
+    clouds = {}
+    for lidar, topic in topics.items():
+        raw_cloud = bag.first_message(topic) if topic in bag.topics else None
+        try:
+            frame = "" if raw_cloud is None else clean_frame(bag.header(raw_cloud).frame_id)
+        except DamagedMessageError:
+            frame = ""
+        if frame:
+            clouds[lidar] = frame
+    if not links and not clouds:
+        raise ExportError(
+            f"{path}: has neither /tf_static nor one of the LiDARs' topics. Give the drive as "
+            "--bag, or none"
+        )
+    return RecordedFrames(clouds, tuple(links), bag.span_ns[0])

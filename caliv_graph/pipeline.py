@@ -15,10 +15,17 @@ from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.problem import TRUSTED_SIGMAS
 from caliv_graph.config import Config, dump_config
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes
+from caliv_graph.fusion.merge import guess_covariance, starting_from, with_earlier
+from caliv_graph.fusion.terms import DRIVES, drive_digest
+from caliv_graph.geometry.se3 import (
+    pose_from_mounting,
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
 from caliv_graph.products import (
     Array,
     Calibration,
+    Guess,
     LidarResult,
     MotionData,
     Recording,
@@ -27,6 +34,8 @@ from caliv_graph.products import (
     Uncertainty,
 )
 from caliv_graph.progress import Progress
+from caliv_graph.readers.sampled import SampledRecording
+from caliv_graph.report.evidence import Evidence
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.targets import extract_targets
 from caliv_graph.targets.ground_planes import measure_grounds
@@ -45,16 +54,21 @@ class CalibrationRun:
         solution: the solved graph.
         observations: the target's clouds.
         warnings: what a person should know, a line each.
+        evidence: what the report shows beside these; None: nothing was kept.
     """
 
     calibration: Calibration
     solution: Solution
     observations: tuple[TargetObservation, ...]
     warnings: tuple[str, ...]
+    evidence: Evidence | None = None
 
 
 def calibrate(
-    recordings: Sequence[Recording], config: Config, progress: Progress
+    recordings: Sequence[Recording],
+    config: Config,
+    progress: Progress,
+    prior: Calibration | None = None,
 ) -> CalibrationRun:
     """Calibrates all LiDARs of one vehicle from one or several drives.
 
@@ -62,11 +76,21 @@ def calibrate(
         recordings: opened drives (`readers.open_recording`).
         config: the configuration.
         progress: told of every stage.
+        prior: an earlier calibration of the vehicle. Its mountings are the guesses that the solve
+            starts from, and what its drives' data say is added to what these drives' say. The
+            solve itself does without: it shall find a mount that has moved since.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
+    # What goes by is looked at in the report; nothing is read for it.
+    sampled = [SampledRecording(recording) for recording in recordings]
+    recordings = sampled
     motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    digests = [drive_digest(motion) for motion in motions.values()]
+    asked = config
+    if prior is not None:
+        config = starting_from(config, prior, digests)
     with progress.stage("smoothing the trajectory", None):
         nowhere: list[list[int]] = [[] for _ in recordings]
         rough = smooth_trajectories(recordings, config, nowhere, motions)
@@ -82,7 +106,11 @@ def calibrate(
         solution.T_vehicle_lidar,
         solution.held,
     )
-    calibration = assemble(solution, uncertainty, config, recordings)
+    calibration = assemble(solution, uncertainty, asked, recordings, digests)
+    prior_warnings: tuple[str, ...] = ()
+    if prior is not None:
+        calibration, prior_warnings = with_earlier(calibration, prior)
+        calibration = unmet_requirements(calibration, asked)
     return CalibrationRun(
         calibration,
         solution,
@@ -91,6 +119,13 @@ def calibrate(
             *_warnings(recordings, trajectories, observations, solution),
             *ground_warnings,
             *_headings(trajectories, motions),
+            *prior_warnings,
+        ),
+        Evidence(
+            tuple(Path(recording.name).absolute().name for recording in recordings),
+            trajectories,
+            tuple(grounds),
+            {drive: recording.kept() for drive, recording in enumerate(sampled)},
         ),
     )
 
@@ -140,14 +175,25 @@ def assemble(
     uncertainty: Uncertainty,
     config: Config,
     recordings: Sequence[Recording],
+    digests: Sequence[str] = (),
 ) -> Calibration:
-    """The reported result: every LiDAR of the config, in its order, in right perturbations."""
+    """The reported result: every LiDAR of the config, in its order, in right perturbations.
+
+    Args:
+        solution: the solved graph.
+        uncertainty: of it.
+        config: guesses, and what was asked.
+        recordings: the drives, for the provenance.
+        digests: of the drives (`drive_digest`).
+    """
     names = config.lidar_order()
     index = {name: i for i, name in enumerate(solution.lidars)}
     used = _scans_used(solution)
     size = 6 * len(names)
     to_right = np.zeros((size, 6 * len(solution.lidars)))
     cov_joint, information = np.zeros((size, size)), np.zeros((size, size))
+    guesses = {name: _guess(config, name) for name in names}
+    information_data, gradient_data = _without_trust(solution, guesses)
     poses: dict[str, gtsam.Pose3] = {}
     for row, name in enumerate(names):
         block = slice(6 * row, 6 * row + 6)
@@ -156,10 +202,10 @@ def assemble(
             column = slice(6 * index[name], 6 * index[name] + 6)
             to_right[block, column] = right_to_vehicle_axes(poses[name]).T
         else:
-            poses[name] = pose_from_mounting(config.lidars[name].initial)
-            cov_joint[block, block] = _prior_covariance(config, name, poses[name])
+            poses[name] = guesses[name].T_vehicle_lidar
+            cov_joint[block, block] = guess_covariance(guesses[name], poses[name])
     cov_joint += to_right @ solution.cov @ to_right.T
-    information += to_right @ solution.information_data @ to_right.T
+    information += to_right @ information_data @ to_right.T
     lidars = {}
     for row, name in enumerate(names):
         block = slice(6 * row, 6 * row + 6)
@@ -170,6 +216,7 @@ def assemble(
             scans_used=used.get(name, 0),
             saw_target=used.get(name, 0) > 0,
             time_offset=solution.time_offsets.get(name),
+            guess=guesses[name],
         )
     complete = not uncertainty.undetermined and all(
         all(lidar.determined.values()) for lidar in lidars.values()
@@ -183,19 +230,46 @@ def assemble(
         undetermined=uncertainty.undetermined,
         weak=uncertainty.weak,
         unmet=(),
-        provenance=_provenance(config, recordings, solution),
+        provenance=_provenance(config, recordings, solution, digests),
+        gradient_data=None if gradient_data is None else to_right @ gradient_data,
     )
     return unmet_requirements(draft, config)
 
 
-def _prior_covariance(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Array:
-    """Covariance of a guess, right perturbation."""
+def _guess(config: Config, name: str) -> Guess:
+    """What the config says of a mounting."""
     lidar = config.lidars[name]
     sigmas = np.array([*lidar.sigma.rpy_rad(), *lidar.sigma.xyz_m()])
-    if lidar.fixed:
-        sigmas = TRUSTED_SIGMAS
-    axes = right_to_vehicle_axes(T_vehicle_lidar)
-    return np.asarray(axes.T @ np.diag(sigmas**2) @ axes)
+    return Guess(
+        pose_from_mounting(lidar.initial), TRUSTED_SIGMAS if lidar.fixed else sigmas, lidar.fixed
+    )
+
+
+def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
+    """Information and gradient of the data (vehicle axes), less what `fixed: true` put in.
+
+    The solve takes a trusted mounting for one more measurement; it is still a guess, and two
+    calibrations that share it must not count it twice.
+    """
+    information = solution.information_data.copy()
+    gradient = None if solution.gradient_data is None else solution.gradient_data.copy()
+    seen = {c.lidar for r in solution.registrations for c in r.observation.clouds}
+    for i, name in enumerate(solution.lidars):
+        rows = slice(6 * i, 6 * i + 6)
+        guess = guesses[name]
+        if not guess.fixed:
+            continue
+        certainty = guess.sigmas**-2.0
+        information[rows, rows] -= np.diag(certainty)
+        if gradient is not None:
+            moved = vehicle_axes_difference(solution.T_vehicle_lidar[name], guess.T_vehicle_lidar)
+            gradient[rows] += certainty * moved
+        if name not in seen:
+            # Nothing is left but the rounding of large numbers.
+            information[rows], information[:, rows] = 0.0, 0.0
+            if gradient is not None:
+                gradient[rows] = 0.0
+    return information, gradient
 
 
 def _scans_used(solution: Solution) -> dict[str, int]:
@@ -208,7 +282,7 @@ def _scans_used(solution: Solution) -> dict[str, int]:
 
 
 def _provenance(
-    config: Config, recordings: Sequence[Recording], solution: Solution
+    config: Config, recordings: Sequence[Recording], solution: Solution, digests: Sequence[str]
 ) -> dict[str, object]:
     """Versions, what was asked, and what the solve found out about its input."""
     # Where the drive lies on this machine is no part of what was asked.
@@ -219,6 +293,7 @@ def _provenance(
         "mode": solution.mode,
         "robust_kernel": config.robust.kernel,
         "recordings": [Path(r.name).absolute().name for r in recordings],
+        **({DRIVES: list(digests)} if digests else {}),
         **({} if solution.pose_noise is None else {"pose_noise": asdict(solution.pose_noise)}),
         "registration_scale": solution.registration_scale,
         "iterations": solution.iterations,

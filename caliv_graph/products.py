@@ -344,6 +344,25 @@ class Registration:
 
 
 @dataclass(frozen=True)
+class Iteration:
+    """One round of the joint loop: a new shape, a graph solve, new weights.
+
+    Attributes:
+        turn_rad: largest rotation of a mounting by the step.
+        shift_m: largest shift of one.
+        sigmas: the step in joint standard deviations of the extrinsics.
+        weight_change: largest change of a cloud's robust weight.
+        undetermined: directions that the data did not determine; None: not asked (mode `joint`).
+    """
+
+    turn_rad: float
+    shift_m: float
+    sigmas: float
+    weight_change: float
+    undetermined: int | None = None
+
+
+@dataclass(frozen=True)
 class Solution:
     """The solved factor graph.
 
@@ -374,6 +393,8 @@ class Solution:
         time_offsets: per LiDAR whose offset was estimated its value and sigma in seconds: header
             stamp minus true acquisition time.
         warnings: what a person should know, a line each.
+        gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not worked out.
+        course: the rounds of the joint loop; empty where there is none (staged).
     """
 
     mode: str
@@ -398,6 +419,8 @@ class Solution:
     stage_times_s: Mapping[str, float] = field(default_factory=dict)
     time_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    gradient_data: Array | None = None
+    course: tuple[Iteration, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -410,6 +433,7 @@ class Direction:
         sigma_prior: 1 sigma of the prior along it, same units.
         text: how a person says it.
         together: whether all LiDARs move as one, so that sensor-to-sensor is left alone.
+        remedy: the manoeuvre or the setting that would determine it, as a person says it.
     """
 
     vector: Mapping[str, Array]
@@ -417,6 +441,7 @@ class Direction:
     sigma_prior: float
     text: str
     together: bool
+    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -437,6 +462,42 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
+class Guess:
+    """A mounting as it was known before any data: from a drawing or a tape measure.
+
+    Attributes:
+        T_vehicle_lidar: the guess.
+        sigmas: (6,) in vehicle axes, rad and m.
+        fixed: the user trusts it; it was not estimated.
+    """
+
+    T_vehicle_lidar: gtsam.Pose3
+    sigmas: Array
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class DataTerm:
+    """What the data of some drives, and nothing else, say about mountings.
+
+    Minus the log-likelihood of a perturbation e of the mountings is
+    `e^T information e / 2 - gradient^T e`, in vehicle axes, LiDARs in the order of
+    `T_vehicle_lidar`, six coordinates each.
+
+    Attributes:
+        sources: digests of the drives, to count none twice.
+        T_vehicle_lidar: where e is zero.
+        information: (6n, 6n).
+        gradient: (6n,).
+    """
+
+    sources: tuple[str, ...]
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+    information: Array
+    gradient: Array
+
+
+@dataclass(frozen=True)
 class LidarResult:
     """One LiDAR's mounting as it is reported.
 
@@ -448,6 +509,7 @@ class LidarResult:
         saw_target: False if it took no part.
         time_offset: (value, sigma) in seconds, header stamp minus true acquisition time; None: not
             estimated.
+        guess: the mounting before any data; None: not known (another program's file).
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -456,6 +518,7 @@ class LidarResult:
     scans_used: int
     saw_target: bool
     time_offset: tuple[float, float] | None = None
+    guess: Guess | None = None
 
 
 @dataclass(frozen=True)
@@ -473,6 +536,11 @@ class Calibration:
         weak: directions, vehicle axes.
         unmet: what `require` or `limits` asked for and did not get, a sentence each.
         provenance: versions, configuration digest, inputs; plain values only.
+        gradient_data: (6n,) of the data's log-likelihood at the mountings, same coordinates: by
+            themselves the data would have them move by `solve(information_data, gradient_data)`.
+            None: not known (another program's file).
+        earlier: what earlier drives said, where they were taken for a prior. Not part of
+            `information_data`, but of the mountings and `cov_joint`.
     """
 
     status: str
@@ -484,3 +552,5 @@ class Calibration:
     weak: tuple[Direction, ...]
     unmet: tuple[str, ...]
     provenance: Mapping[str, object]
+    gradient_data: Array | None = None
+    earlier: tuple[DataTerm, ...] = ()

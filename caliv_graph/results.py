@@ -1,32 +1,49 @@
 """What `calibrate` leaves behind, and reading it back: calibration.yaml, truth.yaml, target.ply.
 
 The keys of calibration.yaml are those of SPEC 6 and, as own ones, `unmet`, `scans_used`,
-`saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `together`, `sigma_data`, `sigma_prior`
-and `provenance`. `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived from the rest.
+`saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `together`, `sigma_data`, `sigma_prior`,
+`provenance`, and what `compare`, `merge` and `--prior` need beside the data's information: `guess`,
+`data_gradient` and `earlier`. `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived
+from the rest.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 import yaml
+from scipy.linalg import block_diag
 
 from caliv_graph.config import Config, dump_config, read_yaml
 from caliv_graph.conventions import AXES
 from caliv_graph.fields import Field
 from caliv_graph.files import atomic_write
+from caliv_graph.fusion.archive import calibration_graph, write_archive
 from caliv_graph.geometry.covariance import parent_axes_covariance
-from caliv_graph.products import Array, Calibration, Direction, LidarResult, Mixture, Solution
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    DataTerm,
+    Direction,
+    Guess,
+    LidarResult,
+    Mixture,
+    Solution,
+)
 from caliv_graph.progress import StageRecord
 from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
+
+if TYPE_CHECKING:
+    from caliv_graph.report.evidence import Evidence
 
 SCHEMA = "caliv-graph/calibration/1"
 
@@ -34,16 +51,21 @@ STATUSES = ("ok", "partial", "inconsistent")
 
 CALIBRATION_FILE = "calibration.yaml"
 
+GRAPH_FILE = "graph.gtsam"
+
+REPORT_FILE = "report.html"
+
 RESULT_FILES = (
     CALIBRATION_FILE,
     "config.yaml",
     "target.ply",
     "target_[0-9]*.ply",
     "log.jsonl",
-    "report.html",
+    REPORT_FILE,
     "graph.gtsam",
+    "graph.values.gtsam",
 )
-"""Names in the folder of a result, for `files.output_folder`; the last two are still to come."""
+"""Names in the folder of a result, for `files.output_folder`."""
 
 _DIGITS = 12
 """Significant digits of the numbers in a file, and decimals of a pose: a picometre."""
@@ -93,6 +115,8 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
             "order": list(calibration.lidars),
             "covariance": _symmetric(calibration.cov_joint),
             "data_information": _symmetric(calibration.information_data),
+            **_gradient_document(calibration),
+            **_earlier_documents(calibration),
         },
         "observability": {
             "undetermined": [_direction_document(d) for d in calibration.undetermined],
@@ -149,68 +173,42 @@ def write_result(
     config: Config,
     stages: Sequence[StageRecord],
     warnings: Sequence[str],
+    evidence: Evidence | None = None,
 ) -> None:
     """Writes all files of a result into a folder (`files.output_folder`).
 
     Args:
         folder: an empty folder.
-        calibration: goes to calibration.yaml.
+        calibration: goes to calibration.yaml and, as priors that GTSAM reads, to graph.gtsam and
+            graph.values.gtsam.
         solution: its reconstructed targets go to target.ply, target_2.ply and so on, its course to
             log.jsonl.
         config: the effective one, goes to config.yaml.
         stages: what was done and how long it took, goes to log.jsonl.
         warnings: go to log.jsonl.
+        evidence: for report.html, which is not written without it; its numbers go to log.jsonl.
 
     Raises:
         OSError: something cannot be written.
         OutputError: likewise.
     """
+    # Here, for reading a result has no use for what the log and the report are made with.
+    from caliv_graph.report.log import log_documents
+
     write_calibration(calibration, folder / CALIBRATION_FILE)
+    write_archive(*calibration_graph(calibration), folder / GRAPH_FILE)
     (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
     for number, registration in enumerate(solution.registrations, start=1):
         file = "target.ply" if number == 1 else f"target_{number}.ply"
         write_target(registration.mixture, folder / file, registration.observation.name)
-    lines = [json.dumps(line) for line in _log(solution, stages, warnings)]
+    documents = log_documents(calibration, solution, config.robust, stages, warnings, evidence)
+    lines = [json.dumps(without_infinities(line)) for line in documents]
     (folder / "log.jsonl").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    if evidence is not None:
+        from caliv_graph.report.html import render_report
 
-
-def stage_documents(stages: Sequence[StageRecord]) -> list[dict[str, Any]]:
-    """What was done and how long it took, plain values only."""
-    return [
-        {
-            "stage": stage.name,
-            "depth": stage.depth,
-            "seconds": None if stage.seconds is None else round(stage.seconds, 4),
-            "done": stage.done,
-            "total": stage.total,
-            "note": stage.note,
-        }
-        for stage in stages
-    ]
-
-
-def _log(
-    solution: Solution, stages: Sequence[StageRecord], warnings: Sequence[str]
-) -> Iterator[dict[str, Any]]:
-    yield from stage_documents(stages)
-    for registration in solution.registrations:
-        yield {
-            "registration": registration.observation.name,
-            "clouds": len(registration.T_target_lidar),
-            "components": len(registration.mixture.means_target),
-            "iterations": registration.iterations,
-            "converged": bool(registration.converged),
-        }
-    yield {
-        "solution": solution.mode,
-        "iterations": solution.iterations,
-        "converged": bool(solution.converged),
-        "registration_scale": float(solution.registration_scale),
-        "held": list(solution.held),
-        "seconds": {name: round(s, 4) for name, s in solution.stage_times_s.items()},
-    }
-    for warning in warnings:
-        yield {"warning": warning}
+        page = render_report(calibration, solution, config, stages, warnings, evidence)
+        (folder / REPORT_FILE).write_text(page, encoding="utf-8")
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -258,6 +256,8 @@ def read_calibration_file(path: Path) -> CalibrationFile:
         weak=_read_directions(observability.child("weak"), poses),
         unmet=tuple(str(item.value) for item in root.get("unmet", []).items()),
         provenance={name: node.value for name, node in root.get("provenance", {}).names().items()},
+        gradient_data=_read_gradient(root.child("joint"), size),
+        earlier=tuple(map(_read_earlier, root.child("joint").get("earlier", []).items())),
     )
     return CalibrationFile(calibration, _read_cov_pairs(root, calibration))
 
@@ -291,6 +291,11 @@ def without_infinities(document: Any) -> Any:
 def _check_finite(calibration: Calibration) -> None:
     parts = {"joint covariance": calibration.cov_joint}
     parts["data information"] = calibration.information_data
+    if calibration.gradient_data is not None:
+        parts["data gradient"] = calibration.gradient_data
+    for term in calibration.earlier:
+        parts["information of earlier data"] = term.information
+        parts["gradient of earlier data"] = term.gradient
     for name, result in calibration.lidars.items():
         parts[f"pose of '{name}'"] = result.T_vehicle_lidar.matrix()
         parts[f"covariance of '{name}'"] = result.cov
@@ -314,9 +319,41 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
         },
         "determined": {axis: bool(result.determined[axis]) for axis in AXES},
         **offset,
+        **({} if result.guess is None else {"guess": _guess_document(result.guess)}),
         "saw_target": bool(result.saw_target),
         "scans_used": int(result.scans_used),
     }
+
+
+def _guess_document(guess: Guess) -> dict[str, Any]:
+    sigma = {"rpy_deg": np.degrees(guess.sigmas[:3]).tolist(), "xyz": guess.sigmas[3:].tolist()}
+    fixed = {"fixed": True} if guess.fixed else {}
+    return {**_pose_document(guess.T_vehicle_lidar), "sigma_vehicle_axes": sigma, **fixed}
+
+
+def _gradient_document(calibration: Calibration) -> dict[str, Any]:
+    if calibration.gradient_data is None:
+        return {}
+    return {"data_gradient": calibration.gradient_data.tolist()}
+
+
+def _earlier_documents(calibration: Calibration) -> dict[str, Any]:
+    """What earlier drives said, in right perturbations as everything under `joint`."""
+    documents = []
+    for term in calibration.earlier:
+        axes = block_diag(*(right_to_vehicle_axes(T) for T in term.T_vehicle_lidar.values()))
+        documents.append(
+            {
+                "drive_sha256": list(term.sources),
+                "T_vehicle_lidar": {
+                    name: _pose_document(T) for name, T in term.T_vehicle_lidar.items()
+                },
+                "order": list(term.T_vehicle_lidar),
+                "data_information": _symmetric(axes.T @ term.information @ axes),
+                "data_gradient": (axes.T @ term.gradient).tolist(),
+            }
+        )
+    return {"earlier": documents} if documents else {}
 
 
 def _pair_document(calibration: Calibration, source: str, to: str) -> dict[str, Any]:
@@ -338,6 +375,7 @@ def _direction_document(direction: Direction) -> dict[str, Any]:
             name: np.asarray(vector).tolist() for name, vector in direction.vector.items()
         },
         "text": direction.text,
+        **({"remedy": direction.remedy} if direction.remedy else {}),
         "together": bool(direction.together),
         "sigma_data": float(direction.sigma_data),
         "sigma_prior": float(direction.sigma_prior),
@@ -397,6 +435,38 @@ def _read_lidar(node: Field, has_data: bool) -> LidarResult:
         time_offset=None
         if offset.value is None
         else (offset.child("value").number(), offset.child("sigma").number()),
+        guess=_read_guess(node),
+    )
+
+
+def _read_guess(lidar: Field) -> Guess | None:
+    if "guess" not in lidar.names():
+        return None
+    node = lidar.child("guess")
+    sigma = node.child("sigma_vehicle_axes")
+    rpy_deg, xyz = sigma.child("rpy_deg"), sigma.child("xyz")
+    sigmas = np.concatenate([np.radians(rpy_deg.vector(3)), xyz.vector(3)])
+    if not (sigmas > 0.0).all():
+        sigma.fail("expected numbers above zero")
+    fixed = node.get("fixed", False).flag()
+    return Guess(T_vehicle_lidar=node.pose(), sigmas=sigmas, fixed=fixed)
+
+
+def _read_gradient(joint: Field, size: int) -> Array | None:
+    return joint.child("data_gradient").vector(size) if "data_gradient" in joint.names() else None
+
+
+def _read_earlier(node: Field) -> DataTerm:
+    poses = node.child("T_vehicle_lidar")
+    names = [str(item.value) for item in node.child("order").items()]
+    T_vehicle_lidar = {name: poses.child(name).pose() for name in names}
+    axes = block_diag(*(right_to_vehicle_axes(T) for T in T_vehicle_lidar.values()))
+    information = node.child("data_information").symmetric(6 * len(names))
+    return DataTerm(
+        sources=tuple(str(item.value) for item in node.child("drive_sha256").items()),
+        T_vehicle_lidar=T_vehicle_lidar,
+        information=axes @ information @ axes.T,
+        gradient=axes @ node.child("data_gradient").vector(6 * len(names)),
     )
 
 
@@ -423,6 +493,7 @@ def _read_directions(
                     else together.flag()
                 ),
                 text=str(item.child("text").value),
+                remedy=str(item.get("remedy", "").value),
             )
         )
     return tuple(directions)

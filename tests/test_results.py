@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import yaml
 
 from caliv_graph.config import load_config, parse_config
 from caliv_graph.errors import ConfigError, OutputError
-from caliv_graph.products import Direction
+from caliv_graph.products import DataTerm, Direction, Guess
 from caliv_graph.progress import SilentProgress
 from caliv_graph.results import (
     SCHEMA,
@@ -455,6 +456,8 @@ def test_the_folder_of_a_result(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "calibration.yaml",
         "config.yaml",
+        "graph.gtsam",
+        "graph.values.gtsam",
         "log.jsonl",
         "target.ply",
         "target_2.ply",
@@ -469,3 +472,54 @@ def test_the_folder_of_a_result(tmp_path: Path) -> None:
         "target 2",
     ]
     assert {"warning": "a warning"} in log
+
+
+def test_what_merging_needs_survives_the_file(tmp_path: Path) -> None:
+    """Guesses, gradient and earlier data, turned to the LiDARs' axes and back."""
+    calibration = make_calibration()
+    rng = np.random.default_rng(2)
+    poses = {
+        n: lidar.T_vehicle_lidar for n, lidar in make_calibration("left", "rear").lidars.items()
+    }
+    term = DataTerm(("a", "b"), poses, np.diag(rng.uniform(1.0, 2.0, 12)), rng.normal(size=12))
+    guess = Guess(poses["rear"], np.array([0.03, 0.03, 0.04, 0.1, 0.2, 0.3]), fixed=True)
+    lidars = dict(calibration.lidars)
+    lidars["rear"] = replace(lidars["rear"], guess=guess)
+    calibration = replace(
+        calibration, lidars=lidars, gradient_data=rng.normal(size=12), earlier=(term,)
+    )
+
+    write_calibration(calibration, tmp_path / "calibration.yaml")
+    back = read_calibration(tmp_path / "calibration.yaml")
+
+    assert back.gradient_data == pytest.approx(calibration.gradient_data, rel=1e-11)
+    assert back.lidars["front"].guess is None
+    stated = back.lidars["rear"].guess
+    assert stated is not None
+    assert stated.fixed
+    assert stated.sigmas == pytest.approx(guess.sigmas, rel=1e-11)
+    assert stated.T_vehicle_lidar.equals(guess.T_vehicle_lidar, 1e-11)
+    (read,) = back.earlier
+    assert read.sources == ("a", "b")
+    assert list(read.T_vehicle_lidar) == ["left", "rear"]
+    assert read.information == pytest.approx(term.information, rel=1e-9, abs=1e-9)
+    assert read.gradient == pytest.approx(term.gradient, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("xyz: [0.1, 0.2, 0.3]", "xyz: [0.1, 0.0, 0.3]", "expected numbers above zero"),
+        ("fixed: true", "fixed: maybe", "expected true or false, got 'maybe'"),
+    ],
+)
+def test_a_guess_that_is_none(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    calibration = make_calibration("front")
+    lidar = calibration.lidars["front"]
+    guess = Guess(lidar.T_vehicle_lidar, np.array([0.03] * 3 + [0.1, 0.2, 0.3]), fixed=True)
+    path = tmp_path / "calibration.yaml"
+    write_calibration(replace(calibration, lidars={"front": replace(lidar, guess=guess)}), path)
+    path.write_text(path.read_text().replace(old, new))
+
+    with pytest.raises(ConfigError, match=complaint):
+        read_calibration(path)

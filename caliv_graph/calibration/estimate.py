@@ -60,6 +60,7 @@ from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import (
     Array,
     GroundObservation,
+    Iteration,
     PoseNoise,
     Registration,
     Solution,
@@ -420,6 +421,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
     offsets = reduced.time_offsets(problem, cov)
+    gradient_data = reduce().c
     state.graph_seconds += time.perf_counter() - begun
     return _solution(
         state,
@@ -433,6 +435,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
         iterations=1,
         converged=True,
         time_offsets=offsets,
+        gradient_data=gradient_data,
     )
 
 
@@ -560,6 +563,7 @@ def _refine(
     steady = _steady_graph(state)
     _begin_shapes(state, states, normals=False)
     undetermined: int | None = None
+    course: list[Iteration] = []
     converged, iteration = False, 0
     while iteration < REFINEMENTS and not converged:
         iteration += 1
@@ -568,8 +572,10 @@ def _refine(
         clouds = shapes.joint(state.scale)
         begun = time.perf_counter()
         reduced = _reduce(problem, state.values, steady, clouds, lines)
+        lost: int | None = None
         if config.solve.mode == "auto":
             split = spectrum(reduced.D, prior, undetermined)
+            lost = int(split.undetermined.sum())
             if iteration >= DECIDED_AFTER:
                 undetermined = int(split.undetermined.sum())
             step = respectful_step(reduced.D, reduced.c, prior, _offset(state), split)
@@ -602,11 +608,13 @@ def _refine(
             and (small or sigmas < STEP_SIGMAS)
             and change < 10.0 * WEIGHT_TOLERANCE
         )
+        last_step = (float(size[:, :3].max()), float(size[:, 3:].max()))
+        course.append(Iteration(*last_step, sigmas, change, lost))
         advance()
-    last_step = (float(size[:, :3].max()), float(size[:, 3:].max()))
-    return _refined_solution(
+    solution = _refined_solution(
         state, states, steady, prior, undetermined, iteration, converged, last_step
     )
+    return replace(solution, course=tuple(course))
 
 
 def _begin_shapes(state: _State, states: Sequence[JointRegistration], normals: bool) -> None:
@@ -684,6 +692,7 @@ def _refined_solution(
         iterations=iterations,
         converged=converged,
         time_offsets=reduced.time_offsets(problem, cov),
+        gradient_data=reduced.c,
     )
 
 
@@ -787,6 +796,7 @@ def _solution(
     iterations: int,
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
+    gradient_data: Array,
 ) -> Solution:
     """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds."""
     problem = state.problem
@@ -823,4 +833,5 @@ def _solution(
         time_offsets=time_offsets,
         graph=graph,
         values=state.values,
+        gradient_data=gradient_data,
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import UNMET
+from caliv_graph.cli.exits import INCONSISTENT, UNMET
 
 if TYPE_CHECKING:
     from caliv_graph.config import Config
@@ -31,6 +31,14 @@ def calibrate(
             "are solved together: repeat the option.",
         ),
     ] = None,
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            "--prior",
+            metavar="CALIBRATION.yaml",
+            help="An earlier calibration of this vehicle: what its drive's data say is added.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an older result.")] = False,
     as_json: Annotated[
         bool,
@@ -42,21 +50,25 @@ def calibrate(
     """Calibrate the LiDARs of a vehicle from one or more drives past a target.
 
     DIR gets calibration.yaml (mountings, covariance, what was not determined), config.yaml (the
-    effective one), target.ply (the reconstructed target) and log.jsonl.
+    effective one), target.ply (the reconstructed target), graph.gtsam and graph.values.gtsam (the
+    mountings as priors that a GTSAM localiser loads), report.html (what the result is worth, in
+    one page without any network) and log.jsonl (every stage, for programs).
 
     Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
-    for was not reached, or a LiDAR never saw the target.
+    for was not reached, or a LiDAR never saw the target. Exit code 4: it is written, but the data
+    contradict each other or the earlier calibration given with '--prior'.
 
     Example: caliv-graph calibrate config.yaml --out result/
     """
     from caliv_graph.config import load_config
     from caliv_graph.files import check_output_folder, output_folder
     from caliv_graph.pipeline import calibrate as run_pipeline
+    from caliv_graph.report.log import stage_documents
     from caliv_graph.report.tables import calibration_table
     from caliv_graph.results import (
         RESULT_FILES,
         calibration_document,
-        stage_documents,
+        read_calibration,
         without_infinities,
         write_result,
     )
@@ -64,16 +76,25 @@ def calibrate(
     start = time.monotonic()
     settings = load_config(config)
     _check_guesses(settings, config)
+    earlier = None if prior is None else read_calibration(prior)
     # Nobody should wait for a result that then has no place to go.
     check_output_folder(out, RESULT_FILES, force)
     recordings = _open_recordings(settings, data)
     with streams.progress_on_stdout(as_json) as progress:
-        run = run_pipeline(recordings, settings, progress)
+        run = run_pipeline(recordings, settings, progress, earlier)
     calibration = run.calibration
     warnings = [*_unused_keys(settings), *run.warnings, *calibration.unmet]
     effective = _with_data(settings, recordings)
     with output_folder(out, RESULT_FILES, force) as folder:
-        write_result(folder, calibration, run.solution, effective, progress.stages, warnings)
+        write_result(
+            folder,
+            calibration,
+            run.solution,
+            effective,
+            progress.stages,
+            warnings,
+            run.evidence,
+        )
     if as_json:
         extra = {
             "out": str(out),
@@ -86,6 +107,8 @@ def calibrate(
         streams.show(calibration_table(calibration, progress.stages, time.monotonic() - start))
         streams.say(f"Written to {out}")
     streams.warn(warnings)
+    if calibration.status == "inconsistent":
+        raise typer.Exit(INCONSISTENT)
     if calibration.unmet:
         raise typer.Exit(UNMET)
 

@@ -19,10 +19,15 @@ import typer
 from caliv_graph import __version__
 from caliv_graph.cli import streams
 from caliv_graph.cli.calibrate import calibrate
+from caliv_graph.cli.compare import compare
 from caliv_graph.cli.evaluate import evaluate
 from caliv_graph.cli.exits import DEFECT, DONE, INTERRUPTED, USAGE
+from caliv_graph.cli.export import export
 from caliv_graph.cli.init import init
 from caliv_graph.cli.inspect import inspect
+from caliv_graph.cli.merge import merge
+from caliv_graph.cli.observability import observability
+from caliv_graph.cli.plan import plan
 from caliv_graph.cli.simulate import simulate
 from caliv_graph.errors import CalivError
 
@@ -39,7 +44,8 @@ app = typer.Typer(
     help="Calibrates LiDARs to each other and to the vehicle from one drive past a target, with "
     "covariance and a statement of what the drive could not determine.",
     epilog="Exit codes: 0 done; 2 bad usage or input; 3 finished, but something required was not "
-    "determined; 130 interrupted; 1 a defect of the program.",
+    "determined; 4 finished, but the data contradict each other; 130 interrupted; 1 a defect of "
+    "the program.",
 )
 
 
@@ -48,7 +54,10 @@ def _paragraphs(docstring: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
 
 
-for _command in (init, simulate, inspect, calibrate, evaluate):
+for _command in (
+    *(init, simulate, inspect, observability, plan),
+    *(calibrate, evaluate, compare, merge, export),
+):
     app.command(help=_paragraphs(_command.__doc__ or ""))(_command)
 
 

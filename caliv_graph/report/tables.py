@@ -14,7 +14,7 @@ from rich.text import Text
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
-from caliv_graph.products import Array, Calibration, LidarResult
+from caliv_graph.products import Array, Calibration, Direction, LidarResult
 from caliv_graph.progress import StageRecord, count_text
 from caliv_graph.report.inspection import DriveSummary, Inspection, Run, Sighting, TargetSummary
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
@@ -36,7 +36,7 @@ _STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": 
 
 
 def calibration_table(
-    calibration: Calibration, stages: Sequence[StageRecord], seconds: float
+    calibration: Calibration, stages: Sequence[StageRecord] = (), seconds: float | None = None
 ) -> RenderableType:
     """The closing words of `calibrate`.
 
@@ -46,7 +46,7 @@ def calibration_table(
     Args:
         calibration: the result.
         stages: what was done.
-        seconds: how long all of it took.
+        seconds: how long all of it took; None: nothing is said of time.
     """
     parts: list[RenderableType] = [_status_line(calibration)]
     parts += _titled(
@@ -67,10 +67,11 @@ def calibration_table(
         )
     parts += _sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
     parts += _sentences("What the drive could not tell:", _undetermined_texts(calibration))
-    weak = [direction.text for direction in calibration.weak]
+    weak = direction_texts(calibration.weak)
     parts += _sentences("What it told only weakly:", weak)
     parts += _sentences("Asked for in the config, but not reached:", calibration.unmet)
-    parts += _titled("Time", _times(stages, seconds))
+    if seconds is not None:
+        parts += _titled("Time", _times(stages, seconds))
     return Group(*parts)
 
 
@@ -291,11 +292,22 @@ def _offset_texts(calibration: Calibration) -> list[str]:
 
 
 def _undetermined_texts(calibration: Calibration) -> list[str]:
-    texts = [direction.text for direction in calibration.undetermined]
+    texts = direction_texts(calibration.undetermined)
     return texts + [
         f"LiDAR '{name}' never saw a target: its mounting is the initial guess"
         for name, result in calibration.lidars.items()
         if not result.saw_target
+    ]
+
+
+def direction_texts(directions: Iterable[Direction]) -> list[str]:
+    """Directions in words, each once; those with the same remedy together, and it below them."""
+    by_remedy: dict[str, list[str]] = {}
+    for direction in directions:
+        by_remedy.setdefault(direction.remedy, []).append(direction.text)
+    return [
+        "\n  - ".join(dict.fromkeys(texts)) + (f"\n    Remedy: {remedy}" if remedy else "")
+        for remedy, texts in by_remedy.items()
     ]
 
 

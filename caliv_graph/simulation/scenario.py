@@ -292,9 +292,37 @@ class GroundModel(_Section):
     ramps: tuple[RampModel, ...] = Field((), description="absent: flat all over")
 
 
+class MoveModel(_Section):
+    """Somebody carries an object to another place. In between nobody is there."""
+
+    begin_s: NonNegative = Field(description="seconds since the start of the drive, picked up")
+    end_s: Positive = Field(description="seconds since the start of the drive, put down")
+    xy_m: Pair = Field(description="metres, its new origin in the map")
+    yaw_deg: Finite = Field(0.0, description="degrees, its +x from map +x at the new place")
+
+    @model_validator(mode="after")
+    def _takes_time(self) -> MoveModel:
+        if self.begin_s >= self.end_s:
+            raise ValueError(f"begin_s ({self.begin_s} s) must be before end_s ({self.end_s} s)")
+        return self
+
+
 class _ObjectSection(_Section):
     xy_m: Pair = Field(description="metres, its origin in the map; it stands on the ground")
     yaw_deg: Finite = Field(0.0, description="degrees, its +x (a chair's front) from map +x")
+    moves: tuple[MoveModel, ...] = Field(
+        (), description="where it is carried, one after the other; absent: it stands all the time"
+    )
+
+    @model_validator(mode="after")
+    def _one_move_after_the_other(self) -> _ObjectSection:
+        for before, after in itertools.pairwise(self.moves):
+            if before.end_s > after.begin_s:
+                raise ValueError(
+                    f"moves: one begins at {after.begin_s} s, before the one at "
+                    f"{before.begin_s} s has ended"
+                )
+        return self
 
 
 class ChairModel(_ObjectSection):
@@ -318,7 +346,35 @@ class PoleModel(_ObjectSection):
     height_m: Positive = Field(4.0, description="metres")
 
 
-ObjectModel = Annotated[ChairModel | BoxModel | PoleModel, Field(discriminator="shape")]
+class CylinderModel(_ObjectSection):
+    """A drum. It looks the same after any turn about its axis: smooth, unlike a pole's 24 sides."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    radius_m: Positive = Field(0.3, description="metres")
+    height_m: Positive = Field(0.9, description="metres")
+
+
+class TableModel(_ObjectSection):
+    """A table on four legs: it looks the same after half a turn, and only then."""
+
+    shape: Literal["table"] = "table"
+    size_m: PositiveTriple = Field((1.1, 0.7, 0.72), description="metres along its x, y, z")
+    top_m: Positive = Field(0.04, description="metres, how thick its top is")
+    leg_m: Positive = Field(0.07, description="metres, side of its square legs")
+
+    @model_validator(mode="after")
+    def _legs_below_the_top(self) -> TableModel:
+        if self.top_m >= self.size_m[2] or 2.0 * self.leg_m > min(self.size_m[:2]):
+            raise ValueError(
+                f"size_m {self.size_m} leaves no room for a top of {self.top_m} m and legs of "
+                f"{self.leg_m} m"
+            )
+        return self
+
+
+ObjectModel = Annotated[
+    ChairModel | BoxModel | PoleModel | CylinderModel | TableModel, Field(discriminator="shape")
+]
 
 
 class WalkerModel(_Section):

@@ -21,8 +21,10 @@ from caliv_graph.simulation.scenario import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
+    CylinderModel,
     ObjectModel,
     PoleModel,
+    TableModel,
     WalkerModel,
     WorldModel,
 )
@@ -33,6 +35,12 @@ GROUND = "ground"
 VEHICLE = "vehicle"
 
 NO_OBJECT = -1
+
+DRUM_SIDES = 360
+"""Of a cylinder: 24 sides would tell its yaw to some milliradians, these do not."""
+
+CARRIER_M = 0.45
+"""How far behind what is carried the person is who carries it."""
 
 Point = tuple[float, float, float]
 
@@ -184,9 +192,11 @@ def chair() -> Mesh:
     return join([_seat(), _backrest(), *_side(1.0), *_side(-1.0)])
 
 
-def cylinder(begin: Point, end: Point, begin_radius_m: float, end_radius_m: float) -> Mesh:
-    """An upright round solid of 24 sides between two levels, tapered if the radii differ."""
-    angle = np.linspace(0.0, 2.0 * math.pi, 24, endpoint=False)
+def cylinder(
+    begin: Point, end: Point, begin_radius_m: float, end_radius_m: float, sides: int = 24
+) -> Mesh:
+    """An upright round solid of so many sides between two levels, tapered if the radii differ."""
+    angle = np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False)
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     low = np.array(begin) + begin_radius_m * rim
     high = np.array(end) + end_radius_m * rim
@@ -202,6 +212,19 @@ def cylinder(begin: Point, end: Point, begin_radius_m: float, end_radius_m: floa
         ]
     )
     return Mesh(np.vstack([low, high, [begin], [end]]), triangles)
+
+
+def table(size_m: Point, top_m: float, leg_m: float) -> Mesh:
+    """A table: a top and four square legs at its corners, its origin on the ground below it."""
+    x, y, z = size_m
+    top = bar((0.0, 0.0, z - top_m), (0.0, 0.0, z), (x, y), (x, y))
+    half_x, half_y = 0.5 * (x - leg_m), 0.5 * (y - leg_m)
+    legs = [
+        bar((a, b, 0.0), (a, b, z - 0.5 * top_m), (leg_m, leg_m), (leg_m, leg_m))
+        for a in (-half_x, half_x)
+        for b in (-half_y, half_y)
+    ]
+    return join([top, *legs])
 
 
 def person() -> Mesh:
@@ -241,6 +264,11 @@ def _object_mesh(model: ObjectModel) -> Mesh:
     if isinstance(model, PoleModel):
         top = (0.0, 0.0, model.height_m)
         return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m)
+    if isinstance(model, CylinderModel):
+        top = (0.0, 0.0, model.height_m)
+        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, DRUM_SIDES)
+    if isinstance(model, TableModel):
+        return table(model.size_m, model.top_m, model.leg_m)
     assert_never(model)
 
 
@@ -277,21 +305,63 @@ class Walker:
 
 
 @dataclass(frozen=True)
+class Carried:
+    """Something that is carried from place to place, or the person who carries it.
+
+    Attributes:
+        mesh: origin on the ground; of a person, facing the way.
+        begins_s: (m,) seconds since the start of the drive, picked up.
+        ends_s: (m,) put down again.
+        places_map: (m + 1, 3) metres, where it stands before, between and after.
+        yaws_rad: (m + 1,) its headings there.
+        carrier: whether this is the person: behind what is carried, and elsewhere in between.
+    """
+
+    mesh: Mesh
+    begins_s: Array
+    ends_s: Array
+    places_map: Array
+    yaws_rad: Array
+    carrier: bool = False
+
+    def poses(self, times_s: Array) -> tuple[Array, Array]:
+        """(n, 3, 3) R_map_mesh and (n, 3) t_map_mesh at (n,) seconds since the start."""
+        times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
+        done = np.searchsorted(self.ends_s, times, side="right")
+        move = np.minimum(done, len(self.begins_s) - 1)
+        begin, end = self.begins_s[move], self.ends_s[move]
+        part = np.clip((times - begin) / (end - begin), 0.0, 1.0)
+        carried = (times > begin) & (times < end)
+        way = self.places_map[move + 1] - self.places_map[move]
+        place = self.places_map[move] + part[:, None] * way
+        yaw = self.yaws_rad[move] + part * (self.yaws_rad[move + 1] - self.yaws_rad[move])
+        if self.carrier:
+            yaw = np.arctan2(way[:, 1], way[:, 0])
+            behind = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
+            place = place - CARRIER_M * behind
+            # Where no ray gets to: below the ground.
+            place[~carried, 2] -= 1000.0
+        cos, sin, zeros, ones = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
+        return R.reshape(-1, 3, 3), place
+
+
+@dataclass(frozen=True)
 class World:
     """What there is to be hit, by name.
 
     Attributes:
         meshes: what stands, in the map: the ground first, then the objects.
-        targets: names of the meshes that serve as targets.
+        targets: names of the objects that serve as targets.
         ground_z_map: height of the level ground in metres.
-        walkers: who walks.
+        walkers: who walks, and what is carried about.
         vehicle: the vehicle's body in its own frame; None: it has none.
     """
 
     meshes: dict[str, Mesh]
     targets: tuple[str, ...]
     ground_z_map: float
-    walkers: dict[str, Walker] = field(default_factory=dict)
+    walkers: dict[str, Walker | Carried] = field(default_factory=dict)
     vehicle: Mesh | None = None
 
     @property
@@ -301,15 +371,27 @@ class World:
         return (*self.meshes, *self.walkers, *vehicle)
 
     def bounds(self, name: str) -> tuple[Array, Array]:
-        """(3,) lower and (3,) upper corner of a mesh in the map."""
-        vertices = self.meshes[name].vertices
+        """(3,) lower and (3,) upper corner of an object in the map, wherever it stands."""
+        vertices = self._vertices(name)
         return vertices.min(axis=0), vertices.max(axis=0)
 
     def bounding_sphere(self, name: str) -> tuple[Array, float]:
-        """(3,) centre in the map and radius in metres of a sphere that holds a mesh."""
+        """(3,) centre in the map and radius in metres of a sphere that holds an object always."""
         low, high = self.bounds(name)
         centre = 0.5 * (low + high)
-        return centre, float(np.linalg.norm(self.meshes[name].vertices - centre, axis=1).max())
+        return centre, float(np.linalg.norm(self._vertices(name) - centre, axis=1).max())
+
+    def _vertices(self, name: str) -> Array:
+        """(n, 3) metres, map; of what is carried about at all its places."""
+        moving = self.walkers.get(name)
+        if not isinstance(moving, Carried):
+            return self.meshes[name].vertices
+        return np.vstack(
+            [
+                moving.mesh.moved(gtsam.Pose3(gtsam.Rot3.Yaw(yaw), place)).vertices
+                for place, yaw in zip(moving.places_map, moving.yaws_rad, strict=True)
+            ]
+        )
 
 
 def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> World:
@@ -323,12 +405,21 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
     terrain = make_terrain(model.ground)
     T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))
     meshes = {GROUND: ground(model.ground.half_size_m, terrain).moved(T_map_ground)}
+    walkers: dict[str, Walker | Carried] = {
+        name: Walker(person(), who, z, terrain) for name, who in model.walkers.items()
+    }
     for name, placed in model.objects.items():
-        rise = 0.0 if terrain is None else terrain.height_at(placed.xy_m)
-        T_map_object = gtsam.Pose3(
-            gtsam.Rot3.Yaw(math.radians(placed.yaw_deg)), np.array([*placed.xy_m, z + rise])
-        )
-        meshes[name] = _object_mesh(placed).moved(T_map_object)
+        stands = [placed, *placed.moves]
+        rises = [0.0 if terrain is None else terrain.height_at(s.xy_m) for s in stands]
+        places = np.array([[*s.xy_m, z + r] for s, r in zip(stands, rises, strict=True)])
+        yaws = np.radians([s.yaw_deg for s in stands])
+        if placed.moves:
+            times = np.array([[move.begin_s, move.end_s] for move in placed.moves]).T
+            walkers[name] = Carried(_object_mesh(placed), *times, places, yaws)
+            walkers[f"who carries {name}"] = Carried(person(), *times, places, yaws, carrier=True)
+        else:
+            T_map_object = gtsam.Pose3(gtsam.Rot3.Yaw(float(yaws[0])), places[0])
+            meshes[name] = _object_mesh(placed).moved(T_map_object)
     parts = [
         box(part.size_m).moved(
             gtsam.Pose3(
@@ -341,7 +432,7 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
         meshes,
         model.targets,
         z,
-        {name: Walker(person(), who, z, terrain) for name, who in model.walkers.items()},
+        walkers,
         join(parts) if parts else None,
     )
 

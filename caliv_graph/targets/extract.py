@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caliv_graph.config import Config, ExtractionConfig, TargetRegion
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
 from caliv_graph.geometry.se3 import pose_from_mounting, skew
 from caliv_graph.products import (
@@ -30,6 +31,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.progress import Progress
 from caliv_graph.targets.ground import fit_ground, height_above
+from caliv_graph.targets.moved import Sightings, periods
 from caliv_graph.targets.search import find_target
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -87,6 +89,9 @@ TOTAL_PER_LIDARS = 2.5
 """Scans of one target that are used at most, in `extraction.max_scans`: with more LiDARs there are
 fewer of each, since what they tell of each other is in all of them, and the cost grows with the
 square."""
+
+FEWEST_OF_A_PLACE = 20
+"""Scans of each place of a target that is moved about, where there are that many."""
 
 CELL_DEG = 5.0
 """Cells of direction in which points are counted for the resolution."""
@@ -181,6 +186,7 @@ class RegionExtractor:
 
     def __init__(self, region: TargetRegion, config: Config, trajectory: VehicleTrajectory) -> None:
         """Binds the region to a drive."""
+        self._region = region
         self._config = config
         self._trajectory = trajectory
         self._low = np.array(region.min)
@@ -195,6 +201,15 @@ class RegionExtractor:
             name: pose_from_mounting(lidar.initial) for name, lidar in config.lidars.items()
         }
         self.tallies: dict[str, _Tally] = {name: _Tally() for name in config.lidars}
+
+    @property
+    def trajectory(self) -> VehicleTrajectory:
+        """Of the drive."""
+        return self._trajectory
+
+    def fresh(self) -> RegionExtractor:
+        """The same, with nothing counted yet."""
+        return RegionExtractor(self._region, self._config, self._trajectory)
 
     @property
     def centre_map(self) -> Array:
@@ -474,7 +489,8 @@ def extract_targets(
         progress: told of every scan.
 
     Returns:
-        One observation per drive and region, clouds in order of LiDAR and stamp. LiDARs that saw
+        One observation per drive and region, clouds in order of LiDAR and stamp; of a target that
+        was moved while the vehicle stood, one per place. LiDARs that saw
         the target in fewer than `extraction.min_scans` scans are left out with a warning.
 
     Raises:
@@ -491,22 +507,20 @@ def extract_targets(
     with progress.stage("reading clouds", total) as advance:
         for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
             extractors = [RegionExtractor(r, config, trajectory) for r in regions[drive]]
-            clouds: list[list[TargetCloud]] = [[] for _ in extractors]
+            seen: list[dict[str, list[list[Candidate]]]] = [
+                {name: [] for name in config.lidars} for _ in extractors
+            ]
             for name in config.lidars:
-                seen: list[list[list[Candidate]]] = [[] for _ in extractors]
                 for scan in recording.scans(name, wanted[drive][name]):
-                    for extractor, scans in zip(extractors, seen, strict=True):
-                        scans.append(extractor.candidates(scan, drive))
+                    for extractor, of_lidar in zip(extractors, seen, strict=True):
+                        of_lidar[name].append(extractor.candidates(scan, drive))
                     advance()
-                for extractor, scans, found in zip(extractors, seen, clouds, strict=True):
-                    found += extractor.choose(scans, name)
-            for index, (extractor, found) in enumerate(zip(extractors, clouds, strict=True)):
+            for index, (extractor, of_lidar) in enumerate(zip(extractors, seen, strict=True)):
                 label = labels[drive] if len(extractors) == 1 else f"target {index + 1}"
                 if len(recordings) > 1:
                     label += f" of {recording.name}"
-                observations.append(
-                    _observation(len(observations), label, extractor, found, config, hints[drive])
-                )
+                for found in _placements(label, extractor, of_lidar, config, hints[drive]):
+                    observations.append(replace(found, placement=len(observations)))
     if not any(o.clouds for o in observations):
         raise TargetError(observations[0].warnings[-1])
     return tuple(observations)
@@ -632,6 +646,93 @@ class _FieldOfView:
         off = np.abs((off + math.pi) % (2.0 * math.pi) - math.pi)
         widened = np.where(range_m > margin_m, np.arcsin(np.minimum(margin_m / range_m, 1.0)), 4.0)
         return np.asarray(enough & (off <= half + widened))
+
+
+def _placements(
+    label: str,
+    extractor: RegionExtractor,
+    seen: Mapping[str, Sequence[Sequence[Candidate]]],
+    config: Config,
+    hints: Sequence[str],
+) -> list[TargetObservation]:
+    """One observation of a target, or one of each of its places if somebody moved it."""
+    flat = {name: [c for scan in scans for c in scan] for name, scans in seen.items()}
+    sightings = {name: _sightings(found) for name, found in flat.items()}
+    moved = periods(sightings, extractor.trajectory, config.extraction.min_scans)
+    if not moved:
+        clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
+        return [_observation(0, label, extractor, clouds, config, hints)]
+    # What a standing vehicle sees of one place is the same in every scan.
+    most = max(config.extraction.max_scans // len(moved), FEWEST_OF_A_PLACE)
+    extraction = config.extraction.model_copy(update={"max_scans": most})
+    fewer = config.model_copy(update={"extraction": extraction})
+    out = []
+    begin_ns, _ = extractor.trajectory.span_ns
+    for number, period in enumerate(moved, start=1):
+        own = extractor.fresh()
+        clouds = []
+        for name, found in flat.items():
+            clouds += own.choose(_of_period(found, period.members[name]), name)
+        times_ns = (period.begin_ns, period.end_ns)
+        from_s, to_s = (max(ns - begin_ns, 0) / NANOSECONDS_PER_SECOND for ns in times_ns)
+        name = f"{label} at place {number} of {len(moved)} ({from_s:.1f} to {to_s:.1f} s)"
+        observation = _observation(0, name, own, clouds, fewer, ())
+        if observation.clouds:
+            out.append(observation)
+    if not out:
+        return [_observation(0, label, extractor, [], config, hints)]
+    told = [*hints, *_told_of_moves(label, extractor, out, len(moved), config)]
+    out = [replace(o, warnings=()) for o in out]
+    return [replace(out[0], warnings=tuple(told)), *out[1:]]
+
+
+def _sightings(found: Sequence[Candidate]) -> Sightings:
+    return Sightings(
+        np.array([c.cloud.stamp_ns for c in found], dtype=np.int64),
+        np.array([c.centre_lidar for c in found], dtype=np.float64).reshape(-1, 3),
+    )
+
+
+def _of_period(found: Sequence[Candidate], members: IntArray) -> list[list[Candidate]]:
+    """The candidates at these indices, scan by scan."""
+    out: dict[int, list[Candidate]] = {}
+    for index in members.tolist():
+        out.setdefault(found[index].cloud.stamp_ns, []).append(found[index])
+    return list(out.values())
+
+
+def _told_of_moves(
+    label: str,
+    extractor: RegionExtractor,
+    observations: Sequence[TargetObservation],
+    places: int,
+    config: Config,
+) -> Iterator[str]:
+    """What a person should know of a target that was moved."""
+    groups: dict[tuple[str, ...], int] = {}
+    for o in observations:
+        lidars = tuple(n for n in config.lidars if any(c.lidar == n for c in o.clouds))
+        groups[lidars] = groups.get(lidars, 0) + 1
+    said = [
+        f"{count} seen by {' and '.join(repr(n) for n in lidars)}"
+        + (" alone" if len(lidars) == 1 else "")
+        for lidars, count in groups.items()
+    ]
+    line = (
+        f"{label}: it was moved while the vehicle stood: {places} places, each solved for by "
+        f"itself: {', '.join(said)}"
+    )
+    seeing = {name for lidars in groups for name in lidars}
+    if len(seeing) > 1 and all(len(lidars) == 1 for lidars in groups):
+        line += ". No place tells how LiDARs are to each other: put it where two of them see it"
+    yield line
+    for name in config.lidars:
+        if name not in seeing and extractor.tallies[name].scans:
+            yield (
+                f"{label}: lidar '{name}' sees it at no place in "
+                f"{config.extraction.min_scans} scans (extraction.min_scans) of its "
+                f"{extractor.tallies[name].scans}"
+            )
 
 
 def _observation(

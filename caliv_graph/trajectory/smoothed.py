@@ -82,6 +82,8 @@ class SmoothedTrajectory:
         values: the estimate that belongs to it.
         chain: its information at the estimate.
         inertial: the IMU samples used.
+        factor_kinds: of each factor of the graph, in order: `imu`, `gnss`, `orientation`,
+            `velocity`, or `prior` for what is assumed.
     """
 
     trajectory: Trajectory
@@ -99,6 +101,7 @@ class SmoothedTrajectory:
     values: gtsam.Values = field(repr=False)
     chain: Chain = field(repr=False)
     inertial: Inertial = field(repr=False)
+    factor_kinds: tuple[str, ...] = field(default=(), repr=False)
 
     @property
     def span_ns(self) -> tuple[int, int]:

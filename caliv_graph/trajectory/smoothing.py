@@ -234,6 +234,7 @@ def smooth_trajectory(
         values=values,
         chain=chain,
         inertial=inertial,
+        factor_kinds=_factor_kinds(data, nodes, states, dropped, graph.size()),
     )
     return replace(smoothed, trajectory=_at_wanted(smoothed, wanted, cov_imu))
 
@@ -642,6 +643,22 @@ def _graph(
     if data.positions is None:
         _add_gauge(graph, data, states)
     return graph
+
+
+def _factor_kinds(
+    data: _Data, nodes: IntArray, states: States, dropped: IntArray, size: int
+) -> tuple[str, ...]:
+    """What each factor of `_graph` is about, in its order. GTSAM's own have no names."""
+    carried = _carry(data, nodes, without_bias(data.inertial, nodes, states))
+    kinds = ["imu"] * (len(nodes) - 1) + ["prior"]
+    if carried.positions is not None:
+        kinds += ["gnss"] * int((~np.isin(carried.positions.fixes, dropped)).sum())
+    if carried.orientations is not None:
+        kinds += ["orientation"] * len(carried.orientations.nodes)
+        kinds += ["prior"] * data.config.imu.yaw_bias
+    if carried.velocities is not None:
+        kinds += ["velocity"] * len(carried.velocities.nodes)
+    return (*kinds, *["prior"] * (size - len(kinds)))
 
 
 def _add_positions(

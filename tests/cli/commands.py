@@ -33,7 +33,7 @@ def start(*arguments: object, pipeline: str = "", cwd: Path = ROOT) -> subproces
 
     Args:
         arguments: its arguments.
-        pipeline: source of `calibrate(recordings, config, progress)`; empty: the real one.
+        pipeline: source of `calibrate(recordings, config, progress, prior)`; empty: the real one.
         cwd: the folder to run it in.
     """
     program = ["-m", "caliv_graph"]

@@ -15,7 +15,7 @@ from caliv_graph.config import Config, load_config
 from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.products import Calibration, Recording
 from caliv_graph.progress import Progress
-from caliv_graph.results import read_calibration
+from caliv_graph.results import read_calibration, write_calibration
 from tests.cli.commands import write_config, write_drive
 from tests.samples import make_calibration, make_solution, unseen
 
@@ -28,11 +28,16 @@ class Pipeline:
     warnings: tuple[str, ...] = ()
     recordings: Sequence[Recording] = ()
     config: Config | None = None
+    prior: Calibration | None = None
 
     def calibrate(
-        self, recordings: Sequence[Recording], config: Config, progress: Progress
+        self,
+        recordings: Sequence[Recording],
+        config: Config,
+        progress: Progress,
+        prior: Calibration | None,
     ) -> types.SimpleNamespace:
-        self.recordings, self.config = recordings, config
+        self.recordings, self.config, self.prior = recordings, config, prior
         with progress.stage("solving", 2) as advance:
             advance(2, "converged")
         return types.SimpleNamespace(
@@ -68,6 +73,8 @@ def test_the_result_is_a_folder(pipeline: Pipeline, config: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == [
         "calibration.yaml",
         "config.yaml",
+        "graph.gtsam",
+        "graph.values.gtsam",
         "log.jsonl",
         "target.ply",
     ]
@@ -156,6 +163,37 @@ def test_a_lidar_that_never_saw_the_target_is_exit_3(pipeline: Pipeline, config:
     assert "never saw a target" in result.stdout
     front = read_calibration(config.parent / "out/calibration.yaml").lidars["front"]
     assert not any(front.determined.values())
+
+
+def test_data_that_contradict_each_other_are_exit_4(pipeline: Pipeline, config: Path) -> None:
+    pipeline.calibration = make_calibration(status="inconsistent", unmet=("this and that",))
+
+    result = calibrate(config, "--out", config.parent / "out")
+
+    assert result.exit_code == 4
+    assert read_calibration(config.parent / "out/calibration.yaml").status == "inconsistent"
+
+
+def test_an_earlier_calibration_is_handed_on(pipeline: Pipeline, config: Path) -> None:
+    earlier = config.parent / "earlier.yaml"
+    write_calibration(make_calibration(reference="front"), earlier)
+
+    result = calibrate(config, "--prior", earlier, "--out", config.parent / "out")
+
+    assert result.exit_code == 0
+    assert pipeline.prior is not None
+    assert pipeline.prior.reference == "front"
+
+
+def test_an_earlier_calibration_that_is_not_there(pipeline: Pipeline, config: Path) -> None:
+    earlier = config.parent / "earlier.yaml"
+
+    result = calibrate(config, "--prior", earlier, "--out", config.parent / "out")
+
+    assert isinstance(result.exception, ConfigError)
+    assert str(result.exception) == f"{earlier}: no such file"
+    assert pipeline.config is None
+    assert not (config.parent / "out").exists()
 
 
 def test_an_older_result_is_replaced_only_with_force(pipeline: Pipeline, config: Path) -> None:

@@ -16,14 +16,14 @@ from caliv_graph import __version__
 from tests.cli.commands import ROOT, run, start, write_config, write_drive
 
 SUCCEEDS = """
-def calibrate(recordings, config, progress):
+def calibrate(recordings, config, progress, prior):
     with progress.stage("solving", 2) as advance:
         advance(2)
     return run_of(make_calibration())
 """
 
 FAILS = """
-def calibrate(recordings, config, progress):
+def calibrate(recordings, config, progress, prior):
     import warnings
     from caliv_graph.errors import TargetError
     warnings.warn("of a library")
@@ -32,19 +32,19 @@ def calibrate(recordings, config, progress):
 """
 
 BREAKS = """
-def calibrate(recordings, config, progress):
+def calibrate(recordings, config, progress, prior):
     raise ZeroDivisionError("nobody thought of this")
 """
 
 WAITS = """
-def calibrate(recordings, config, progress):
+def calibrate(recordings, config, progress, prior):
     import time
     with progress.stage("solving", 2) as advance:
         time.sleep(60)
 """
 
 LOSES_THE_INTERRUPT = """
-def calibrate(recordings, config, progress):
+def calibrate(recordings, config, progress, prior):
     import time
     with progress.stage("solving", 2) as advance:
         try:
@@ -69,9 +69,17 @@ def test_help_is_quick_and_names_only_what_there_is() -> None:
 
     assert result.returncode == 0
     assert result.stderr == ""
-    for command in ("init", "inspect", "simulate", "calibrate", "evaluate"):
+    for command in (
+        "init",
+        "inspect",
+        "simulate",
+        "observability",
+        "plan",
+        "calibrate",
+        "evaluate",
+    ):
         assert f"│ {command} " in result.stdout
-    assert "observability" not in result.stdout
+    assert "│ teleport" not in result.stdout
     # 0.4 s on a quiet machine (SPEC 5); the quickest of three, on one that may not be.
     assert min(starts) < 0.8
 

@@ -90,8 +90,9 @@ TOTAL_PER_LIDARS = 2.5
 fewer of each, since what they tell of each other is in all of them, and the cost grows with the
 square."""
 
-FEWEST_OF_A_PLACE = 20
-"""Scans of each place of a target that is moved about, where there are that many."""
+SCANS_OF_A_PLACE = 10
+"""Scans of each place of a target that is moved about while the vehicle stands. Each shows the same
+spots of it: more of them would average the noise, but not what no beam hits, and claim both."""
 
 CELL_DEG = 5.0
 """Cells of direction in which points are counted for the resolution."""
@@ -662,10 +663,6 @@ def _placements(
     if not moved:
         clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
         return [_observation(0, label, extractor, clouds, config, hints)]
-    # What a standing vehicle sees of one place is the same in every scan.
-    most = max(config.extraction.max_scans // len(moved), FEWEST_OF_A_PLACE)
-    extraction = config.extraction.model_copy(update={"max_scans": most})
-    fewer = config.model_copy(update={"extraction": extraction})
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -676,6 +673,10 @@ def _placements(
         times_ns = (period.begin_ns, period.end_ns)
         from_s, to_s = (max(ns - begin_ns, 0) / NANOSECONDS_PER_SECOND for ns in times_ns)
         name = f"{label} at place {number} of {len(moved)} ({from_s:.1f} to {to_s:.1f} s)"
+        most = config.extraction.max_scans // len(moved) if period.drove else 0
+        most = max(most, SCANS_OF_A_PLACE, config.extraction.min_scans)
+        extraction = config.extraction.model_copy(update={"max_scans": most})
+        fewer = config.model_copy(update={"extraction": extraction})
         observation = _observation(0, name, own, clouds, fewer, ())
         if observation.clouds:
             out.append(observation)

@@ -167,7 +167,7 @@ def broken(path: str, value: Any) -> dict[str, Any]:
         ("lidars/front/range_sigma_m", float("nan"), "range_sigma_m"),
         ("reference", "back", "reference 'back' is not one of the lidars: front"),
         ("world/targets", ["table"], "target 'table' is not one of the objects: chair"),
-        ("world/objects/chair/shape", "table", "'table'"),
+        ("world/objects/chair/shape", "sofa", "'sofa'"),
         ("name", "two\nlines", "name"),
         ("lidars/front/elevations_deg", [-3.0, -3.0, 1.0], "elevations_deg must ascend"),
         ("lidars/front/elevations_deg", [-95.0, 1.0], "elevations_deg must lie within -90 and 90"),

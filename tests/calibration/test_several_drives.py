@@ -1,0 +1,209 @@
+"""Several drives, several targets: what they share, and what each has of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config import Config, Mounting, parse_config
+from caliv_graph.conventions import AXES
+from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.products import LidarScan, Recording
+from caliv_graph.progress import SilentProgress
+from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.scenario import (
+    ArcDrive,
+    ChairModel,
+    CropModel,
+    GnssModel,
+    GroundModel,
+    LidarModel,
+    ObjectModel,
+    Scenario,
+    WorldModel,
+)
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.uncertainty.evaluation import evaluate
+
+MM, MRAD = 1e-3, 1e-3
+
+RIGHT = ArcDrive(duration_s=14.0)
+LEFT = ArcDrive(duration_s=14.0, turn="left")
+
+CHAIR = {"chair": ChairModel(xy_m=(15.16, -9.16), yaw_deg=90.0)}
+CHAIR_LEFT = {"chair": ChairModel(xy_m=(15.16, 9.16), yaw_deg=-120.0)}
+TWO_CHAIRS = {
+    **CHAIR,
+    "other": ChairModel(xy_m=(11.6, 0.6), yaw_deg=40.0),
+}
+
+
+def lidar(x_m: float, yaw_deg: float, y_m: float = 0.0) -> LidarModel:
+    return LidarModel(
+        mounting=Mounting(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
+        rate_hz=4.0,
+        channels=90,
+        horizontal_resolution_deg=0.3,
+    )
+
+
+LIDARS = {"front": lidar(2.0, 0.0), "rear": lidar(-0.4, 180.0)}
+
+
+def scenario(
+    drive: ArcDrive,
+    objects: dict[str, ObjectModel],
+    lidars: dict[str, LidarModel] = LIDARS,
+    ground_m: float = 0.0,
+    datum_deg: float = 48.0,
+) -> Scenario:
+    """A drive with raw sensors; each has a map origin and a ground of its own."""
+    return Scenario(
+        name="drive",
+        drive=drive,
+        lidars=lidars,
+        world=WorldModel(
+            ground=GroundModel(height_m=ground_m),
+            objects=objects,
+            targets=tuple(objects),
+            region_margin_m=1.5,
+        ),
+        gnss=GnssModel(latitude_deg=datum_deg),
+        crop=CropModel(margin_m=0.5, elsewhere_stride=10),
+    )
+
+
+@cache
+def right() -> SimulatedRecording:
+    return simulate_drive(scenario(RIGHT, {**CHAIR}), 11)
+
+
+@cache
+def left() -> SimulatedRecording:
+    """In another country, on higher ground, past a chair of its own."""
+    return simulate_drive(scenario(LEFT, {**CHAIR_LEFT}, ground_m=3.0, datum_deg=51.0), 12)
+
+
+def config(*recordings: SimulatedRecording, use: tuple[str, ...] = ()) -> Config:
+    """Guesses of the first drive, regions of all, few scans and components."""
+    raw = config_of(recordings[0], has_bag=True)
+    # Of each drive its regions: what is in no region of a drive is nobody's target there.
+    raw["target"] = [r for one in recordings for r in config_of(one, has_bag=True)["target"]]
+    raw |= {"registration": {"components": 200, "max_points": 160}}
+    raw["extraction"] = {"max_scans": 16}
+    raw["require"] = []
+    if use:
+        raw["lidars"] = {name: raw["lidars"][name] for name in use}
+    return parse_config(raw, "config.yaml", Path("/nowhere"))
+
+
+@cache
+def together() -> CalibrationRun:
+    return calibrate([right(), left()], config(right(), left()), SilentProgress())
+
+
+def test_one_arc_does_not_tell_x_and_yaw() -> None:
+    run = calibrate([right()], config(right()), SilentProgress())
+    assert run.calibration.status == "partial"
+    (direction,) = run.calibration.undetermined
+    assert direction.together
+    assert "turn centre" in direction.text
+    for result in run.calibration.lidars.values():
+        assert [a for a in AXES if not result.determined[a]] == ["yaw", "x"]
+
+
+def test_a_right_and_a_left_arc_tell_everything() -> None:
+    run = together()
+    assert run.calibration.undetermined == ()
+    assert run.calibration.status == "ok"
+    errors = evaluate(run.calibration, right().truth.T_vehicle_lidar)
+    for name, result in run.calibration.lidars.items():
+        assert all(result.determined.values())
+        error = errors["lidars"][name]["s2v"]
+        # A 9.16 m lever: 40 mm of x would be 4 mrad of yaw, as either arc alone is off by.
+        assert abs(error["rotation_rad"][2]) < 2.0 * MRAD
+        assert np.abs(error["translation_m"][:2]).max() < 15 * MM
+        # 99.9 percent of a chi-square of 6 degrees of freedom.
+        assert error["nees"] < 22.5
+
+
+def test_drives_share_the_extrinsics_and_nothing_else() -> None:
+    run = together()
+    solution = run.solution
+    # A placement in each drive that sees a target, in the map of that drive.
+    assert [{c.drive for c in o.clouds} for o in run.observations if o.clouds] == [{0}, {1}]
+    heights = [T.inverse().translation()[2] for T in solution.T_target_map]
+    origins = [r.motion().gnss for r in (right(), left())]
+    assert all(origin is not None for origin in origins)
+    # Each map begins at its own first fix: the chair's middle stands 0.6 m over either ground.
+    assert heights == pytest.approx([0.6, 0.6], abs=0.15)
+    # One plane, one height error, and one chain of poses per drive; nothing joins two drives.
+    graph, keys = solution.graph, {0: set[int](), 1: set[int]()}
+    index = {pose: i for i, pose in enumerate(sorted(solution.T_map_vehicle))}
+    for (drive, _), i in index.items():
+        keys[drive].add(gtsam.symbol("x", i))
+    for drive in (0, 1):
+        keys[drive] |= {gtsam.symbol(letter, drive) for letter in "cgh"}
+    assert keys[0] | keys[1] <= set(solution.values.keys())
+    for i in range(graph.size()):
+        touched = set(graph.at(i).keys())
+        assert not (touched & keys[0] and touched & keys[1])
+
+
+def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others() -> None:
+    lidars = {**LIDARS, "side": lidar(1.0, -80.0, -0.8)}
+    three = simulate_drive(scenario(RIGHT, {**CHAIR}, lidars), 13)
+
+    class Without:
+        """A drive in which one LiDAR of the config recorded nothing."""
+
+        def __init__(self, drive: SimulatedRecording) -> None:
+            self._drive = drive
+            self.name, self.lidars = drive.name, tuple(lidars)
+            self.motion, self.warnings = drive.motion, drive.warnings
+
+        def scan_stamps_ns(self, name: str) -> Sequence[int]:
+            return [] if name == "side" else self._drive.scan_stamps_ns(name)
+
+        def scans(self, name: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+            return iter(()) if name == "side" else self._drive.scans(name, wanted)
+
+    drives: list[Recording] = [three, Without(left()), Without(right())]
+    run = calibrate(drives, config(three, left()), SilentProgress())
+    assert any("'side' has no scans in this drive" in line for line in run.warnings)
+    # Tied to the others by the first drive, and through them to the vehicle by all three.
+    assert run.calibration.undetermined == ()
+    errors = evaluate(run.calibration, three.truth.T_vehicle_lidar)
+    assert set(errors["lidars"]) == {"front", "rear", "side"}
+    for name, found in errors["lidars"].items():
+        # 99.9 percent of a chi-square of 6 degrees of freedom; the side LiDAR passes a chair once,
+        # for a few seconds.
+        assert found["s2v"]["nees"] < 22.5
+        if name != "side":
+            assert abs(found["s2v"]["rotation_rad"][2]) < 2.0 * MRAD
+
+
+def test_two_targets_in_a_drive() -> None:
+    recording = simulate_drive(scenario(RIGHT, {**TWO_CHAIRS}), 14)
+    both = config(recording)
+    assert both.target is not None
+    assert len(both.target) == 2
+    run = calibrate([recording], both, SilentProgress())
+    assert [o.name for o in run.observations] == ["target 1", "target 2"]
+    assert all({c.lidar for c in o.clouds} == {"front", "rear"} for o in run.observations)
+    places = [T.inverse().translation() for T in run.solution.T_target_map]
+    # 10.4 m apart, each with a pose of its own.
+    first, other = (np.array(chair.xy_m) for chair in TWO_CHAIRS.values())
+    apart = float(np.linalg.norm((places[0] - places[1])[:2]))
+    assert apart == pytest.approx(float(np.linalg.norm(first - other)), abs=0.15)
+    (errors,) = evaluate(run.calibration, recording.truth.T_vehicle_lidar)["pairs"]
+    assert np.abs(errors["rotation_rad"]).max() < 2.0 * MRAD
+    # On an arc a second target moves no turn centre: the same is undetermined.
+    (direction,) = run.calibration.undetermined
+    assert direction.together
+    assert "turn centre" in direction.text

@@ -1,0 +1,278 @@
+"""Shapes of known symmetry, ray-cast with noise from known places, and what is found of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.geometry.se3 import stack, unstack
+from caliv_graph.products import Array, Registration
+from caliv_graph.registration.register import FINE_SIGMA_M, JointRegistration
+from caliv_graph.registration.symmetry import (
+    Symmetry,
+    View,
+    _Seen,
+    alarming,
+    forget_turns,
+    refit,
+    symmetries,
+    symmetry_sentence,
+    views_of,
+)
+from caliv_graph.simulation.lidar import SimulatedLidar
+from caliv_graph.simulation.scenario import (
+    BoxModel,
+    ChairModel,
+    CropModel,
+    CylinderModel,
+    LidarModel,
+    ObjectModel,
+    TableModel,
+    WorldModel,
+)
+from caliv_graph.simulation.worlds import RayCaster, make_world
+from tests.registration.scenes import STRAIGHT, config_of, looking_at_target, observe
+
+NAMED: dict[str, ObjectModel] = {
+    "chair": ChairModel(xy_m=(0.0, 0.0), yaw_deg=30.0),
+    "cylinder": CylinderModel(xy_m=(0.0, 0.0), radius_m=0.35, height_m=1.2),
+    "cube": BoxModel(xy_m=(0.0, 0.0), yaw_deg=20.0, size_m=(0.7, 0.7, 1.0)),
+    "box": BoxModel(xy_m=(0.0, 0.0), yaw_deg=20.0, size_m=(0.9, 0.6, 1.0)),
+    # 60 mm: a fifth of what separates its faces from those of a cube is 3 sigma of one beam.
+    "nearly a cube": BoxModel(xy_m=(0.0, 0.0), yaw_deg=20.0, size_m=(0.73, 0.67, 1.0)),
+    "table": TableModel(xy_m=(0.0, 0.0), yaw_deg=-40.0),
+}
+
+ALL_AROUND = tuple(np.linspace(0.0, 324.0, 10).tolist())
+A_QUARTER = tuple(np.linspace(0.0, 90.0, 10).tolist())
+OPPOSITE = (*np.linspace(5.0, 35.0, 5).tolist(), *np.linspace(185.0, 215.0, 5).tolist())
+
+SIGMA_M = 0.01
+
+
+@cache
+def seen(name: str, azimuths_deg: Sequence[float], seed: int = 0) -> Registration:
+    """The shape as it is reconstructed from poses that are off by a milliradian and 2 mm."""
+    world = make_world(WorldModel(objects={"it": NAMED[name]}, targets=("it",)))
+    rng = np.random.default_rng(seed)
+    model = LidarModel(mounting=STRAIGHT, range_sigma_m=SIGMA_M)
+    crop = CropModel(margin_m=0.0, elsewhere_stride=0)
+    lidar = SimulatedLidar(model, world, RayCaster(world), crop, rng)
+    T_map_target = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.6]))
+    clouds, poses = [], []
+    for azimuth in azimuths_deg:
+        T = looking_at_target(azimuth, 8.0)
+        returns = lidar.scan(T_map_target.compose(T))
+        clouds.append(returns.points_lidar[returns.objects == world.names.index("it")])
+        error = rng.normal(size=6) * np.repeat([1e-3, 2e-3], 3)
+        poses.append(gtsam.Pose3.Expmap(error).compose(T))
+    state = JointRegistration(observe(clouds), config_of(components=600, max_points=400))
+    R, t = stack(poses)
+    state.refine_normals(R, t)
+    state.seed(R, t, FINE_SIGMA_M)
+    while not state.finest:
+        quadratic = state.expect(R, t)
+        state.maximise(R, t)
+    return state.result(R, t, quadratic, 1, True, (0.0, 0.0))
+
+
+def found(registration: Registration) -> tuple[Symmetry, ...]:
+    return symmetries(registration.mixture, views_of(registration), SIGMA_M)
+
+
+@cache
+def upright(name: str, azimuths_deg: Sequence[float]) -> Symmetry | None:
+    return next((s for s in found(seen(name, azimuths_deg)) if s.upright), None)
+
+
+@pytest.mark.parametrize("azimuths", [ALL_AROUND, A_QUARTER, OPPOSITE])
+def test_a_chair_is_the_same_after_no_turn(azimuths: tuple[float, ...]) -> None:
+    assert found(seen("chair", azimuths)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("cylinder", 0.0), ("cube", 90.0), ("box", 180.0), ("nearly a cube", 180.0), ("table", 180.0)],
+)
+def test_the_smallest_turn_of_a_shape_seen_from_all_sides(name: str, expected: float) -> None:
+    symmetry = upright(name, ALL_AROUND)
+    assert symmetry is not None
+    assert math.degrees(symmetry.turn_rad) == pytest.approx(expected)
+    assert symmetry.compared > 0.9
+    # The axis goes through the middle of the shape, which stands at the target's origin.
+    assert np.abs(symmetry.centre_target[:2]).max() < 5e-3
+
+
+def test_a_cube_of_which_two_lidars_see_opposite_corners_is_the_same_after_half_a_turn() -> None:
+    # Each sees two faces, and none of the other's.
+    symmetry = upright("cube", OPPOSITE)
+    assert symmetry is not None
+    assert symmetry.turn_rad in (math.pi / 2.0, math.pi)
+
+
+def test_a_drum_seen_from_one_side_is_known_by_what_was_seen() -> None:
+    symmetry = upright("cylinder", A_QUARTER)
+    assert symmetry is not None
+    assert symmetry.continuous
+    # What is at the edges of the view turns to where nobody looked.
+    assert len(symmetry.unseen) > 0
+    assert symmetry.compared < 1.0
+    again = refit(symmetry, seen("cylinder", A_QUARTER).mixture)
+    # The middle of the drum, a third of a metre behind what is seen of it.
+    assert np.abs(again.centre_target[:2]).max() < 5e-3
+    assert again.axis_target[2] > math.cos(10e-3)
+
+
+def test_one_side_of_a_box_says_nothing_of_turns_about_the_vertical() -> None:
+    # Turned, the face that was seen is where nobody looked, whichever way.
+    assert upright("box", tuple(np.linspace(18.0, 22.0, 10).tolist())) is None
+
+
+def test_another_frame_changes_nothing() -> None:
+    registration = seen("table", ALL_AROUND)
+    T = gtsam.Pose3(gtsam.Rot3.Yaw(0.7), np.array([0.4, -0.3, 0.2]))
+    R = T.rotation().matrix()
+    mixture = registration.mixture
+    moved = replace(
+        registration,
+        T_target_lidar=tuple(T.compose(pose) for pose in registration.T_target_lidar),
+        mixture=replace(
+            mixture,
+            means_target=mixture.means_target @ R.T + T.translation(),
+            normals_target=mixture.normals_target @ R.T,
+        ),
+    )
+    before = upright("table", ALL_AROUND)
+    after = next((s for s in found(moved) if s.upright), None)
+    assert before is not None
+    assert after is not None
+    assert before.turn_rad == after.turn_rad
+    expected = T.transformFrom(before.centre_target)
+    np.testing.assert_allclose(after.centre_target[:2], expected[:2], atol=2e-3)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_one_view_says_of_a_surface(whole: bool) -> None:
+    # A square of 1 m, 5 m ahead, in steps of 25 mm, seen head on.
+    y, z = np.meshgrid(np.arange(-0.5, 0.501, 0.025), np.arange(-0.5, 0.501, 0.025))
+    square = np.column_stack([np.full(y.size, 5.0), y.ravel(), z.ravel()])
+    view = _Seen.of(View(np.zeros(3), square, whole))
+    asked = np.array(
+        [
+            [5.0, 0.1, 0.1],  # on it
+            [5.02, 0.1, 0.1],  # 20 mm behind it: it is 20 mm in front
+            [4.7, 0.1, 0.1],  # in front of it: the beam went on
+            [5.3, 0.1, 0.1],  # behind it: hidden
+            [5.0, 0.7, 0.1],  # beside it: nothing came back from there
+            [5.0, 2.0, 0.1],  # far beside it: perhaps nobody looked
+            [5.0, 0.1, 0.8],  # above it: the field of view may end there
+        ]
+    )
+    towards = np.tile([-1.0, 0.0, 0.0], (len(asked), 1))
+    off, counts, pierced = view.look(asked, towards)
+    nan = math.nan
+    np.testing.assert_allclose(off, [0.0, 0.02, nan, nan, nan, nan, nan], atol=1e-9)
+    assert counts.tolist() == [4, 4, 0, 0, 0, 0, 0]
+    assert pierced.tolist() == [False, False, True, False, whole, False, False]
+    # A surface that looks away could not have been seen.
+    off, _, pierced = view.look(asked, -towards)
+    assert np.isnan(off).all()
+    assert not pierced.any()
+
+
+def test_nothing_is_claimed_of_a_shape_that_nobody_saw() -> None:
+    assert symmetries(seen("cube", ALL_AROUND).mixture, (), SIGMA_M) == ()
+
+
+# ------------------------------------------------------------------ what it means
+
+
+def quadratic_of(name: str) -> tuple[Array, Array]:
+    H = seen(name, A_QUARTER).information_joint
+    return H, np.random.default_rng(1).normal(size=len(H))
+
+
+def test_turns_about_the_axis_are_forgotten_and_nothing_else() -> None:
+    symmetry = upright("cylinder", A_QUARTER)
+    assert symmetry is not None
+    H, g = quadratic_of("cylinder")
+    forgot, gradient = forget_turns(H, g, symmetry)
+    count = len(H) // 6
+    turns = np.kron(np.eye(count), symmetry.generator()[:, None])
+    scale = np.abs(H).max()
+    assert np.abs(forgot @ turns).max() < 1e-7 * scale
+    assert np.abs(turns.T @ gradient).max() < 1e-6 * np.abs(g).max()
+    # A Schur complement: of all turns the quadratic takes the best, never a better one.
+    values = np.linalg.eigvalsh(H - forgot)
+    assert values.min() > -1e-9 * scale
+    assert (values > 1e-9 * scale).sum() <= count
+    # Of any step, what is lost is what the best turns regain.
+    step = np.random.default_rng(2).normal(size=len(H))
+    best = np.linalg.lstsq(turns.T @ H @ turns, -turns.T @ (H @ step), rcond=None)[0]
+    regained = step + turns @ best
+    assert step @ forgot @ step == pytest.approx(regained @ H @ regained, rel=1e-6)
+
+
+def test_the_generator_moves_points_about_the_axis() -> None:
+    symmetry = Symmetry(
+        axis_target=np.array([0.0, 0.0, 1.0]),
+        centre_target=np.array([0.3, -0.2, 0.5]),
+        turn_rad=0.0,
+        fitted_rad=1.0,
+        compared=1.0,
+        contradicted=0.0,
+        unseen=np.zeros(0, dtype=np.int64),
+    )
+    quarter = gtsam.Pose3.Expmap(0.5 * math.pi * symmetry.generator())
+    np.testing.assert_allclose(quarter.transformFrom(np.array([1.3, -0.2, 0.9])), [0.3, 0.8, 0.9])
+
+
+def test_a_drum_alone_claims_its_yaw_and_the_symmetry_takes_it_back() -> None:
+    # The reason for `forget_turns`: flat components on a round surface resist a turn a little,
+    # each as much as what it spans of the surface bends.
+    registration = seen("cylinder", A_QUARTER)
+    symmetry = upright("cylinder", A_QUARTER)
+    assert symmetry is not None
+    symmetry = refit(symmetry, registration.mixture)
+    turn = symmetry.generator()
+    claimed = [float(turn @ block @ turn) ** -0.5 for block in registration.information]
+    # Of a hundred such clouds that would be some milliradians.
+    assert np.median(claimed) < 50e-3
+    left = [
+        float(turn @ forget_turns(b, np.zeros(6), symmetry)[0] @ turn)
+        for b in registration.information
+    ]
+    assert max(left) < 1.0
+    # A true turn of one cloud about the axis: by half a radian it is still the same drum.
+    R, t = stack(list(registration.T_target_lidar))
+    (back,) = unstack(R[:1], t[:1])
+    points = registration.observation.clouds[0].points_lidar
+    turned = gtsam.Pose3.Expmap(0.2 * turn).compose(back).transformFrom(points.T).T
+    off = turned - symmetry.centre_target
+    radius = np.hypot(off[:, 0], off[:, 1])
+    side = np.abs(off[:, 2]) < 0.5
+    assert np.sqrt(np.mean((radius[side] - 0.35) ** 2)) < 2.0 * SIGMA_M
+
+
+def test_what_a_person_is_told() -> None:
+    drum, cube = upright("cylinder", A_QUARTER), upright("cube", ALL_AROUND)
+    assert drum is not None
+    assert cube is not None
+    sigma = math.radians(1.73)
+    said = symmetry_sentence(drum, "target", sigma)
+    assert said.startswith("target: it looks the same after any turn about the vertical")
+    assert "as far as it was seen" in said
+    said = symmetry_sentence(cube, "target", sigma)
+    assert "after a turn by 90 degrees about the vertical" in said
+    assert "more than 45 degrees" in said
+    # 5 degrees off a cube is no danger, 20 degrees (1 sigma) is.
+    assert alarming(drum, sigma)
+    assert not alarming(cube, sigma)
+    assert alarming(cube, math.radians(20.0))
+    assert "give better ones" in symmetry_sentence(cube, "target", math.radians(20.0))

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 import caliv_graph
+from caliv_graph.calibration.contrasts import (
+    assumptions,
+    cloud_counts,
+    contrasts,
+    registration_sigma,
+    typical_speed,
+)
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.problem import TRUSTED_SIGMAS
 from caliv_graph.config import Config, dump_config
 from caliv_graph.conventions import AXES
+from caliv_graph.errors import SolveError
 from caliv_graph.fusion.merge import guess_covariance, starting_from, with_earlier
 from caliv_graph.fusion.terms import DRIVES, drive_digest
 from caliv_graph.geometry.se3 import (
@@ -39,9 +48,10 @@ from caliv_graph.report.evidence import Evidence
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.targets import extract_targets
 from caliv_graph.targets.ground_planes import measure_grounds
-from caliv_graph.trajectory.heading import heading_disagreement
+from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.uncertainty import consistency
 from caliv_graph.uncertainty.observability import assess
 
 
@@ -107,6 +117,8 @@ def calibrate(
         solution.held,
     )
     calibration = assemble(solution, uncertainty, asked, recordings, digests)
+    headings = _headings(trajectories, motions)
+    calibration, untested = _checked(calibration, solution, recordings, trajectories, headings)
     prior_warnings: tuple[str, ...] = ()
     if prior is not None:
         calibration, prior_warnings = with_earlier(calibration, prior)
@@ -118,7 +130,8 @@ def calibrate(
         (
             *_warnings(recordings, trajectories, observations, solution),
             *ground_warnings,
-            *_headings(trajectories, motions),
+            *(heading.warning for heading in headings.values() if heading.warning),
+            *untested,
             *prior_warnings,
         ),
         Evidence(
@@ -132,13 +145,60 @@ def calibrate(
 
 def _headings(
     trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData]
-) -> Iterator[str]:
-    """A line for each drive whose orientation source does not point where the vehicle goes."""
+) -> dict[int, HeadingDisagreement]:
+    """Per drive that tells it, how the orientation source and the direction of travel differ."""
+    out = {}
     for index, trajectory in enumerate(trajectories):
         if isinstance(trajectory, SmoothedTrajectory):
             disagreement = heading_disagreement(trajectory, motions[index])
-            if disagreement is not None and disagreement.warning:
-                yield disagreement.warning
+            if disagreement is not None:
+                out[index] = disagreement
+    return out
+
+
+def _checked(
+    calibration: Calibration,
+    solution: Solution,
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    headings: Mapping[int, HeadingDisagreement],
+) -> tuple[Calibration, tuple[str, ...]]:
+    """The calibration with what contradicts what, and a line on what could not be tested."""
+    drives = [Path(recording.name).name for recording in recordings]
+    trusted = [
+        name for name, lidar in calibration.lidars.items() if lidar.guess and lidar.guess.fixed
+    ]
+    untested: tuple[str, ...] = ()
+    try:
+        between = contrasts(solution, trajectories, trusted)
+    except SolveError as e:
+        # The result stands; that it was tested must not be believed.
+        between = ()
+        untested = (f"parts of the drive were not tested against each other: {e}",)
+    found = consistency.contradictions(
+        consistency.Evidence(
+            lidars=calibration.lidars,
+            contrasts=between,
+            counts=cloud_counts(solution, trajectories),
+            registration_scale=solution.registration_scale,
+            registration_sigma=registration_sigma(solution),
+            assumed=assumptions(solution, drives),
+            headings=[
+                consistency.Heading(
+                    drives[index],
+                    heading.yaw_rad,
+                    heading.sigma_rad,
+                    told_apart=heading.measured or math.isfinite(heading.axle_m),
+                    measured=heading.measured,
+                )
+                for index, heading in headings.items()
+            ],
+            speed_m_s=typical_speed(solution, trajectories),
+        )
+    )
+    if found:
+        calibration = replace(calibration, status="inconsistent", contradictions=found)
+    return calibration, untested
 
 
 def _stamps_used(

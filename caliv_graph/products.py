@@ -541,6 +541,8 @@ class Calibration:
             None: not known (another program's file).
         earlier: what earlier drives said, where they were taken for a prior. Not part of
             `information_data`, but of the mountings and `cov_joint`.
+        contradictions: what contradicts what, a sentence each; the status is inconsistent if there
+            is any.
     """
 
     status: str
@@ -554,3 +556,4 @@ class Calibration:
     provenance: Mapping[str, object]
     gradient_data: Array | None = None
     earlier: tuple[DataTerm, ...] = ()
+    contradictions: tuple[str, ...] = ()

@@ -1,10 +1,10 @@
 """What `calibrate` leaves behind, and reading it back: calibration.yaml, truth.yaml, target.ply.
 
-The keys of calibration.yaml are those of SPEC 6 and, as own ones, `unmet`, `scans_used`,
-`saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `together`, `sigma_data`, `sigma_prior`,
-`provenance`, and what `compare`, `merge` and `--prior` need beside the data's information: `guess`,
-`data_gradient` and `earlier`. `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived
-from the rest.
+The keys of calibration.yaml are those of SPEC 6 and, as own ones, `unmet`, `contradictions`,
+`scans_used`, `saw_target`, `sigma_vehicle_axes`, `determined` of a pair, `together`, `sigma_data`,
+`sigma_prior`, `provenance`, and what `compare`, `merge` and `--prior` need beside the data's
+information: `guess`, `data_gradient` and `earlier`. `sensor_to_sensor`, `rpy_deg` and
+`sigma_vehicle_axes` are derived from the rest.
 """
 
 from __future__ import annotations
@@ -106,6 +106,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "status": calibration.status,
         "reference": calibration.reference,
         "unmet": list(calibration.unmet),
+        "contradictions": list(calibration.contradictions),
         "lidars": {name: _lidar_document(result) for name, result in calibration.lidars.items()},
         "sensor_to_sensor": [
             _pair_document(calibration, source, to)
@@ -255,6 +256,7 @@ def read_calibration_file(path: Path) -> CalibrationFile:
         undetermined=_read_directions(observability.child("undetermined"), poses),
         weak=_read_directions(observability.child("weak"), poses),
         unmet=tuple(str(item.value) for item in root.get("unmet", []).items()),
+        contradictions=tuple(str(item.value) for item in root.get("contradictions", []).items()),
         provenance={name: node.value for name, node in root.get("provenance", {}).names().items()},
         gradient_data=_read_gradient(root.child("joint"), size),
         earlier=tuple(map(_read_earlier, root.child("joint").get("earlier", []).items())),

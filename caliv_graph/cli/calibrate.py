@@ -56,7 +56,7 @@ def calibrate(
 
     Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
     for was not reached, or a LiDAR never saw the target. Exit code 4: it is written, but the data
-    contradict each other or the earlier calibration given with '--prior'.
+    contradict each other, the initial guess, or the earlier calibration given with '--prior'.
 
     Example: caliv-graph calibrate config.yaml --out result/
     """
@@ -83,7 +83,12 @@ def calibrate(
     with streams.progress_on_stdout(as_json) as progress:
         run = run_pipeline(recordings, settings, progress, earlier)
     calibration = run.calibration
-    warnings = [*_unused_keys(settings), *run.warnings, *calibration.unmet]
+    warnings = [
+        *_unused_keys(settings),
+        *calibration.contradictions,
+        *run.warnings,
+        *calibration.unmet,
+    ]
     effective = _with_data(settings, recordings)
     with output_folder(out, RESULT_FILES, force) as folder:
         write_result(

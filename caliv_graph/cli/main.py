@@ -29,6 +29,7 @@ from caliv_graph.cli.merge import merge
 from caliv_graph.cli.observability import observability
 from caliv_graph.cli.plan import plan
 from caliv_graph.cli.simulate import simulate
+from caliv_graph.cli.validate import validate
 from caliv_graph.errors import CalivError
 
 _PROGRAM = "caliv-graph"
@@ -56,7 +57,7 @@ def _paragraphs(docstring: str) -> str:
 
 for _command in (
     *(init, simulate, inspect, observability, plan),
-    *(calibrate, evaluate, compare, merge, export),
+    *(calibrate, evaluate, validate, compare, merge, export),
 ):
     app.command(help=_paragraphs(_command.__doc__ or ""))(_command)
 

@@ -85,7 +85,12 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         "merged": [dict(c.provenance) for c in calibrations.values()],
         DRIVES: list(data.sources),
     }
-    draft = replace(first, provenance=provenance, unmet=(), earlier=())
+    contradictions = tuple(
+        dict.fromkeys(t for c in calibrations.values() for t in c.contradictions)
+    )
+    draft = replace(
+        first, provenance=provenance, unmet=(), earlier=(), contradictions=contradictions
+    )
     calibration = _assembled(draft, results, fused, data, disagree)
     warnings = [
         *_disagreements(agreement, len(calibrations)),

@@ -49,6 +49,7 @@ def calibration_table(
         seconds: how long all of it took; None: nothing is said of time.
     """
     parts: list[RenderableType] = [_status_line(calibration)]
+    parts += _sentences("What contradicts what:", calibration.contradictions)
     parts += _titled(
         "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _mountings(calibration)
     )

@@ -414,9 +414,12 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
         places = np.array([[*s.xy_m, z + r] for s, r in zip(stands, rises, strict=True)])
         yaws = np.radians([s.yaw_deg for s in stands])
         if placed.moves:
-            times = np.array([[move.begin_s, move.end_s] for move in placed.moves]).T
-            walkers[name] = Carried(_object_mesh(placed), *times, places, yaws)
-            walkers[f"who carries {name}"] = Carried(person(), *times, places, yaws, carrier=True)
+            begins = np.array([move.begin_s for move in placed.moves])
+            ends = np.array([move.end_s for move in placed.moves])
+            walkers[name] = Carried(_object_mesh(placed), begins, ends, places, yaws)
+            walkers[f"who carries {name}"] = Carried(
+                person(), begins, ends, places, yaws, carrier=True
+            )
         else:
             T_map_object = gtsam.Pose3(gtsam.Rot3.Yaw(float(yaws[0])), places[0])
             meshes[name] = _object_mesh(placed).moved(T_map_object)

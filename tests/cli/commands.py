@@ -17,7 +17,8 @@ sys.path.insert(0, {root!r})
 from tests.samples import make_calibration, make_solution, unseen
 def run_of(calibration, warnings=()):
     return types.SimpleNamespace(
-        calibration=calibration, solution=make_solution(), observations=(), warnings=warnings
+        calibration=calibration, solution=make_solution(), observations=(), warnings=warnings,
+        evidence=None,
     )
 {pipeline}
 module = types.ModuleType("caliv_graph.pipeline")

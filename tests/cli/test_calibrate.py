@@ -41,7 +41,10 @@ class Pipeline:
         with progress.stage("solving", 2) as advance:
             advance(2, "converged")
         return types.SimpleNamespace(
-            calibration=self.calibration, solution=make_solution(), warnings=self.warnings
+            calibration=self.calibration,
+            solution=make_solution(),
+            warnings=self.warnings,
+            evidence=None,
         )
 
 

@@ -1,0 +1,116 @@
+"""`caliv-graph validate`: alignment before and after, on structure that calibration did not use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caliv_graph.cli import streams
+from caliv_graph.cli.exits import INCONSISTENT, UNMET
+
+
+def validate(
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION.yaml", help="A result of 'calibrate'.")
+    ],
+    config: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CONFIG.yaml", help="The config: initial guesses, topics, target and ground."
+        ),
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            metavar="PATH",
+            help="The drive, instead of data.path of the config: the one that was calibrated, or "
+            "another of the same vehicle.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for validation.json and .html."),
+    ] = None,
+    repeat: Annotated[
+        bool,
+        typer.Option(
+            "--repeat/--no-repeat",
+            help="Calibrate the two halves of the drive as well, and compare them.",
+        ),
+    ] = True,
+    p_value: Annotated[
+        float,
+        typer.Option(
+            "--p-value",
+            min=1e-12,
+            max=0.5,
+            help="Chance of a false alarm of the comparison of the halves, over all its tests.",
+        ),
+    ] = 0.01,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older result.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document: metres and radians.")
+    ] = False,
+) -> None:
+    """Validate a calibration on walls, poles and objects that it did not use.
+
+    The clouds of all LiDARs are brought into the map, before and after: with the initial guesses of
+    the config, and with the calibration. The target is left out, and the ground, unless the config
+    says 'ground: {use: false}'. Measured are how far the LiDARs have the same wall or pole apart,
+    how thick walls and poles are, for all LiDARs and for each alone, and what noise, trajectory and
+    the calibration's sigmas lead one to expect. DIR gets validation.json and validation.html, with
+    pictures.
+
+    Exit code 3: there is nothing to validate on. Exit code 4: what remains is more than noise,
+    trajectory and sigmas explain, by more than 5 sigma.
+
+    Example: caliv-graph validate result/calibration.yaml config.yaml --data drive/ --out checked/
+    """
+    import json
+
+    from caliv_graph.config import load_config
+    from caliv_graph.files import check_output_folder, output_folder
+    from caliv_graph.readers import open_recording
+    from caliv_graph.repeatability import split_halves
+    from caliv_graph.report.validation import validation_document, validation_table
+    from caliv_graph.results import read_calibration, without_infinities
+    from caliv_graph.validation import validate as validate_calibration
+
+    content = ("validation.json", "validation.html")
+    settings = load_config(config)
+    result = read_calibration(calibration)
+    if out is not None:
+        # Nobody should wait for a result that then has no place to go.
+        check_output_folder(out, content, force)
+    recording = open_recording(settings, data)
+    repeated = None
+    with streams.progress_on_stdout(as_json) as progress:
+        motion = recording.motion()
+        found = validate_calibration(recording, result, settings, progress, motion)
+        if repeat:
+            repeated = split_halves(recording, settings, progress, p_value, motion)
+    document = without_infinities(validation_document(found, repeated, p_value))
+    if out is not None:
+        from caliv_graph.report.validation_page import render_validation
+
+        page = render_validation(found, repeated, p_value)
+        with output_folder(out, content, force) as folder:
+            text = json.dumps(document, indent=2, allow_nan=False)
+            (folder / content[0]).write_text(f"{text}\n", encoding="utf-8")
+            (folder / content[1]).write_text(page, encoding="utf-8")
+    if as_json:
+        streams.show_json(document)
+    else:
+        streams.show(validation_table(found, repeated, p_value))
+        if out is not None:
+            streams.say(f"Written to {out}")
+    streams.warn(found.warnings)
+    if not found.has_structure:
+        streams.warn(found.verdict.sentences)
+        raise typer.Exit(UNMET)
+    if found.verdict.contradicts:
+        streams.warn([f"{calibration}: {found.verdict.sentences[1]}"])
+        raise typer.Exit(INCONSISTENT)

@@ -1,0 +1,92 @@
+"""A recording that remembers a little of what was read from it, for pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from caliv_graph.products import IntArray, LidarScan, MotionData, Recording
+
+SCANS = 12
+"""Of one LiDAR over a drive: enough to see whether a wall stands once or twice."""
+
+POINTS = 1500
+"""Of one scan."""
+
+CELL_M = 0.25
+"""Of the grid that points are thinned on: most of them lie on the ground near the vehicle."""
+
+RANGE_M = 40.0
+"""Farther points would only make the picture small."""
+
+
+class SampledRecording:
+    """Passes a recording on, and keeps a few thinned clouds of each LiDAR as they go by.
+
+    Nothing is read twice, and memory stays bounded: `SCANS` clouds of `POINTS` points per LiDAR.
+
+    Attributes:
+        recording: what is passed on.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self._kept: dict[tuple[str, int], LidarScan] = {}
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages: the path."""
+        return self.recording.name
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """LiDARs of the config, in the config's order."""
+        return self.recording.lidars
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """Stamps of the clouds of one LiDAR, ascending, without reading a cloud."""
+        return self.recording.scan_stamps_ns(lidar)
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in order of their stamps; see `Recording`."""
+        stamps = self.scan_stamps_ns(lidar)
+        begin, end = (stamps[0], stamps[-1]) if len(stamps) else (0, 0)
+        for scan in self.recording.scans(lidar, wanted):
+            # One of each twelfth of the drive, the first that is read at all.
+            part = min(SCANS * (scan.stamp_ns - begin) // max(end - begin, 1), SCANS - 1)
+            if (lidar, part) not in self._kept:
+                self._kept[lidar, part] = thinned(scan)
+            yield scan
+
+    def motion(self) -> MotionData:
+        """What the recording tells of the vehicle's motion, read in one pass."""
+        return self.recording.motion()
+
+    def warnings(self) -> Sequence[str]:
+        """What was left out so far, and why, a line each."""
+        return self.recording.warnings()
+
+    def kept(self) -> tuple[LidarScan, ...]:
+        """The thinned clouds, by LiDAR and stamp."""
+        return tuple(self._kept[key] for key in sorted(self._kept))
+
+
+def thinned(scan: LidarScan) -> LidarScan:
+    """At most `POINTS` points of a cloud, one per cell of a grid, with their times.
+
+    The same cloud gives the same points.
+    """
+    near = np.flatnonzero(np.linalg.norm(scan.points_lidar, axis=1) <= RANGE_M)
+    cells = np.floor(scan.points_lidar[near] / CELL_M).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    some: IntArray = near[np.sort(first)]
+    if len(some) > POINTS:
+        some = some[np.sort(np.random.default_rng(0).choice(len(some), POINTS, replace=False))]
+    times = scan.point_times_s
+    return replace(
+        scan,
+        points_lidar=scan.points_lidar[some],
+        point_times_s=None if times is None else times[some],
+    )

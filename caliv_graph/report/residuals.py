@@ -1,0 +1,267 @@
+"""What did not fit, by kind of measurement, and which clouds were believed less, and why."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.robust import DOF, explained_part
+from caliv_graph.config import RobustConfig
+from caliv_graph.products import Array, IntArray, Solution
+from caliv_graph.report.evidence import Evidence
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+NOTABLE_WEIGHT = 0.9
+"""Clouds below this weight are listed."""
+
+_MRAD, _MM, _MM_S = ("mrad", 1e3), ("mm", 1e3), ("mm/s", 1e3)
+
+_SOLUTION_KINDS = {
+    "xd": ("given poses, white part", {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)}),
+    "dd": (
+        "given poses, change of the slow part",
+        {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)},
+    ),
+    "xeg": ("ground, as the LiDARs see it", {"tilt": (_MRAD, 0, 2), "distance": (_MM, 2, 3)}),
+    "xgh": ("ground, height of the vehicle above it", {"height": (_MM, 0, 1)}),
+    "xgp": ("ground, vehicle parallel to it", {"tilt": (_MRAD, 0, 2)}),
+}
+"""By the letters of a factor's keys: what it is called, and where its residual holds what."""
+
+_TRAJECTORY_KINDS = {
+    "gnss": ("GNSS fixes", {"position": (_MM, 0, 3)}),
+    "orientation": ("orientation", {"rotation": (_MRAD, 0, 3)}),
+    "velocity": ("velocity", {"velocity": (_MM_S, 0, 3)}),
+    "imu": (
+        "IMU, preintegrated between nodes",
+        {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6), "velocity": (_MM_S, 6, 9)},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one kind of measurement at the estimate.
+
+    Attributes:
+        kind: what was measured.
+        whitened: (n, k), by the noise that was assumed: N(0, 1) if it was right, and the narrower
+            the more of the measurements the fit used up.
+        physical: quantity -> (unit, (m,) values in it).
+    """
+
+    kind: str
+    whitened: Array
+    physical: Mapping[str, tuple[str, Array]]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the whitened residuals."""
+        return float(np.sqrt(np.mean(self.whitened**2)))
+
+    @property
+    def beyond_three(self) -> float:
+        """Part of the whitened residuals beyond three sigma; 0.0027 of a normal distribution."""
+        return float(np.mean(np.abs(self.whitened) > 3.0))
+
+
+@dataclass(frozen=True)
+class CloudVerdict:
+    """A cloud of a target that was believed less than the others.
+
+    Attributes:
+        lidar: name.
+        target: name of the placement.
+        drive: index of the drive.
+        stamp_ns: stamp of the scan.
+        source: what to call the scan.
+        weight: its robust weight, 1 full and 0 dropped.
+        turn_rad: length of its rotation residual.
+        shift_m: length of its position residual, at the target.
+        reason: why, as a person says it.
+    """
+
+    lidar: str
+    target: str
+    drive: int
+    stamp_ns: int
+    source: str
+    weight: float
+    turn_rad: float
+    shift_m: float
+    reason: str
+
+
+def figures_of(value: float) -> str:
+    """A number to two significant figures, never with an exponent unless it is very small."""
+    value = float(value)
+    if abs(value) >= 100.0:
+        return f"{value:.0f}"
+    return f"{value:.2g}"
+
+
+def solution_residuals(solution: Solution) -> tuple[Residuals, ...]:
+    """Residuals of the calibration's graph, by kind: clouds, given poses, ground.
+
+    Clouds that were dropped are left out; those that were weighed down are there, unweighed.
+    """
+    found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
+    for index in range(solution.graph.size()):
+        factor = solution.graph.at(index)
+        keys = factor.keys()
+        letters = "".join(chr(gtsam.symbolChr(key)) for key in keys).replace("s", "")
+        if letters in _SOLUTION_KINDS:
+            found[letters].append(factor)
+    out = [_of_clouds(solution)]
+    out += [
+        _of_factors(*_SOLUTION_KINDS[letters], found[letters], solution.values)
+        for letters in _SOLUTION_KINDS
+        if letters in found
+    ]
+    return tuple(r for r in out if len(r.whitened))
+
+
+def trajectory_residuals(trajectory: SmoothedTrajectory) -> tuple[Residuals, ...]:
+    """Residuals of a smoothed trajectory, by sensor. Dropped GNSS fixes are not among them."""
+    found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
+    for index, kind in enumerate(trajectory.factor_kinds):
+        found[kind].append(trajectory.graph.at(index))
+    return tuple(
+        _of_factors(*_TRAJECTORY_KINDS[kind], found[kind], trajectory.values)
+        for kind in _TRAJECTORY_KINDS
+        if kind in found
+    )
+
+
+def all_residuals(solution: Solution, evidence: Evidence) -> tuple[Residuals, ...]:
+    """Of the calibration's graph and of every smoothed trajectory."""
+    out = list(solution_residuals(solution))
+    for name, trajectory in zip(evidence.drives, evidence.trajectories, strict=True):
+        if isinstance(trajectory, SmoothedTrajectory):
+            for r in trajectory_residuals(trajectory):
+                kind = f"{r.kind} (recording '{name}')" if len(evidence.drives) > 1 else r.kind
+                out.append(replace(r, kind=kind))
+    return tuple(out)
+
+
+def gnss_residuals(trajectory: SmoothedTrajectory) -> tuple[IntArray, Array]:
+    """Stamps (k,) of the nodes that fixes belong to, and residuals (k, 3) in metres, map axes."""
+    nodes, residuals = [], []
+    for index, kind in enumerate(trajectory.factor_kinds):
+        if kind == "gnss":
+            factor = trajectory.graph.at(index)
+            nodes.append(gtsam.symbolIndex(factor.keys()[0]))
+            residuals.append(_errors(factor, trajectory.values)[1])
+    stamps = trajectory.nodes_ns[np.array(nodes, dtype=np.int64)]
+    return stamps, np.array(residuals).reshape(-1, 3)
+
+
+def cloud_residuals(solution: Solution, placement: int) -> Array:
+    """(J, 6) residuals of a placement's clouds, rad and m, target frame: the whitening undone."""
+    information = solution.registrations[placement].information
+    root = np.linalg.cholesky(information / solution.registration_scale**2)
+    white = solution.residuals[placement]
+    return np.asarray(np.linalg.solve(np.swapaxes(root, 1, 2), white[..., None])[..., 0])
+
+
+def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdict, ...]:
+    """The clouds whose weight is below `NOTABLE_WEIGHT`, the least believed first."""
+    out = []
+    for m, registration in enumerate(solution.registrations):
+        r = cloud_residuals(solution, m)
+        explained = (
+            np.ones(len(r))
+            if robust.kernel == "none"
+            else explained_part(registration.inlier_ratio)
+        )
+        typical = float(np.median(registration.inlier_ratio))
+        for j, cloud in enumerate(registration.observation.clouds):
+            weight = float(solution.cloud_weights[m][j])
+            if weight >= NOTABLE_WEIGHT:
+                continue
+            reasons = []
+            if explained[j] < 1.0:
+                reasons.append(
+                    f"only {registration.inlier_ratio[j]:.0%} of its points lie on the target, "
+                    f"{typical:.0%} of a typical cloud's"
+                )
+            reasons += _misfit(weight / max(float(explained[j]), 1e-9), robust)
+            out.append(
+                CloudVerdict(
+                    cloud.lidar,
+                    registration.observation.name,
+                    cloud.drive,
+                    cloud.stamp_ns,
+                    cloud.source,
+                    weight,
+                    float(np.linalg.norm(r[j, :3])),
+                    float(np.linalg.norm(r[j, 3:])),
+                    "; ".join(reasons),
+                )
+            )
+    return tuple(sorted(out, key=lambda cloud: cloud.weight))
+
+
+def _misfit(part: float, robust: RobustConfig) -> list[str]:
+    """Why the kernel took a cloud's weight down to `part`, if it did."""
+    if part > 0.99:
+        return []
+    if robust.kernel == "huber":
+        bend = robust.huber_k * math.sqrt(DOF)
+        return [
+            f"its pose is off by {bend / part:.1f} sigma ({DOF} degrees of freedom; full weight up "
+            f"to {bend:.1f})"
+        ]
+    if robust.kernel == "tls":
+        return [
+            "its pose is off by more than chance explains (robust.tls_p_value "
+            f"{robust.tls_p_value:g})"
+        ]
+    return [f"among the {robust.trim_percent:g} percent whose pose fits worst"]
+
+
+def _of_clouds(solution: Solution) -> Residuals:
+    white, physical = [np.zeros((0, 6))], [np.zeros((0, 6))]
+    for m, weights in enumerate(solution.cloud_weights):
+        used = weights > 0.01
+        white.append(solution.residuals[m][used])
+        physical.append(cloud_residuals(solution, m)[used])
+    r = np.concatenate(physical)
+    return Residuals(
+        "target clouds, pose of each",
+        np.concatenate(white),
+        {"rotation": ("mrad", 1e3 * r[:, :3].ravel()), "position": ("mm", 1e3 * r[:, 3:].ravel())},
+    )
+
+
+def _of_factors(
+    kind: str,
+    parts: Mapping[str, tuple[tuple[str, float], int, int]],
+    factors: Sequence[gtsam.NonlinearFactor],
+    values: gtsam.Values,
+) -> Residuals:
+    pairs = [_errors(factor, values) for factor in factors]
+    white, raw = (np.array(errors) for errors in zip(*pairs, strict=True))
+    return Residuals(
+        kind,
+        white,
+        {
+            name: (unit, scale * raw[:, first:last].ravel())
+            for name, ((unit, scale), first, last) in parts.items()
+        },
+    )
+
+
+def _errors(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> tuple[Array, Array]:
+    """Residual of a factor, whitened and as it is."""
+    if isinstance(factor, gtsam.NoiseModelFactor):
+        return factor.whitenedError(values), factor.unwhitenedError(values)
+    # Linear ones know no errors of their own; the right-hand side is what is left to do.
+    linear = factor.linearize(values)
+    assert isinstance(linear, gtsam.JacobianFactor)
+    return -linear.jacobian()[1], -linear.jacobianUnweighted()[1]

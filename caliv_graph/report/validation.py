@@ -1,0 +1,316 @@
+"""A validation as tables and as plain values. Millimetres exist in the tables only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from caliv_graph.fusion.compare import Comparison
+from caliv_graph.repeatability import Repeatability
+from caliv_graph.report.comparison import comparison_document
+from caliv_graph.report.tables import _sentences, _table, _titled
+from caliv_graph.validation.surfaces import Pole, Thing, Wall
+from caliv_graph.validation.validate import (
+    AFTER,
+    BEFORE,
+    STAGES,
+    Pair,
+    SurfaceResult,
+    ThingResult,
+    Validation,
+)
+
+_UNTOLD = "-"
+
+MOST_SHOWN = 12
+"""Surfaces in the table; the JSON document has all."""
+
+
+def validation_table(found: Validation, repeated: Repeatability | None, p_value: float) -> Group:
+    """Distances between LiDARs, thicknesses, objects, repeatability, and the verdict.
+
+    Args:
+        found: the validation.
+        repeated: split-half repeatability, if it was asked for.
+        p_value: limit of the tests in it.
+    """
+    parts: list[RenderableType] = []
+    for title, headings, rows in tables(found):
+        table = _table(*headings)
+        for row in rows:
+            table.add_row(*map(Text, row))
+        parts += _titled(title, table)
+    if repeated is not None:
+        parts += _sentences("Split-half repeatability:", repeatability_sentences(repeated, p_value))
+    style = "bold green"
+    if not found.has_structure:
+        style = "bold yellow"
+    elif found.verdict.contradicts or (found.verdict.better or 1.0) < 1.0:
+        style = "bold red"
+    parts.append("")
+    parts += [Text(sentence, style=style) for sentence in found.verdict.sentences]
+    return Group(*parts)
+
+
+def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The tables, as title, headings and rows of text."""
+    out: list[tuple[str, list[str], list[list[str]]]] = []
+    if found.pairs:
+        rows = []
+        for pair in found.pairs:
+            a, b = pair.lidars
+            values = [_mm(pair.distance_m.get(stage)) for stage in STAGES]
+            expected = _mm(pair.expected_m if pair.surfaces else None)
+            clouds = [_mm(pair.cloud_m[stage]) for stage in (BEFORE, AFTER)]
+            overlap = " / ".join(f"{100.0 * pair.overlap[s]:.0f}" for s in (BEFORE, AFTER))
+            rows.append([f"{a} to {b}", str(pair.surfaces), *values, expected, *clouds, overlap])
+        headings = ["", "walls,\npoles", "before\nmm", "after\nmm", "best\nmm", "expected\nmm"]
+        headings += ["cloud\nbefore mm", "cloud\nafter mm", "overlap\n%"]
+        out.append(
+            ("Distance between LiDARs: on walls and poles, and from cloud to cloud", headings, rows)
+        )
+    if found.surfaces:
+        rows = [["merged", *_stages(found.thickness_m), _mm(found.expected_thickness_m)]]
+        rows += [
+            [
+                f"{name} alone",
+                *(_mm(found.alone_m[stage].get(name)) for stage in STAGES),
+                _mm(found.expected_alone_m.get(name)),
+            ]
+            for name in found.lidars
+        ]
+        headings = ["", "before\nmm", "after\nmm", "best\nmm", "expected\nmm"]
+        out.append(("Thickness of walls and poles, RMS", headings, rows))
+        headings = ["", "at x y\nm", "size\nm", "points", "thick\nbefore mm", "thick\nafter mm"]
+        headings += ["apart\nbefore mm", "apart\nafter mm", "expected\nmm"]
+        shown = found.surfaces[:MOST_SHOWN]
+        title = f"The {len(shown)} largest of {len(found.surfaces)} walls and poles"
+        out.append((title, headings, [_surface_row(s) for s in shown]))
+    if found.things:
+        headings = ["", "at x y\nm", "size\nm", "points", "apart\nbefore mm", "apart\nafter mm"]
+        rows = [_thing_row(t) for t in found.things[:MOST_SHOWN]]
+        out.append(
+            (
+                "Objects: mean distance from the other LiDAR's nearest point",
+                [*headings, "best\nmm"],
+                rows,
+            )
+        )
+    return out
+
+
+def repeatability_sentences(repeated: Repeatability, p_value: float) -> list[str]:
+    """What the halves of the drive say of each other."""
+    comparison = repeated.comparison
+    if comparison is None:
+        return [f"not done: {repeated.reason}"]
+    first, second = repeated.halves
+    out = [f"{first} against {second}, largest differences along determined axes:"]
+    for movement in comparison.movements:
+        name = " to ".join(movement.lidars)
+        if not movement.dof:
+            out.append(f"{name}: no direction that both halves determine")
+            continue
+        kinds = []
+        for axes, unit in ((slice(3, 6), "mm"), (slice(0, 3), "mrad")):
+            told = [
+                (abs(d), s)
+                for d, s, t in zip(
+                    movement.movement[axes], movement.sigma[axes], movement.told[axes], strict=True
+                )
+                if t
+            ]
+            if told:
+                d, s = max(told)
+                kinds.append(f"{1e3 * d:.2f} {unit} (sigma {1e3 * s:.2f})")
+        kind = "S2S" if len(movement.lidars) == 2 else "S2V"
+        out.append(
+            f"{kind} {name}: {', '.join(kinds) or 'only mixed directions'}; chi2 "
+            f"{movement.chi2:.1f} of {movement.dof} dof, p {movement.p_value:.2g}"
+        )
+    out.append(_repeats(comparison, p_value))
+    if not repeated.by_passes:
+        out.append(
+            "such halves share the errors of the trajectory: two drives would agree less; a drive "
+            "that passes the target twice would tell more"
+        )
+    return out
+
+
+def _repeats(comparison: Comparison, p_value: float) -> str:
+    if not any(m.dof for m in comparison.movements):
+        return "the halves have no direction in common that both determine"
+    together = f"all at once: chi2 {comparison.chi2:.1f} of {comparison.dof} dof"
+    if comparison.moved:
+        return (
+            f"the halves differ by more than their sigmas explain ({together}; limit p {p_value:g} "
+            "over all tests)"
+        )
+    return f"the halves agree within their sigmas ({together}; limit p {p_value:g} over all tests)"
+
+
+def validation_document(
+    found: Validation, repeated: Repeatability | None, p_value: float
+) -> dict[str, Any]:
+    """A validation in plain values: metres; null where nothing can be said."""
+    verdict = found.verdict
+    document: dict[str, Any] = {
+        "drive": found.drive,
+        "structure": found.has_structure,
+        "verdict": {
+            "text": " ".join(verdict.sentences),
+            "better": verdict.better,
+            "measure": verdict.measure if found.surfaces else None,
+            "of_expected": verdict.of_expected,
+            "chi2": verdict.chi2 if verdict.dof else None,
+            "dof": verdict.dof,
+            "p_value": verdict.p_value,
+            "contradicts": verdict.contradicts,
+        },
+        "scans": dict(found.scans),
+        "pairs": [
+            {
+                "from": pair.lidars[0],
+                "to": pair.lidars[1],
+                "surfaces": pair.surfaces,
+                "distance_m": {s: pair.distance_m.get(s) for s in STAGES},
+                "expected_distance_m": pair.expected_m if pair.surfaces else None,
+                "cloud_to_cloud_m": dict(pair.cloud_m),
+                "overlap": dict(pair.overlap),
+            }
+            for pair in found.pairs
+        ],
+        "thickness_m": {
+            "merged": {s: v if found.surfaces else None for s, v in found.thickness_m.items()},
+            "expected_merged": found.expected_thickness_m if found.surfaces else None,
+            "lidars": {
+                name: {
+                    **{stage: found.alone_m[stage].get(name) for stage in STAGES},
+                    "expected": found.expected_alone_m.get(name),
+                }
+                for name in found.lidars
+            },
+        },
+        "surfaces": [_surface_document(surface) for surface in found.surfaces],
+        "objects": [_thing_document(thing) for thing in found.things],
+        "repeatability": None,
+    }
+    if repeated is not None:
+        comparison = repeated.comparison
+        document["repeatability"] = {
+            "halves": list(repeated.halves),
+            "by_passes": repeated.by_passes,
+            "not_done": repeated.reason or None,
+            "agree": None if comparison is None else not comparison.moved,
+            "comparison": None
+            if comparison is None
+            else comparison_document(comparison, repeated.halves, p_value),
+        }
+    return document
+
+
+def _surface_document(found: SurfaceResult) -> dict[str, Any]:
+    x, y, size = place_of(found.surface)
+    return {
+        "name": found.name,
+        "xy_map_m": [x, y],
+        "size_m": list(size),
+        "points": dict(found.points),
+        "thickness_m": {s: t.merged for s, t in found.thickness.items()},
+        "expected_thickness_m": found.expected.merged,
+        "alone_m": {s: dict(t.alone) for s, t in found.thickness.items()},
+        "pairs": [
+            {
+                "from": a,
+                "to": b,
+                "distance_m": {
+                    s: apart[a, b].distance_m if (a, b) in apart else None
+                    for s, apart in found.apart.items()
+                },
+                "expected_distance_m": found.expected.distance_m.get((a, b)),
+            }
+            for a, b in _pairs_of(found)
+        ],
+    }
+
+
+def _thing_document(found: ThingResult) -> dict[str, Any]:
+    x, y, size = place_of(found.thing)
+    return {
+        "name": found.name,
+        "xy_map_m": [x, y],
+        "size_m": list(size),
+        "points": dict(found.points),
+        "pairs": [
+            {
+                "from": a,
+                "to": b,
+                "distance_m": {s: d.get((a, b)) for s, d in found.distance_m.items()},
+            }
+            for a, b in found.distance_m[AFTER]
+        ],
+    }
+
+
+def place_of(surface: Wall | Pole | Thing) -> tuple[float, float, tuple[float, ...]]:
+    """Where something is in the map, x and y in metres, and its sizes.
+
+    Length and width of a wall; diameter and height of a pole; width of an object.
+    """
+    if isinstance(surface, Wall):
+        return float(surface.centre[0]), float(surface.centre[1]), surface.extent_m
+    if isinstance(surface, Pole):
+        x, y = (float(v) for v in surface.foot)
+        return x, y, (2.0 * surface.radius_m, surface.height_m)
+    return float(surface.centre[0]), float(surface.centre[1]), (surface.extent_m,)
+
+
+def _pairs_of(found: SurfaceResult) -> list[Pair]:
+    return list(found.apart[AFTER])
+
+
+def _surface_row(found: SurfaceResult) -> list[str]:
+    x, y, size = place_of(found.surface)
+    pairs = _pairs_of(found)
+    apart = [
+        _lines(_mm(found.apart[s][p].distance_m if p in found.apart[s] else None) for p in pairs)
+        for s in (BEFORE, AFTER)
+    ]
+    return [
+        found.name,
+        f"{x:.1f} {y:.1f}",
+        " x ".join(f"{v:.2f}" for v in size),
+        _lines(str(n) for n in found.points.values()),
+        _mm(found.thickness[BEFORE].merged),
+        _mm(found.thickness[AFTER].merged),
+        *apart,
+        _lines(_mm(found.expected.distance_m.get(p)) for p in pairs),
+    ]
+
+
+def _thing_row(found: ThingResult) -> list[str]:
+    x, y, size = place_of(found.thing)
+    pairs = list(found.distance_m[AFTER])
+    return [
+        found.name,
+        f"{x:.1f} {y:.1f}",
+        " x ".join(f"{v:.2f}" for v in size),
+        _lines(str(n) for n in found.points.values()),
+        *(_lines(_mm(found.distance_m[s].get(p)) for p in pairs) for s in STAGES),
+    ]
+
+
+def _stages(values: Mapping[str, float]) -> list[str]:
+    return [_mm(values[stage]) for stage in STAGES]
+
+
+def _lines(texts: Any) -> str:
+    shown: Sequence[str] = list(texts)
+    return "\n".join(shown) or _UNTOLD
+
+
+def _mm(value: float | None) -> str:
+    return _UNTOLD if value is None else f"{1e3 * value:.1f}"

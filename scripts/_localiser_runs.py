@@ -1,0 +1,275 @@
+"""Drives of the localiser example: what is simulated, run, measured and kept of each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config import Mounting
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.files import atomic_write
+from caliv_graph.geometry.se3 import (
+    pose_from_mounting,
+    retract_vehicle_axes,
+    rpy,
+    vehicle_axes_difference,
+)
+from caliv_graph.products import Array, Calibration, LidarScan, MotionData
+from caliv_graph.results import read_calibration
+from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive
+from caliv_graph.simulation.scenario import Scenario, StandstillDrive, dump_scenario
+from caliv_graph.simulation.worlds import World
+from scripts import _localiser
+from scripts._localiser import Localiser, Mountings, Track, make_map
+
+KEYFRAME_S = 0.5
+"""Between keyframes. The LiDARs take turns: scans taken together would share the heave."""
+
+SEED_OF_DRIVES = 10_000
+"""Added to the seeds, so that no drive shares its noise with one that was calibrated on."""
+
+VARIANTS = {
+    "initial": "initial guess, constants",
+    "calibrated": "calibrated, constants",
+    "priors": "calibrated, priors refined on line",
+}
+
+Run = dict[str, Any]
+"""Of one localiser on one drive, plain values only."""
+
+
+class KnockedRecording:
+    """A drive in the middle of which a mount is knocked; otherwise the same, noise included."""
+
+    def __init__(
+        self, scenario: Scenario, seed: int, lidar: str, turn_rad: Array, after_s: float
+    ) -> None:
+        """Simulates both halves.
+
+        Args:
+            scenario: the drive.
+            seed: of all that is drawn.
+            lidar: whose mount is knocked.
+            turn_rad: (3,) rotation vector about the LiDAR's own origin, vehicle axes.
+            after_s: seconds since the start of the drive.
+        """
+        self._before = simulate_drive(scenario, seed)
+        self.knock_ns = self._before.truth.start_ns + round(after_s * NANOSECONDS_PER_SECOND)
+        mount = self._before.truth.T_vehicle_lidar[lidar]
+        moved = retract_vehicle_axes(mount, np.concatenate([turn_rad, np.zeros(3)]))
+        x, y, z = (float(v) for v in moved.translation())
+        roll, pitch, yaw = (float(v) for v in np.degrees(rpy(moved.rotation().matrix())))
+        model = scenario.lidars[lidar].model_copy(
+            update={"mounting": Mounting(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))}
+        )
+        knocked = scenario.model_copy(update={"lidars": {**scenario.lidars, lidar: model}})
+        self._after = simulate_drive(knocked, seed)
+
+    @property
+    def truth(self) -> SimulatedTruth:
+        """What is true up to the knock; of the vehicle's poses, throughout."""
+        return self._before.truth
+
+    @property
+    def world(self) -> World:
+        """What stands around."""
+        return self._before.world
+
+    def motion(self) -> MotionData:
+        """IMU, GNSS and velocity."""
+        return self._before.motion()
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        """Stamps of the clouds of one LiDAR, ascending."""
+        return self._before.scan_stamps_ns(lidar)
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        """The clouds of one LiDAR in order of their stamps."""
+        stamps = [s for s in self.scan_stamps_ns(lidar) if wanted is None or s in wanted]
+        before = {s for s in stamps if s < self.knock_ns}
+        yield from self._before.scans(lidar, before)
+        yield from self._after.scans(lidar, set(stamps) - before)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is run of a seed.
+
+    Attributes:
+        scenario: the drive.
+        calibration: of the vehicle; from whichever drives.
+        knock_deg: how far a mount is turned; 0: no such drive.
+        draw: whether the errors of the calibration are drawn anew, from what it says of them, or
+            stay those that it has.
+    """
+
+    scenario: Scenario
+    calibration: Path
+    knock_deg: float
+    draw: bool
+
+    def digest(self) -> str:
+        """Of all that the outcome depends on, this project's estimator aside."""
+        text = hashlib.sha256(dump_scenario(self.scenario).encode())
+        text.update(self.calibration.read_bytes())
+        text.update(repr((self.knock_deg, self.draw)).encode())
+        monitor = Path(_localiser.__file__).parents[1] / "caliv_graph" / "fusion" / "monitor.py"
+        for source in (Path(__file__), Path(_localiser.__file__), monitor):
+            text.update(source.read_bytes())
+        return text.hexdigest()[:16]
+
+
+def cached_runs(task: Task, seed: int, folder: Path) -> dict[str, Run]:
+    """The runs of a seed: those kept in `folder`, or made now."""
+    path = folder / f"seed-{seed}-{task.digest()}.json"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, json.dumps(runs(task, seed)))
+    found: dict[str, Run] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def runs(task: Task, seed: int) -> dict[str, Run]:
+    """All localisers on the drive of a seed, and the last one with a knocked mount."""
+    recording = simulate_drive(task.scenario, SEED_OF_DRIVES + seed)
+    calibration = read_calibration(task.calibration)
+    if task.draw:
+        calibration = drawn(calibration, recording.truth.T_vehicle_lidar, seed)
+    mountings: dict[str, Mountings] = {
+        "initial": {n: pose_from_mounting(guess) for n, guess in recording.guesses.items()},
+        "calibrated": {n: r.T_vehicle_lidar for n, r in calibration.lidars.items()},
+        "priors": calibration,
+    }
+    out = {name: one_run(recording, task.scenario, m) for name, m in mountings.items()}
+    if task.knock_deg > 0.0:
+        out["knocked"] = knocked_run(task, seed, calibration)
+    return out
+
+
+def knocked_run(task: Task, seed: int, calibration: Calibration) -> Run:
+    """The localiser with priors, in mid-drive of which one mount is turned about a random axis."""
+    names = list(task.scenario.lidars)
+    lidar = names[seed % len(names)]
+    axis = np.random.default_rng([seed, 1]).normal(size=3)
+    turn = np.radians(task.knock_deg) * axis / np.linalg.norm(axis)
+    truth = simulate_drive(task.scenario, SEED_OF_DRIVES + seed).truth
+    half_s = 0.5 * (truth.end_ns - truth.start_ns) / NANOSECONDS_PER_SECOND
+    recording = KnockedRecording(task.scenario, SEED_OF_DRIVES + seed, lidar, turn, half_s)
+    run = one_run(recording, task.scenario, calibration)
+    return {**run, "knocked": lidar, "turn": turn.tolist(), "knock_s": half_s}
+
+
+def drawn(calibration: Calibration, truth: Mapping[str, gtsam.Pose3], seed: int) -> Calibration:
+    """A calibration that errs as this one says of itself: drawn about the truth."""
+    values, vectors = np.linalg.eigh(calibration.cov_joint)
+    normal = np.random.default_rng([seed, 0]).normal(size=len(values))
+    error = vectors @ (np.sqrt(np.maximum(values, 0.0)) * normal)
+    return replace(
+        calibration,
+        lidars={
+            name: replace(result, T_vehicle_lidar=truth[name].retract(error[6 * i : 6 * i + 6]))
+            for i, (name, result) in enumerate(calibration.lidars.items())
+        },
+    )
+
+
+def one_run(
+    recording: SimulatedRecording | KnockedRecording, scenario: Scenario, mountings: Mountings
+) -> Run:
+    """A localiser on a drive."""
+    truth = recording.truth
+    drive = scenario.drive
+    standing_s = drive.duration_s if isinstance(drive, StandstillDrive) else drive.standstill_s
+    first_ns = truth.start_ns + round(standing_s * NANOSECONDS_PER_SECOND)
+    localiser = Localiser(
+        recording.motion(),
+        scenario,
+        truth.datum,
+        make_map(recording.world),
+        mountings,
+        first_ns,
+        1.0 / KEYFRAME_S,
+    )
+    for scan in keyframes(recording, list(scenario.lidars), first_ns):
+        localiser.step(scan)
+    return measured(localiser.track, truth)
+
+
+def keyframes(
+    recording: SimulatedRecording | KnockedRecording, names: Sequence[str], first_ns: int
+) -> list[LidarScan]:
+    """A scan every `KEYFRAME_S`, of one LiDAR after the other."""
+    step_ns = round(KEYFRAME_S * NANOSECONDS_PER_SECOND)
+    out: list[LidarScan] = []
+    for i, name in enumerate(names):
+        wanted = {
+            s
+            for s in recording.scan_stamps_ns(name)
+            if s > first_ns
+            and (s - first_ns) % step_ns == 0
+            and (s - first_ns) // step_ns % len(names) == i
+        }
+        out.extend(recording.scans(name, wanted))
+    return sorted(out, key=lambda scan: scan.stamp_ns)
+
+
+def measured(track: Track, truth: SimulatedTruth) -> Run:
+    """What a track is worth, against the truth."""
+    true = truth.T_map_vehicle(np.array(track.stamps_ns))
+    errors = np.array(
+        [vehicle_axes_difference(a, b) for a, b in zip(track.T_map_vehicle, true, strict=True)]
+    )
+    local = np.array(
+        [gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(track.T_map_vehicle, true, strict=True)]
+    )
+    cov = np.array(track.cov)
+    return {
+        "time_s": [(s - truth.start_ns) / NANOSECONDS_PER_SECOND for s in track.stamps_ns],
+        "position_m": np.linalg.norm(errors[:, 3:], axis=1).tolist(),
+        "heading_rad": errors[:, 2].tolist(),
+        "nees": _nees(local, cov, slice(None)),
+        "nees_position": _nees(local, cov, slice(3, 6)),
+        "nees_heading": _nees(local, cov, slice(2, 3)),
+        "nees_registration": _registration_nees(track, truth),
+        "innovations": track.innovations,
+        "left_out": track.left_out,
+        "alarms": [
+            {
+                "lidar": alarm.lidar,
+                "time_s": (alarm.stamp_ns - truth.start_ns) / NANOSECONDS_PER_SECOND,
+                "movement": alarm.movement.tolist(),
+                "sigma": alarm.sigma.tolist(),
+                "scans": alarm.scans,
+                "chi2": alarm.chi2,
+                "alone": alarm.alone,
+            }
+            for alarm in track.alarms
+        ],
+    }
+
+
+def _nees(errors: Array, cov: Array, axes: slice) -> list[float]:
+    """Normalised estimation error squared of some axes, not yet divided by their number."""
+    e, P = errors[:, axes], cov[:, axes, axes]
+    return [float(v) for v in np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0])]
+
+
+def _registration_nees(track: Track, truth: SimulatedTruth) -> list[float]:
+    """Of the registrations alone, against where the LiDARs truly were; not of a knocked mount."""
+    out = []
+    for name, stamp_ns, found in track.registered:
+        (pose,) = truth.T_map_vehicle(np.array([stamp_ns]))
+        heave_m = truth.heave_m[(stamp_ns - truth.start_ns) // (NANOSECONDS_PER_SECOND // 10)]
+        lifted = gtsam.Pose3(pose.rotation(), pose.translation() + np.array([0.0, 0.0, heave_m]))
+        d = gtsam.Pose3.Logmap(
+            found.T_map_lidar.between(lifted.compose(truth.T_vehicle_lidar[name]))
+        )
+        out.append(float(d @ np.linalg.solve(found.cov, d)))
+    return out

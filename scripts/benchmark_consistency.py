@@ -1,0 +1,247 @@
+"""Is a wrong result called wrong, and a right one never? False alarms and faults, from raw sensors.
+
+Needs the environment that scripts/demo makes:
+
+    .venv/bin/python scripts/benchmark_consistency.py --seeds 50
+    .venv/bin/python scripts/benchmark_consistency.py --faults --seeds 3
+    .venv/bin/python scripts/benchmark_consistency.py --summary
+
+Clean drives: seed n is one of the scenarios in turn. Every run draws all that a stated sigma
+covers; none may come out `inconsistent`. Faults, all on figure_eight: stamps of one LiDAR that are
+off, clouds of one LiDAR that lie elsewhere, swapped topics; each has to come out `inconsistent` or,
+where no target is found, as an error. A run is a line in out/consistency/runs.jsonl, written as it
+is done: a second start does what is missing. Runs of another version of the program's text do not
+count unless --any-version is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
+
+import numpy as np
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
+
+from caliv_graph.errors import CalivError  # noqa: E402
+from caliv_graph.pipeline import calibrate  # noqa: E402
+from caliv_graph.products import LidarScan, MotionData, Recording  # noqa: E402
+from caliv_graph.progress import SilentProgress  # noqa: E402
+from caliv_graph.simulation.scenario import load_scenario  # noqa: E402
+from caliv_graph.simulation.thinned import (  # noqa: E402
+    GroundWaves,
+    ThinnedRecording,
+    cached_selection,
+)
+from scripts._tables_rows import config_for  # noqa: E402
+from scripts.benchmark_tables import code_digest  # noqa: E402
+
+OUT = REPOSITORY / "out" / "consistency"
+SCENARIOS = ("figure_eight", "s_curve", "paper_arc", "tri_lidar")
+
+
+@dataclass(frozen=True)
+class Faulty:
+    """A recording with something wrong (products.Recording).
+
+    Attributes:
+        recording: what it is made from.
+        late_ns: per LiDAR, by how much its stamps are late.
+        displaced: per LiDAR, which clouds (number, of how many) lie elsewhere, and by what (metres,
+            lidar frame).
+        source: per LiDAR, whose clouds come under its name.
+    """
+
+    recording: Recording
+    late_ns: Mapping[str, int] = field(default_factory=dict)
+    displaced: Mapping[str, tuple[Callable[[int, int], bool], tuple[float, float, float]]] = field(
+        default_factory=dict
+    )
+    source: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        return self.recording.lidars
+
+    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+        late_ns = self.late_ns.get(lidar, 0)
+        source = self.source.get(lidar, lidar)
+        return [stamp + late_ns for stamp in self.recording.scan_stamps_ns(source)]
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        late_ns = self.late_ns.get(lidar, 0)
+        source = self.source.get(lidar, lidar)
+        stamps = self.recording.scan_stamps_ns(source)
+        number = {stamp: k for k, stamp in enumerate(stamps)}
+        asked = frozenset(s for s in stamps if wanted is None or s + late_ns in wanted)
+        which, by = self.displaced.get(lidar, (_none, (0.0, 0.0, 0.0)))
+        for scan in self.recording.scans(source, asked):
+            shift = np.array(by) * which(number[scan.stamp_ns], len(stamps))
+            yield replace(
+                scan,
+                lidar=lidar,
+                stamp_ns=scan.stamp_ns + late_ns,
+                points_lidar=scan.points_lidar + shift,
+            )
+
+    def motion(self) -> MotionData:
+        return self.recording.motion()
+
+    def warnings(self) -> Sequence[str]:
+        return self.recording.warnings()
+
+
+def _none(number: int, count: int) -> bool:
+    return False
+
+
+def _every_other(number: int, count: int) -> bool:
+    return number % 2 == 0
+
+
+def _second_half(number: int, count: int) -> bool:
+    return 2 * number >= count
+
+
+def _by_chance(number: int, count: int) -> bool:
+    return bool(np.random.default_rng(number).random() < 0.5)
+
+
+FAULTS: dict[str, Callable[[Recording], Recording]] = {
+    "front 0.3 s late": lambda r: Faulty(r, late_ns={"front": 300_000_000}),
+    "rear 0.3 s early": lambda r: Faulty(r, late_ns={"rear": -300_000_000}),
+    "front 0.05 s late": lambda r: Faulty(r, late_ns={"front": 50_000_000}),
+    "every other cloud 0.2 m forward": lambda r: Faulty(
+        r, displaced={"front": (_every_other, (0.2, 0.0, 0.0))}
+    ),
+    "second half 0.2 m forward": lambda r: Faulty(
+        r, displaced={"front": (_second_half, (0.2, 0.0, 0.0))}
+    ),
+    "half, by chance, 0.2 m left": lambda r: Faulty(
+        r, displaced={"front": (_by_chance, (0.0, 0.2, 0.0))}
+    ),
+    "every other cloud 0.2 m up": lambda r: Faulty(
+        r, displaced={"rear": (_every_other, (0.0, 0.0, 0.2))}
+    ),
+    "swapped topics": lambda r: Faulty(r, source={"front": "rear", "rear": "front"}),
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: a scenario, what is wrong with it (empty: nothing), a seed."""
+
+    scenario: str
+    fault: str
+    seed: int
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=12, help="1 to N (default: 12)")
+    parser.add_argument("--faults", action="store_true", help="drives with faults, N of each")
+    parser.add_argument("--summary", action="store_true", help="only print what is there")
+    parser.add_argument("--any-version", action="store_true", help="count runs of older text too")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/consistency)")
+    parser.add_argument(
+        "--beams",
+        type=Path,
+        default=REPOSITORY / "out" / "tables" / "beams",
+        help="folder of the beams that matter, found once per scenario",
+    )
+    asked = parser.parse_args(arguments)
+    path = asked.out / "runs.jsonl"
+    if not asked.summary:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        done = {
+            Task(r["scenario"], r["fault"], r["seed"]) for r in lines_of(path, asked.any_version)
+        }
+        for task in tasks(asked.seeds, faults=asked.faults):
+            if task not in done:
+                line = perform(task, asked.beams)
+                with path.open("a", encoding="utf-8") as file:
+                    file.write(f"{json.dumps(line)}\n")
+                what = task.fault or "clean"
+                print(f"{task.scenario}, {what}, seed {task.seed}: {line['status']}", flush=True)
+    text, failures = summary(lines_of(path, asked.any_version))
+    print(text)
+    return 1 if failures else 0
+
+
+def tasks(seeds: int, *, faults: bool) -> list[Task]:
+    """What there shall be."""
+    if faults:
+        return [Task("figure_eight", f, seed) for seed in range(1, seeds + 1) for f in FAULTS]
+    return [Task(SCENARIOS[(n - 1) % len(SCENARIOS)], "", n) for n in range(1, seeds + 1)]
+
+
+def perform(task: Task, beams: Path) -> dict[str, Any]:
+    """Simulates and calibrates once; the line to write."""
+    model = load_scenario(REPOSITORY / "configs" / "scenarios" / f"{task.scenario}.yaml")
+    selection = cached_selection(model, beams)
+    drive = ThinnedRecording(model, selection, task.seed, waves=GroundWaves())
+    recording: Recording = FAULTS[task.fault](drive) if task.fault else drive
+    line: dict[str, Any] = {
+        "scenario": task.scenario,
+        "fault": task.fault,
+        "seed": task.seed,
+        "code": code_digest(),
+    }
+    try:
+        run = calibrate([recording], config_for(drive, {}), SilentProgress())
+    except CalivError as e:
+        return {**line, "status": "error", "said": [str(e)]}
+    return {
+        **line,
+        "status": run.calibration.status,
+        "said": list(run.calibration.contradictions),
+        "registration_scale": run.solution.registration_scale,
+    }
+
+
+def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
+    """The runs of a file that count; half a line is none."""
+    out = []
+    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        if any_version or line["code"] == code_digest():
+            out.append(line)
+    return out
+
+
+def summary(lines: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
+    """What came of the runs, and how many came out as they should not."""
+    clean = [line for line in lines if not line["fault"]]
+    alarms = [line for line in clean if line["status"] not in ("ok", "partial")]
+    out = [f"clean drives: {len(clean)}, of which {len(alarms)} are called wrong"]
+    for line in alarms:
+        out += [f"  {line['scenario']} seed {line['seed']}: {said}" for said in line["said"]]
+    missed = 0
+    for fault in FAULTS:
+        runs = [line for line in lines if line["fault"] == fault]
+        found = [line for line in runs if line["status"] in ("inconsistent", "error")]
+        missed += len(runs) - len(found)
+        if runs:
+            out.append(f"{fault}: {len(found)} of {len(runs)} are called wrong")
+            out += [f"  {said}" for said in (found[0]["said"] if found else ())]
+    return "\n".join(out), len(alarms) + missed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,6 +12,7 @@ import pytest
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.mixture import (
+    ALONG_SURFACE,
     Responsibilities,
     ShapeQuadratic,
     expect,
@@ -220,13 +221,15 @@ def directions(rng: np.random.Generator, count: int) -> Array:
     return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
 
-def whitened_normals(case: Case) -> Array:
-    """(N, 4, 3) normal of each pair's component, by the root of its weight across the surface."""
+def weight_matrices(case: Case) -> Array:
+    """(N, 4, 3, 3) weight of each pair, across its component and a part of it along."""
     _, _, _, mixture, who = case
-    out = np.empty((*who.component.shape, 3))
+    out = np.empty((*who.component.shape, 3, 3))
     for n, (ks, alphas) in enumerate(zip(who.component, who.alpha, strict=True)):
         for i, (k, a) in enumerate(zip(ks, alphas, strict=True)):
-            out[n, i] = np.sqrt(a / mixture.var_normal[k]) * mixture.normals_target[k]
+            normal = np.outer(mixture.normals_target[k], mixture.normals_target[k])
+            out[n, i] = a * normal / mixture.var_normal[k]
+            out[n, i] += a * ALONG_SURFACE * (np.eye(3) - normal) / mixture.var_tangent[k]
     return out
 
 
@@ -239,8 +242,8 @@ def whitened(case: Case, d: Array) -> Array:
     for k in range(len(mu)):
         n, i = np.nonzero(who.component == k)
         mu[k] = np.average(y[n], axis=0, weights=who.alpha[n, i])
-    offset = y[:, None] - mu[who.component]
-    return np.asarray(np.einsum("nki,nki->nk", whitened_normals(case), offset)).ravel()
+    root = np.linalg.cholesky(weight_matrices(case))
+    return np.asarray(np.einsum("nkji,nkj->nki", root, y[:, None] - mu[who.component])).ravel()
 
 
 def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
@@ -273,8 +276,7 @@ def test_blocks_are_the_information_given_the_shape() -> None:
     # SPEC 3: the sum of alpha J^T W J, J = [-skew(y), I]; -skew(y) by the cross product.
     case = random_case(2)
     stack, R, t, _, _ = case
-    root = whitened_normals(case)
-    W = np.einsum("nki,nkj->nij", root, root)
+    W = weight_matrices(case).sum(axis=1)
     expected = np.zeros((3, 6, 6))
     for n, j in enumerate(stack.cloud):
         y = R[j] @ stack.points[n] + t[j]
@@ -284,17 +286,18 @@ def test_blocks_are_the_information_given_the_shape() -> None:
     assert blocks == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
-def test_where_points_lie_along_a_surface_says_nothing() -> None:
+def test_isotropic_components_have_the_paper_s_information() -> None:
+    # Where a component is no surface, W = alpha / s^2: that of a shift is the count over s^2.
     stack, R, t, mixture, who = random_case(3)
-    flat = replace(mixture, normals_target=np.tile([0.0, 0.0, 1.0], (8, 1)))
-    quadratic = shape_quadratic(stack, R, t, flat, who)
-    # Shifts in the plane and a turn in it: yaw, x, y.
-    for kept, lost in ((slice(0, 2), slice(2, 5)), (slice(5, 6), slice(2, 5))):
-        assert np.abs(quadratic.blocks[:, kept, kept]).min() > 0.0
-        assert quadratic.blocks[:, lost] == pytest.approx(0.0, abs=1e-6)
-    assert quadratic.gradient[:, 2:5] == pytest.approx(0.0, abs=1e-9)
-    weight = (who.alpha / mixture.var_normal[who.component]).sum(axis=1)
-    assert quadratic.blocks[:, 5, 5] == pytest.approx(stack.sum_per_cloud(weight))
+    even = replace(
+        mixture,
+        var_normal=np.full(8, 0.02**2),
+        var_tangent=np.full(8, ALONG_SURFACE * 0.02**2),
+    )
+    blocks = shape_quadratic(stack, R, t, even, who).blocks
+    mass = stack.sum_per_cloud(who.alpha.sum(axis=1))
+    for j in range(3):
+        assert blocks[j, 3:, 3:] == pytest.approx(np.eye(3) * mass[j] / 0.02**2, abs=1e-6)
 
 
 def common(quadratic: ShapeQuadratic) -> Array:

@@ -74,6 +74,15 @@ from caliv_graph.registration.register import (
     left_step,
     register_jointly,
 )
+from caliv_graph.registration.symmetry import (
+    Symmetry,
+    alarming,
+    forget_turns,
+    refit,
+    symmetries,
+    symmetry_sentence,
+    views_of,
+)
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.observability import (
@@ -122,6 +131,7 @@ class _State:
     weights: RobustWeights
     motion: gtsam.NonlinearFactorGraph
     grounds: tuple[GroundObservation, ...] = ()
+    turns: tuple[Symmetry | None, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
 
@@ -197,9 +207,11 @@ def _estimate(
             state.refine_normals(R, t)
             again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()
+    turns, alike = _symmetries(again, config)
+    warnings += alike
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
-    solve = _solve_registered(problem, again, grounds, config)
+    solve = _solve_registered(problem, again, grounds, config, turns)
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
             solution = _staged(solve, again)
@@ -275,10 +287,43 @@ def _prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
     return out
 
 
-def _measured(registrations: Sequence[Registration]) -> tuple[list[gtsam.Pose3], Array]:
+def _symmetries(
+    registrations: Sequence[Registration], config: Config
+) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
+    """Per placement the turn that its target looks the same after, any turn; and what to tell.
+
+    How far a cloud of a drum is turned about it is not in the cloud: it comes from noise and from
+    how the beams fell, and is forgotten wherever clouds speak.
+    """
+    turns: list[Symmetry | None] = []
+    told = []
+    sigma = max(max(lidar.sigma.rpy_rad()) for lidar in config.lidars.values())
+    for registration in registrations:
+        found = symmetries(registration.mixture, views_of(registration), config.noise.lidar_range_m)
+        turns.append(next((s for s in found if s.continuous and s.upright), None))
+        told += [
+            symmetry_sentence(s, registration.observation.name, sigma)
+            for s in found
+            if alarming(s, sigma)
+        ]
+    return tuple(turns), tuple(told)
+
+
+def _measured(
+    registrations: Sequence[Registration], turns: Sequence[Symmetry | None] = ()
+) -> tuple[list[gtsam.Pose3], Array]:
     """Registered poses and informations of all placements, in order."""
     poses = [T for r in registrations for T in r.T_target_lidar]
-    return poses, np.concatenate([r.information for r in registrations])
+    information = []
+    for r, turn in zip(registrations, turns or [None] * len(registrations), strict=True):
+        blocks = r.information
+        if turn is not None:
+            blocks = np.array([forget_turns(b, np.zeros(6), turn)[0] for b in blocks])
+            # Pose factors want an information that can be inverted.
+            ridge = 1e-9 * np.trace(blocks, axis1=1, axis2=2)
+            blocks = blocks + ridge[:, None, None] * np.eye(6)
+        information.append(blocks)
+    return poses, np.concatenate(information)
 
 
 def _residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:
@@ -301,10 +346,11 @@ def _solve_registered(
     registrations: Sequence[Registration],
     grounds: tuple[GroundObservation, ...],
     config: Config,
+    turns: tuple[Symmetry | None, ...] = (),
 ) -> _State:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data."""
     begun = time.perf_counter()
-    measured, information = _measured(registrations)
+    measured, information = _measured(registrations, turns)
     state = _State(
         problem=problem,
         config=config,
@@ -314,6 +360,7 @@ def _solve_registered(
         weights=RobustWeights(config.robust, problem.clouds),
         motion=motion_graph(problem),
         grounds=grounds,
+        turns=turns,
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would take the slow error of the poses for outliers, and
@@ -386,9 +433,16 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     """
     begun = time.perf_counter()
     problem = state.problem
-    measured, information = _measured(registrations)
+    measured, information = _measured(registrations, state.turns)
     root = np.repeat(np.sqrt(state.weights.values), 6)
-    H = block_diag(*[r.information_joint for r in registrations])
+    H = block_diag(
+        *[
+            r.information_joint
+            if turn is None
+            else forget_turns(r.information_joint, np.zeros(len(r.information_joint)), turn)[0]
+            for r, turn in zip(registrations, state.turns, strict=True)
+        ]
+    )
     H *= np.outer(root, root) / state.scale**2
     steady = _steady_graph(state)
     prior = problem.guess_information()
@@ -485,25 +539,45 @@ class _Shapes:
 
     poses: list[tuple[Array, Array]]
     quadratics: list[ShapeQuadratic]
+    turns: list[Symmetry | None]
 
     def joint(self, scale: float) -> tuple[Array, Array]:
         """(6 J, 6 J) and (6 J,) of all placements."""
-        blocks = [q.joint() for q in self.quadratics]
-        size = sum(len(b) for b in blocks)
-        H, start = np.zeros((size, size)), 0
-        for block in blocks:
-            H[start : start + len(block), start : start + len(block)] = block
-            start += len(block)
-        return H / scale**2, np.concatenate([q.gradient.ravel() for q in self.quadratics]) / (
-            scale**2
-        )
+        size = sum(q.gradient.size for q in self.quadratics)
+        H, gradient, start = np.zeros((size, size)), np.zeros(size), 0
+        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
+            part = slice(start, start + quadratic.gradient.size)
+            H[part, part], gradient[part] = quadratic.joint(), quadratic.gradient.ravel()
+            if turn is not None:
+                H[part, part], gradient[part] = forget_turns(H[part, part], gradient[part], turn)
+            start = part.stop
+        return H / scale**2, gradient / scale**2
+
+    def single(self) -> tuple[Array, Array]:
+        """(J, 6, 6) and (J, 6): each cloud by itself, given the shape."""
+        blocks, gradients = [], []
+        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
+            for H, gradient in zip(quadratic.blocks, quadratic.gradient, strict=True):
+                if turn is not None:
+                    H, gradient = forget_turns(H, gradient, turn)
+                blocks.append(H)
+                gradients.append(gradient)
+        return np.array(blocks), np.array(gradients)
 
 
-def _expect(states: Sequence[JointRegistration], lines: CloudLinearisation) -> _Shapes:
+def _expect(
+    states: Sequence[JointRegistration],
+    lines: CloudLinearisation,
+    turns: Sequence[Symmetry | None],
+) -> _Shapes:
     """E-step of every placement at the poses that the graph predicts."""
     poses = _per_placement(states, lines)
     quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
-    return _Shapes(poses, quadratics)
+    fitted = [
+        None if turn is None else refit(turn, state.mixture)
+        for turn, state in zip(turns, states, strict=True)
+    ]
+    return _Shapes(poses, quadratics, fitted)
 
 
 def _per_placement(
@@ -541,8 +615,7 @@ class _ShapeMeasurements:
 def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
     """The pose factors that the quadratic stands for, one per cloud."""
     weights = state.weights.values
-    blocks = np.concatenate([q.blocks for q in shapes.quadratics])
-    gradient = np.concatenate([q.gradient for q in shapes.quadratics])
+    blocks, gradient = shapes.single()
     information = blocks / weights[:, None, None] / state.scale**2
     # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
     ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
@@ -568,7 +641,7 @@ def _refine(
     while iteration < REFINEMENTS and not converged:
         iteration += 1
         lines = linearise_clouds(problem, state.values)
-        shapes = _expect(states, lines)
+        shapes = _expect(states, lines, state.turns)
         clouds = shapes.joint(state.scale)
         begun = time.perf_counter()
         reduced = _reduce(problem, state.values, steady, clouds, lines)
@@ -660,7 +733,7 @@ def _refined_solution(
     """Reads covariance, residuals and registrations off the last estimate."""
     problem = state.problem
     lines = linearise_clouds(problem, state.values)
-    shapes = _expect(states, lines)
+    shapes = _expect(states, lines, state.turns)
     clouds = shapes.joint(state.scale)
     begun = time.perf_counter()
     reduced = _reduce(problem, state.values, steady, clouds, lines)

@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.config import Mounting, RobustConfig, RobustKernel, SolveConfig, load_config
+from caliv_graph.config import (
+    Mounting,
+    MountingSigma,
+    RobustConfig,
+    RobustKernel,
+    SolveConfig,
+    load_config,
+)
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import CalibrationRun, calibrate
@@ -156,6 +163,26 @@ def test_a_drum_is_named_and_turns_about_it_are_forgotten(tmp_path: Path) -> Non
     # Poses that are exact tell the rest; what noise seems to say of turns is not among it.
     assert tried.nees() < 20.0
     assert np.abs(tried.s2s()[3:]).max() < 10.0 * MM
+
+
+def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(tmp_path: Path) -> None:
+    drive = simulated(paper_scenario(rate_hz=2.5), 1, tmp_path / "drive")
+    rng = np.random.default_rng(3)
+    lidars = {}
+    for name, lidar in drive.config.lidars.items():
+        truth = drive.truth[name]
+        way = rng.choice([-1.0, 1.0], 6)
+        initial = Mounting(
+            xyz=tuple((truth.translation() + 0.5 * way[:3]).tolist()),
+            rpy_deg=tuple((np.degrees(truth.rotation().rpy()) + 10.0 * way[3:]).tolist()),
+        )
+        sigma = MountingSigma(xyz=0.29, rpy_deg=5.8)
+        lidars[name] = lidar.model_copy(update={"initial": initial, "sigma": sigma})
+    far = replace(drive, config=drive.config.model_copy(update={"lidars": lidars}))
+    near, tried = try_out(drive).s2s(), try_out(far)
+    assert np.abs(tried.s2s() - near)[:3].max() < 0.5 * MRAD
+    assert np.abs(tried.s2s() - near)[3:].max() < 3.0 * MM
+    assert not tried.run.calibration.contradictions
 
 
 # ------------------------------------------------------------------ the paper's arc

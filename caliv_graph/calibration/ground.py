@@ -62,17 +62,25 @@ class GroundWeights:
 
 def plane_normal(g: Array) -> Array:
     """(3,) upward unit normal in the map of a plane g."""
-    normal = np.array([-g[0], -g[1], 1.0])
-    return np.asarray(normal / np.linalg.norm(normal))
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    return np.array([-a * inverse, -b * inverse, inverse])
 
 
 def _normal_jacobian(g: Array) -> Array:
     """(3, 3) derivative of `plane_normal` by g."""
-    length = math.sqrt(1.0 + g[0] ** 2 + g[1] ** 2)
-    n = plane_normal(g)
-    out = np.zeros((3, 3))
-    out[:, :2] = -(np.eye(3) - np.outer(n, n))[:, :2] / length
-    return out
+    # Written out, as is what follows: a graph asks this of hundreds of factors some fifty times,
+    # and numpy takes microseconds for every small array.
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    cube = inverse**3
+    return np.array(
+        [
+            [a * a * cube - inverse, a * b * cube, 0.0],
+            [a * b * cube, b * b * cube - inverse, 0.0],
+            [-a * cube, -b * cube, 0.0],
+        ]
+    )
 
 
 def _height_over(g: Array, anchor: Array, place_map: Array) -> tuple[float, Array, Array]:
@@ -81,14 +89,18 @@ def _height_over(g: Array, anchor: Array, place_map: Array) -> tuple[float, Arra
     Returns:
         metres; (3,) by g; (3,) by the place.
     """
-    n = plane_normal(g)
-    offset = place_map - np.array([anchor[0], anchor[1], g[2]])
-    by_plane = offset @ _normal_jacobian(g)
-    by_plane[2] -= n[2]
-    return float(n @ offset), np.asarray(by_plane), n
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    x, y = float(place_map[0] - anchor[0]), float(place_map[1] - anchor[1])
+    height = inverse * (float(place_map[2] - g[2]) - a * x - b * y)
+    bend = -height * inverse**2
+    by_plane = np.array([bend * a - inverse * x, bend * b - inverse * y, -inverse])
+    return height, by_plane, np.array([-a * inverse, -b * inverse, inverse])
 
 
-def _chain(values: gtsam.Values, keys: Sequence[int]) -> tuple[gtsam.Pose3, list[Array]]:
+def _chain(
+    values: gtsam.Values, keys: Sequence[int], derivatives: bool
+) -> tuple[gtsam.Pose3, list[Array]]:
     """The product of poses, and per pose what a right perturbation of it does to the product's.
 
     Only the poses after it matter: no number here grows with the distance from the map's origin.
@@ -96,7 +108,8 @@ def _chain(values: gtsam.Values, keys: Sequence[int]) -> tuple[gtsam.Pose3, list
     after = gtsam.Pose3()
     moves: list[Array] = []
     for key in reversed(keys):
-        moves.append(np.asarray(after.inverse().AdjointMap()))
+        if derivatives:
+            moves.append(np.asarray(after.inverse().AdjointMap()))
         after = values.atPose3(key).compose(after)
     return after, moves[::-1]
 
@@ -141,7 +154,7 @@ def ground_plane_factor(
     axes = observation.axes_lidar
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        T, moves = _chain(values, poses)
+        T, moves = _chain(values, poses, jacobians is not None)
         g = values.atVector(key_plane)
         d, by_plane, n = _height_over(g, anchor, T.translation())
         R_lidar_map = T.rotation().matrix().T

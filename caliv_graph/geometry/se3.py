@@ -15,6 +15,20 @@ from caliv_graph.config import Mounting
 from caliv_graph.products import Array
 
 
+def tangent_axes(direction: Array) -> Array:
+    """Two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other.
+
+    With the direction as third they are a right-handed frame.
+    """
+    x, y, z = direction.tolist()
+    # At right angles to the coordinate axis that is farthest from the direction, too.
+    least = min(range(3), key=lambda axis: abs(direction[axis]))
+    u = [(0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)][least]
+    length = math.hypot(*u)
+    a, b, c = (part / length for part in u)
+    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a]])
+
+
 def skew(vectors: Array) -> Array:
     """Cross-product matrices: `skew(a) @ b == cross(a, b)`.
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray, TargetObservation
 
 SINGLE_NEIGHBOURS = 16
@@ -35,6 +38,9 @@ GATE_SIGMAS = 3.0
 
 GATE_ROUNDS = 5
 """Plane fits per normal, while the gate narrows."""
+
+THREADS = 2
+"""Threads that share out work on clouds and points; the result does not depend on them."""
 
 RIDGE = 1e-6
 """Keeps plane fits solvable."""
@@ -76,6 +82,22 @@ class CloudStack:
     def count(self) -> int:
         """Number of clouds."""
         return len(self.starts)
+
+    @cached_property
+    def centres(self) -> Array:
+        """(J, 3) mean of each cloud's points, lidar frame."""
+        sizes = np.diff(np.append(self.starts, len(self.points)))
+        return np.asarray(self.sum_per_cloud(self.points) / sizes[:, None])
+
+    @cached_property
+    def features(self) -> Array:
+        """(N, 13) what the mixture sums up, in the lidar frame.
+
+        `h h^T`, upper triangle, h = (1, point less its cloud's centre); and flatness times normal.
+        """
+        h = np.column_stack([np.ones(len(self.points)), self.points - self.centres[self.cloud]])
+        row, column = np.triu_indices(4)
+        return np.column_stack([h[:, row] * h[:, column], self.flatness[:, None] * self.normals])
 
     def rotated(self, R: Array, vectors: Array) -> Array:
         """Rotates (N, 3) vectors of the points by the (J, 3, 3) rotation of their cloud."""
@@ -191,7 +213,8 @@ def merged_normals(
     whole = [cloud @ R[j].T + t[j] for j, cloud in enumerate(stack.whole)]
     sizes = np.array([len(cloud) for cloud in whole])
     normals, flatness = np.zeros_like(points), np.zeros(len(points))
-    for j in range(stack.count):
+
+    def of_cloud(j: int) -> None:
         apart = np.where(lidar == lidar[j], np.arccos(np.clip(views @ views[j], -1.0, 1.0)), np.inf)
         near = np.argsort(apart, kind="stable")
         before = np.cumsum(sizes[near]) - sizes[near]
@@ -201,6 +224,9 @@ def merged_normals(
         normals[own], flatness[own] = _normals_across(
             points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, sigma_range_m
         )
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(of_cloud, range(stack.count)))
     back = np.swapaxes(R, 1, 2)
     mixed = _towards_sensor(stack.rotated(back, normals), flatness, stack.beams)
     return replace(stack, normals=mixed, flatness=flatness)
@@ -244,8 +270,7 @@ def _normals_across(
     """
     along = beams.mean(axis=0)
     along /= np.linalg.norm(along)
-    u, v = _across(along)
-    plane = np.column_stack([u, v])
+    plane = tangent_axes(along).T
     k = min(neighbours, len(around))
     distance, near = cKDTree(around @ plane).query(points @ plane, k, distance_upper_bound=radius_m)
     distance, near = np.reshape(distance, (-1, k)), np.reshape(near, (-1, k))
@@ -283,11 +308,3 @@ def _normals_across(
     total, square = weight.sum(axis=1), np.sum(weight**2, axis=1)
     enough = total**2 >= FEWEST_NEIGHBOURS * square
     return normals, np.where(enough, flatness, 0.0)
-
-
-def _across(along: Array) -> tuple[Array, Array]:
-    """Two unit vectors at right angles to `along` and to each other."""
-    other = np.eye(3)[np.abs(along).argmin()]
-    u = np.cross(other, along)
-    u /= np.linalg.norm(u)
-    return u, np.cross(along, u)

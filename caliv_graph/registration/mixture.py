@@ -10,15 +10,17 @@ are those of SPEC 3.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 from scipy.linalg import blas
 from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
-from caliv_graph.registration.clouds import CloudStack, sampling_order
+from caliv_graph.registration.clouds import THREADS, CloudStack, sampling_order
 
 NEIGHBOURS = 6
 """Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
@@ -32,8 +34,8 @@ NORMAL_CONCENTRATION = 4.0
 GRAZING = 0.05
 """Cosine between beam and surface at which visibility fades."""
 
-SEARCH_THREADS = 2
-"""Threads of the neighbour search, the one part of the E-step that is worth sharing out."""
+PART_POINTS = 8192
+"""Points of a part of the E-step: what belongs to them stays in the processor's cache."""
 
 ALONG_SURFACE = 0.1
 """Part of what a point's position *along* the surface seems to say that is believed. Components
@@ -69,31 +71,79 @@ class ShapeQuadratic:
 
     As a function of left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then
     translation) the negative log-likelihood is `d^T H d / 2 + g^T d`, where H is `blocks` on the
-    diagonal minus `coupling^T coupling`: the means of the components are eliminated, since they
-    come from the same points. `blocks` alone, per-cloud information given the shape, claims more.
+    diagonal minus what is lost because the means of the components come from the same points: they
+    are eliminated. `blocks` alone, per-cloud information given the shape, claims more.
+
+    A cloud moves the mean of component k by `A_jk d_j / mass_k`, A_jk (3, 6) being the sum of
+    `alpha [-skew(y), I]`. So the loss is the sum over k of `A_jk^T W_k A_j'k / mass_k`; since
+    `W_k = a n n^T + b I` it is two matrix products, half the work of one with the root of W.
 
     Attributes:
         blocks: (J, 6, 6).
         gradient: (J, 6).
-        coupling: (3 K, 6 J).
+        across: (K, 6 J) of the loss across the surfaces, `sqrt(|a| / mass) n^T A`.
+        sign: (K,) of a, which is negative where a component is thicker than it is wide.
+        along: (K, 4 J) of the rest, `sqrt(b / mass)` times the sums of alpha and alpha y.
     """
 
     blocks: Array
     gradient: Array
-    coupling: Array
+    across: Array
+    sign: Array
+    along: Array
 
     def joint(self) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite."""
-        size = self.coupling.shape[1]
-        # Transposed, its memory is in the order that BLAS wants; only a triangle comes back.
-        upper = blas.dsyrk(-1.0, self.coupling.T)
-        H = upper + upper.T
-        diagonal = np.arange(size)
-        H[diagonal, diagonal] *= 0.5
-        H4 = H.reshape(size // 6, 6, size // 6, 6)
-        j = np.arange(size // 6)
+        count = len(self.blocks)
+        # Transposed, their memory is in the order that BLAS wants; only a triangle comes back.
+        flat = self.sign > 0.0
+        H = blas.dsyrk(-1.0, self.across.T if flat.all() else self.across[flat].T)
+        if not flat.all():
+            H += blas.dsyrk(1.0, self.across[~flat].T)
+        even = blas.dsyrk(-1.0, self.along.T)
+        for upper in (H, even):
+            upper += upper.T
+            diagonal = np.arange(len(upper))
+            upper[diagonal, diagonal] *= 0.5
+        pairs = even.reshape(count, 4, count, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
+        H4 = H.reshape(count, 6, count, 6)
+        H4 += (pairs @ _EVEN_PAIRS).reshape(count, count, 6, 6).transpose(0, 2, 1, 3)
+        j = np.arange(count)
         H4[j, :, j, :] += self.blocks
         return np.asarray(H)
+
+
+# A point's position in homogeneous coordinates, h = (1, y), makes all that follows linear in the
+# second moments of h, ten numbers: the upper triangle of h h^T, row by row.
+
+_ROW, _COLUMN = np.triu_indices(4)
+
+_MOVES = np.zeros((4, 3, 6))
+"""J = [-skew(y), I] = h_0 E_0 + h_1 E_1 + h_2 E_2 + h_3 E_3: the E."""
+_MOVES[0, :, 3:] = np.eye(3)
+_MOVES[1:, :, :3] = -skew(np.eye(3))
+
+_SYMMETRIC = np.zeros((6, 3, 3))
+"""W = sum of its upper triangle times these."""
+for _q, (_c, _d) in enumerate(zip(*np.triu_indices(3), strict=True)):
+    _SYMMETRIC[_q, [_c, _d], [_d, _c]] = 1.0
+
+_TWICE = np.where(_ROW == _COLUMN, 0.5, 1.0)
+
+_BLOCKS = np.einsum("ace,qcd,bdf->abqef", _MOVES, _SYMMETRIC, _MOVES)[_ROW, _COLUMN]
+_BLOCKS = _TWICE[:, None, None, None] * (_BLOCKS + np.swapaxes(_BLOCKS, 2, 3))
+_BLOCKS = _BLOCKS.reshape(60, 36)
+"""`J^T W J` of the ten moments times the six entries of W."""
+
+_PULLS = np.zeros((4, 4, 6, 6))
+_PULLS[:, 1:] = np.einsum("ace,qcd->adqe", _MOVES, _SYMMETRIC)
+_PULLS = (_TWICE[:, None, None] * (_PULLS + np.swapaxes(_PULLS, 0, 1))[_ROW, _COLUMN]).reshape(
+    60, 6
+)
+"""`J^T W y` of the same."""
+
+_EVEN_PAIRS = np.einsum("ace,bcf->abef", _MOVES, _MOVES).reshape(16, 36)
+"""`A_j^T A_j'` of the first moments of two clouds."""
 
 
 def seed_mixture(stack: CloudStack, R: Array, t: Array, components: int, sigma_m: float) -> Mixture:
@@ -150,121 +200,133 @@ def expect(
         outlier_density: gamma / (h (gamma + 1)), per cubic metre.
         cloud_weights: (J,) robust weight of each cloud.
     """
-    points = stack.moved(R, t)
-    normals = stack.rotated(R, stack.normals)
-    beams = stack.rotated(R, stack.beams)
     k = min(NEIGHBOURS, len(mixture.weights))
+    near = np.empty((len(stack.points), k), dtype=np.int64)
+    alpha = np.empty((len(stack.points), k))
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
-    _, near = tree.query(
-        np.column_stack([points, NORMAL_METRES * normals]), k, workers=SEARCH_THREADS
-    )
-    near = near.reshape(len(points), k)
-    n_k = mixture.normals_target[near]
-    offset = points[:, None] - mixture.means_target[near]
-    along = np.einsum("nki,nki->nk", offset, n_k)
-    across2 = np.maximum(np.einsum("nki,nki->nk", offset, offset) - along**2, 0.0)
-    var_n, var_t = mixture.var_normal[near], mixture.var_tangent[near]
-    agreement = np.einsum("nki,ni->nk", n_k, normals)
-    facing = -np.einsum("nki,ni->nk", n_k, beams)
-    log_alpha = (
-        np.log(mixture.weights[near])
+    constant = (
+        np.log(mixture.weights)
         - 1.5 * np.log(2.0 * np.pi)
-        - 0.5 * np.log(var_n)
-        - np.log(var_t)
-        - 0.5 * along**2 / var_n
-        - 0.5 * across2 / var_t
-        + NORMAL_CONCENTRATION * stack.flatness[:, None] * (agreement - 1.0)
+        - 0.5 * np.log(mixture.var_normal)
+        - np.log(mixture.var_tangent)
     )
-    visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 1e-3, 1.0)
-    alpha = np.exp(log_alpha) * visible
-    alpha /= alpha.sum(axis=1, keepdims=True) + outlier_density
+    even = -0.5 / mixture.var_tangent
+    extra = -0.5 / mixture.var_normal - even
+    means, directions = mixture.means_target.T.copy(), mixture.normals_target.T.copy()
+
+    def of_part(part: slice) -> None:
+        cloud = stack.cloud[part]
+        turn = R[cloud]
+        points = np.einsum("nij,nj->ni", turn, stack.points[part]) + t[cloud]
+        normals = np.einsum("nij,nj->ni", turn, stack.normals[part])
+        beams = np.einsum("nij,nj->ni", turn, stack.beams[part])
+        _, found = tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
+        found = np.reshape(found, (-1, k))
+        along = np.zeros(found.shape)
+        all2, agreement, facing = along.copy(), along.copy(), along.copy()
+        for axis in range(3):
+            n = directions[axis][found]
+            offset = points[:, axis, None] - means[axis][found]
+            along += offset * n
+            all2 += offset * offset
+            agreement += n * normals[:, axis, None]
+            facing -= n * beams[:, axis, None]
+        log_alpha = constant[found]
+        log_alpha += extra[found] * along**2
+        log_alpha += even[found] * np.maximum(all2, along**2)
+        log_alpha += NORMAL_CONCENTRATION * stack.flatness[part, None] * (agreement - 1.0)
+        visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 1e-3, 1.0)
+        likelihood = np.exp(log_alpha) * visible
+        likelihood /= likelihood.sum(axis=1, keepdims=True) + outlier_density
+        near[part], alpha[part] = found, likelihood
+
+    # Every part is computed by itself, so that the result is the same on any number of cores.
+    parts = [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)]
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(of_part, parts))
     inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
         np.append(stack.starts, len(stack.points))
     )
     return Responsibilities(near, alpha * cloud_weights[stack.cloud][:, None], inlier)
 
 
-def component_means(points: Array, who: Responsibilities, before: Array) -> tuple[Array, Array]:
-    """Weighted means of the points of each component (K, 3), and their weights (K,).
+def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:
+    """What the M-steps need of the points: sums per cloud and component ("cell").
 
     Args:
-        points: (N, 3) in the target frame.
-        who: responsibilities of the components for them.
-        before: (K, 3) means that components without points keep.
+        stack: the clouds.
+        who: responsibilities of the components for their points.
+        components: how many there are, K.
+
+    Returns:
+        (J, K, 13): sums of `alpha h h^T`, upper triangle, h = (1, p), p the point in the frame of
+        its LiDAR less its cloud's centre; and of alpha times flatness times normal, lidar frame.
     """
-    components = len(before)
-    flat = who.component.ravel()
-    mass = np.asarray(np.bincount(flat, who.alpha.ravel(), components) + PRIOR_COUNT, np.float64)
-    sums = [
-        np.bincount(flat, (who.alpha * points[:, None, axis]).ravel(), components)
-        for axis in range(3)
-    ]
-    means = (np.stack(sums, axis=1) + PRIOR_COUNT * before) / mass[:, None]
-    return np.asarray(means, np.float64), mass
+    cells, width = stack.count * components, who.component.shape[1]
+    # A column per point, an entry per component it may belong to: the product is one pass.
+    belongs = scipy.sparse.csc_array(
+        (
+            who.alpha.ravel(),
+            (stack.cloud[:, None] * components + who.component).ravel().astype(np.int32),
+            np.arange(0, who.component.size + 1, width, dtype=np.int32),
+        ),
+        shape=(cells, len(stack.points)),
+    )
+    return np.asarray(belongs @ stack.features).reshape(stack.count, components, 13)
+
+
+def _carried(stack: CloudStack, R: Array, t: Array) -> Array:
+    """(J, 10, 10) that, from the right, carry moments from the lidar to the target frame."""
+    A = np.zeros((stack.count, 4, 4))
+    A[:, 0, 0] = 1.0
+    A[:, 1:, 0] = np.einsum("jab,jb->ja", R, stack.centres) + t
+    A[:, 1:, 1:] = R
+    both = np.einsum("jac,jbd->jcdab", A, A)[..., _ROW, _COLUMN]
+    both = both + np.swapaxes(both, 1, 2)
+    return np.asarray(_TWICE[:, None] * both[:, _ROW, _COLUMN])
 
 
 def shape_quadratic(
-    stack: CloudStack, R: Array, t: Array, mixture: Mixture, who: Responsibilities
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array
 ) -> ShapeQuadratic:
     """The quadratic of `ShapeQuadratic` at the current poses, means eliminated.
 
     A point y of cloud j contributes `alpha (y - mu)^T W (y - mu)`, with `dy = [-skew(y), I] d_j`
     and `W = n n^T / var_normal + ALONG_SURFACE (I - n n^T) / var_tangent` of its component.
+
+    Args:
+        stack: the clouds.
+        R: (J, 3, 3) rotations of current `T_target_lidar`.
+        t: (J, 3) translations of current `T_target_lidar`.
+        mixture: the components of the E-step.
+        cells: (J, K, 13) `cell_moments` of its responsibilities.
     """
     count, K = stack.count, len(mixture.weights)
-    points = stack.moved(R, t)
-    means, mass = component_means(points, who, mixture.means_target)
-    near, alpha = who.component, who.alpha
-    n_k = mixture.normals_target[near]
-    w_t = ALONG_SURFACE * alpha / mixture.var_tangent[near]
-    w_n = alpha / mixture.var_normal[near] - w_t
-    rows = np.empty((*near.shape, 6))
-    rows[..., :3] = _cross(points[:, None], n_k)
-    rows[..., 3:] = n_k
-    weighted = w_n[..., None] * rows
-    offset = points[:, None] - means[near]
-    along = np.einsum("nki,nki->nk", offset, n_k)
-    even = np.einsum("nk,nki->ni", w_t, offset)
-    pull = np.einsum("nk,nka->na", along, weighted)
-    pull += np.concatenate([_cross(points, even), even], axis=1)
-    gradient = stack.sum_per_cloud(pull)
-    blocks = _even_blocks(stack, points, w_t.sum(axis=1))
-    ends = np.append(stack.starts[1:], len(points))
-    for j, (start, end) in enumerate(zip(stack.starts, ends, strict=True)):
-        blocks[j] += weighted[start:end].reshape(-1, 6).T @ rows[start:end].reshape(-1, 6)
-
-    # Sums of alpha and alpha * y per cloud and component: what the component means depend on.
-    cell = (stack.cloud[:, None] * K + near).ravel()
-    mass_jk = np.bincount(cell, alpha.ravel(), count * K).reshape(count, K)
-    sums = [
-        np.bincount(cell, (alpha * points[:, None, axis]).ravel(), count * K) for axis in range(3)
-    ]
-    sum_jk = np.stack(sums, axis=-1, dtype=np.float64).reshape(count, K, 3)
+    moments = np.matmul(cells[..., :10], _carried(stack, R, t))
+    mass = moments[..., 0].sum(axis=0) + PRIOR_COUNT
+    first = moments[..., 1:4].sum(axis=0)
+    means = (first + PRIOR_COUNT * mixture.means_target) / mass[:, None]
     n = mixture.normals_target
-    root_t = (ALONG_SURFACE / mixture.var_tangent) ** 0.5
-    root = (mixture.var_normal**-0.5 - root_t)[:, None, None] * (n[:, :, None] * n[:, None, :])
-    diagonal = np.arange(3)
-    root[:, diagonal, diagonal] += root_t[:, None]
-    root /= np.sqrt(mass)[:, None, None]
-    coupling = np.empty((K, 3, count, 6))
-    for i in range(3):
-        coupling[:, i, :, :3] = _cross(sum_jk, root[:, i]).transpose(1, 0, 2)
-        coupling[:, i, :, 3:] = mass_jk.T[..., None] * root[:, i, None]
-    return ShapeQuadratic(blocks, gradient, coupling.reshape(3 * K, 6 * count))
-
-
-def _even_blocks(stack: CloudStack, points: Array, weight: Array) -> Array:
-    """(J, 6, 6) sums of `weight J^T J`, J = [-skew(y), I], over the points (N, 3) of each cloud."""
-    first = stack.sum_per_cloud(weight[:, None] * points)
-    second = stack.sum_per_cloud((weight[:, None] * points)[:, :, None] * points[:, None])
-    out = np.zeros((stack.count, 6, 6))
-    identity = np.eye(3)
-    trace = np.trace(second, axis1=1, axis2=2)[:, None, None]
-    out[:, :3, :3] = trace * identity - second
-    out[:, 3:, 3:] = stack.sum_per_cloud(weight)[:, None, None] * identity
-    out[:, :3, 3:] = skew(first)
-    out[:, 3:, :3] = np.swapaxes(skew(first), 1, 2)
-    return out
+    b = ALONG_SURFACE / mixture.var_tangent
+    a = 1.0 / mixture.var_normal - b
+    W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
+    upper = np.triu_indices(3)
+    by_cloud = np.swapaxes(moments, 1, 2)
+    against = (by_cloud @ W[:, upper[0], upper[1]]).reshape(count, 60)
+    pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
+    gradient = against @ _PULLS - np.einsum("jac,ace->je", pull, _MOVES)
+    sums = moments[..., :4].transpose(1, 0, 2)
+    across = np.empty((K, count, 6))
+    root = n * np.sqrt(np.abs(a) / mass)[:, None]
+    across[..., :3] = _cross(sums[..., 1:], root[:, None])
+    across[..., 3:] = sums[..., :1] * root[:, None]
+    return ShapeQuadratic(
+        blocks=(against @ _BLOCKS).reshape(count, 6, 6),
+        gradient=np.asarray(gradient),
+        across=across.reshape(K, 6 * count),
+        sign=np.sign(a),
+        along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
+    )
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -284,7 +346,7 @@ def maximise_shape(
     R: Array,
     t: Array,
     mixture: Mixture,
-    who: Responsibilities,
+    cells: Array,
     sigma_floor_m: float,
 ) -> Mixture:
     """M-step of the components at new poses: means, normals, variances, priors.
@@ -294,30 +356,28 @@ def maximise_shape(
         R: (J, 3, 3) rotations of the new `T_target_lidar`.
         t: (J, 3) translations of the new `T_target_lidar`.
         mixture: the components of the E-step.
-        who: its responsibilities.
+        cells: (J, K, 13) `cell_moments` of its responsibilities.
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
     """
-    K = len(mixture.weights)
-    points = stack.moved(R, t)
-    means, mass = component_means(points, who, mixture.means_target)
-    flat = who.component.ravel()
-    trusted = who.alpha * stack.flatness[:, None]
-    rotated = stack.rotated(R, stack.normals)
-    normals = PRIOR_COUNT * mixture.normals_target + np.stack(
-        [np.bincount(flat, (trusted * rotated[:, None, axis]).ravel(), K) for axis in range(3)],
-        axis=1,
-    )
+    moments = np.matmul(cells[..., :10], _carried(stack, R, t)).sum(axis=0)
+    mass = moments[:, 0] + PRIOR_COUNT
+    means = (moments[:, 1:4] + PRIOR_COUNT * mixture.means_target) / mass[:, None]
+    trusted = np.matmul(cells[..., 10:], np.swapaxes(R, 1, 2)).sum(axis=0)
+    normals = PRIOR_COUNT * mixture.normals_target + trusted
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    offset = points[:, None] - means[who.component]
-    along2 = np.einsum("nki,nki->nk", offset, normals[who.component]) ** 2
-    all2 = np.einsum("nki,nki->nk", offset, offset)
+    full = np.empty((len(mass), 4, 4))
+    full[:, _ROW, _COLUMN] = full[:, _COLUMN, _ROW] = moments
+    offset = np.zeros((len(mass), 3, 4))  # of y - mean in h
+    offset[:, :, 0] = -means
+    offset[:, :, 1:] = np.eye(3)
+    scatter = offset @ full @ np.swapaxes(offset, 1, 2)
+    along2 = np.einsum("ka,kab,kb->k", normals, scatter, normals)
+    all2 = np.trace(scatter, axis1=1, axis2=2)
     floor = sigma_floor_m**2
-    var_n = np.bincount(flat, (who.alpha * along2).ravel(), K) / mass
-    var_t = np.bincount(flat, (who.alpha * (all2 - along2)).ravel(), K) / (2.0 * mass)
     return Mixture(
         means_target=means,
         normals_target=normals,
-        var_normal=np.maximum(var_n, floor),
-        var_tangent=np.maximum(var_t, floor),
+        var_normal=np.maximum(along2 / mass, floor),
+        var_tangent=np.maximum((all2 - along2) / (2.0 * mass), floor),
         weights=mass / mass.sum(),
     )

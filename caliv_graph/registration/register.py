@@ -20,8 +20,8 @@ from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Mixture, Registration, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.mixture import (
-    Responsibilities,
     ShapeQuadratic,
+    cell_moments,
     expect,
     maximise_shape,
     seed_mixture,
@@ -98,7 +98,8 @@ class JointRegistration:
         self._floor = COARSE_SIGMA_M
         self._volume = 1.0
         self._mixture: Mixture | None = None
-        self._who: Responsibilities | None = None
+        self._cells: Array | None = None
+        self._inlier_ratio: Array = np.ones(self.clouds.count)
         self.weights: Array = np.ones(self.clouds.count)
 
     def refine_normals(self, R: Array, t: Array) -> None:
@@ -118,9 +119,7 @@ class JointRegistration:
     @property
     def inlier_ratio(self) -> Array:
         """(J,) part of each cloud's points that the mixture explains."""
-        if self._who is None:
-            return np.ones(self.clouds.count)
-        return self._who.inlier_ratio
+        return self._inlier_ratio
 
     @property
     def finest(self) -> bool:
@@ -139,14 +138,16 @@ class JointRegistration:
         """E-step at (R, t), and the quadratic that it puts on the poses."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         density = self._gamma / (self._volume * (self._gamma + 1.0))
-        self._who = expect(self.clouds, R, t, self.mixture, density, self.weights)
-        return shape_quadratic(self.clouds, R, t, self.mixture, self._who)
+        who = expect(self.clouds, R, t, self.mixture, density, self.weights)
+        self._inlier_ratio = who.inlier_ratio
+        self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
+        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells)
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new poses (R, t)."""
-        if self._who is None:
+        if self._cells is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
-        self._mixture = maximise_shape(self.clouds, R, t, self.mixture, self._who, self._floor)
+        self._mixture = maximise_shape(self.clouds, R, t, self.mixture, self._cells, self._floor)
 
     def result(
         self,

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from caliv_graph.config import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.geometry.se3 import pose_from_mounting, tangent_axes
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -154,14 +154,6 @@ class GroundPlane:
         """
         floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
         return np.asarray(self.cov + np.diag(floors**2) + np.outer(self.beyond, self.beyond))
-
-
-def tangent_axes(normal: Array) -> Array:
-    """Two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other."""
-    other = np.eye(3)[np.abs(normal).argmin()]
-    u = np.cross(other, normal)
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(normal, u)])
 
 
 def near_points(points: Array, up: Array) -> IntArray:

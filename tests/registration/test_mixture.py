@@ -15,6 +15,7 @@ from caliv_graph.registration.mixture import (
     ALONG_SURFACE,
     Responsibilities,
     ShapeQuadratic,
+    cell_moments,
     expect,
     maximise_shape,
     seed_mixture,
@@ -87,6 +88,20 @@ def together(*mixtures: Mixture) -> Mixture:
 
 
 UP = np.array([[0.0, 0.0, 1.0]])
+
+
+def quadratic_of(
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, who: Responsibilities
+) -> ShapeQuadratic:
+    cells = cell_moments(stack, who, len(mixture.weights))
+    return shape_quadratic(stack, R, t, mixture, cells)
+
+
+def maximised(
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, who: Responsibilities, floor_m: float
+) -> Mixture:
+    cells = cell_moments(stack, who, len(mixture.weights))
+    return maximise_shape(stack, R, t, mixture, cells, floor_m)
 
 
 # ------------------------------------------------------------------ E-step
@@ -248,7 +263,7 @@ def whitened(case: Case, d: Array) -> Array:
 
 def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
     case = random_case()
-    quadratic = shape_quadratic(*case)
+    quadratic = quadratic_of(*case)
     step = 1e-5
     numerical = np.array(
         [
@@ -269,7 +284,7 @@ def test_joint_is_the_square_of_the_numerical_jacobian() -> None:
     ).T
     expected = J.T @ J
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert shape_quadratic(*case).joint() / scale == pytest.approx(expected / scale, abs=1e-3)
+    assert quadratic_of(*case).joint() / scale == pytest.approx(expected / scale, abs=1e-3)
 
 
 def test_blocks_are_the_information_given_the_shape() -> None:
@@ -282,7 +297,7 @@ def test_blocks_are_the_information_given_the_shape() -> None:
         y = R[j] @ stack.points[n] + t[j]
         J = np.hstack([np.cross(np.eye(3), y).T, np.eye(3)])
         expected[j] += J.T @ W[n] @ J
-    blocks = shape_quadratic(*case).blocks
+    blocks = quadratic_of(*case).blocks
     assert blocks == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
@@ -294,7 +309,7 @@ def test_isotropic_components_have_the_paper_s_information() -> None:
         var_normal=np.full(8, 0.02**2),
         var_tangent=np.full(8, ALONG_SURFACE * 0.02**2),
     )
-    blocks = shape_quadratic(stack, R, t, even, who).blocks
+    blocks = quadratic_of(stack, R, t, even, who).blocks
     mass = stack.sum_per_cloud(who.alpha.sum(axis=1))
     for j in range(3):
         assert blocks[j, 3:, 3:] == pytest.approx(np.eye(3) * mass[j] / 0.02**2, abs=1e-6)
@@ -308,7 +323,7 @@ def common(quadratic: ShapeQuadratic) -> Array:
 
 
 def test_joint_is_positive_semidefinite_with_a_common_shift_in_its_null_space() -> None:
-    quadratic = shape_quadratic(*random_case(4))
+    quadratic = quadratic_of(*random_case(4))
     H = quadratic.joint()
     np.testing.assert_allclose(H, H.T, rtol=0.0, atol=1e-12 * np.abs(H).max())
     eigenvalues = np.linalg.eigvalsh(H)
@@ -321,7 +336,7 @@ def test_joint_is_positive_semidefinite_with_a_common_shift_in_its_null_space() 
 
 
 def test_joint_never_claims_more_than_the_blocks() -> None:
-    quadratic = shape_quadratic(*random_case(5))
+    quadratic = quadratic_of(*random_case(5))
     taken = np.zeros((18, 18))
     for j in range(3):
         taken[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] = quadratic.blocks[j]
@@ -333,8 +348,8 @@ def test_joint_never_claims_more_than_the_blocks() -> None:
 def test_quadratic_grows_with_the_weight_of_a_cloud() -> None:
     stack, R, t, mixture, who = random_case(6)
     half = replace(who, alpha=who.alpha * np.array([1.0, 0.5, 1.0])[stack.cloud][:, None])
-    full_blocks = shape_quadratic(stack, R, t, mixture, who).blocks
-    half_blocks = shape_quadratic(stack, R, t, mixture, half).blocks
+    full_blocks = quadratic_of(stack, R, t, mixture, who).blocks
+    half_blocks = quadratic_of(stack, R, t, mixture, half).blocks
     assert half_blocks[1] == pytest.approx(0.5 * full_blocks[1])
     assert half_blocks[[0, 2]] == pytest.approx(full_blocks[[0, 2]])
 
@@ -357,8 +372,8 @@ def skins(thickness_m: float = 0.025) -> tuple[CloudStack, Array, Array, ShapeQu
     mixture = seed_mixture(stack, R, t, 150, 0.01)
     for _ in range(6):
         who = expect(stack, R, t, mixture, 0.05, np.ones(6))
-        mixture = maximise_shape(stack, R, t, mixture, who, 0.005)
-    return stack, R, t, shape_quadratic(stack, R, t, mixture, who)
+        mixture = maximised(stack, R, t, mixture, who, 0.005)
+    return stack, R, t, quadratic_of(stack, R, t, mixture, who)
 
 
 RELATIVE = np.kron(np.array([0.5, -0.5] * 3)[:, None], np.eye(6))
@@ -417,7 +432,7 @@ def test_means_are_weighted_means() -> None:
         np.ones(1),
     )
     places = [component((0.1 * k, 0.0, 0.0), sigma_tangent=0.3) for k in range(3)]
-    after = maximise_shape(
+    after = maximised(
         stack_of(points, UP.repeat(3, axis=0)), *IDENTITY, together(*places), who, 0.01
     )
     # (300 x 0 + 100 x (1, 2, 3) + 400 x (2, 0, 0)) / 800.
@@ -439,14 +454,14 @@ def test_components_learn_the_surface_and_its_noise() -> None:
     who = Responsibilities(np.zeros((4000, 1), np.int64), np.ones((4000, 1)), np.ones(1))
     before = component((0.9, 2.0, 3.0), (0.0, 0.0, 1.0))
 
-    after = maximise_shape(stack, *IDENTITY, before, who, 0.001)
+    after = maximised(stack, *IDENTITY, before, who, 0.001)
 
     assert after.means_target[0] == pytest.approx([1.0, 2.0, 3.0], abs=5e-3)
     assert after.normals_target[0] == pytest.approx(normal, abs=1e-4)
     assert math.sqrt(after.var_normal[0]) == pytest.approx(0.004, rel=0.05)
     # Uniform over 0.2 m: 0.2 / sqrt(12).
     assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.0577, rel=0.05)
-    floored = maximise_shape(stack, *IDENTITY, before, who, 0.01)
+    floored = maximised(stack, *IDENTITY, before, who, 0.01)
     assert math.sqrt(floored.var_normal[0]) == pytest.approx(0.01)
     assert floored.var_tangent == pytest.approx(after.var_tangent)
 
@@ -458,7 +473,7 @@ def test_normals_of_components_are_those_that_can_be_trusted() -> None:
     flatness = np.where(np.arange(20) < 4, 1.0, 0.0)
     stack = stack_of(np.zeros((20, 3)), normals, flatness=flatness)
     who = Responsibilities(np.zeros((20, 1), np.int64), np.ones((20, 1)), np.ones(1))
-    after = maximise_shape(stack, *IDENTITY, component((0, 0, 0)), who, 0.01)
+    after = maximised(stack, *IDENTITY, component((0, 0, 0)), who, 0.01)
     assert after.normals_target[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-3)
 
 
@@ -467,7 +482,7 @@ def test_weights_of_components_are_their_part_of_the_points() -> None:
     stack = stack_of(rng.normal(size=(40, 3)), UP.repeat(40, axis=0))
     who = Responsibilities(np.tile([0, 1], (40, 1)), np.tile([0.6, 0.2], (40, 1)), np.ones(1))
     pair = together(component((0, 0, 0)), component((1, 0, 0)))
-    after = maximise_shape(stack, *IDENTITY, pair, who, 0.01)
+    after = maximised(stack, *IDENTITY, pair, who, 0.01)
     assert after.weights == pytest.approx([0.75, 0.25], abs=1e-4)
 
 
@@ -475,7 +490,7 @@ def test_an_abandoned_component_stays_defined() -> None:
     stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
     who = Responsibilities(np.zeros((20, 1), np.int64), np.ones((20, 1)), np.ones(1))
     pair = together(component((0.3, 0.3, 0.3)), component((1, 0, 0), (0.0, 1.0, 0.0)))
-    after = maximise_shape(stack, *IDENTITY, pair, who, 0.01)
+    after = maximised(stack, *IDENTITY, pair, who, 0.01)
     for values in (after.means_target, after.var_normal, after.var_tangent, after.weights):
         assert np.isfinite(values).all()
     assert after.normals_target[1] == pytest.approx([0.0, 1.0, 0.0])
@@ -487,7 +502,7 @@ def test_an_abandoned_component_stays_where_it_was() -> None:
     stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
     who = Responsibilities(np.zeros((20, 1), np.int64), np.ones((20, 1)), np.ones(1))
     pair = together(component((0.3, 0.3, 0.3)), component((1, 0, 0), (0.0, 1.0, 0.0)))
-    after = maximise_shape(stack, *IDENTITY, pair, who, 0.01)
+    after = maximised(stack, *IDENTITY, pair, who, 0.01)
     assert after.means_target[1] == pytest.approx([1.0, 0.0, 0.0])
 
 

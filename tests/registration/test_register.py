@@ -412,7 +412,9 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
     return ShapeQuadratic(
         blocks=information,
         gradient=-np.einsum("jab,jb->ja", information, minima),
-        coupling=np.zeros((3, 6 * len(minima))),
+        across=np.zeros((1, 6 * len(minima))),
+        sign=np.ones(1),
+        along=np.zeros((1, 4 * len(minima))),
     )
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from caliv_graph.config import Config, load_config, parse_config
 from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -36,7 +37,6 @@ from caliv_graph.targets.ground_planes import (
     measure_grounds,
     near_points,
     nearest_scans,
-    tangent_axes,
 )
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.select import GivenTrajectory

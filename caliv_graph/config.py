@@ -262,7 +262,7 @@ class RegistrationConfig(_Section):
     )
     max_iterations: Annotated[int, Field(ge=5)] = Field(100, description="EM iterations at most")
     max_points: Annotated[int, Field(ge=20)] = Field(
-        600, description="points of one cloud used at most; a larger cloud is thinned"
+        1500, description="points of one cloud used at most; a larger cloud is thinned"
     )
 
 

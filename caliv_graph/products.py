@@ -267,7 +267,7 @@ class GroundObservation:
     Attributes:
         lidar: name of the LiDAR.
         drive: index of the drive.
-        stamp_ns: stamp of the scan.
+        stamp_ns: stamp of the pose that the scan speaks for.
         normal_lidar: (3,) unit normal, upwards, lidar frame.
         distance_m: of the LiDAR's origin above the plane, along the normal.
         axes_lidar: (2, 3) unit vectors u and v, at right angles to the normal and to each other.
@@ -279,6 +279,8 @@ class GroundObservation:
         by_mounting: (3, 3) what (a, b, distance) become more by if that is `R_vehicle_lidar Exp(w)`
             instead, per radian of w; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
             the ground rise by a centimetre during a sweep.
+        apart_ns: how long after `stamp_ns` the scan was really taken. The trajectory brings it
+            there, but for what it does not know: the body's heave on its springs.
     """
 
     lidar: str
@@ -292,6 +294,7 @@ class GroundObservation:
     points: int
     R_vehicle_lidar: Array | None = None
     by_mounting: Array | None = None
+    apart_ns: int = 0
 
 
 @dataclass(frozen=True)

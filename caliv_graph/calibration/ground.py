@@ -29,6 +29,13 @@ SWAY_SIGMA_RAD = 1e-3
 """How far the body on its springs is off its own mean tilt at each stamp, about either axis: it
 leans by 1.3 mrad in a turn at walking pace (SPEC 3)."""
 
+TOGETHER_NS = 5_000_000
+"""Scans that are nearer to a pose than this see it lifted by the same heave: a body that moves by
+5 mm at 2 Hz has moved by 0.3 mm."""
+
+APART_NS = 10_000_000
+"""Scans are alike in how far they are from their pose, in steps of this."""
+
 SPREADS = (4.0, 8.0)
 """An observation has full weight up to so many spreads of its like, and none beyond the other."""
 
@@ -37,6 +44,9 @@ MEDIAN_OF_NORMAL = 0.6745
 
 FEWEST_ALIKE = 5
 """Of fewer observations no spread can be told; all are believed."""
+
+FEWEST_PAIRS = 20
+"""Pairs of observations that tell a spread to a sixth of it."""
 
 TILT_RAD = (math.radians(1.0), math.radians(2.0))
 """A vehicle tilted by less than this against how it stands mostly stands on the plane, one tilted
@@ -51,10 +61,12 @@ class GroundWeights:
     Attributes:
         planes: (n,) of each observation, 0 to 1; zero if no LiDAR or pose of the problem took it.
         stands: (m,) of each pose: whether the vehicle stands on the plane there, 0 to 1.
+        heave_m: (n,) 1 sigma of what the vehicle's heave was another at the scan than at the pose.
     """
 
     planes: Array
     stands: Array
+    heave_m: Array
 
 
 # ------------------------------------------------------------------ factors
@@ -135,6 +147,7 @@ def ground_plane_factor(
     anchor: Array,
     observation: GroundObservation,
     weight: float = 1.0,
+    heave_m: float = 0.0,
 ) -> gtsam.CustomFactor:
     """Role a: the plane as a LiDAR sees it.
 
@@ -149,6 +162,7 @@ def ground_plane_factor(
         anchor: (2,) metres, where the plane's height is told.
         observation: what was measured.
         weight: on its information.
+        heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
     """
     poses = list(pose_keys)
     axes = observation.axes_lidar
@@ -173,8 +187,15 @@ def ground_plane_factor(
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ _normal_jacobian(g), by_plane])
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(observation.cov / weight)
+    noise = gtsam.noiseModel.Gaussian.Covariance(_cov(observation, heave_m) / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane], error)
+
+
+def _cov(observation: GroundObservation, heave_m: float) -> Array:
+    """(3, 3) of an observation, with the heave between scan and pose."""
+    cov = observation.cov.copy()
+    cov[2, 2] += heave_m**2
+    return cov
 
 
 def standing_factor(
@@ -276,7 +297,18 @@ def full_weights(problem: Problem, observations: Sequence[GroundObservation]) ->
     taken = _taken(problem, observations)
     stands = np.zeros(len(problem.poses))
     stands[taken[taken >= 0]] = 1.0
-    return GroundWeights((taken >= 0).astype(np.float64), stands)
+    heave = np.array([_first_heave(problem, o) for o in observations])
+    return GroundWeights((taken >= 0).astype(np.float64), stands, heave)
+
+
+def _first_heave(problem: Problem, observation: GroundObservation) -> float:
+    """Heave between scan and pose, metres, when nothing is known of it: that of two scans.
+
+    Given poses know it; what IMU, GNSS and wheels make of it is lost in their noise.
+    """
+    if observation.drive not in problem.motion or abs(observation.apart_ns) <= TOGETHER_NS:
+        return 0.0
+    return math.sqrt(2.0) * HEAVE_SIGMA_M
 
 
 def ground_graph(
@@ -307,10 +339,14 @@ def ground_graph(
         if config.parallel_sigma_deg is not None:
             sigma = math.radians(config.parallel_sigma_deg)
             graph.add(_centred(key_parallel(drive), np.full(2, sigma)))
-    for o, i, weight in zip(observations, taken.tolist(), weights.planes.tolist(), strict=True):
+    believed = zip(
+        observations, taken.tolist(), weights.planes.tolist(), weights.heave_m.tolist(), strict=True
+    )
+    for o, i, weight, heave_m in believed:
         if i >= 0 and weight > 0.0:
             keys = (key_vehicle(i), *problem.mounting_keys(o.lidar))
-            graph.add(ground_plane_factor(keys, key_ground(o.drive), anchors[o.drive], o, weight))
+            plane, anchor = key_ground(o.drive), anchors[o.drive]
+            graph.add(ground_plane_factor(keys, plane, anchor, o, weight, heave_m))
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)
     ):
@@ -408,7 +444,10 @@ def _residuals(
 
 
 def ground_squares(
-    problem: Problem, observations: Sequence[GroundObservation], values: gtsam.Values
+    problem: Problem,
+    observations: Sequence[GroundObservation],
+    values: gtsam.Values,
+    weights: GroundWeights | None = None,
 ) -> Array:
     """(n,) squared whitened residuals, 3 degrees of freedom each; NaN where not taken.
 
@@ -416,14 +455,16 @@ def ground_squares(
         problem: LiDARs and poses.
         observations: the planes.
         values: the estimate, with the drives' planes.
+        weights: of `ground_weights`, for the heave that they found; None: as at first.
     """
+    heave = (weights or full_weights(problem, observations)).heave_m
     taken = _taken(problem, observations)
     poses = [values.atPose3(key) for key in problem.pose_keys()]
     r = _residuals(problem, observations, taken, poses, values)
     return np.array(
         [
-            row @ np.linalg.solve(o.cov, row) if i >= 0 else np.nan
-            for row, o, i in zip(r, observations, taken, strict=True)
+            row @ np.linalg.solve(_cov(o, h), row) if i >= 0 else np.nan
+            for row, o, i, h in zip(r, observations, taken, heave, strict=True)
         ]
     )
 
@@ -445,6 +486,7 @@ def ground_weights(
     taken = _taken(problem, observations)
     r = _residuals(problem, observations, taken, problem.T_map_vehicle, values)
     planes = np.zeros(len(observations))
+    heave = _heave_between(problem, observations, taken, r[:, 2])
     for drive in _drives(observations, taken):
         for name in problem.lidars:
             alike = np.array(
@@ -456,9 +498,50 @@ def ground_weights(
                 dtype=np.int64,
             )
             if len(alike):
-                floor = np.sqrt([np.diag(observations[n].cov) for n in alike])
-                planes[alike] = _believed(r[alike], floor)
-    return GroundWeights(planes, _standing(problem, observations, taken, planes, values))
+                cov = [np.diag(_cov(observations[n], heave[n])) for n in alike]
+                planes[alike] = _believed(r[alike], np.sqrt(cov))
+    stands = _standing(problem, observations, taken, planes, values)
+    return GroundWeights(planes, stands, heave)
+
+
+def _heave_between(
+    problem: Problem, observations: Sequence[GroundObservation], taken: IntArray, height: Array
+) -> Array:
+    """(n,) 1 sigma of the heave between each scan and its pose, from the observations themselves.
+
+    LiDARs that do not turn together see the vehicle at heights that differ by what its springs did
+    in between, of which nobody knows how much that is. But two LiDARs at one pose, one that saw it
+    then and one that saw it later, differ in their distances by just that, beside their own errors.
+    Taken for nothing, it makes of S2S z of such LiDARs a quarter of a millimetre that is 1.4.
+
+    Args:
+        problem: LiDARs and poses.
+        observations: the planes.
+        taken: (n,) their poses, -1 for none.
+        height: (n,) residuals of their distances, metres.
+    """
+    out = np.array([_first_heave(problem, o) for o in observations])
+    at_once: dict[int, list[int]] = {}
+    for n, i in enumerate(taken.tolist()):
+        if i >= 0 and abs(observations[n].apart_ns) <= TOGETHER_NS:
+            at_once.setdefault(i, []).append(n)
+    later = np.flatnonzero((taken >= 0) & (out > 0.0)).tolist()
+    lags = {n: round(abs(observations[n].apart_ns) / APART_NS) for n in later}
+    for drive, lag in sorted({(observations[n].drive, lags[n]) for n in later}):
+        alike = [n for n in later if (observations[n].drive, lags[n]) == (drive, lag)]
+        pairs = [(n, m) for n in alike for m in at_once.get(int(taken[n]), [])]
+        if len(pairs) < FEWEST_PAIRS:
+            continue
+        apart = np.array([height[n] - height[m] for n, m in pairs])
+        own = np.array([observations[n].cov[2, 2] + observations[m].cov[2, 2] for n, m in pairs])
+        # What the mountings are still off by is the same for two LiDARs at all times.
+        who = [(observations[n].lidar, observations[m].lidar) for n, m in pairs]
+        for both in sorted(set(who)):
+            of_both = np.array([w == both for w in who])
+            apart[of_both] -= np.median(apart[of_both])
+        spread = float(np.median(np.abs(apart))) / MEDIAN_OF_NORMAL
+        out[alike] = math.sqrt(max(spread**2 - float(np.mean(own)), 0.0))
+    return out
 
 
 def _standing(

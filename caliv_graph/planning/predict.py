@@ -17,7 +17,7 @@ import numpy as np
 
 from caliv_graph.calibration.estimate import OFFSET_TOLD_S
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
-from caliv_graph.calibration.ground import TILT_RAD
+from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config import ExtractionConfig, Mounting, MountingSigma
 from caliv_graph.conventions import AXES
@@ -495,7 +495,6 @@ def _add_ground(
         assumptions.ground_tilt_sigma_rad,
         assumptions.ground_distance_sigma_m,
     )
-    info = np.array([tilt_sigma, tilt_sigma, distance_sigma]) ** -2.0
     stood = np.zeros(len(level), dtype=np.bool_)
     for name in columns.lidars:
         model = scenario.lidars[name]
@@ -505,7 +504,13 @@ def _add_ground(
         if not len(scans):
             continue
         nearest = np.abs(scans[None] - motion.nodes_ns[nodes][:, None]).min(axis=1)
-        at = nodes[(nearest <= MAX_APART_NS) & level[nodes]]
+        near = (nearest <= MAX_APART_NS) & level[nodes]
+        at = nodes[near]
+        # A scan between two poses sees another heave; how much another is only known afterwards.
+        info = np.tile([tilt_sigma, tilt_sigma, distance_sigma], (len(at), 1)) ** -2.0
+        heave_variance = 2.0 * assumptions.heave_sigma_m**2
+        later = nearest[near] > TOGETHER_NS
+        info[later, 2] = 1.0 / (distance_sigma**2 + heave_variance)
         stood[at] = True
         t = pose_from_mounting(model.mounting).translation()
         R, place = motion.R_map_vehicle[at], motion.position_map[at]
@@ -521,7 +526,7 @@ def _add_ground(
         J[:, 2, 3:6] = J[:, 2, lidar + 3 : lidar + 6] = R[:, 2]
         J[:, 2, plane : plane + 2] = -arm[:, :2]
         J[:, 2, plane + 2] = -1.0
-        np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, None] * J))
+        np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, :, None] * J))
     if assumptions.ground != "height":
         return
     at = np.flatnonzero(stood)

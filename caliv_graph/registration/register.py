@@ -74,7 +74,8 @@ class JointRegistration:
         Args:
             observation: the clouds.
             config: size of the mixture and of the clouds.
-            rough: half the points and components, for a registration that another follows.
+            rough: a quarter of the points and half the components, for a registration that another
+                follows.
             normals: False if `refine_normals` follows.
 
         Raises:
@@ -87,7 +88,7 @@ class JointRegistration:
         self.observation = observation
         self.clouds: CloudStack = stack_clouds(
             observation,
-            config.registration.max_points // (2 if rough else 1),
+            config.registration.max_points // (4 if rough else 1),
             config.noise.lidar_range_m,
             normals,
         )

@@ -501,6 +501,7 @@ class GroundMeter:
             points=plane.points,
             R_vehicle_lidar=None if by_mounting is None else guess.rotation().matrix(),
             by_mounting=by_mounting,
+            apart_ns=scan.stamp_ns - at_ns,
         )
 
     def warnings(self) -> tuple[str, ...]:

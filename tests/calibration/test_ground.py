@@ -47,6 +47,7 @@ from caliv_graph.geometry.se3 import (
     pose_from_mounting,
     retract_vehicle_axes,
     right_to_vehicle_axes,
+    tangent_axes,
     vehicle_axes_difference,
 )
 from caliv_graph.products import (
@@ -63,7 +64,6 @@ from caliv_graph.targets.ground_planes import (
     DISTANCE_FLOOR_M,
     NORMAL_FLOOR_RAD,
     measure_grounds,
-    tangent_axes,
 )
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.uncertainty.observability import scaling
@@ -366,7 +366,7 @@ def test_factors_by_role() -> None:
     ]
     # A prior per drive and an observation each; and a prior per drive and one per pose.
     assert sizes == [2 + 22, 24 + 2 + 11, 37 + 2 + 11]
-    weights = GroundWeights(np.zeros(22), np.zeros(12))
+    weights = GroundWeights(np.zeros(22), np.zeros(12), np.zeros(22))
     assert ground_graph(case.problem, observations, HEIGHT_KNOWN, weights).size() == 4
 
 
@@ -660,6 +660,71 @@ def test_a_pose_that_has_followed_a_wrong_plane_does_not_excuse_it() -> None:
     weights = ground_weights(case.problem, observations, values)
     assert np.flatnonzero(weights.planes < 1.0).tolist() == [5, 5 + COUNT]
     assert weights.stands[5] == 0.0
+
+
+# ------------------------------------------------------------------ heave between scan and pose
+
+
+def one_later(
+    apart_ns: int, heave_m: float, count: int = 80
+) -> tuple[Case, list[GroundObservation]]:
+    """Smoothed poses; the second LiDAR saw the vehicle lifted by something else."""
+    case = on_path(make_case(count=count), path([-0.05] * count))
+    case = replace(case, problem=replace(case.problem, motion={0: np.eye(6 * count)}))
+    rng = np.random.default_rng(5)
+    later = case.problem.lidars[1]
+
+    def off(n: int) -> Array:
+        noise = SIGMAS * rng.normal(size=3)
+        if n >= count:  # of the second LiDAR
+            noise[2] += heave_m * rng.normal()
+        return np.asarray(noise)
+
+    observations = observed(case.problem, case.truth, np.array([0.0, 0.0, GROUND_Z]), off)
+    return case, [replace(o, apart_ns=apart_ns * (o.lidar == later)) for o in observations]
+
+
+def heave_found(case: Case, observations: Sequence[GroundObservation]) -> Array:
+    """(n,) of all observations."""
+    values = with_planes(case.truth, np.array([0.0, 0.0, GROUND_Z]))
+    return ground_weights(case.problem, observations, values).heave_m
+
+
+@pytest.mark.parametrize("heave_m", [0.004, 0.007, 0.015])
+def test_heave_between_scans_is_read_off_the_scans(heave_m: float) -> None:
+    case, observations = one_later(40_000_000, heave_m)
+    found = heave_found(case, observations)
+    assert found[:80].tolist() == [0.0] * 80
+    # 80 pairs tell a median to 13 percent.
+    assert found[80:] == pytest.approx(np.full(80, heave_m), rel=0.35)
+
+
+def test_where_scans_share_the_heave_none_is_found() -> None:
+    assert heave_found(*one_later(40_000_000, 0.0)).max() < 0.0015
+    # A few milliseconds apart it is not even asked, nor are poses that know their heave.
+    assert not heave_found(*one_later(4_000_000, 0.007)).any()
+    case, observations = one_later(40_000_000, 0.007)
+    given = replace(case, problem=replace(case.problem, motion={}))
+    assert not heave_found(given, observations).any()
+
+
+def test_heave_between_a_few_scans_is_that_of_two() -> None:
+    case, observations = one_later(40_000_000, 0.0, count=8)
+    expected = math.sqrt(2.0) * HEAVE_SIGMA_M
+    assert heave_found(case, observations)[8:] == pytest.approx(np.full(8, expected))
+    assert full_weights(case.problem, observations).heave_m.tolist() == [0.0] * 8 + [expected] * 8
+
+
+def test_heave_is_in_the_sigma_of_the_distance_and_in_nothing_else() -> None:
+    case, observations = one_later(40_000_000, 0.0, count=2)
+    g = np.array([0.0, 0.0, GROUND_Z])
+    keys = (X, *case.problem.mounting_keys(observations[2].lidar))
+    anchor = ground_anchor(case.problem, 0)
+    factor = ground_plane_factor(keys, G, anchor, observations[2], 0.5, 0.007)
+    plain = ground_plane_factor(keys, G, anchor, observations[2])
+    values = with_planes(case.truth, g)
+    expected = plain.unwhitenedError(values) / np.hypot(SIGMAS, [0.0, 0.0, 0.007]) * math.sqrt(0.5)
+    assert factor.whitenedError(values) == pytest.approx(expected)
 
 
 # ------------------------------------------------------------------ a drive

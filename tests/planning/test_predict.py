@@ -255,6 +255,22 @@ def test_what_is_held_has_the_joint_guesss_sigma() -> None:
         assert sigma[5] == pytest.approx(0.1 / math.sqrt(6.0), rel=0.01)
 
 
+def test_scans_at_other_times_see_another_heave() -> None:
+    # The planes of both tie z together: 2 mm per scan each, and two draws of 5 mm between scans.
+    first, *others = DRIVES["figure-eight"]
+    sigma = []
+    for phase_s in (0.0, 0.003, 0.05):
+        rear = first.lidars["rear"].model_copy(update={"phase_s": phase_s})
+        lidars = {**first.lidars, "rear": rear}
+        scenarios = [s.model_copy(update={"lidars": lidars}) for s in (first, *others)]
+        prediction = predict(scenarios[0], scenarios[1:], Assumptions(ground="plane"))
+        (pair,) = prediction.sigma_s2s.values()
+        sigma.append(pair[5])
+    assert sigma[1] == pytest.approx(sigma[0], rel=0.05)
+    # sqrt(2 x 2^2 + 2 x 5^2) mm against sqrt(2 x 2^2) mm, for as many scans; own scans are shared.
+    assert 1.5 < sigma[2] / sigma[0] < 2.8
+
+
 def test_height_is_as_good_as_that_of_the_vehicle() -> None:
     for sigma_m in (0.002, 0.01):
         prediction = planned("figure-eight", "height", ground_height_sigma_m=sigma_m)

@@ -10,43 +10,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.estimate import OFFSET_TOLD_S
-from caliv_graph.calibration.graph import (
-    CloudLinearisation,
-    DenseSystem,
-    add_shape,
-    cloud_graph,
-    dense_system,
-    initial_values,
-    linearise_clouds,
-    merged,
-    offset_graph,
-    optimise,
-    pose_graph,
-    prior_graph,
-    with_given_poses,
-)
-from caliv_graph.calibration.ground import ground_graph, ground_values, ground_weights
-from caliv_graph.calibration.noise import (
-    TYPICAL_SCALE,
-    first_pose_noise,
-    fit_pose_noise,
-    sound_clouds,
+from caliv_graph.calibration.estimate import (
+    OFFSET_TOLD_S,
+    SolveState,
+    prealigned,
+    reduced_registered,
+    solve_registered,
 )
 from caliv_graph.calibration.problem import Problem, pose_problem
-from caliv_graph.calibration.robust import explained_part
 from caliv_graph.config import Config
-from caliv_graph.conventions import key_offset
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import (
     Array,
     GroundObservation,
-    PoseNoise,
     Recording,
     Registration,
     TargetObservation,
@@ -61,15 +40,6 @@ from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
 
 ROUGH_ITERATIONS = 40
 """Of the registration at most: millimetres do not change what a drive determines."""
-
-SOLVES = 2
-"""Graph solves, the ground weighed anew in between."""
-
-STEPS = 10
-"""Of Levenberg-Marquardt per solve."""
-
-SOUND_PART = 0.5
-"""Of a cloud's points that has to be target, against the typical cloud, for it to count."""
 
 
 @dataclass(frozen=True)
@@ -125,18 +95,6 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     )
 
 
-@dataclass
-class _Rough:
-    """A problem, solved roughly."""
-
-    problem: Problem
-    values: gtsam.Values
-    noise: PoseNoise
-    scale: float
-    weights: Array
-    steady: gtsam.NonlinearFactorGraph
-
-
 def survey_observations(
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
@@ -162,107 +120,36 @@ def survey_observations(
     with progress.stage("registering the clouds roughly", len(observations)) as advance:
         for m, observation in enumerate(observations):
             state = JointRegistration(observation, config, rough=True)
-            registrations.append(register_jointly(state, _prealigned(problem, m), limit))
+            registrations.append(register_jointly(state, prealigned(problem, m), limit))
             advance()
     with progress.stage("reading the information off the graph", None):
-        solved = _solve(problem, registrations, grounds, config)
-        system, _ = _system(solved, registrations)
-        offsets_s = _offset_sigmas(solved, system)
+        solved, D, offsets_s = _solve(problem, registrations, tuple(grounds), config)
         told = {name for name, sigma in offsets_s.items() if sigma < OFFSET_TOLD_S}
         if told != problem.offsets:
             # As `calibrate` does: what is not told stays out, for it would take x and yaw along.
             problem = replace(
                 problem, offsets=frozenset(told), twists=problem.twists if told else None
             )
-            solved = _solve(problem, registrations, grounds, config)
-            system, _ = _system(solved, registrations)
-        D = _in_vehicle_axes(solved, system)
+            solved, D, _ = _solve(problem, registrations, tuple(grounds), config)
     return _verdict(solved, D, offsets_s, observations, config)
-
-
-def _prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
-    """T_map_vehicle T_vehicle_lidar of the clouds of a placement, at the guesses."""
-    return [
-        problem.T_map_vehicle[problem.cloud_pose[j]].compose(
-            problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
-        )
-        for j in np.flatnonzero(problem.cloud_placement == placement).tolist()
-    ]
 
 
 def _solve(
     problem: Problem,
     registrations: Sequence[Registration],
-    grounds: Sequence[GroundObservation],
+    grounds: tuple[GroundObservation, ...],
     config: Config,
-) -> _Rough:
-    """Pose factors of the registered clouds, gross ones left out, noise levels from the data."""
-    measured = [T for r in registrations for T in r.T_target_lidar]
-    information = np.concatenate([r.information for r in registrations])
-    explained = np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
-    values = initial_values(problem, measured)
-    values.insert(ground_values(problem, grounds, values, config.ground))
-    noise, scale = first_pose_noise(config.noise), TYPICAL_SCALE
-    weights = np.where(explained > SOUND_PART, 1.0, 0.0)
-    stands = None
-    for _ in range(SOLVES):
-        ground = ground_graph(problem, grounds, config.ground, stands)
-        fixed = prior_graph(problem, sorted(problem.fixed))
-        steady = merged(pose_graph(problem, noise), offset_graph(problem), ground, fixed)
-        guesses = prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
-        weighted = information / scale**2 * weights[:, None, None]
-        clouds = cloud_graph(problem, measured, weighted)
-        values = optimise(merged(steady, guesses, clouds), values, STEPS)
-        if grounds and config.ground.use:
-            stands = ground_weights(problem, grounds, values)
-        given = with_given_poses(problem, values)
-        sound = sound_clouds(problem, measured, information, given, noise)
-        sound &= explained > SOUND_PART
-        weights = sound.astype(np.float64)
-        noise, scale = fit_pose_noise(problem, measured, information, sound, given, config.noise)
-    ground = ground_graph(problem, grounds, config.ground, stands)
-    steady = merged(pose_graph(problem, noise), offset_graph(problem), ground, fixed)
-    return _Rough(problem, values, noise, scale, weights, steady)
-
-
-def _system(
-    solved: _Rough, registrations: Sequence[Registration]
-) -> tuple[DenseSystem, CloudLinearisation]:
-    """The data's quadratic: motion, ground, and all clouds with the shape eliminated."""
-    lines = linearise_clouds(solved.problem, solved.values)
-    root = np.repeat(np.sqrt(solved.weights), 6) / solved.scale
-    H = block_diag(*[r.information_joint for r in registrations]) * np.outer(root, root)
-    system = dense_system(solved.problem, solved.steady, solved.values)
-    return add_shape(system, lines, H, np.zeros(len(H))), lines
-
-
-def _in_vehicle_axes(solved: _Rough, system: DenseSystem) -> Array:
-    """(6n, 6n) information on the mountings, everything else eliminated."""
-    back = np.linalg.inv(solved.problem.to_vehicle_axes(solved.values))
-    D = back.T @ system.schur()[0] @ back
-    return np.asarray(0.5 * (D + D.T))
-
-
-def _offset_sigmas(solved: _Rough, system: DenseSystem) -> dict[str, float]:
-    """LiDAR -> 1 sigma of its time offset in seconds, of those that are free."""
-    problem = solved.problem
-    if not problem.offsets:
-        return {}
-    Q = problem.to_vehicle_axes(solved.values)
-    cov = np.asarray(np.linalg.inv(system.schur()[0] + Q.T @ _prior(problem) @ Q), np.float64)
-    return {
-        name: float(np.sqrt(system.covariance_of(key_offset(i), cov)[0, 0]))
-        for i, name in enumerate(problem.lidars)
-        if name in problem.offsets
-    }
-
-
-def _prior(problem: Problem) -> Array:
-    return np.diag(np.concatenate([problem.prior_sigmas[n] for n in problem.lidars]) ** -2.0)
+) -> tuple[SolveState, Array, dict[str, float]]:
+    """The solved graph, the data's (6n, 6n) information, LiDAR -> 1 sigma of its free offset."""
+    solved = solve_registered(problem, registrations, grounds, config)
+    reduced = reduced_registered(solved, registrations)
+    cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
+    offsets = reduced.time_offsets(problem, cov)
+    return solved, reduced.D, {name: sigma for name, (_, sigma) in offsets.items()}
 
 
 def _verdict(
-    solved: _Rough,
+    solved: SolveState,
     D: Array,
     offsets_s: Mapping[str, float],
     observations: Sequence[TargetObservation],
@@ -270,7 +157,7 @@ def _verdict(
 ) -> Survey:
     problem = solved.problem
     scans: dict[tuple[str, str], int] = {}
-    for j in np.flatnonzero(solved.weights > 0.0).tolist():
+    for j in np.flatnonzero(solved.weights.values >= 0.5).tolist():
         target = observations[int(problem.cloud_placement[j])].name
         key = (target, problem.lidars[int(problem.cloud_lidar[j])])
         scans[key] = scans.get(key, 0) + 1
@@ -285,7 +172,7 @@ def _verdict(
             for name, lidar in config.lidars.items()
         },
         {
-            name: problem.prior_sigmas[name]
+            name: problem.guess_sigmas(name)
             if name in problem.lidars
             else np.array([*lidar.sigma.rpy_rad(), *lidar.sigma.xyz_m()])
             for name, lidar in config.lidars.items()

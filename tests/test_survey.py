@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from caliv_graph.calibration.problem import TRUSTED_SIGMAS
 from caliv_graph.config import Config, GroundConfig, RegistrationConfig, parse_config
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.predict import Ground
@@ -164,3 +165,22 @@ def test_from_the_recording_on() -> None:
     rough = found.outlook.calibration.lidars["front"].T_vehicle_lidar.translation()
     assert abs(rough[2] - truth[2]) < 0.03
     assert abs(rough[1] - truth[1]) < 0.05
+
+
+def test_a_fixed_lidar_is_told_and_tells_where_the_other_one_is() -> None:
+    """As in `calibrate`: the trust is among the data, and no guess to be measured against."""
+    drive = extracted("arc")
+    lidars = dict(drive.config.lidars)
+    lidars["front"] = lidars["front"].model_copy(update={"fixed": True})
+    config = drive.config.model_copy(update={"lidars": lidars, "registration": QUICK})
+
+    found = survey_observations(
+        drive.observations, drive.trajectories, drive.grounds, config, SilentProgress()
+    ).outlook
+
+    assert found.undetermined == ()
+    assert all(all(verdict.values()) for verdict in found.uncertainty.determined.values())
+    # 0.01 mrad and 0.1 mm are trusted; what the target tells of the pair is all that is left.
+    assert found.sigma_s2v["front"] == pytest.approx(TRUSTED_SIGMAS, rel=0.01)
+    pair = found.sigma_s2s["front", "rear"]
+    assert (found.sigma_s2v["rear"][[2, 3, 4]] < 1.5 * pair[[2, 3, 4]]).all()

@@ -120,7 +120,7 @@ COUPLED_STEPS = 4
 
 
 @dataclass
-class _State:
+class SolveState:
     """What the solve carries along."""
 
     problem: Problem
@@ -182,15 +182,15 @@ def _estimate(
     registrations = []
     with progress.stage("registering the clouds", len(states)) as advance:
         for m, state in enumerate(states):
-            registrations.append(register_jointly(state, _prealigned(problem, m), limit))
+            registrations.append(register_jointly(state, prealigned(problem, m), limit))
             advance()
     times = {"registration": time.perf_counter() - begun}
     with progress.stage("solving the graph", None):
-        solve = _solve_registered(problem, registrations, grounds, config)
+        solve = solve_registered(problem, registrations, grounds, config)
         times["graph"] = solve.graph_seconds
         problem, warnings = _with_determined_offsets(solve, registrations)
         if warnings:
-            solve = _solve_registered(problem, registrations, grounds, config)
+            solve = solve_registered(problem, registrations, grounds, config)
             times["graph"] += solve.graph_seconds
 
     # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
@@ -211,7 +211,7 @@ def _estimate(
     warnings += alike
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
-    solve = _solve_registered(problem, again, grounds, config, turns)
+    solve = solve_registered(problem, again, grounds, config, turns)
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
             solution = _staged(solve, again)
@@ -243,7 +243,7 @@ def _deskewed(
 
 
 def _with_determined_offsets(
-    state: _State, registrations: Sequence[Registration]
+    state: SolveState, registrations: Sequence[Registration]
 ) -> tuple[Problem, tuple[str, ...]]:
     """The problem without the time offsets that the drive does not determine, and their names.
 
@@ -278,7 +278,7 @@ def _with_determined_offsets(
     return replace(problem, offsets=frozenset(kept), twists=twists), tuple(warnings)
 
 
-def _prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
+def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
     """T_map_vehicle T_vehicle_lidar of the clouds of a placement, at the guesses."""
     out = []
     for j in np.flatnonzero(problem.cloud_placement == placement):
@@ -341,17 +341,28 @@ def _whitened(residuals: Array, information: Array) -> Array:
     return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
 
 
-def _solve_registered(
+def solve_registered(
     problem: Problem,
     registrations: Sequence[Registration],
     grounds: tuple[GroundObservation, ...],
     config: Config,
     turns: tuple[Symmetry | None, ...] = (),
-) -> _State:
-    """The paper's minimisation on the graph: pose factors, robust, noise levels from the data."""
+) -> SolveState:
+    """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
+
+    Args:
+        problem: what takes part.
+        registrations: of its placements, in order.
+        grounds: the ground as the LiDARs saw it.
+        config: kernels, noise, ground.
+        turns: per placement the turn that its target looks the same after; empty: none known.
+
+    Raises:
+        SolveError: the graph is singular.
+    """
     begun = time.perf_counter()
     measured, information = _measured(registrations, turns)
-    state = _State(
+    state = SolveState(
         problem=problem,
         config=config,
         values=initial_values(problem, measured),
@@ -382,7 +393,7 @@ def _solve_registered(
 
 
 def _reweight(
-    state: _State,
+    state: SolveState,
     measured: Sequence[gtsam.Pose3],
     information: Array,
     explained: Array,
@@ -413,10 +424,39 @@ def _reweight(
             break
 
 
+def _joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
+    """(6J, 6J) information of all registered poses, with what they share and their weights."""
+    root = np.repeat(np.sqrt(state.weights.values), 6)
+    turns = state.turns or [None] * len(registrations)
+    H = block_diag(
+        *[
+            r.information_joint
+            if turn is None
+            else forget_turns(r.information_joint, np.zeros(len(r.information_joint)), turn)[0]
+            for r, turn in zip(registrations, turns, strict=True)
+        ]
+    )
+    return np.asarray(H * np.outer(root, root) / state.scale**2)
+
+
+def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
+    """What registered clouds, motion and ground say of the extrinsics where the solve is.
+
+    Args:
+        state: of `solve_registered`.
+        registrations: what it was given.
+    """
+    problem = state.problem
+    H = _joint_information(state, registrations)
+    lines = linearise_clouds(problem, state.values)
+    r = _residuals(lines, _measured(registrations)[0]).ravel()
+    return _reduce(problem, state.values, _steady_graph(state), (H, H @ r), lines)
+
+
 # ---------------------------------------------------------------- staged
 
 
-def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
+def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solution:
     """The paper's two stages on the registered clouds.
 
     Stage 1 estimates all S_a with E free under its prior. Stage 2 fixes S_a, holds the reference
@@ -434,20 +474,11 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
     begun = time.perf_counter()
     problem = state.problem
     measured, information = _measured(registrations, state.turns)
-    root = np.repeat(np.sqrt(state.weights.values), 6)
-    H = block_diag(
-        *[
-            r.information_joint
-            if turn is None
-            else forget_turns(r.information_joint, np.zeros(len(r.information_joint)), turn)[0]
-            for r, turn in zip(registrations, state.turns, strict=True)
-        ]
-    )
-    H *= np.outer(root, root) / state.scale**2
+    H = _joint_information(state, registrations)
     steady = _steady_graph(state)
     prior = problem.guess_information()
 
-    def reduce() -> _Reduced:
+    def reduce() -> Reduced:
         lines = linearise_clouds(problem, state.values)
         r = _residuals(lines, measured).ravel()
         return _reduce(problem, state.values, steady, (H, H @ r), lines)
@@ -494,7 +525,7 @@ def _staged(state: _State, registrations: Sequence[Registration]) -> Solution:
 
 
 def _staged_covariance(
-    state: _State, information_data: Array, prior: Array, first: gtsam.Values
+    state: SolveState, information_data: Array, prior: Array, first: gtsam.Values
 ) -> Array:
     """Covariance of the staged result, vehicle axes.
 
@@ -591,7 +622,7 @@ def _per_placement(
     return out
 
 
-def _hand_weights(state: _State, states: Sequence[JointRegistration]) -> None:
+def _hand_weights(state: SolveState, states: Sequence[JointRegistration]) -> None:
     """Gives every placement the robust weights of its clouds."""
     start = 0
     for shape in states:
@@ -612,7 +643,7 @@ class _ShapeMeasurements:
     information: Array
 
 
-def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
+def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurements:
     """The pose factors that the quadratic stands for, one per cloud."""
     weights = state.weights.values
     blocks, gradient = shapes.single()
@@ -626,7 +657,7 @@ def _shape_measurements(state: _State, shapes: _Shapes) -> _ShapeMeasurements:
 
 
 def _refine(
-    state: _State,
+    state: SolveState,
     states: Sequence[JointRegistration],
     advance: Callable[..., None],
 ) -> Solution:
@@ -690,7 +721,7 @@ def _refine(
     return replace(solution, course=tuple(course))
 
 
-def _begin_shapes(state: _State, states: Sequence[JointRegistration], normals: bool) -> None:
+def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
     """A new mixture, and if asked for new normals, where the graph puts the clouds.
 
     EM ends near where it starts: what it starts from shall not depend on the way that the
@@ -704,7 +735,7 @@ def _begin_shapes(state: _State, states: Sequence[JointRegistration], normals: b
     _hand_weights(state, states)
 
 
-def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
+def _steady_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     """What stays the same while clouds are weighed anew: poses, ground and trusted mountings."""
     problem = state.problem
     return merged(
@@ -715,13 +746,13 @@ def _steady_graph(state: _State) -> gtsam.NonlinearFactorGraph:
     )
 
 
-def _ground_graph(state: _State) -> gtsam.NonlinearFactorGraph:
+def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     """What the ground says, as far as it is believed."""
     return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
 
 
 def _refined_solution(
-    state: _State,
+    state: SolveState,
     states: Sequence[JointRegistration],
     steady: gtsam.NonlinearFactorGraph,
     prior: Array,
@@ -773,7 +804,7 @@ def _refined_solution(
 
 
 @dataclass
-class _Reduced:
+class Reduced:
     """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
 
     `D` and `c`: the quadratic `e^T D e / 2 - c^T e` of the data in a step e of the extrinsics.
@@ -827,17 +858,17 @@ def _reduce(
     graph: gtsam.NonlinearFactorGraph,
     clouds: tuple[Array, Array],
     lines: CloudLinearisation,
-) -> _Reduced:
+) -> Reduced:
     """Linearises a graph and the clouds' quadratic (H, gradient), and eliminates the rest."""
     system = add_shape(dense_system(problem, graph, values), lines, *clouds)
     D, c, G, g = system.schur()
     Q = problem.to_vehicle_axes(values)
     inverse = np.linalg.inv(Q)
     D = inverse.T @ D @ inverse
-    return _Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
+    return Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
 
 
-def _offset(state: _State) -> Array:
+def _offset(state: SolveState) -> Array:
     """(6n,) where the estimate is from the guesses, vehicle axes."""
     problem = state.problem
     return np.concatenate(
@@ -848,7 +879,7 @@ def _offset(state: _State) -> Array:
     )
 
 
-def _target_in_its_map(state: _State, placement: int) -> gtsam.Pose3:
+def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:
     """T_target_map of a placement in the map of its drive."""
     problem = state.problem
     cloud = int(np.flatnonzero(problem.cloud_placement == placement)[0])
@@ -858,7 +889,7 @@ def _target_in_its_map(state: _State, placement: int) -> gtsam.Pose3:
 
 
 def _solution(
-    state: _State,
+    state: SolveState,
     registrations: Sequence[Registration],
     steady: gtsam.NonlinearFactorGraph,
     measured: Sequence[gtsam.Pose3],

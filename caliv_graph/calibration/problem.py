@@ -139,8 +139,11 @@ class Problem:
         The trust is among the data (`prior_graph`), and a direction is determined if the data know
         it better than a guess: against its own 0.1 mm a trusted mounting would not be.
         """
-        sigmas = [USUAL_SIGMAS if n in self.fixed else self.prior_sigmas[n] for n in self.lidars]
-        return np.diag(np.concatenate(sigmas) ** -2.0)
+        return np.diag(np.concatenate([self.guess_sigmas(n) for n in self.lidars]) ** -2.0)
+
+    def guess_sigmas(self, lidar: str) -> Array:
+        """(6,) what the guess of a LiDAR is worth, vehicle axes; a trusted one as any other."""
+        return USUAL_SIGMAS if lidar in self.fixed else self.prior_sigmas[lidar]
 
     def times_s(self) -> Array:
         """(n,) times of the poses in seconds; between drives they mean nothing."""

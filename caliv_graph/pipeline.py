@@ -31,6 +31,7 @@ from caliv_graph.geometry.se3 import (
     right_to_vehicle_axes,
     vehicle_axes_difference,
 )
+from caliv_graph.preparation import prepare
 from caliv_graph.products import (
     Array,
     Calibration,
@@ -46,10 +47,8 @@ from caliv_graph.progress import Progress
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.report.evidence import Evidence
 from caliv_graph.requirements import unmet_requirements
-from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground_planes import measure_grounds
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
 from caliv_graph.uncertainty.observability import assess
@@ -101,15 +100,9 @@ def calibrate(
     asked = config
     if prior is not None:
         config = starting_from(config, prior, digests)
-    with progress.stage("smoothing the trajectory", None):
-        nowhere: list[list[int]] = [[] for _ in recordings]
-        rough = smooth_trajectories(recordings, config, nowhere, motions)
-    observations = extract_targets(recordings, rough, config, progress)
-    grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
-    with progress.stage("smoothing the trajectory at the target's scans", None):
-        stamps = _stamps_used(recordings, observations)
-        trajectories = smooth_trajectories(recordings, config, stamps, motions)
-    solution = estimate(observations, trajectories, config, progress, grounds)
+    prepared = prepare(recordings, config, motions, progress)
+    trajectories, observations = prepared.trajectories, prepared.observations
+    solution = estimate(observations, trajectories, config, progress, prepared.grounds)
     uncertainty = assess(
         solution.information_data,
         solution.information_prior,
@@ -128,8 +121,8 @@ def calibrate(
         solution,
         observations,
         (
-            *_warnings(recordings, trajectories, observations, solution),
-            *ground_warnings,
+            *prepared.warnings,
+            *_warnings(solution),
             *(heading.warning for heading in headings.values() if heading.warning),
             *untested,
             *prior_warnings,
@@ -137,7 +130,7 @@ def calibrate(
         Evidence(
             tuple(Path(recording.name).absolute().name for recording in recordings),
             trajectories,
-            tuple(grounds),
+            prepared.grounds,
             {drive: recording.kept() for drive, recording in enumerate(sampled)},
         ),
     )
@@ -201,24 +194,8 @@ def _checked(
     return calibration, untested
 
 
-def _stamps_used(
-    recordings: Sequence[Recording], observations: Sequence[TargetObservation]
-) -> list[list[int]]:
-    """Per drive the stamps of the scans that see a target."""
-    seen = {(cloud.drive, cloud.stamp_ns) for o in observations for cloud in o.clouds}
-    return [sorted(stamp for d, stamp in seen if d == drive) for drive in range(len(recordings))]
-
-
-def _warnings(
-    recordings: Sequence[Recording],
-    trajectories: Sequence[VehicleTrajectory],
-    observations: Sequence[TargetObservation],
-    solution: Solution,
-) -> tuple[str, ...]:
-    out = [w for r in recordings for w in r.warnings()]
-    out += [w for t in trajectories for w in t.warnings]
-    out += [w for o in observations for w in o.warnings]
-    out += solution.warnings
+def _warnings(solution: Solution) -> tuple[str, ...]:
+    out = [*solution.warnings]
     for registration in solution.registrations:
         if not registration.converged:
             turn, shift = registration.last_step

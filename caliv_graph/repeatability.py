@@ -7,7 +7,6 @@ would be (`fusion.compare`): on the joint covariance, along the directions that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,18 +17,15 @@ from caliv_graph.errors import RegistrationError, SolveError, TargetError
 from caliv_graph.fusion.compare import Comparison, compare
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.pipeline import assemble
+from caliv_graph.preparation import Prepared, prepare
 from caliv_graph.products import (
     Calibration,
-    GroundObservation,
     MotionData,
     Recording,
     TargetCloud,
     TargetObservation,
 )
 from caliv_graph.progress import Progress
-from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground_planes import measure_grounds
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.uncertainty.observability import assess
 
 PASS_GAP_NS = 5_000_000_000
@@ -115,14 +111,11 @@ def split_halves(
         RecordingError, TrajectoryError: the recording could not be read.
     """
     motion = recording.motion() if motion is None else motion
-    (rough,) = smooth_trajectories([recording], config, [[]], {0: motion})
     try:
-        observations = extract_targets([recording], (rough,), config, progress)
+        prepared = prepare([recording], config, {0: motion}, progress)
     except TargetError as e:
         return Repeatability(("", ""), None, reason=str(e))
-    grounds, _ = measure_grounds([recording], (rough,), observations, config, progress)
-    stamps = sorted({cloud.stamp_ns for o in observations for cloud in o.clouds})
-    (trajectory,) = smooth_trajectories([recording], config, [stamps], {0: motion})
+    observations = prepared.observations
     fewest = config.extraction.min_scans
     names, halves = ("first passes", "later passes"), [split(o, fewest) for o in observations]
     by_passes = None not in halves
@@ -132,14 +125,18 @@ def split_halves(
     digest = drive_digest(motion)
     results: list[Calibration] = []
     for half, name in enumerate(names):
-        parts = [
+        parts = tuple(
             replace(o, clouds=of[half]) for o, of in zip(observations, halves, strict=True) if of
-        ]
+        )
         try:
             with progress.stage(f"calibrating by half the scans: {name}", None):
                 results.append(
                     _calibrated(
-                        recording, parts, trajectory, grounds, config, progress, f"{digest} {name}"
+                        recording,
+                        replace(prepared, observations=parts),
+                        config,
+                        progress,
+                        f"{digest} {name}",
                     )
                 )
         except (TargetError, RegistrationError, SolveError) as e:
@@ -149,16 +146,14 @@ def split_halves(
 
 def _calibrated(
     recording: Recording,
-    observations: Sequence[TargetObservation],
-    trajectory: VehicleTrajectory,
-    grounds: Sequence[GroundObservation],
+    prepared: Prepared,
     config: Config,
     progress: Progress,
     digest: str,
 ) -> Calibration:
-    stamps = {cloud.stamp_ns for o in observations for cloud in o.clouds}
-    own = [ground for ground in grounds if ground.stamp_ns in stamps]
-    solution = estimate(observations, (trajectory,), config, progress, own)
+    stamps = {cloud.stamp_ns for o in prepared.observations for cloud in o.clouds}
+    own = [ground for ground in prepared.grounds if ground.stamp_ns in stamps]
+    solution = estimate(prepared.observations, prepared.trajectories, config, progress, own)
     uncertainty = assess(
         solution.information_data,
         solution.information_prior,

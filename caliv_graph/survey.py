@@ -20,9 +20,10 @@ from caliv_graph.calibration.estimate import (
     reduced_registered,
     solve_registered,
 )
-from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.config import Config
 from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.preparation import prepare
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -33,9 +34,7 @@ from caliv_graph.products import (
 from caliv_graph.progress import Progress
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.requirements import unmet_requirements
-from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground_planes import measure_grounds
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
 
 ROUGH_ITERATIONS = 40
@@ -73,25 +72,15 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
         CalivError: something is wrong with the input; the message says what to do.
     """
     motions = {i: recording.motion() for i, recording in enumerate(recordings)}
-    with progress.stage("smoothing the trajectory", None):
-        rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-    observations = extract_targets(recordings, rough, config, progress)
-    grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
-    with progress.stage("smoothing the trajectory at the target's scans", None):
-        seen = {(cloud.drive, cloud.stamp_ns) for o in observations for cloud in o.clouds}
-        stamps = [sorted(t for d, t in seen if d == drive) for drive in range(len(recordings))]
-        trajectories = smooth_trajectories(recordings, config, stamps, motions)
-    warnings = [w for r in recordings for w in r.warnings()]
-    warnings += [w for t in trajectories for w in t.warnings]
-    warnings += [w for o in observations for w in o.warnings]
-    used = [o for o in observations if len(o.clouds) >= 2]
-    used = [replace(o, placement=m) for m, o in enumerate(used)]
+    prepared = prepare(recordings, config, motions, progress)
     with threadpool_limits(limits=1):
-        found = survey_observations(used, trajectories, grounds, config, progress)
+        found = survey_observations(
+            prepared.observations, prepared.trajectories, prepared.grounds, config, progress
+        )
     return replace(
         found,
         names=tuple(recording.name for recording in recordings),
-        warnings=(*warnings, *ground_warnings, *found.warnings),
+        warnings=(*prepared.warnings, *found.warnings),
     )
 
 
@@ -105,7 +94,7 @@ def survey_observations(
     """The same from extracted targets and grounds; without names and the warnings before it.
 
     Args:
-        observations: clouds of each target placement, numbered from 0.
+        observations: clouds of each target placement.
         trajectories: one per drive.
         grounds: the ground as the LiDARs saw it.
         config: modes, kernels, priors.
@@ -114,6 +103,7 @@ def survey_observations(
     Raises:
         RegistrationError, SolveError: it could not be done.
     """
+    observations = usable(observations)
     problem = pose_problem(observations, trajectories, config)
     limit = min(config.registration.max_iterations, ROUGH_ITERATIONS)
     registrations = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from caliv_graph.calibration.problem import TRUSTED_SIGMAS
 from caliv_graph.config import Config, GroundConfig, RegistrationConfig, parse_config
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.predict import Ground
-from caliv_graph.products import GroundObservation, TargetObservation
+from caliv_graph.preparation import Prepared, prepare
 from caliv_graph.progress import SilentProgress
 from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.scenario import (
@@ -28,9 +27,6 @@ from caliv_graph.simulation.scenario import (
 )
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.survey import Survey, survey, survey_observations
-from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground_planes import measure_grounds
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from tests.drives_with_chair import paper_lidar, paper_scenario
 
 HEIGHT = "height of all LiDARs together"
@@ -67,21 +63,15 @@ class Extracted:
     """The stages before the graph, which the columns of the table share."""
 
     config: Config
-    observations: Sequence[TargetObservation]
-    trajectories: Sequence[VehicleTrajectory]
-    grounds: Sequence[GroundObservation]
+    prepared: Prepared
 
 
 @functools.cache
 def extracted(name: str, seed: int = 1) -> Extracted:
     recording = simulate_drive(scenario_of(name), seed)
     config = parse_config(config_of(recording, has_bag=True), name, Path())
-    rough = smooth_trajectories([recording], config, [[]])
-    observations = extract_targets([recording], rough, config, SilentProgress())
-    grounds, _ = measure_grounds([recording], rough, observations, config, SilentProgress())
-    stamps = sorted({c.stamp_ns for o in observations for c in o.clouds})
-    trajectories = smooth_trajectories([recording], config, [stamps])
-    return Extracted(config, observations, trajectories, grounds)
+    prepared = prepare([recording], config, {0: recording.motion()}, SilentProgress())
+    return Extracted(config, prepared)
 
 
 def surveyed(name: str, ground: Ground, registration: RegistrationConfig = QUICK) -> Survey:
@@ -94,9 +84,10 @@ def surveyed(name: str, ground: Ground, registration: RegistrationConfig = QUICK
     config = drive.config.model_copy(
         update={"ground": settings[ground], "registration": registration}
     )
-    grounds = drive.grounds if ground != "none" else ()
+    prepared = drive.prepared
+    grounds = prepared.grounds if ground != "none" else ()
     return survey_observations(
-        drive.observations, drive.trajectories, grounds, config, SilentProgress()
+        prepared.observations, prepared.trajectories, grounds, config, SilentProgress()
     )
 
 
@@ -175,7 +166,11 @@ def test_a_fixed_lidar_is_told_and_tells_where_the_other_one_is() -> None:
     config = drive.config.model_copy(update={"lidars": lidars, "registration": QUICK})
 
     found = survey_observations(
-        drive.observations, drive.trajectories, drive.grounds, config, SilentProgress()
+        drive.prepared.observations,
+        drive.prepared.trajectories,
+        drive.prepared.grounds,
+        config,
+        SilentProgress(),
     ).outlook
 
     assert found.undetermined == ()

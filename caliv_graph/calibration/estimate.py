@@ -51,7 +51,7 @@ from caliv_graph.calibration.noise import (
     sound_clouds,
     squares_without_own_pose,
 )
-from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
+from caliv_graph.calibration.problem import Problem, moved_map, pose_problem, usable
 from caliv_graph.calibration.robust import RobustWeights, explained_part
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_offset, key_target, key_vehicle
@@ -156,8 +156,7 @@ def estimate(
     Raises:
         RegistrationError, SolveError: it could not be done.
     """
-    used = [o for o in observations if len(o.clouds) >= 2]
-    used = [replace(o, placement=m) for m, o in enumerate(used)]
+    used = usable(observations)
     problem = pose_problem(used, trajectories, config)
     if config.solve.mode == "staged":
         grounds = ()

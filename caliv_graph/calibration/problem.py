@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -182,6 +182,12 @@ class Problem:
                 column = 6 * keys.index(key)
                 out[6 * i : 6 * i + 6, column : column + 6] = block
         return out
+
+
+def usable(observations: Sequence[TargetObservation]) -> list[TargetObservation]:
+    """Placements of which there are two clouds to register, numbered from 0."""
+    used = [o for o in observations if len(o.clouds) >= 2]
+    return [replace(o, placement=m) for m, o in enumerate(used)]
 
 
 def moved_map(T_map_vehicle: gtsam.Pose3, shift: Array) -> gtsam.Pose3:

@@ -19,6 +19,7 @@ from caliv_graph.calibration.estimate import (
     prealigned,
     reduced_registered,
     solve_registered,
+    turns_of_targets,
 )
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.config import Config
@@ -33,6 +34,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.progress import Progress
 from caliv_graph.registration.register import JointRegistration, register_jointly
+from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
@@ -113,15 +115,17 @@ def survey_observations(
             registrations.append(register_jointly(state, prealigned(problem, m), limit))
             advance()
     with progress.stage("reading the information off the graph", None):
-        solved, D, offsets_s = _solve(problem, registrations, tuple(grounds), config)
+        turns, alike = turns_of_targets(registrations, config)
+        solved, D, offsets_s = _solve(problem, registrations, tuple(grounds), config, turns)
         told = {name for name, sigma in offsets_s.items() if sigma < OFFSET_TOLD_S}
         if told != problem.offsets:
             # As `calibrate` does: what is not told stays out, for it would take x and yaw along.
             problem = replace(
                 problem, offsets=frozenset(told), twists=problem.twists if told else None
             )
-            solved, D, _ = _solve(problem, registrations, tuple(grounds), config)
-    return _verdict(solved, D, offsets_s, observations, config)
+            solved, D, _ = _solve(problem, registrations, tuple(grounds), config, turns)
+    found = _verdict(solved, D, offsets_s, observations, config)
+    return replace(found, warnings=(*alike, *found.warnings))
 
 
 def _solve(
@@ -129,9 +133,10 @@ def _solve(
     registrations: Sequence[Registration],
     grounds: tuple[GroundObservation, ...],
     config: Config,
+    turns: tuple[Symmetry | None, ...],
 ) -> tuple[SolveState, Array, dict[str, float]]:
     """The solved graph, the data's (6n, 6n) information, LiDAR -> 1 sigma of its free offset."""
-    solved = solve_registered(problem, registrations, grounds, config)
+    solved = solve_registered(problem, registrations, grounds, config, turns)
     reduced = reduced_registered(solved, registrations)
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
     offsets = reduced.time_offsets(problem, cov)

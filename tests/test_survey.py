@@ -18,7 +18,9 @@ from caliv_graph.progress import SilentProgress
 from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.scenario import (
     ArcDrive,
+    ChairModel,
     CropModel,
+    CylinderModel,
     DriveModel,
     Scenario,
     SCurveDrive,
@@ -179,3 +181,24 @@ def test_a_fixed_lidar_is_told_and_tells_where_the_other_one_is() -> None:
     assert found.sigma_s2v["front"] == pytest.approx(TRUSTED_SIGMAS, rel=0.01)
     pair = found.sigma_s2s["front", "rear"]
     assert (found.sigma_s2v["rear"][[2, 3, 4]] < 1.5 * pair[[2, 3, 4]]).all()
+
+
+def test_a_target_that_looks_the_same_after_any_turn_is_named() -> None:
+    scenario = scenario_of("arc")
+    chair = scenario.world.objects["chair"]
+    assert isinstance(chair, ChairModel)
+    drum = CylinderModel(xy_m=chair.xy_m, radius_m=0.35, height_m=1.1)
+    world = scenario.world.model_copy(update={"objects": {**scenario.world.objects, "chair": drum}})
+    recording = simulate_drive(scenario.model_copy(update={"world": world}), 1)
+    config = parse_config(config_of(recording, has_bag=True), "drum", Path())
+    config = config.model_copy(update={"registration": QUICK})
+
+    found = survey([recording], config, SilentProgress())
+
+    assert any("looks the same after any turn about the vertical" in w for w in found.warnings)
+    # Where a drum is, from poses that turn, tells the pair's yaw all the same.
+    assert all(found.outlook.determined_s2s["front", "rear"].values())
+
+
+def test_a_chair_does_not_look_the_same_after_a_turn() -> None:
+    assert not any("looks the same" in w for w in surveyed("arc", "height").warnings)

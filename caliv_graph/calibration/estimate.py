@@ -206,7 +206,7 @@ def _estimate(
             state.refine_normals(R, t)
             again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()
-    turns, alike = _symmetries(again, config)
+    turns, alike = turns_of_targets(again, config)
     warnings += alike
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
@@ -286,7 +286,7 @@ def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
     return out
 
 
-def _symmetries(
+def turns_of_targets(
     registrations: Sequence[Registration], config: Config
 ) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
     """Per placement the turn that its target looks the same after, any turn; and what to tell.

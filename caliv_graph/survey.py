@@ -20,8 +20,9 @@ from caliv_graph.calibration.estimate import (
     reduced_registered,
     solve_registered,
     turns_of_targets,
+    with_determined_offsets,
 )
-from caliv_graph.calibration.problem import Problem, pose_problem, usable
+from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.config import Config
 from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.preparation import prepare
@@ -29,12 +30,10 @@ from caliv_graph.products import (
     Array,
     GroundObservation,
     Recording,
-    Registration,
     TargetObservation,
 )
 from caliv_graph.progress import Progress
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.requirements import unmet_requirements
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
@@ -116,31 +115,13 @@ def survey_observations(
             advance()
     with progress.stage("reading the information off the graph", None):
         turns, alike = turns_of_targets(registrations, config)
-        solved, D, offsets_s = _solve(problem, registrations, tuple(grounds), config, turns)
-        told = {name for name, sigma in offsets_s.items() if sigma < OFFSET_TOLD_S}
-        if told != problem.offsets:
-            # As `calibrate` does: what is not told stays out, for it would take x and yaw along.
-            problem = replace(
-                problem, offsets=frozenset(told), twists=problem.twists if told else None
-            )
-            solved, D, _ = _solve(problem, registrations, tuple(grounds), config, turns)
+        solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
+        problem, offsets_s = with_determined_offsets(solved, registrations)
+        if problem.offsets != solved.problem.offsets:
+            solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
+        D = reduced_registered(solved, registrations).D
     found = _verdict(solved, D, offsets_s, observations, config)
     return replace(found, warnings=(*alike, *found.warnings))
-
-
-def _solve(
-    problem: Problem,
-    registrations: Sequence[Registration],
-    grounds: tuple[GroundObservation, ...],
-    config: Config,
-    turns: tuple[Symmetry | None, ...],
-) -> tuple[SolveState, Array, dict[str, float]]:
-    """The solved graph, the data's (6n, 6n) information, LiDAR -> 1 sigma of its free offset."""
-    solved = solve_registered(problem, registrations, grounds, config, turns)
-    reduced = reduced_registered(solved, registrations)
-    cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
-    offsets = reduced.time_offsets(problem, cov)
-    return solved, reduced.D, {name: sigma for name, (_, sigma) in offsets.items()}
 
 
 def _verdict(

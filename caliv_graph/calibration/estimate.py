@@ -90,6 +90,7 @@ from caliv_graph.uncertainty.observability import (
     respectful_step,
     spectrum,
 )
+from caliv_graph.uncertainty.outlook import untold_offsets
 
 REWEIGHTINGS = 12
 """Rounds of reweighting at most; graduated non-convexity needs more and may take twice this."""
@@ -187,7 +188,8 @@ def _estimate(
     with progress.stage("solving the graph", None):
         solve = solve_registered(problem, registrations, grounds, config)
         times["graph"] = solve.graph_seconds
-        problem, warnings = _with_determined_offsets(solve, registrations)
+        problem, offsets_s = with_determined_offsets(solve, registrations)
+        warnings = tuple(untold_offsets(offsets_s, OFFSET_TOLD_S))
         if warnings:
             solve = solve_registered(problem, registrations, grounds, config)
             times["graph"] += solve.graph_seconds
@@ -241,40 +243,29 @@ def _deskewed(
     return replace(observation, clouds=tuple(clouds))
 
 
-def _with_determined_offsets(
+def with_determined_offsets(
     state: SolveState, registrations: Sequence[Registration]
-) -> tuple[Problem, tuple[str, ...]]:
-    """The problem without the time offsets that the drive does not determine, and their names.
+) -> tuple[Problem, dict[str, float]]:
+    """The problem without the time offsets that the drive does not determine.
 
     At constant speed on an arc an offset of a LiDAR is the same as its own x and yaw: to free it
     would lose what the drive does tell of them (SPEC 4).
+
+    Args:
+        state: of `solve_registered`, offsets free.
+        registrations: what it was given.
+
+    Returns:
+        The problem; and LiDAR -> 1 sigma in seconds of each offset that was free.
     """
     problem = state.problem
     if not problem.offsets:
-        return problem, ()
-    measured, information = _measured(registrations)
-    lines = linearise_clouds(problem, state.values)
-    weights = state.weights.values / state.scale**2
-    H = block_diag(*(information * weights[:, None, None]))
-    system = dense_system(problem, _steady_graph(state), state.values)
-    system = add_shape(system, lines, H, H @ _residuals(lines, measured).ravel())
-    Q = problem.to_vehicle_axes(state.values)
-    D = system.schur()[0] + Q.T @ problem.guess_information() @ Q
-    cov = np.asarray(np.linalg.inv(D), np.float64)
-    kept, warnings = set(), []
-    for i, name in enumerate(problem.lidars):
-        if name not in problem.offsets:
-            continue
-        sigma = float(np.sqrt(system.covariance_of(key_offset(i), cov)[0, 0]))
-        if sigma < OFFSET_TOLD_S:
-            kept.add(name)
-        else:
-            warnings.append(
-                f"lidar '{name}': this drive does not tell its time offset (it would have a sigma "
-                f"of {1e3 * sigma:.0f} ms): taken as 0. Drive a figure-eight, or vary the speed"
-            )
-    twists = problem.twists if kept else None
-    return replace(problem, offsets=frozenset(kept), twists=twists), tuple(warnings)
+        return problem, {}
+    reduced = reduced_registered(state, registrations)
+    cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
+    sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
+    kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_TOLD_S)
+    return replace(problem, offsets=kept, twists=problem.twists if kept else None), sigmas
 
 
 def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:

@@ -29,6 +29,7 @@ from caliv_graph.fusion.terms import DRIVES, drive_digest
 from caliv_graph.geometry.se3 import (
     pose_from_mounting,
     right_to_vehicle_axes,
+    sigmas_from_mounting,
     vehicle_axes_difference,
 )
 from caliv_graph.preparation import prepare
@@ -276,10 +277,8 @@ def assemble(
 def _guess(config: Config, name: str) -> Guess:
     """What the config says of a mounting."""
     lidar = config.lidars[name]
-    sigmas = np.array([*lidar.sigma.rpy_rad(), *lidar.sigma.xyz_m()])
-    return Guess(
-        pose_from_mounting(lidar.initial), TRUSTED_SIGMAS if lidar.fixed else sigmas, lidar.fixed
-    )
+    sigmas = TRUSTED_SIGMAS if lidar.fixed else sigmas_from_mounting(lidar.sigma)
+    return Guess(pose_from_mounting(lidar.initial), sigmas, lidar.fixed)
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:

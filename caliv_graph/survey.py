@@ -24,7 +24,7 @@ from caliv_graph.calibration.estimate import (
 )
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.config import Config
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.geometry.se3 import pose_from_mounting, sigmas_from_mounting
 from caliv_graph.preparation import prepare
 from caliv_graph.products import (
     Array,
@@ -150,7 +150,7 @@ def _verdict(
         {
             name: problem.guess_sigmas(name)
             if name in problem.lidars
-            else np.array([*lidar.sigma.rpy_rad(), *lidar.sigma.xyz_m()])
+            else sigmas_from_mounting(lidar.sigma)
             for name, lidar in config.lidars.items()
         },
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},

@@ -18,11 +18,10 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.calibration.problem import _twists
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, IntArray, Solution
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.uncertainty.consistency import Assumed, CloudCount, Contrast, ContrastKind
 
 LEAST_TURN_RAD_S = 0.02
@@ -90,7 +89,7 @@ class _Clouds:
         for drive in sorted({d for d, _ in self.place}):
             mine = [j for j, (d, _) in enumerate(self.place) if d == drive]
             stamps = [self.place[j][1] for j in mine]
-            self.twists[mine] = _twists(trajectories[drive], stamps)
+            self.twists[mine] = twists_at(trajectories[drive], stamps)
         scale2 = solution.registration_scale**2
         information = np.concatenate([r.information for r in solution.registrations]) / scale2
         white = np.concatenate(solution.residuals)
@@ -285,7 +284,7 @@ def cloud_counts(
         down |= (np.concatenate(solution.residuals) ** 2).sum(axis=1) > FAR_OFF
     middles, turns, rates = _middles(solution), [], []
     for cloud in observed:
-        rates.append(_twists(trajectories[cloud.drive], [cloud.stamp_ns])[0, 2])
+        rates.append(twists_at(trajectories[cloud.drive], [cloud.stamp_ns])[0, 2])
         turns.append(solution.T_map_vehicle[cloud.drive, cloud.stamp_ns].rotation().matrix())
     rate = np.array(rates)
     out = []
@@ -375,7 +374,7 @@ def typical_speed(solution: Solution, trajectories: Sequence[VehicleTrajectory])
     return float(
         np.median(
             [
-                np.linalg.norm(_twists(trajectories[drive], [stamp])[0, 3:])
+                np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
                 for drive, stamp in solution.T_map_vehicle
             ]
         )

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.config import Config, MountingSigma
+from caliv_graph.config import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
     key_drift,
@@ -20,26 +20,24 @@ from caliv_graph.conventions import (
     key_vehicle,
 )
 from caliv_graph.errors import SolveError
-from caliv_graph.geometry.se3 import pose_from_mounting, right_to_vehicle_axes, unstack
+from caliv_graph.geometry.se3 import (
+    USUAL_SIGMAS,
+    pose_from_mounting,
+    right_to_vehicle_axes,
+    sigmas_from_mounting,
+    unstack,
+)
 from caliv_graph.products import Array, IntArray, TargetObservation
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
 """Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
 0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
 
-USUAL_SIGMAS = np.array([*MountingSigma().rpy_rad(), *MountingSigma().xyz_m()])
-"""(6,) What a guess is worth where nothing is said: the config's defaults."""
-
-
 HEAVE_SIGMA_M = 0.005
 """How far the body on its springs, and the LiDARs with it, is off its height at each stamp. The
 smoothed trajectory knows nothing of it; given poses are told apart from it by the data."""
-
-
-TWIST_WINDOW_NS = 50_000_000
-"""Half the time over which the vehicle's velocity is averaged."""
 
 
 @dataclass(frozen=True)
@@ -220,23 +218,20 @@ def pose_problem(
         stamps = [stamp for drive, stamp in poses if drive == d]
         T_map_vehicle += unstack(*trajectories[d].poses_at(stamps))
         if config.solve.time_offset:
-            twists.append(_twists(trajectories[d], stamps))
+            twists.append(twists_at(trajectories[d], stamps))
     origins = {
         d: np.asarray(T.translation(), np.float64)
         for (d, _), T in reversed(list(zip(poses, T_map_vehicle, strict=True)))
     }
     fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
-    sigmas = {}
-    for name in lidars:
-        sigma = config.lidars[name].sigma
-        sigmas[name] = (
-            TRUSTED_SIGMAS if name in fixed else np.array([*sigma.rpy_rad(), *sigma.xyz_m()])
-        )
     return Problem(
         lidars=lidars,
         reference=reference,
         guesses={n: pose_from_mounting(config.lidars[n].initial) for n in lidars},
-        prior_sigmas=sigmas,
+        prior_sigmas={
+            n: TRUSTED_SIGMAS if n in fixed else sigmas_from_mounting(config.lidars[n].sigma)
+            for n in lidars
+        },
         fixed=fixed,
         poses=poses,
         T_map_vehicle=tuple(
@@ -266,20 +261,3 @@ def _with_heave(information: Array) -> Array:
     cov[z, z] += HEAVE_SIGMA_M**2
     with_heave = np.linalg.inv(cov)
     return np.asarray(0.5 * (with_heave + with_heave.T))
-
-
-def _twists(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
-    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
-    begin, end = trajectory.span_ns
-    stamps = np.asarray(stamps_ns, dtype=np.int64)
-    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
-    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
-    first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
-    return np.array(
-        [
-            gtsam.Pose3.Logmap(a.between(b)) / max(seconds, 1e-9)
-            for a, b, seconds in zip(
-                first, second, (after - before) / NANOSECONDS_PER_SECOND, strict=True
-            )
-        ]
-    )

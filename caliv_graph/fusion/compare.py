@@ -16,9 +16,10 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
 from caliv_graph.errors import ConfigError
-from caliv_graph.fusion.terms import USUAL_SIGMAS, arranged, guess_of, own_term
+from caliv_graph.fusion.terms import arranged, guess_of, own_term
 from caliv_graph.geometry.covariance import relative_jacobian
 from caliv_graph.geometry.se3 import (
+    USUAL_SIGMAS,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     vehicle_axes_difference,

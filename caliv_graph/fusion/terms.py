@@ -13,9 +13,9 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from caliv_graph.config import MountingSigma
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
+    USUAL_SIGMAS,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     vehicle_axes_difference,
@@ -30,9 +30,6 @@ from caliv_graph.uncertainty.observability import (
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
-
-USUAL_SIGMAS = np.array([*MountingSigma().rpy_rad(), *MountingSigma().xyz_m()])
-"""(6,) What a guess is worth where a file does not say: the config's defaults."""
 
 _STEPS = 20
 _STEP_TOLERANCE = 1e-12

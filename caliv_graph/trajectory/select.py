@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from caliv_graph.config import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.geometry.se3 import stack
+from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
 from caliv_graph.trajectory.given import given_trajectory
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
 from caliv_graph.trajectory.smoothing import smooth_trajectory
+
+TWIST_WINDOW_NS = 50_000_000
+"""Half the time over which the vehicle's velocity is averaged."""
 
 
 class VehicleTrajectory(Protocol):
@@ -80,16 +85,9 @@ class GivenTrajectory:
         Raises:
             TrajectoryError: a stamp is outside the span.
         """
-        stamps = np.asarray(stamps_ns, dtype=np.int64)
-        begin, end = self.span_ns
-        outside = (stamps < begin) | (stamps > end)
-        if outside.any():
-            at = int(stamps[np.argmax(outside)])
-            raise TrajectoryError(
-                f"trajectory: stamp {at} ns is outside the given poses, {begin} to {end} ns"
-            )
+        stamps = within_span(stamps_ns, self.span_ns, "the given poses")
         seconds, turns, t = self._knots
-        s = (stamps - begin) * 1e-9
+        s = (stamps - self.span_ns[0]) * 1e-9
         position = np.stack([np.interp(s, seconds, axis) for axis in t.T], axis=1)
         return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
 
@@ -153,3 +151,20 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
         f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
     )
     return GivenTrajectory(trajectory, tuple(lost.tolist()), (line,))
+
+
+def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
+    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
+    begin, end = trajectory.span_ns
+    stamps = np.asarray(stamps_ns, dtype=np.int64)
+    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
+    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
+    first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
+    return np.array(
+        [
+            gtsam.Pose3.Logmap(a.between(b)) / max(seconds, 1e-9)
+            for a, b, seconds in zip(
+                first, second, (after - before) / NANOSECONDS_PER_SECOND, strict=True
+            )
+        ]
+    )

@@ -62,6 +62,28 @@ def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> Dead
     )
 
 
+def within_span(
+    stamps_ns: Sequence[int] | IntArray, span_ns: tuple[int, int], whose: str
+) -> IntArray:
+    """The stamps (m,) as an array, all within a span.
+
+    Args:
+        stamps_ns: (m,) in any order.
+        span_ns: first and last that there may be.
+        whose: span it is, for the message.
+
+    Raises:
+        TrajectoryError: a stamp is outside.
+    """
+    stamps = np.asarray(stamps_ns, dtype=np.int64)
+    begin, end = span_ns
+    outside = (stamps < begin) | (stamps > end)
+    if outside.any():
+        at = int(stamps[np.argmax(outside)])
+        raise TrajectoryError(f"trajectory: stamp {at} ns is outside {whose}, {begin} to {end} ns")
+    return stamps
+
+
 @dataclass(frozen=True)
 class SmoothedTrajectory:
     """The vehicle's motion over one drive, as a Gaussian.
@@ -124,20 +146,12 @@ class SmoothedTrajectory:
         Raises:
             TrajectoryError: a stamp is outside the span.
         """
-        stamps = np.asarray(stamps_ns, dtype=np.int64)
-        R, p, _ = self._imu_states(stamps)
+        R, p, _ = self._imu_states(within_span(stamps_ns, self.span_ns, "its span"))
         R_iv, t_iv = stack([self.T_vehicle_imu.inverse()])
         return R @ R_iv[0], p + R @ t_iv[0]
 
     def _imu_states(self, stamps: IntArray) -> tuple[Array, Array, Array]:
         """R_map_imu, its origin and its velocity in the map."""
-        begin, end = self.span_ns
-        outside = (stamps < begin) | (stamps > end)
-        if outside.any():
-            at = int(stamps[np.argmax(outside)])
-            raise TrajectoryError(
-                f"trajectory: stamp {at} ns is outside its span, {begin} to {end} ns"
-            )
         i = np.clip(np.searchsorted(self.nodes_ns, stamps, "right") - 1, 0, len(self.nodes_ns) - 2)
         R, p, v = self._carried(i, stamps)
         miss_R, miss_p, miss_v = self._misses
@@ -174,7 +188,7 @@ class SmoothedTrajectory:
 
         Both in vehicle axes. The gyroscope is averaged over 0.1 s.
         """
-        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        stamps = within_span(stamps_ns, self.span_ns, "its span")
         R, _, v = self._imu_states(stamps)
         rates = self._dead.rates(stamps, 50_000_000)
         R_vi = self.T_vehicle_imu.rotation().matrix()

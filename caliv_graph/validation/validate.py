@@ -14,7 +14,7 @@ from caliv_graph.calibration.noise import first_pose_noise
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config import Config
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.geometry.se3 import pose_from_mounting, sigmas_from_mounting
 from caliv_graph.products import Array, Calibration, IntArray, MotionData, PoseNoise, Recording
 from caliv_graph.progress import Progress
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
@@ -242,9 +242,7 @@ def _validate(
         config.noise.lidar_range_m,
         HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
     )
-    sigmas = np.array(
-        [[*config.lidars[n].sigma.rpy_rad(), *config.lidars[n].sigma.xyz_m()] for n in names]
-    )
+    sigmas = np.array([sigmas_from_mounting(config.lidars[n].sigma) for n in names])
     with progress.stage("measuring the alignment", None):
         start = sharper(clouds, (AFTER, BEFORE))
         structure, best = align(clouds, clouds.placed[start], sigmas, not config.ground.use)

@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import AXES
-from caliv_graph.fusion.terms import USUAL_SIGMAS, fuse
-from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes
+from caliv_graph.fusion.terms import fuse
+from caliv_graph.geometry.se3 import USUAL_SIGMAS, retract_vehicle_axes, right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
 from tests.samples import MOUNTINGS, make_covariance, pose, turn_about_centre

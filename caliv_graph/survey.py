@@ -110,7 +110,9 @@ def survey_observations(
     registrations = []
     with progress.stage("registering the clouds roughly", len(observations)) as advance:
         for m, observation in enumerate(observations):
-            state = JointRegistration(observation, config, rough=True)
+            state = JointRegistration(
+                observation, config, rough=True, shares=problem.cloud_shares(m)
+            )
             registrations.append(register_jointly(state, prealigned(problem, m), limit))
             advance()
     with progress.stage("reading the information off the graph", None):

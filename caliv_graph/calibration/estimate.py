@@ -178,7 +178,10 @@ def _estimate(
     """The stages of `estimate`, timed."""
     limit = config.registration.max_iterations
     begun = time.perf_counter()
-    states = [JointRegistration(o, config, rough=True) for o in observations]
+    states = [
+        JointRegistration(o, config, rough=True, shares=problem.cloud_shares(m))
+        for m, o in enumerate(observations)
+    ]
     registrations = []
     with progress.stage("registering the clouds", len(states)) as advance:
         for m, state in enumerate(states):
@@ -201,7 +204,10 @@ def _estimate(
     lines = linearise_clouds(problem, solve.values)
     mountings = {name: problem.mounting(solve.values, name) for name in problem.lidars}
     observations = [_deskewed(o, mountings, trajectories) for o in observations]
-    states = [JointRegistration(o, config, normals=False) for o in observations]
+    states = [
+        JointRegistration(o, config, normals=False, shares=problem.cloud_shares(m))
+        for m, o in enumerate(observations)
+    ]
     again = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
         for state, (R, t) in zip(states, _per_placement(states, lines), strict=True):
@@ -371,10 +377,10 @@ def solve_registered(
     explained = np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
-    sound = sound_clouds(problem, measured, information, given, state.noise) & (explained > 0.5)
-    state.noise, state.scale = fit_pose_noise(
-        problem, measured, information, sound, given, config.noise
-    )
+    # How far a cloud by itself may be off: what it shares with others from its place included.
+    single = information / problem.cloud_shares()[:, None, None]
+    sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
+    state.noise, state.scale = fit_pose_noise(problem, measured, single, sound, given, config.noise)
     state.weights = kernel
     rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
     _reweight(state, measured, information, explained, rounds)
@@ -392,6 +398,7 @@ def _reweight(
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
     scaled = information / state.scale**2
+    single = scaled / problem.cloud_shares()[:, None, None]
     for _ in range(rounds):
         steady = merged(
             pose_graph(problem, state.noise, state.motion),
@@ -407,7 +414,7 @@ def _reweight(
         lines = linearise_clouds(problem, state.values)
         r = _residuals(lines, measured)
         change = state.weights.update(
-            squares_without_own_pose(problem, lines, r, scaled, state.values, state.noise),
+            squares_without_own_pose(problem, lines, r, single, state.values, state.noise),
             explained,
         )
         if change < WEIGHT_TOLERANCE and state.weights.settled:
@@ -676,8 +683,9 @@ def _refine(
         else:
             step = reduced.step_with(prior, _offset(state))
         wanted = _shape_measurements(state, shapes)
+        single = wanted.information / problem.cloud_shares()[:, None, None]
         squared = squares_without_own_pose(
-            problem, lines, -wanted.pull, wanted.information, state.values, state.noise
+            problem, lines, -wanted.pull, single, state.values, state.noise
         )
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun

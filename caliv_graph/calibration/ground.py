@@ -20,6 +20,7 @@ from caliv_graph.config import GroundConfig
 from caliv_graph.conventions import key_ground, key_height, key_parallel, key_vehicle
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, GroundObservation, IntArray
+from caliv_graph.targets.views import view_shares
 
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Of a plane before anything is seen: 45 degrees, and 100 m about the drive's poses. Next to the
@@ -339,8 +340,9 @@ def ground_graph(
         if config.parallel_sigma_deg is not None:
             sigma = math.radians(config.parallel_sigma_deg)
             graph.add(_centred(key_parallel(drive), np.full(2, sigma)))
+    worth = weights.planes * _place_shares(problem, observations, taken)
     believed = zip(
-        observations, taken.tolist(), weights.planes.tolist(), weights.heave_m.tolist(), strict=True
+        observations, taken.tolist(), worth.tolist(), weights.heave_m.tolist(), strict=True
     )
     for o, i, weight, heave_m in believed:
         if i >= 0 and weight > 0.0:
@@ -362,6 +364,21 @@ def ground_graph(
         if config.parallel_sigma_deg is not None:
             graph.add(parallel_factor(X, plane, key_parallel(drive), weight))
     return graph
+
+
+def _place_shares(
+    problem: Problem, observations: Sequence[GroundObservation], taken: IntArray
+) -> Array:
+    """(n,) what each observation counts: a standing vehicle sees the same bumps in every scan."""
+    out = np.ones(len(observations))
+    alike: dict[tuple[int, str], list[int]] = {}
+    for n, (o, i) in enumerate(zip(observations, taken.tolist(), strict=True)):
+        if i >= 0:
+            alike.setdefault((o.drive, o.lidar), []).append(n)
+    for own in alike.values():
+        places = [problem.T_map_vehicle[taken[n]].translation() for n in own]
+        out[own] = view_shares(np.array(places))
+    return out
 
 
 def _centred(key: int, sigmas: Array) -> gtsam.PriorFactorVector:

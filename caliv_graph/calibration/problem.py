@@ -28,6 +28,7 @@ from caliv_graph.geometry.se3 import (
     unstack,
 )
 from caliv_graph.products import Array, IntArray, TargetObservation
+from caliv_graph.targets.views import view_shares
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -64,6 +65,8 @@ class Problem:
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is.
+        shares: (J,) what each cloud counts beside others from the same place, 0 to 1
+            (`targets.views`); None: all count fully.
     """
 
     lidars: tuple[str, ...]
@@ -81,11 +84,17 @@ class Problem:
     motion: Mapping[int, Array] = field(default_factory=dict)
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
+    shares: Array | None = None
 
     @property
     def clouds(self) -> int:
         """Number of clouds."""
         return len(self.cloud_lidar)
+
+    def cloud_shares(self, placement: int | None = None) -> Array:
+        """What each cloud counts, of all (J,) or of those of one placement."""
+        shares = np.ones(self.clouds) if self.shares is None else self.shares
+        return shares if placement is None else shares[self.cloud_placement == placement]
 
     def mounting_keys(self, lidar: str) -> tuple[int, ...]:
         """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""
@@ -224,6 +233,7 @@ def pose_problem(
         for (d, _), T in reversed(list(zip(poses, T_map_vehicle, strict=True)))
     }
     fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
+    of_pose = dict(zip(poses, T_map_vehicle, strict=True))
     return Problem(
         lidars=lidars,
         reference=reference,
@@ -251,7 +261,28 @@ def pose_problem(
         },
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
+        shares=np.concatenate([_shares(o, of_pose, config) for o in observations]),
     )
+
+
+def _shares(
+    observation: TargetObservation,
+    T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3],
+    config: Config,
+) -> Array:
+    """What each cloud of a placement counts; by the guesses, which move all of a LiDAR's alike."""
+    out = np.ones(len(observation.clouds))
+    names = np.array([c.lidar for c in observation.clouds])
+    for name in dict.fromkeys(names.tolist()):
+        own = np.flatnonzero(names == name)
+        guess = pose_from_mounting(config.lidars[name].initial)
+        places = []
+        for i in own.tolist():
+            cloud = observation.clouds[i]
+            T = T_map_vehicle[cloud.drive, cloud.stamp_ns].compose(guess)
+            places.append(T.transformTo(observation.centre_map))
+        out[own] = view_shares(np.array(places))
+    return out
 
 
 def _with_heave(information: Array) -> Array:

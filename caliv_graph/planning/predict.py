@@ -40,6 +40,7 @@ from caliv_graph.simulation.drives import Drive, make_drive
 from caliv_graph.simulation.scenario import Scenario
 from caliv_graph.simulation.terrain import make_terrain
 from caliv_graph.targets.ground_planes import DISTANCE_FLOOR_M, MAX_APART_NS, NORMAL_FLOOR_RAD
+from caliv_graph.targets.views import view_shares
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
 from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
 
@@ -229,7 +230,9 @@ def _sightings(scenario: Scenario, drive: Drive, assumptions: Assumptions) -> tu
     for placement in placements(scenario):
         alike = [sight(drive, scenario, name, placement, extraction) for name in scenario.lidars]
         seeing = sum(len(s.stamps_ns) >= extraction.min_scans for s in alike)
-        out += [replace(s, used=thinned(len(s.stamps_ns), seeing, extraction)) for s in alike]
+        for s in alike:
+            used = thinned(view_shares(s.centres_lidar), seeing, extraction)
+            out.append(replace(s, used=used))
     return tuple(out)
 
 
@@ -447,6 +450,7 @@ def _add_clouds(
     model = scenario.lidars[sighting.lidar]
     independent = sighting.points[sighting.used] * INDEPENDENT_PART / SEEN_PART
     info = placement.information(independent, model.range_sigma_m)
+    info *= view_shares(sighting.centres_lidar[sighting.used])[:, None, None]
     R = motion.R_map_vehicle[nodes]
     # Adjoint of C X: the target's frame has map axes, its origin at the target.
     by_pose = np.zeros((len(nodes), 6, 6))
@@ -511,6 +515,7 @@ def _add_ground(
         heave_variance = 2.0 * assumptions.heave_sigma_m**2
         later = nearest[near] > TOGETHER_NS
         info[later, 2] = 1.0 / (distance_sigma**2 + heave_variance)
+        info *= view_shares(motion.position_map[at])[:, None]
         stood[at] = True
         t = pose_from_mounting(model.mounting).translation()
         R, place = motion.R_map_vehicle[at], motion.position_map[at]

@@ -22,6 +22,7 @@ from caliv_graph.simulation.scenario import LidarModel, ObjectModel, Scenario, W
 from caliv_graph.simulation.terrain import Terrain, make_terrain
 from caliv_graph.simulation.worlds import make_world
 from caliv_graph.targets.extract import TOTAL_PER_LIDARS
+from caliv_graph.targets.views import evenly_spread
 
 SEEN_PART = 0.87
 """Part of the surface that faces a LiDAR that returns points: the rest hides behind itself. 480
@@ -108,6 +109,7 @@ class Sighting:
         range_m: (m,) to the target's centre.
         points: (m,) about how many points of the target.
         towards_deg: (m,) azimuth in the map from the target to the LiDAR: the side it sees.
+        centres_lidar: (m, 3) metres, the target's centre in the lidar frame.
         used: (u,) indices of the clouds that `calibrate` would use.
     """
 
@@ -118,6 +120,7 @@ class Sighting:
     range_m: Array
     points: Array
     towards_deg: Array
+    centres_lidar: Array
     used: IntArray
 
 
@@ -257,25 +260,24 @@ def sight(
         range_m=range_m[seen],
         points=SEEN_PART * facing[seen],
         towards_deg=np.degrees(np.arctan2(towards[seen, 1], towards[seen, 0])),
+        centres_lidar=level[seen],
         used=np.zeros(0, dtype=np.int64),
     )
 
 
-def thinned(count: int, seeing: int, extraction: ExtractionConfig) -> IntArray:
+def thinned(shares: Array, seeing: int, extraction: ExtractionConfig) -> IntArray:
     """Which of the clouds that see a target are used, as `targets.extract` chooses them.
 
     Args:
-        count: clouds of one LiDAR that see it.
+        shares: (n,) what each cloud of one LiDAR that sees it counts (`targets.views`).
         seeing: LiDARs that see it often enough.
         extraction: how many are used.
     """
-    if count < extraction.min_scans:
+    if len(shares) < extraction.min_scans:
         return np.zeros(0, dtype=np.int64)
     most = extraction.max_scans
     most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
-    if count <= most:
-        return np.arange(count, dtype=np.int64)
-    return np.linspace(0, count - 1, most).round().astype(np.int64)
+    return evenly_spread(shares, most)
 
 
 def sees_ground(model: LidarModel) -> bool:

@@ -8,6 +8,7 @@ put it: origin at the target's centre, axes of the map.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 import gtsam
@@ -33,6 +34,9 @@ COARSE_SIGMA_M = 0.05
 
 FINE_SIGMA_M = 0.02
 """The same where a solved graph has put the clouds: their poses move by millimetres."""
+
+ROUGH_POINTS = 400
+"""Points of a cloud at most in a registration that another follows."""
 
 ANNEALING = 0.85
 """Factor on the floor of the standard deviation, per iteration."""
@@ -68,15 +72,16 @@ class JointRegistration:
         config: Config,
         rough: bool = False,
         normals: bool = True,
+        shares: Array | None = None,
     ) -> None:
         """Stacks the clouds of `observation`.
 
         Args:
             observation: the clouds.
             config: size of the mixture and of the clouds.
-            rough: a quarter of the points and half the components, for a registration that another
-                follows.
+            rough: fewer points and half the components, for a registration that another follows.
             normals: False if `refine_normals` follows.
+            shares: (J,) what each cloud counts beside others that saw the same; None: all fully.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -88,7 +93,7 @@ class JointRegistration:
         self.observation = observation
         self.clouds: CloudStack = stack_clouds(
             observation,
-            config.registration.max_points // (4 if rough else 1),
+            min(config.registration.max_points, ROUGH_POINTS if rough else sys.maxsize),
             config.noise.lidar_range_m,
             normals,
         )
@@ -101,6 +106,7 @@ class JointRegistration:
         self._mixture: Mixture | None = None
         self._cells: Array | None = None
         self._inlier_ratio: Array = np.ones(self.clouds.count)
+        self._shares = np.ones(self.clouds.count) if shares is None else shares
         self.weights: Array = np.ones(self.clouds.count)
 
     def refine_normals(self, R: Array, t: Array) -> None:
@@ -139,7 +145,7 @@ class JointRegistration:
         """E-step at (R, t), and the quadratic that it puts on the poses."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         density = self._gamma / (self._volume * (self._gamma + 1.0))
-        who = expect(self.clouds, R, t, self.mixture, density, self.weights)
+        who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
         self._inlier_ratio = who.inlier_ratio
         self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         return shape_quadratic(self.clouds, R, t, self.mixture, self._cells)

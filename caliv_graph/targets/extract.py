@@ -33,6 +33,7 @@ from caliv_graph.progress import Progress
 from caliv_graph.targets.ground import fit_ground, height_above
 from caliv_graph.targets.moved import Sightings, periods
 from caliv_graph.targets.search import find_target
+from caliv_graph.targets.views import evenly_spread, view_shares
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -561,10 +562,11 @@ def _regions(
 
 
 def _thinned(clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
-    """At most so many of the clouds, evenly spread."""
+    """At most so many of a LiDAR's clouds, those of a standing vehicle first of all left out."""
     if len(clouds) <= most:
         return clouds
-    return [clouds[i] for i in np.linspace(0, len(clouds) - 1, most).round().astype(int)]
+    centres = np.array([c.points_lidar.mean(axis=0) for c in clouds])
+    return [clouds[i] for i in evenly_spread(view_shares(centres), most).tolist()]
 
 
 def _wanted(
@@ -589,6 +591,7 @@ def _wanted(
         return frozenset(stamps.tolist())
     view = _FieldOfView.of(seen)
     possible = np.zeros(len(stamps), dtype=np.bool_)
+    share = np.zeros(len(stamps))
     for region in regions:
         extractor = RegionExtractor(region, config, trajectory)
         towards = extractor.directions(lidar, stamps.tolist())
@@ -596,13 +599,13 @@ def _wanted(
         margin_m = extractor.reach_m() + np.array(
             [widened_margin_m(config, lidar, r) for r in range_m.tolist()]
         )
-        possible |= view.may_see(towards, margin_m, config.extraction.min_points)
-    stamps = stamps[possible]
+        sees = view.may_see(towards, margin_m, config.extraction.min_points)
+        share[sees] = np.maximum(share[sees], view_shares(towards[sees]))
+        possible |= sees
+    stamps, share = stamps[possible], share[possible]
     # A long drive passes the target many times over: a part of it is enough.
     most = DECODED_PER_SCAN_USED * config.extraction.max_scans
-    if len(stamps) > most:
-        stamps = stamps[np.linspace(0, len(stamps) - 1, most).round().astype(np.int64)]
-    return frozenset(stamps.tolist())
+    return frozenset(stamps[evenly_spread(share, most)].tolist())
 
 
 @dataclass(frozen=True)

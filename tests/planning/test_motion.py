@@ -184,6 +184,7 @@ class OneScan:
             whole.range_m,
             whole.points,
             whole.towards_deg,
+            whole.centres_lidar,
             np.array([at]),
         )
         self.stamps = whole.stamps_ns[[at]]

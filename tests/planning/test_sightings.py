@@ -207,7 +207,7 @@ def test_stamps_are_true_times() -> None:
     [(7, 2, 0), (8, 2, 8), (120, 2, 120), (300, 2, 120), (300, 3, 100), (300, 1, 120)],
 )
 def test_as_many_clouds_as_calibrate_takes(count: int, seeing: int, used: int) -> None:
-    chosen = thinned(count, seeing, ExtractionConfig(max_scans=120))
+    chosen = thinned(np.ones(count), seeing, ExtractionConfig(max_scans=120))
 
     assert len(chosen) == used
     assert len(set(chosen.tolist())) == used

@@ -11,6 +11,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import INCONSISTENT, UNMET
+from caliv_graph.cli.options import ConfigArgument, Drives, Force, ResultAsJson, open_drives
 
 if TYPE_CHECKING:
     from caliv_graph.config import Config
@@ -18,19 +19,9 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    config: Annotated[
-        Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' drafts one.")
-    ],
+    config: ConfigArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the result.")],
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--data",
-            metavar="PATH",
-            help="The drive, instead of data.path of the config. Several drives of one vehicle "
-            "are solved together: repeat the option.",
-        ),
-    ] = None,
+    data: Drives = None,
     prior: Annotated[
         Path | None,
         typer.Option(
@@ -39,13 +30,8 @@ def calibrate(
             help="An earlier calibration of this vehicle: what its drive's data say is added.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older result.")] = False,
-    as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json", help="Print one JSON document, calibration.yaml's content and more."
-        ),
-    ] = False,
+    force: Force = False,
+    as_json: ResultAsJson = False,
 ) -> None:
     """Calibrate the LiDARs of a vehicle from one or more drives past a target.
 
@@ -79,7 +65,7 @@ def calibrate(
     earlier = None if prior is None else read_calibration(prior)
     # Nobody should wait for a result that then has no place to go.
     check_output_folder(out, RESULT_FILES, force)
-    recordings = _open_recordings(settings, data)
+    recordings = open_drives(settings, data)
     with streams.progress_on_stdout(as_json) as progress:
         run = run_pipeline(recordings, settings, progress, earlier)
     calibration = run.calibration
@@ -116,18 +102,6 @@ def calibrate(
         raise typer.Exit(INCONSISTENT)
     if calibration.unmet:
         raise typer.Exit(UNMET)
-
-
-def _open_recordings(config: Config, data: Sequence[Path] | None) -> list[Recording]:
-    from caliv_graph.errors import ConfigError
-    from caliv_graph.readers import open_recording
-
-    seen: set[Path] = set()
-    for path in data or ():
-        if path.resolve() in seen:
-            raise ConfigError(f"--data {path}: given twice; a drive counts once")
-        seen.add(path.resolve())
-    return [open_recording(config, path) for path in data or (None,)]
 
 
 def _check_guesses(config: Config, path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import P_VALUE, AsJson, PValue
 
 
 def compare(
@@ -15,18 +16,8 @@ def compare(
         Path, typer.Argument(metavar="A.yaml", help="The earlier result of 'calibrate'.")
     ],
     second: Annotated[Path, typer.Argument(metavar="B.yaml", help="The later one.")],
-    p_value: Annotated[
-        float,
-        typer.Option(
-            "--p-value",
-            min=1e-12,
-            max=0.5,
-            help="Chance of a false alarm if nothing has moved, over all tests together.",
-        ),
-    ] = 0.01,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document: metres and radians.")
-    ] = False,
+    p_value: PValue = P_VALUE,
+    as_json: AsJson = False,
 ) -> None:
     """Tell whether a LiDAR's mount has moved between two calibrations of one vehicle.
 

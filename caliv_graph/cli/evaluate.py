@@ -8,21 +8,18 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import AsJson, CalibrationArgument
 
 
 def evaluate(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION.yaml", help="A result of 'calibrate'.")
-    ],
+    calibration: CalibrationArgument,
     truth: Annotated[
         Path,
         typer.Argument(
             metavar="TRUTH.yaml", help="True mountings; another calibration.yaml serves as well."
         ),
     ],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document: metres and radians.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare a calibration with the truth: sensor-to-vehicle and sensor-to-sensor errors, NEES.
 

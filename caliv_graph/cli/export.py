@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import AsJson, CalibrationArgument, Force
 
 if TYPE_CHECKING:
     from caliv_graph.export.request import Export, Request
@@ -16,9 +17,7 @@ _POSE = "x,y,z,roll,pitch,yaw"
 
 
 def export(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION.yaml", help="A result of 'calibrate'.")
-    ],
+    calibration: CalibrationArgument,
     to: Annotated[
         Literal[
             "urdf",
@@ -119,8 +118,8 @@ def export(
             "ros2 (default) or ros1.",
         ),
     ] = "",
-    force: Annotated[bool, typer.Option("--force", help="Replace older output.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a calibration for the stack that uses it: URDF, tf2, Autoware, LIO configs, GTSAM.
 

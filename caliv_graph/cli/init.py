@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import Force
 
 
 def init(
@@ -21,9 +22,7 @@ def init(
             "--urdf", metavar="FILE", help="The vehicle's URDF, for the initial guesses (of a bag)."
         ),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace the config if it exists.")
-    ] = False,
+    force: Force = False,
 ) -> None:
     """Write a commented config for a drive.
 

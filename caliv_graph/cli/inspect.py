@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import AsJson
 
 
 def inspect(
@@ -20,7 +21,7 @@ def inspect(
             "--config", metavar="CONFIG", help="Also look for the target with this config."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show what a recording holds: topics, rates, gaps, clocks, times of points, units, the drive.
 

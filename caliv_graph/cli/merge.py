@@ -9,6 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import INCONSISTENT
+from caliv_graph.cli.options import P_VALUE, Force, PValue, ResultAsJson, each_once
 
 
 def merge(
@@ -17,20 +18,9 @@ def merge(
         typer.Argument(metavar="A.yaml B.yaml ...", help="Results of 'calibrate', of one vehicle."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The merged calibration.")],
-    p_value: Annotated[
-        float,
-        typer.Option(
-            "--p-value",
-            min=1e-12,
-            max=0.5,
-            help="Chance that calibrations of mounts that stayed are said to disagree.",
-        ),
-    ] = 0.01,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older file.")] = False,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="Print one JSON document, the file's content and more."),
-    ] = False,
+    p_value: PValue = P_VALUE,
+    force: Force = False,
+    as_json: ResultAsJson = False,
 ) -> None:
     """Merge several calibrations of one vehicle into one.
 
@@ -55,11 +45,7 @@ def merge(
 
     if len(calibrations) < 2:
         raise ConfigError(f"{calibrations[0]}: is one calibration; to merge takes two or more")
-    seen: set[Path] = set()
-    for path in calibrations:
-        if path.resolve() in seen:
-            raise ConfigError(f"{path}: given twice; a calibration counts once")
-        seen.add(path.resolve())
+    each_once(calibrations, "", "a calibration")
     check_output_file(out, force)
     merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)
     write_calibration(merger.calibration, out, force)

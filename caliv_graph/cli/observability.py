@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import UNMET
+from caliv_graph.cli.options import AsJson, ConfigArgument, Drives, open_drives
 
 
 def observability(
-    config: Annotated[
-        Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' drafts one.")
-    ],
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--data",
-            metavar="PATH",
-            help="The drive, instead of data.path of the config. Several drives of one vehicle "
-            "are looked at together: repeat the option.",
-        ),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    config: ConfigArgument,
+    data: Drives = None,
+    as_json: AsJson = False,
 ) -> None:
     """Find out what a recorded drive determines, before calibrating.
 
@@ -38,17 +26,11 @@ def observability(
     Example: caliv-graph observability config.yaml --data drive/
     """
     from caliv_graph.config import load_config
-    from caliv_graph.errors import ConfigError
-    from caliv_graph.readers import open_recording
     from caliv_graph.report.outlook import survey_document, survey_table
     from caliv_graph.survey import survey
 
     settings = load_config(config)
-    paths = [path.resolve() for path in data or ()]
-    for path, resolved in zip(data or (), paths, strict=True):
-        if paths.count(resolved) > 1:
-            raise ConfigError(f"--data {path}: given twice; a drive counts once")
-    recordings = [open_recording(settings, path) for path in data or (None,)]
+    recordings = open_drives(settings, data)
     with streams.progress_on_stdout(as_json) as progress:
         found = survey(recordings, settings, progress)
     if as_json:

@@ -9,6 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import UNMET
+from caliv_graph.cli.options import AsJson, Force
 
 
 def plan(
@@ -48,8 +49,8 @@ def plan(
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write the suggested drive as a scenario."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older FILE.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Predict what a planned drive will tell: sigma per LiDAR and axis, and what stays open.
 

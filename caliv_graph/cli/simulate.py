@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from caliv_graph.cli import streams
+from caliv_graph.cli.options import AsJson, Force
 
 if TYPE_CHECKING:
     from caliv_graph.simulation import SimulatedDrive
@@ -35,10 +36,8 @@ def simulate(
             help="A ROS 2 bag (MCAP) with raw sensors, a CaLiV folder with vehicle poses, or both.",
         ),
     ] = "bag",
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an older simulated drive.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a drive past a target, with known truth.
 

@@ -9,12 +9,11 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import INCONSISTENT, UNMET
+from caliv_graph.cli.options import P_VALUE, AsJson, CalibrationArgument, Force, PValue
 
 
 def validate(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION.yaml", help="A result of 'calibrate'.")
-    ],
+    calibration: CalibrationArgument,
     config: Annotated[
         Path,
         typer.Argument(
@@ -41,19 +40,9 @@ def validate(
             help="Calibrate the two halves of the drive as well, and compare them.",
         ),
     ] = True,
-    p_value: Annotated[
-        float,
-        typer.Option(
-            "--p-value",
-            min=1e-12,
-            max=0.5,
-            help="Chance of a false alarm of the comparison of the halves, over all its tests.",
-        ),
-    ] = 0.01,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older result.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document: metres and radians.")
-    ] = False,
+    p_value: PValue = P_VALUE,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Validate a calibration on walls, poles and objects that it did not use.
 

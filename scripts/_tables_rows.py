@@ -27,6 +27,7 @@ from caliv_graph.products import (
     Recording,
 )
 from caliv_graph.progress import SilentProgress
+from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.simulation import SimulatedRecording, SimulatedTruth
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
@@ -92,24 +93,22 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class View:
+class View(ForwardingRecording):
     """A recording of which some is hidden, or that knows the true poses (products.Recording).
 
     Attributes:
-        recording: what it is a view of.
-        lidars: that are left.
+        left: LiDARs that are there.
         hidden: (lidar, stamp) of clouds that are not there.
         poses: instead of all other motion data; None: those of the recording.
     """
 
-    recording: Recording
-    lidars: tuple[str, ...]
+    left: tuple[str, ...]
     hidden: frozenset[tuple[str, int]] = frozenset()
     poses: GivenPoses | None = None
 
     @property
-    def name(self) -> str:
-        return self.recording.name
+    def lidars(self) -> tuple[str, ...]:
+        return self.left
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         stamps = self.recording.scan_stamps_ns(lidar)
@@ -125,9 +124,6 @@ class View:
         if self.poses is None:
             return self.recording.motion()
         return MotionData(name=self.name, poses=self.poses)
-
-    def warnings(self) -> Sequence[str]:
-        return self.recording.warnings()
 
 
 def true_poses(truth: SimulatedTruth, stamps_ns: Sequence[int]) -> GivenPoses:

@@ -34,8 +34,9 @@ sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run f
 
 from caliv_graph.errors import CalivError  # noqa: E402
 from caliv_graph.pipeline import calibrate  # noqa: E402
-from caliv_graph.products import LidarScan, MotionData, Recording  # noqa: E402
+from caliv_graph.products import LidarScan, Recording  # noqa: E402
 from caliv_graph.progress import SilentProgress  # noqa: E402
+from caliv_graph.readers.forwarding import ForwardingRecording  # noqa: E402
 from caliv_graph.simulation.scenario import load_scenario  # noqa: E402
 from caliv_graph.simulation.thinned import (  # noqa: E402
     GroundWaves,
@@ -50,31 +51,21 @@ SCENARIOS = ("figure_eight", "s_curve", "paper_arc", "tri_lidar")
 
 
 @dataclass(frozen=True)
-class Faulty:
+class Faulty(ForwardingRecording):
     """A recording with something wrong (products.Recording).
 
     Attributes:
-        recording: what it is made from.
         late_ns: per LiDAR, by how much its stamps are late.
         displaced: per LiDAR, which clouds (number, of how many) lie elsewhere, and by what (metres,
             lidar frame).
         source: per LiDAR, whose clouds come under its name.
     """
 
-    recording: Recording
     late_ns: Mapping[str, int] = field(default_factory=dict)
     displaced: Mapping[str, tuple[Callable[[int, int], bool], tuple[float, float, float]]] = field(
         default_factory=dict
     )
     source: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return self.recording.name
-
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        return self.recording.lidars
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         late_ns = self.late_ns.get(lidar, 0)
@@ -96,12 +87,6 @@ class Faulty:
                 stamp_ns=scan.stamp_ns + late_ns,
                 points_lidar=scan.points_lidar + shift,
             )
-
-    def motion(self) -> MotionData:
-        return self.recording.motion()
-
-    def warnings(self) -> Sequence[str]:
-        return self.recording.warnings()
 
 
 def _none(number: int, count: int) -> bool:

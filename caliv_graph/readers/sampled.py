@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from caliv_graph.products import IntArray, LidarScan, MotionData, Recording
+from caliv_graph.products import IntArray, LidarScan
+from caliv_graph.readers.forwarding import ForwardingRecording
 
 SCANS = 12
 """Of one LiDAR over a drive: enough to see whether a wall stands once or twice."""
@@ -22,32 +23,14 @@ RANGE_M = 40.0
 """Farther points would only make the picture small."""
 
 
-class SampledRecording:
+@dataclass(frozen=True)
+class SampledRecording(ForwardingRecording):
     """Passes a recording on, and keeps a few thinned clouds of each LiDAR as they go by.
 
     Nothing is read twice, and memory stays bounded: `SCANS` clouds of `POINTS` points per LiDAR.
-
-    Attributes:
-        recording: what is passed on.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        self._kept: dict[tuple[str, int], LidarScan] = {}
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages: the path."""
-        return self.recording.name
-
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        """LiDARs of the config, in the config's order."""
-        return self.recording.lidars
-
-    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
-        """Stamps of the clouds of one LiDAR, ascending, without reading a cloud."""
-        return self.recording.scan_stamps_ns(lidar)
+    _kept: dict[tuple[str, int], LidarScan] = field(default_factory=dict, init=False, repr=False)
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in order of their stamps; see `Recording`."""
@@ -59,14 +42,6 @@ class SampledRecording:
             if (lidar, part) not in self._kept:
                 self._kept[lidar, part] = thinned(scan)
             yield scan
-
-    def motion(self) -> MotionData:
-        """What the recording tells of the vehicle's motion, read in one pass."""
-        return self.recording.motion()
-
-    def warnings(self) -> Sequence[str]:
-        """What was left out so far, and why, a line each."""
-        return self.recording.warnings()
 
     def kept(self) -> tuple[LidarScan, ...]:
         """The thinned clouds, by LiDAR and stamp."""

@@ -15,6 +15,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.pipeline import CalibrationRun, calibrate
 from caliv_graph.products import LidarScan, Recording
 from caliv_graph.progress import SilentProgress
+from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.scenario import (
     ArcDrive,
@@ -159,19 +160,18 @@ def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others()
     lidars = {**LIDARS, "side": lidar(1.0, -80.0, -0.8)}
     three = simulate_drive(scenario(RIGHT, {**CHAIR}, lidars), 13)
 
-    class Without:
+    class Without(ForwardingRecording):
         """A drive in which one LiDAR of the config recorded nothing."""
 
-        def __init__(self, drive: SimulatedRecording) -> None:
-            self._drive = drive
-            self.name, self.lidars = drive.name, tuple(lidars)
-            self.motion, self.warnings = drive.motion, drive.warnings
+        @property
+        def lidars(self) -> tuple[str, ...]:
+            return tuple(lidars)
 
-        def scan_stamps_ns(self, name: str) -> Sequence[int]:
-            return [] if name == "side" else self._drive.scan_stamps_ns(name)
+        def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
+            return [] if lidar == "side" else super().scan_stamps_ns(lidar)
 
-        def scans(self, name: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-            return iter(()) if name == "side" else self._drive.scans(name, wanted)
+        def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+            return iter(()) if lidar == "side" else super().scans(lidar, wanted)
 
     drives: list[Recording] = [three, Without(left()), Without(right())]
     run = calibrate(drives, config(three, left()), SilentProgress())

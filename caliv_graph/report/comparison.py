@@ -10,16 +10,15 @@ from rich.text import Text
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import Merger
-from caliv_graph.report.tables import (
-    _SHOWN_AXES,
-    _decimals,
-    _fixed,
-    _headings,
-    _sentences,
-    _table,
-    _titled,
-    calibration_table,
+from caliv_graph.report.layout import (
+    SHOWN_AXES,
+    axis_headings,
+    new_table,
+    sentences,
+    titled,
+    value_and_sigma,
 )
+from caliv_graph.report.tables import calibration_table
 
 _UNTOLD = "-"
 
@@ -32,10 +31,10 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
         labels: of the earlier and the later calibration.
         p_value: the limit that was applied.
     """
-    table = _table("", *_headings("mm", "mrad"), "chi2\ndof", "p\ncorrected", "moved")
+    table = new_table("", *axis_headings("mm", "mrad"), "chi2\ndof", "p\ncorrected", "moved")
     for movement in comparison.movements:
         table.add_row(Text(_name(movement)), *_cells(movement), *_verdict(movement))
-    parts = _titled(
+    parts = titled(
         f"Movement from {labels[0]} to {labels[1]}, and 1 sigma, in vehicle axes", table
     )[1:]
     if not all(all(m.told) for m in comparison.movements):
@@ -43,8 +42,8 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
             Text(f"{_UNTOLD}: not determined by both: nothing can be said.", style="yellow")
         )
     for label, texts in zip(labels, comparison.undetermined, strict=True):
-        parts += _sentences(f"What {label} could not tell:", texts)
-    parts += _sentences(
+        parts += sentences(f"What {label} could not tell:", texts)
+    parts += sentences(
         "Not compared:", (f"LiDAR '{n}': {why}" for n, why in comparison.not_compared.items())
     )
     style = "bold red" if comparison.moved else "bold green" if _any(comparison) else "bold yellow"
@@ -61,7 +60,7 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
 
 def merger_table(merger: Merger, p_value: float) -> RenderableType:
     """The merged calibration, and whether its parts agree."""
-    table = _table("", "tests", "smallest p\ncorrected", "verdict")
+    table = new_table("", "tests", "smallest p\ncorrected", "verdict")
     for label, comparison in merger.agreement.items():
         tested = [m.p_corrected for m in comparison.movements if m.dof]
         table.add_row(
@@ -73,7 +72,7 @@ def merger_table(merger: Merger, p_value: float) -> RenderableType:
             else Text("agrees" if tested else "nothing to compare"),
         )
     parts: list[RenderableType] = [calibration_table(merger.calibration)]
-    parts += _titled(f"Each against the others together (limit {p_value:g} over all)", table)
+    parts += titled(f"Each against the others together (limit {p_value:g} over all)", table)
     return Group(*parts)
 
 
@@ -146,14 +145,13 @@ def _name(movement: Movement) -> str:
 
 def _cells(movement: Movement) -> list[Text]:
     cells = []
-    for axis in _SHOWN_AXES:
+    for axis in SHOWN_AXES:
         i = AXES.index(axis)
         if not movement.told[i]:
             cells.append(Text(_UNTOLD, style="yellow"))
             continue
         value, sigma = 1e3 * movement.movement[i], 1e3 * movement.sigma[i]
-        decimals = _decimals(sigma, 2)
-        cells.append(Text(f"{_fixed(value, decimals)}\n±{sigma:.{decimals}f}"))
+        cells.append(Text(value_and_sigma(value, sigma)))
     return cells
 
 

@@ -150,7 +150,7 @@ def sigma_figure(calibration: Calibration) -> Figure | None:
             categoryorder="array", categoryarray=order[column], tickangle=-50, row=1, col=column
         )
     figure.update_yaxes(type="log", dtick="D2")
-    _finish(figure, 400)
+    finish(figure, 400)
     return Figure(
         "sigmas",
         "1 sigma in vehicle axes, before (circles) and after the drive. A cross marks an axis "
@@ -175,7 +175,7 @@ def spectrum_figure(solution: Solution) -> Figure:
     ):
         figure.add_scatter(
             x=number,
-            y=_small(ratio * prior),
+            y=small(ratio * prior),
             mode="lines",
             line={"color": GREY, "dash": dash, "shape": "hvh"},
             name=what,
@@ -191,7 +191,7 @@ def spectrum_figure(solution: Solution) -> Figure:
             beyond = data[mask] > top
             figure.add_scatter(
                 x=number[mask],
-                y=_small(np.minimum(data[mask], top)),
+                y=small(np.minimum(data[mask], top)),
                 mode="markers",
                 marker={
                     "color": colour,
@@ -203,7 +203,7 @@ def spectrum_figure(solution: Solution) -> Figure:
             )
     figure.update_yaxes(type="log", title="1 sigma (mrad; 1 mrad as 10 mm)", dtick=1)
     figure.update_xaxes(title="direction, best determined first", dtick=1)
-    _finish(figure, 380)
+    finish(figure, 380)
     held = (
         f" Mode {solution.mode} holds {', '.join(solution.held)} at the guess, whatever the data "
         "say."
@@ -252,7 +252,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     )
     figure.update_yaxes(autorange="reversed", scaleanchor="x", constrain="domain")
     figure.update_xaxes(tickangle=-60, constrain="domain")
-    _finish(figure, min(460 + 14 * len(ticks), 900))
+    finish(figure, min(460 + 14 * len(ticks), 900))
     return Figure(
         "correlation",
         "Correlations of the reported covariance, vehicle axes, priors included. Numbers near -1 "
@@ -271,12 +271,12 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
     density, _ = np.histogram(white, edges, density=True)
     middles = 0.5 * (edges[1:] + edges[:-1])
     figure.add_bar(
-        x=_small(middles), y=_small(density), marker={"color": SKY}, name="whitened", row=1, col=1
+        x=small(middles), y=small(density), marker={"color": SKY}, name="whitened", row=1, col=1
     )
     x = np.linspace(-5.0, 5.0, 121)
     figure.add_scatter(
-        x=_small(x),
-        y=_small(np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi)),
+        x=small(x),
+        y=small(np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi)),
         mode="lines",
         line={"color": BLACK, "width": 2},
         name="N(0, 1)",
@@ -289,7 +289,7 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
         reach = max(6.0 * float(np.median(np.abs(values))), 1e-6)
         heights, bounds = np.histogram(np.clip(values, -reach, reach), 40, (-reach, reach))
         figure.add_bar(
-            x=_small(0.5 * (bounds[1:] + bounds[:-1])),
+            x=small(0.5 * (bounds[1:] + bounds[:-1])),
             y=heights,
             marker={"color": GREEN},
             name="count",
@@ -297,7 +297,7 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
             col=column,
         )
     figure.update_layout(bargap=0.05, showlegend=False)
-    _finish(figure, 260)
+    finish(figure, 260)
     n, k = residuals.whitened.shape
     wide = " Wider than assumed: the noise is larger than stated, or something is not in the model."
     return Figure(
@@ -333,8 +333,8 @@ def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure:
                     weight.append(float(w))
         if at:
             figure.add_scatter(
-                x=_small(np.array(at)),
-                y=_small(np.array(weight)),
+                x=small(np.array(at)),
+                y=small(np.array(weight)),
                 mode="markers",
                 marker={"color": colour[name], "symbol": SYMBOLS[i % len(SYMBOLS)], "size": 7},
                 name=shown[name],
@@ -342,7 +342,7 @@ def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure:
             )
     figure.update_yaxes(title="weight", range=[-0.05, 1.05])
     figure.update_xaxes(title=f"seconds{' (drives overlaid by their stamps)' * (drives > 1)}")
-    _finish(figure, 300)
+    finish(figure, 300)
     return Figure(
         "weights",
         "Weight of every cloud of a target in the solve: 1 full, 0 dropped. A run of low weights "
@@ -385,7 +385,7 @@ def course_figure(solution: Solution) -> Figure | None:
     ):
         figure.add_scatter(
             x=number,
-            y=_small(np.maximum(values, 1e-9)),
+            y=small(np.maximum(values, 1e-9)),
             mode="lines+markers",
             line={"color": colour, "dash": dash},
             marker={"symbol": symbol, "size": 8},
@@ -394,7 +394,7 @@ def course_figure(solution: Solution) -> Figure | None:
         )
     figure.update_yaxes(type="log", title="largest step of a mounting", exponentformat="power")
     figure.update_xaxes(title="iteration", dtick=1)
-    _finish(figure, 340)
+    finish(figure, 340)
     return Figure(
         "course",
         "Expectation-maximisation whose M-step is the graph solve: the step of the mountings per "
@@ -484,7 +484,7 @@ def path_figure(
             )
     figure.update_yaxes(scaleanchor="x", title="m")
     figure.update_xaxes(title="m, from the first pose, map axes", constrain="domain")
-    _finish(figure, 480)
+    finish(figure, 480)
     return Figure(
         f"path_{drive}",
         f"Recording '{name}' from above. Scans of a second LiDAR are drawn aside.",
@@ -514,7 +514,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
             value, spread = 1e3 * values[some, axis], 1e3 * sigma[:, first + axis]
             figure.add_scatter(
                 x=np.concatenate([seconds, seconds[::-1]]),
-                y=_small(np.concatenate([value + spread, (value - spread)[::-1]])),
+                y=small(np.concatenate([value + spread, (value - spread)[::-1]])),
                 fill="toself",
                 fillcolor=f"{colour}22",
                 line={"width": 0},
@@ -526,7 +526,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
             )
             figure.add_scatter(
                 x=seconds,
-                y=_small(value),
+                y=small(value),
                 mode="lines",
                 line={"color": colour, "dash": dashes[axis]},
                 name=f"{axes[axis]} of the IMU",
@@ -542,7 +542,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
         ):
             figure.add_scatter(
                 x=_seconds(fixes[few] - begin),
-                y=_small(1e3 * r[few, axis]),
+                y=small(1e3 * r[few, axis]),
                 mode="markers",
                 marker={"color": colour, "symbol": symbol, "size": 4},
                 name=("east", "north", "up")[axis],
@@ -550,7 +550,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
                 col=1,
             )
     figure.update_xaxes(title="seconds", row=len(titles), col=1)
-    _finish(figure, 200 * len(titles) + 60)
+    finish(figure, 200 * len(titles) + 60)
     dropped = len(trajectory.gnss_rejected)
     return Figure(
         f"motion_{drive}",
@@ -589,7 +589,7 @@ def correction_figure(
         ):
             figure.add_scatter(
                 x=seconds,
-                y=_small(1e3 * values[:, axis]),
+                y=small(1e3 * values[:, axis]),
                 mode="markers",
                 marker={"color": colour, "symbol": symbol, "size": 5},
                 name=f"{'xyz'[axis]} (vehicle axes)",
@@ -599,7 +599,7 @@ def correction_figure(
                 col=1,
             )
     figure.update_xaxes(title="seconds from the first scan used", row=2, col=1)
-    _finish(figure, 420)
+    finish(figure, 420)
     before = "smoothed" if isinstance(trajectory, SmoothedTrajectory) else "given"
     return Figure(
         f"correction_{drive}",
@@ -639,8 +639,8 @@ def target_figures(
                 continue
             p = points[lidar][_every(len(points[lidar]), 900)]
             flat.add_scatter(
-                x=_small(p[:, pick[0]]),
-                y=_small(p[:, pick[1]]),
+                x=small(p[:, pick[0]]),
+                y=small(p[:, pick[1]]),
                 mode="markers",
                 marker={
                     "color": colour[lidar],
@@ -662,7 +662,7 @@ def target_figures(
             row=1,
             col=column,
         )
-    _finish(flat, 340)
+    finish(flat, 340)
     return (
         Figure(f"target_{placement}", note, solid, solid=True),
         Figure(f"target_flat_{placement}", f"The same, flat: {note}", flat),
@@ -766,7 +766,7 @@ def _pair_of_scenes(
         for name in lidars:
             if name not in points:
                 continue
-            x, y, z = _small(points[name]).T
+            x, y, z = small(points[name]).T
             figure.add_scatter3d(
                 x=x,
                 y=y,
@@ -781,7 +781,7 @@ def _pair_of_scenes(
                 col=column,
             )
         if path is not None:
-            x, y, z = _small(path).T
+            x, y, z = small(path).T
             figure.add_scatter3d(
                 x=x,
                 y=y,
@@ -810,14 +810,20 @@ def _pair_of_scenes(
     aspect = dict(zip("xyz", (longest * extent / extent.max()).round(3).tolist(), strict=True))
     figure.update_scenes(aspectmode="manual", aspectratio=aspect, camera=camera, **spans)
     figure.update_layout(legend={"itemsizing": "constant"})
-    _finish(figure, 480)
+    finish(figure, 480)
     return figure
 
 
 # ------------------------------------------------------------------ shared
 
 
-def _finish(figure: go.Figure, height: int) -> None:
+def finish(figure: go.Figure, height: int) -> None:
+    """Gives a figure the report's look.
+
+    Args:
+        figure: changed in place.
+        height: pixels.
+    """
     figure.update_layout(
         template="plotly_white",
         width=WIDTH,
@@ -833,7 +839,7 @@ def _finish(figure: go.Figure, height: int) -> None:
 
 def _line(figure: go.Figure, x: Array, y: Array, name: str, colour: str) -> None:
     figure.add_scatter(
-        x=_small(x), y=_small(y), mode="lines", line={"color": colour, "width": 1}, name=name
+        x=small(x), y=small(y), mode="lines", line={"color": colour, "width": 1}, name=name
     )
 
 
@@ -842,8 +848,8 @@ def _dots(
 ) -> None:
     some = _every(len(x), MOST_SAMPLES)
     figure.add_scatter(
-        x=_small(x[some]),
-        y=_small(y[some]),
+        x=small(x[some]),
+        y=small(y[some]),
         mode="markers",
         marker={"color": colour, "symbol": symbol, "size": size},
         name=name,
@@ -878,6 +884,6 @@ def _short(value: float, digits: int = 4) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def _small(values: Any) -> npt.NDArray[np.float32]:
+def small(values: Any) -> npt.NDArray[np.float32]:
     """Single precision: what the eye sees, in half the space."""
     return np.asarray(values, np.float32)

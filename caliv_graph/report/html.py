@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import gtsam
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -26,13 +25,14 @@ from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, Direction, LidarResult, Solution
 from caliv_graph.progress import StageRecord, count_text
 from caliv_graph.report.evidence import Evidence
+from caliv_graph.report.layout import SHOWN_AXES, decimals_of, fixed
+from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import (
     CloudVerdict,
     all_residuals,
     down_weighted,
     figures_of,
 )
-from caliv_graph.report.tables import _SHOWN_AXES, _decimals, _fixed
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
@@ -96,26 +96,20 @@ def render_report(
     # Here, for a run that writes no report has no use for them.
     from plotly.offline import get_plotlyjs
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("caliv_graph.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["figures_of"] = figures_of
-    environment.globals["median"] = lambda values: float(np.median(np.abs(values)))
+    pages = environment()
+    pages.globals["figures_of"] = figures_of
+    pages.globals["median"] = lambda values: float(np.median(np.abs(values)))
     sections = _sections(calibration, solution, evidence)
     figures = {f.name: f for figures in sections.values() for f in figures}
     clouds = down_weighted(solution, config.robust)
-    template = environment.get_template("report.html.j2")
+    template = pages.get_template("report.html.j2")
     return template.render(
         calibration=calibration,
         headline=_HEADLINES.get(calibration.status, calibration.status),
         verdicts=verdicts(calibration),
         conflicts=_conflicts(calibration, warnings),
         directions=_direction_rows(calibration),
-        axes=_SHOWN_AXES,
+        axes=SHOWN_AXES,
         mountings={n: _mounting_row(r) for n, r in calibration.lidars.items()},
         pairs=_pair_rows(calibration),
         moves=_move_rows(calibration),
@@ -127,7 +121,7 @@ def render_report(
         solution=solution,
         noise=_noise_rows(solution, evidence),
         sections=sections,
-        data={name: Markup(_script_json(f)) for name, f in figures.items()},
+        data={name: script_data(f) for name, f in figures.items()},
         warnings=list(dict.fromkeys(warnings)),
         stages=[(s.depth, s.name, s.seconds, count_text(s)) for s in stages],
         config=dump_config(config),
@@ -156,8 +150,8 @@ def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def _told(determined: Mapping[str, bool]) -> tuple[str, str]:
-    told = [axis for axis in _SHOWN_AXES if determined[axis]]
-    lost = [axis for axis in _SHOWN_AXES if not determined[axis]]
+    told = [axis for axis in SHOWN_AXES if determined[axis]]
+    lost = [axis for axis in SHOWN_AXES if not determined[axis]]
     return ("all six axes" if not lost else ", ".join(told)), (
         "all six axes" if not told else ", ".join(lost)
     )
@@ -233,15 +227,15 @@ def _cells(T_parent_child: gtsam.Pose3, cov: Array, determined: Mapping[str, boo
     values = np.concatenate([T_parent_child.rotation().rpy(), T_parent_child.translation()])
     values[:3], sigma[:3] = np.degrees(values[:3]), np.degrees(sigma[:3])
     out = []
-    for axis in _SHOWN_AXES:
+    for axis in SHOWN_AXES:
         i = AXES.index(axis)
         if determined[axis]:
-            decimals = _decimals(float(sigma[i]), 2)
-            value = _fixed(float(values[i]), decimals)
+            decimals = decimals_of(float(sigma[i]), 2)
+            value = fixed(float(values[i]), decimals)
             out.append(Cell(value, f"± {sigma[i]:.{decimals}f}", True))
         else:
-            decimals = _decimals(float(sigma[i]), 1)
-            out.append(Cell(f"({_fixed(float(values[i]), decimals)})", "not determined", False))
+            decimals = decimals_of(float(sigma[i]), 1)
+            out.append(Cell(f"({fixed(float(values[i]), decimals)})", "not determined", False))
     return out
 
 
@@ -254,7 +248,7 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
         moved = vehicle_axes_difference(lidar.T_vehicle_lidar, lidar.guess.T_vehicle_lidar)
         after = np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
         cells = []
-        for axis in _SHOWN_AXES:
+        for axis in SHOWN_AXES:
             i = AXES.index(axis)
             told, prior = lidar.determined[axis], lidar.guess.sigmas[i]
             cells.append(
@@ -262,7 +256,7 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
                     "moved": f"{1e3 * moved[i]:.3g}" if told else "not determined",
                     "prior": f"{1e3 * prior:.3g}",
                     "after": figures_of(1e3 * after[i]) if told else "the guess's",
-                    "sigmas": _fixed(float(moved[i] / prior), 1) if told else "",
+                    "sigmas": fixed(float(moved[i] / prior), 1) if told else "",
                     "far": bool(told and abs(moved[i]) > FAR_SIGMAS * prior),
                     "determined": told,
                 }
@@ -395,9 +389,3 @@ def _sections(
         "convergence": [draw.course_figure(solution)],
     }
     return {name: [f for f in found if f is not None] for name, found in sections.items()}
-
-
-def _script_json(figure: Figure) -> str:
-    """A figure's data for a script element: no text in it can end the element."""
-    text: str = figure.figure.to_json()
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

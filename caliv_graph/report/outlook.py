@@ -13,14 +13,8 @@ from rich.text import Text
 
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
-from caliv_graph.report.tables import (
-    _SHOWN_AXES,
-    _headings,
-    _sentences,
-    _table,
-    _titled,
-    direction_texts,
-)
+from caliv_graph.report.layout import SHOWN_AXES, axis_headings, new_table, sentences, titled
+from caliv_graph.report.tables import direction_texts
 from caliv_graph.results import calibration_document, without_infinities
 
 if TYPE_CHECKING:
@@ -44,12 +38,12 @@ def survey_table(survey: Survey) -> RenderableType:
         Text.assemble(("What the drive will tell", "bold"), f": {', '.join(survey.names)}"),
         *_sigma_parts(outlook, "Expected"),
     ]
-    seen = _table("target", "LiDAR", "scans\nthat count")
+    seen = new_table("target", "LiDAR", "scans\nthat count")
     for (target, lidar), count in survey.scans.items():
         seen.add_row(Text(target), Text(lidar), str(count))
-    parts += _titled("Who sees the target", seen)
+    parts += titled("Who sees the target", seen)
     parts += _direction_parts(outlook)
-    parts += _sentences("Asked for in the config, but not to be had:", survey.unmet)
+    parts += sentences("Asked for in the config, but not to be had:", survey.unmet)
     return Group(*parts)
 
 
@@ -89,7 +83,7 @@ def plan_table(
             f": {', '.join(prediction.names)}, {prediction.duration_s:.0f} s, {x:.0f} x {y:.0f} m",
         ),
         *_sigma_parts(outlook, "Predicted"),
-        *_titled("Who sees the target when", _sightings(prediction)),
+        *titled("Who sees the target when", _sightings(prediction)),
         *_direction_parts(outlook),
     ]
     if goals:
@@ -163,7 +157,7 @@ def _rounded(value: float) -> float:
 
 def _sightings(prediction: Prediction) -> Table:
     several = len(prediction.names) > 1
-    table = _table(
+    table = new_table(
         *(("drive",) if several else ()),
         "LiDAR",
         "target",
@@ -243,30 +237,30 @@ def _worst(prediction: Prediction, key: str) -> str:
 
 def _sigma_parts(outlook: Outlook, word: str) -> list[RenderableType]:
     """Tables of sigmas; what is held by the guess in brackets."""
-    mountings = _table("LiDAR", *_headings("mm", "mrad"))
+    mountings = new_table("LiDAR", *axis_headings("mm", "mrad"))
     verdicts = {name: r.determined for name, r in outlook.calibration.lidars.items()}
     for name, sigma in outlook.sigma_s2v.items():
         mountings.add_row(Text(name), *_sigma_cells(sigma, verdicts[name]))
-    parts = _titled(f"{word} 1 sigma of each mounting, vehicle axes", mountings)
+    parts = titled(f"{word} 1 sigma of each mounting, vehicle axes", mountings)
     if outlook.sigma_s2s:
-        pairs = _table("from\nto", *_headings("mm", "mrad"))
+        pairs = new_table("from\nto", *axis_headings("mm", "mrad"))
         for (a, b), sigma in outlook.sigma_s2s.items():
             cells = _sigma_cells(sigma, outlook.determined_s2s[a, b])
             pairs.add_row(Text(f"{a}\n{b}"), *cells)
-        parts += _titled(f"{word} 1 sigma of one LiDAR against another, vehicle axes", pairs)
+        parts += titled(f"{word} 1 sigma of one LiDAR against another, vehicle axes", pairs)
     held = any(not known for verdict in verdicts.values() for known in verdict.values())
     if held:
         note = "In brackets: the drive does not determine it; it will be the initial guess's."
         parts.append(Text(note, style="yellow"))
     offsets = [f"LiDAR '{n}': {1e3 * s:.2f} ms" for n, s in outlook.offsets_s.items()]
-    parts += _sentences(f"{word} 1 sigma of the clocks:", offsets)
+    parts += sentences(f"{word} 1 sigma of the clocks:", offsets)
     return parts
 
 
 def _sigma_cells(sigma: Array, determined: Mapping[str, bool]) -> list[Text]:
     values = dict(zip(AXES, 1e3 * sigma, strict=True))
     cells = []
-    for axis in _SHOWN_AXES:
+    for axis in SHOWN_AXES:
         text = _three_digits(float(values[axis]))
         cells.append(Text(text) if determined[axis] else Text(f"({text})", style="yellow"))
     return cells
@@ -286,8 +280,8 @@ def _direction_parts(outlook: Outlook) -> list[RenderableType]:
             for name in outlook.unseeing
         ),
     ]
-    parts = _sentences("What the drive cannot tell:", lost)
-    parts += _sentences("What it tells only weakly:", direction_texts(outlook.weak))
+    parts = sentences("What the drive cannot tell:", lost)
+    parts += sentences("What it tells only weakly:", direction_texts(outlook.weak))
     if not lost:
         parts += ["", Text("It leaves nothing undetermined.", style="bold green")]
     scaled = ", ".join(_three_digits(s) if s < 1e4 else "none" for s in _finite(outlook))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -17,20 +15,22 @@ from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, Direction, LidarResult
 from caliv_graph.progress import StageRecord, count_text
 from caliv_graph.report.inspection import DriveSummary, Inspection, Run, Sighting, TargetSummary
+from caliv_graph.report.layout import (
+    SHOWN_AXES,
+    axis_headings,
+    decimals_of,
+    fixed,
+    new_table,
+    sentences,
+    titled,
+    value_and_sigma,
+)
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
 if TYPE_CHECKING:
     from caliv_graph.report.bag_inspection import BagInspection, BagLidarSummary, TopicSummary
 
-_SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Order in tables: as people write a mounting down."""
-
-_MOST_DECIMALS = 6
-
 _HELD = "held"
-
-_TEXT_COLUMNS = ("frames", "seconds", "type", "times of points")
-"""Last columns that hold text of any length."""
 
 _STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
 
@@ -49,12 +49,12 @@ def calibration_table(
         seconds: how long all of it took; None: nothing is said of time.
     """
     parts: list[RenderableType] = [_status_line(calibration)]
-    parts += _sentences("What contradicts what:", calibration.contradictions)
-    parts += _titled(
+    parts += sentences("What contradicts what:", calibration.contradictions)
+    parts += titled(
         "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _mountings(calibration)
     )
     if len(calibration.lidars) > 1:
-        parts += _titled(
+        parts += titled(
             "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
             _sensor_to_sensor(calibration),
         )
@@ -66,13 +66,13 @@ def calibration_table(
                 style="yellow",
             )
         )
-    parts += _sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
-    parts += _sentences("What the drive could not tell:", _undetermined_texts(calibration))
+    parts += sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
+    parts += sentences("What the drive could not tell:", _undetermined_texts(calibration))
     weak = direction_texts(calibration.weak)
-    parts += _sentences("What it told only weakly:", weak)
-    parts += _sentences("Asked for in the config, but not reached:", calibration.unmet)
+    parts += sentences("What it told only weakly:", weak)
+    parts += sentences("Asked for in the config, but not reached:", calibration.unmet)
     if seconds is not None:
-        parts += _titled("Time", _times(stages, seconds))
+        parts += titled("Time", _times(stages, seconds))
     return Group(*parts)
 
 
@@ -83,7 +83,7 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
         evaluation: what `uncertainty.evaluation.evaluate` returned.
         calibration: what was evaluated; tells which axes were held.
     """
-    table = _table("", *_headings("mm", "mrad"))
+    table = new_table("", *axis_headings("mm", "mrad"))
     table.add_column("NEES\n6 dof", justify="right")
     any_held = False
     for name, errors in evaluation["lidars"].items():
@@ -95,7 +95,7 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
         seen = all(calibration.lidars[errors[end]].saw_target for end in ("from", "to"))
         name = f"S2S {errors['from']} to {errors['to']}"
         table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
-    parts = _titled("Errors in vehicle axes (estimate against truth)", table)
+    parts = titled("Errors in vehicle axes (estimate against truth)", table)
     if any_held:
         note = "In brackets: the drive did not determine this axis; its error is that of the guess."
         parts.append(Text(note, style="yellow"))
@@ -106,7 +106,7 @@ def inspection_table(inspection: Inspection | BagInspection) -> RenderableType:
     """What a recording holds."""
     if not isinstance(inspection, Inspection):
         return _bag_inspection(inspection)
-    table = _table(
+    table = new_table(
         "LiDAR",
         "clouds",
         "frames",
@@ -125,7 +125,7 @@ def inspection_table(inspection: Inspection | BagInspection) -> RenderableType:
             f"{points.min} / {points.median} / {points.max}",
         )
     parts: list[RenderableType] = [Text(inspection.data, style="bold")]
-    parts += _titled("Clouds by frame number (rates are nominal: 10 frames per second)", table)
+    parts += titled("Clouds by frame number (rates are nominal: 10 frames per second)", table)
     parts += [
         Text(f"{name}: clouds are missing between the frames {_runs(lidar.gaps, ' and ')}")
         for name, lidar in inspection.lidars.items()
@@ -149,7 +149,7 @@ def _target_parts(targets: Iterable[TargetSummary] | None) -> list[RenderableTyp
     for target in targets or ():
         x, y, z = target.centre_map_m
         in_time = any(sighting.times_s is not None for sighting in target.lidars.values())
-        seen = _table(
+        seen = new_table(
             "LiDAR",
             "scans",
             "range\nm",
@@ -158,7 +158,7 @@ def _target_parts(targets: Iterable[TargetSummary] | None) -> list[RenderableTyp
         )
         for name, sighting in target.lidars.items():
             seen.add_row(Text(name), *_sighting_cells(sighting))
-        parts += _titled(f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map", seen)
+        parts += titled(f"{target.name} near ({x:.1f}, {y:.1f}, {z:.1f}) m in the map", seen)
     return parts
 
 
@@ -166,7 +166,7 @@ def _bag_inspection(inspection: BagInspection) -> RenderableType:
     parts: list[RenderableType] = [
         Text(f"{inspection.data}: {inspection.duration_s:.1f} s", style="bold")
     ]
-    topics = _table(
+    topics = new_table(
         "topic",
         "messages",
         "rate\nHz",
@@ -176,14 +176,14 @@ def _bag_inspection(inspection: BagInspection) -> RenderableType:
     )
     for name, topic in inspection.topics.items():
         topics.add_row(Text(name), *_topic_cells(topic))
-    parts += _titled("Topics", topics)
-    lidars = _table(
+    parts += titled("Topics", topics)
+    lidars = new_table(
         "LiDAR", "frame", "clouds", "points per cloud\nmin / median / max", "times of points"
     )
     for name, lidar in inspection.lidars.items():
         lidars.add_row(Text(name), *_bag_lidar_cells(lidar))
     sampled = max((lidar.sampled for lidar in inspection.lidars.values()), default=0)
-    parts += _titled(f"LiDARs (points and times of up to {sampled} clouds of each)", lidars)
+    parts += titled(f"LiDARs (points and times of up to {sampled} clouds of each)", lidars)
     parts += [
         Text(f"{name}: times of points are not used: {lidar.times_problem}", style="yellow")
         for name, lidar in inspection.lidars.items()
@@ -248,9 +248,9 @@ def _status_line(calibration: Calibration) -> Text:
 
 
 def _mountings(calibration: Calibration) -> Table:
-    table = _table(
+    table = new_table(
         "LiDAR",
-        *_headings("m", "deg"),
+        *axis_headings("m", "deg"),
         "scans\nused",
     )
     for name, result in calibration.lidars.items():
@@ -266,9 +266,9 @@ def _scans_cell(result: LidarResult) -> Text:
 
 
 def _sensor_to_sensor(calibration: Calibration) -> Table:
-    table = _table(
+    table = new_table(
         "from\nto",
-        *_headings("m", "deg"),
+        *axis_headings("m", "deg"),
     )
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):
         T_vehicle_from = calibration.lidars[source].T_vehicle_lidar
@@ -312,13 +312,8 @@ def direction_texts(directions: Iterable[Direction]) -> list[str]:
     ]
 
 
-def _sentences(heading: str, texts: Iterable[str]) -> list[RenderableType]:
-    lines: list[RenderableType] = [Text(f"  - {text}") for text in texts]
-    return ["", Text(heading, style="bold"), *lines] if lines else []
-
-
 def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
-    table = _table("stage", "seconds", "done")
+    table = new_table("stage", "seconds", "done")
     for stage in stages:
         taken = "-" if stage.seconds is None else f"{stage.seconds:.2f}"
         table.add_row(Text(f"{'  ' * stage.depth}{stage.name}"), taken, count_text(stage))
@@ -326,65 +321,27 @@ def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
     return table
 
 
-def _titled(title: str, table: Table) -> list[RenderableType]:
-    """A table below its title. Rich's own titles are no wider than their tables."""
-    return ["", Text(title, style="bold"), table]
-
-
-def _table(*columns: str) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        show_edge=False,
-    )
-    for number, column in enumerate(columns):
-        last_of_text = column in _TEXT_COLUMNS and number == len(columns) - 1
-        left = number == 0 or last_of_text
-        table.add_column(
-            column, justify="left" if left else "right", no_wrap=not last_of_text, overflow="fold"
-        )
-    return table
-
-
-def _headings(length: str, angle: str) -> list[str]:
-    return [f"{axis}\n{length if axis in 'xyz' else angle}" for axis in _SHOWN_AXES]
-
-
 def _pose_cells(T_parent_child: Any, cov: Array, determined: Mapping[str, bool]) -> list[Text]:
-    """A cell per axis of `_SHOWN_AXES`: the value and, below it, its sigma in the parent's axes."""
+    """A cell per axis of `SHOWN_AXES`: the value and, below it, its sigma in the parent's axes."""
     sigma = np.sqrt(np.diag(parent_axes_covariance(T_parent_child, cov)))
     values = np.concatenate([T_parent_child.rotation().rpy(), T_parent_child.translation()])
     values[:3], sigma[:3] = np.degrees(values[:3]), np.degrees(sigma[:3])
     cells = dict(zip(AXES, zip(values, sigma, strict=True), strict=True))
-    return [_value_cell(*cells[axis], determined[axis]) for axis in _SHOWN_AXES]
+    return [_value_cell(*cells[axis], determined[axis]) for axis in SHOWN_AXES]
 
 
 def _value_cell(value: float, sigma: float, determined: bool) -> Text:
     """A value to two digits of its sigma; or, held, to one and in brackets."""
     if not determined:
-        return Text(f"({_fixed(value, _decimals(sigma, 1))})\n{_HELD}", style="yellow")
-    decimals = _decimals(sigma, 2)
-    return Text(f"{_fixed(value, decimals)}\n±{sigma:.{decimals}f}")
-
-
-def _decimals(sigma: float, digits: int) -> int:
-    """Decimals that show so many digits of a sigma."""
-    if not sigma > 0.0:
-        return 3
-    return min(max(digits - 1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS)
-
-
-def _fixed(value: float, decimals: int) -> str:
-    # Rounded first: a minus before zeros says nothing.
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+        return Text(f"({fixed(value, decimals_of(sigma, 1))})\n{_HELD}", style="yellow")
+    return Text(value_and_sigma(value, sigma))
 
 
 def _error_cells(errors: Mapping[str, Any], determined: Mapping[str, bool]) -> list[Text]:
     values = dict(zip(AXES, [*errors["rotation_rad"], *errors["translation_m"]], strict=True))
     cells = []
-    for axis in _SHOWN_AXES:
-        text = _fixed(1e3 * values[axis], 2)
+    for axis in SHOWN_AXES:
+        text = fixed(1e3 * values[axis], 2)
         cells.append(Text(text) if determined[axis] else Text(f"({text})", style="yellow"))
     nees = errors["nees"]
     return [*cells, Text("-" if nees is None else f"{nees:.2f}")]

@@ -11,7 +11,7 @@ from rich.text import Text
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.repeatability import Repeatability
 from caliv_graph.report.comparison import comparison_document
-from caliv_graph.report.tables import _sentences, _table, _titled
+from caliv_graph.report.layout import new_table, sentences, titled
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
 from caliv_graph.validation.validate import (
     AFTER,
@@ -39,12 +39,12 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
     """
     parts: list[RenderableType] = []
     for title, headings, rows in tables(found):
-        table = _table(*headings)
+        table = new_table(*headings)
         for row in rows:
             table.add_row(*map(Text, row))
-        parts += _titled(title, table)
+        parts += titled(title, table)
     if repeated is not None:
-        parts += _sentences("Split-half repeatability:", repeatability_sentences(repeated, p_value))
+        parts += sentences("Split-half repeatability:", repeatability_sentences(repeated, p_value))
     style = "bold green"
     if not found.has_structure:
         style = "bold yellow"
@@ -213,12 +213,8 @@ def validation_document(
 
 
 def _surface_document(found: SurfaceResult) -> dict[str, Any]:
-    x, y, size = place_of(found.surface)
     return {
-        "name": found.name,
-        "xy_map_m": [x, y],
-        "size_m": list(size),
-        "points": dict(found.points),
+        **_place_document(found, found.surface),
         "thickness_m": {s: t.merged for s, t in found.thickness.items()},
         "expected_thickness_m": found.expected.merged,
         "alone_m": {s: dict(t.alone) for s, t in found.thickness.items()},
@@ -238,12 +234,8 @@ def _surface_document(found: SurfaceResult) -> dict[str, Any]:
 
 
 def _thing_document(found: ThingResult) -> dict[str, Any]:
-    x, y, size = place_of(found.thing)
     return {
-        "name": found.name,
-        "xy_map_m": [x, y],
-        "size_m": list(size),
-        "points": dict(found.points),
+        **_place_document(found, found.thing),
         "pairs": [
             {
                 "from": a,
@@ -252,6 +244,18 @@ def _thing_document(found: ThingResult) -> dict[str, Any]:
             }
             for a, b in found.distance_m[AFTER]
         ],
+    }
+
+
+def _place_document(
+    found: SurfaceResult | ThingResult, where: Wall | Pole | Thing
+) -> dict[str, Any]:
+    x, y, size = place_of(where)
+    return {
+        "name": found.name,
+        "xy_map_m": [x, y],
+        "size_m": list(size),
+        "points": dict(found.points),
     }
 
 

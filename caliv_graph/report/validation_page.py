@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 import caliv_graph
 from caliv_graph.products import Array, IntArray
 from caliv_graph.repeatability import Repeatability
-from caliv_graph.report.figures import SYMBOLS, Figure, _finish, _small, colours, label
-from caliv_graph.report.html import _script_json
+from caliv_graph.report.figures import SYMBOLS, Figure, colours, finish, label, small
+from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.validation import repeatability_sentences, tables
 from caliv_graph.validation.validate import AFTER, BEFORE, Validation
 
@@ -41,22 +40,19 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     from plotly.offline import get_plotlyjs
 
     figures = validation_figures(found)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("caliv_graph.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("validation.html.j2").render(
-        found=found,
-        status=_status(found),
-        tables=tables(found),
-        repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
-        figures=figures,
-        data={figure.name: Markup(_script_json(figure)) for figure in figures},
-        plotlyjs=Markup(get_plotlyjs()),
-        version=caliv_graph.__version__,
+    return (
+        environment()
+        .get_template("validation.html.j2")
+        .render(
+            found=found,
+            status=_status(found),
+            tables=tables(found),
+            repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
+            figures=figures,
+            data={figure.name: script_data(figure) for figure in figures},
+            plotlyjs=Markup(get_plotlyjs()),
+            version=caliv_graph.__version__,
+        )
     )
 
 
@@ -166,8 +162,8 @@ def _two(
             own = own[np.sort(rng.choice(len(own), MOST_POINTS, replace=False))]
         for column, stage in enumerate(stages.values(), start=1):
             figure.add_scatter(
-                x=_small(views[stage][own, 0]),
-                y=_small(views[stage][own, 1]),
+                x=small(views[stage][own, 0]),
+                y=small(views[stage][own, 1]),
                 mode="markers",
                 marker={
                     "color": colour[name],
@@ -192,5 +188,5 @@ def _two(
             figure.update_layout(yaxis3_scaleanchor="x3")
         figure.update_xaxes(constrain="domain")
         figure.update_yaxes(constrain="domain")
-    _finish(figure, height)
+    finish(figure, height)
     return figure

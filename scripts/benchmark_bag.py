@@ -19,7 +19,6 @@ import json
 import math
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +27,9 @@ from pathlib import Path
 from typing import IO, Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: the matrices are small
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # for the module beside this script, run from anywhere
 
 import numpy as np
 from rosbags.interfaces import Connection
@@ -45,8 +47,7 @@ from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import Scenario, parse_scenario
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
-
-COMMAND = Path(sys.executable).with_name("caliv-graph")
+from scripts._command import COMMAND, Usage, calibrate_measured, exit_code_of
 
 RATE_HZ = 10.0
 LAP_S = 60
@@ -64,25 +65,9 @@ a sine of its length advances by J0(amplitude) per length: by nothing."""
 
 LEAST_SPEEDUP = 3.0
 MOST_MEMORY_MB = 2048.0
-"""Issue 3: at least three times faster than real time in at most 2 GB."""
+"""A workstation shall be through several drives while one is driven, beside other work."""
 
 SPARE_DISK = 1.15
-
-# A process inherits the peak memory of the one that started it; this one is small.
-LAUNCHER = """
-import json, os, resource, subprocess, sys, time
-cores = int(sys.argv[1])
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-start = time.monotonic()
-code = subprocess.run(sys.argv[2:], stdout=subprocess.DEVNULL).returncode
-seconds = time.monotonic() - start
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(json.dumps({
-    "code": code, "wall_s": seconds, "cpu_s": used.ru_utime + used.ru_stime,
-    "peak_mb": used.ru_maxrss / 1024,
-}))
-"""
 
 
 @dataclass(frozen=True)
@@ -157,25 +142,6 @@ class RepeatingWriter(BagWriter):
 
 
 @dataclass(frozen=True)
-class Usage:
-    """What one calibration took.
-
-    Attributes:
-        code: its exit code.
-        wall_s: from start to end.
-        cpu_s: of processor time.
-        peak_mb: largest resident memory.
-        stages_s: seconds per stage, from its log.
-    """
-
-    code: int
-    wall_s: float
-    cpu_s: float
-    peak_mb: float
-    stages_s: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class WorstError:
     """The axis between two LiDARs that is off by the largest part of its sigma; m or rad."""
 
@@ -186,14 +152,7 @@ class WorstError:
 
 def main() -> int:
     arguments = parse_arguments()
-    try:
-        return benchmark(arguments)
-    except (CalivError, OSError) as e:
-        print(f"error: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted", file=sys.stderr)
-        return 130
+    return exit_code_of(lambda: benchmark(arguments))
 
 
 def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
@@ -252,7 +211,7 @@ def benchmark(arguments: argparse.Namespace) -> int:
         size_mb = write_laps(recording, folder, progress)
         if not arguments.warm:
             drop_from_cache(folder / BAG_FOLDER)
-        usage = time_command(folder, arguments.cores)
+        usage = calibrate_measured(folder / "config.yaml", folder / "result", arguments.cores)
         worst = worst_error(folder, scenario.reference)
     duration_s = recording.truth.drive.duration_s
     kept = duration_s >= LEAST_SPEEDUP * usage.wall_s and usage.peak_mb <= MOST_MEMORY_MB
@@ -395,23 +354,6 @@ def drop_from_cache(folder: Path) -> None:
         with file.open("rb") as opened:
             os.fsync(opened.fileno())
             os.posix_fadvise(opened.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
-def time_command(folder: Path, cores: int) -> Usage:
-    """Runs `caliv-graph calibrate` in a process of its own."""
-    result = folder / "result"
-    command = map(str, (COMMAND, "calibrate", folder / "config.yaml", "--out", result))
-    launch = [sys.executable, "-I", "-S", "-c", LAUNCHER, str(cores), *command]
-    launched = subprocess.run(launch, check=True, capture_output=True, text=True)
-    usage = json.loads(launched.stdout)
-    if usage["code"] not in (0, 3, 4):
-        why = "; ".join(launched.stderr.strip().splitlines()[-2:])
-        raise CalivError(f"caliv-graph calibrate, exit code {usage['code']}: {why}")
-    stages: dict[str, float] = {}
-    for line in map(json.loads, (result / "log.jsonl").read_text(encoding="utf-8").splitlines()):
-        if "stage" in line and line["depth"] == 0:
-            stages[line["stage"]] = stages.get(line["stage"], 0.0) + line["seconds"]
-    return Usage(stages_s=stages, **usage)
 
 
 def worst_error(folder: Path, reference: str) -> WorstError | None:

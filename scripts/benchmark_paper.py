@@ -26,26 +26,27 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one core for both
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the estimator beside this script, run from anywhere
 
-import gtsam  # noqa: E402
-import numpy as np  # noqa: E402
+import gtsam
+import numpy as np
 
-from caliv_graph import __version__  # noqa: E402
-from caliv_graph._open3d import import_open3d  # noqa: E402
-from caliv_graph.config import Config, Mounting, load_config, parse_config  # noqa: E402
-from caliv_graph.conventions import AXES  # noqa: E402
-from caliv_graph.errors import CalivError  # noqa: E402
-from caliv_graph.geometry.se3 import pose_from_mounting, rpy  # noqa: E402
-from caliv_graph.pipeline import calibrate  # noqa: E402
-from caliv_graph.products import LidarScan, MotionData, Recording  # noqa: E402
-from caliv_graph.progress import SilentProgress  # noqa: E402
-from caliv_graph.readers import open_recording  # noqa: E402
-from caliv_graph.simulation.recording import simulate_drive  # noqa: E402
-from caliv_graph.simulation.scenario import CropModel, load_scenario  # noqa: E402
-from caliv_graph.simulation.writer import config_of  # noqa: E402
-from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs  # noqa: E402
-from scripts import benchmark_released as released  # noqa: E402
-from scripts._paper import PERCENTILE, paper_from_recording  # noqa: E402
-from scripts._paper_registration import COMPONENTS, ITERATIONS  # noqa: E402
+from caliv_graph import __version__
+from caliv_graph._open3d import import_open3d
+from caliv_graph.config import Config, Mounting, load_config, parse_config
+from caliv_graph.conventions import AXES
+from caliv_graph.errors import CalivError
+from caliv_graph.geometry.se3 import pose_from_mounting, rpy
+from caliv_graph.pipeline import calibrate
+from caliv_graph.products import LidarScan, MotionData, Recording
+from caliv_graph.progress import SilentProgress
+from caliv_graph.readers import open_recording
+from caliv_graph.simulation.recording import simulate_drive
+from caliv_graph.simulation.scenario import CropModel, load_scenario
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
+from scripts import benchmark_released as released
+from scripts._command import exit_code_of, positive
+from scripts._paper import PERCENTILE, paper_from_recording
+from scripts._paper_registration import COMPONENTS, ITERATIONS
 
 SCENARIOS = ("paper_arc", "figure_eight")
 RELEASED = "released"
@@ -130,14 +131,11 @@ class Job:
 
 def main() -> int:
     arguments = parse_arguments()
-    try:
-        outcomes = benchmark(arguments)
-    except (CalivError, OSError) as e:
-        print(f"error: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted; what is finished is kept", file=sys.stderr)
-        return 130
+    return exit_code_of(lambda: show(arguments), "interrupted; what is finished is kept")
+
+
+def show(arguments: argparse.Namespace) -> int:
+    outcomes = benchmark(arguments)
     if arguments.json:
         say(json.dumps([vars(o) for o in outcomes], indent=2))
     else:
@@ -155,7 +153,7 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--scenarios", nargs="*", default=list(SCENARIOS), metavar="NAME")
     parser.add_argument(
-        "--runs", type=released.positive, default=1, help="seeds 1 to N, guesses 1 to N (default 1)"
+        "--runs", type=positive, default=1, help="seeds 1 to N, guesses 1 to N (default 1)"
     )
     parser.add_argument(
         "--starts", nargs="+", choices=STARTS, default=["guess"], help="pre-alignment by"

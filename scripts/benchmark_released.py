@@ -16,7 +16,6 @@ import multiprocessing
 import os
 import re
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +23,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # for the module beside this script, run from anywhere
 
 import gtsam
 import numpy as np
@@ -46,10 +48,9 @@ from caliv_graph.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.simulation.noise import perturbed_mounting
 from caliv_graph.simulation.scenario import InitialGuessModel
+from scripts._command import COMMAND, calibrate_measured, exit_code_of, positive
 
-REPOSITORY = Path(__file__).resolve().parents[1]
 CONFIG = REPOSITORY / "configs/caliv_released.yaml"
-COMMAND = Path(sys.executable).with_name("caliv-graph")
 
 MODES: tuple[SolveMode, ...] = get_args(SolveMode)
 KERNELS: tuple[RobustKernel, ...] = get_args(RobustKernel)
@@ -104,19 +105,6 @@ SMALL_SIGMA = 0.5
 TOTAL_LIMIT_S = 15.0
 GRAPH_LIMIT_S = 2.0
 MEMORY_LIMIT_MB = 1024.0
-
-# A process inherits the peak memory of the one that started it; this one is small.
-LAUNCHER = """
-import json, resource, subprocess, sys, time
-start = time.monotonic()
-code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
-seconds = time.monotonic() - start
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(json.dumps({
-    "code": code, "wall_s": seconds, "cpu_s": used.ru_utime + used.ru_stime,
-    "peak_mb": used.ru_maxrss / 1024,
-}))
-"""
 
 
 @dataclass(frozen=True)
@@ -215,14 +203,7 @@ class Verdict:
 
 def main() -> int:
     arguments = parse_arguments()
-    try:
-        return benchmark(arguments)
-    except (CalivError, OSError) as e:
-        print(f"error: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted", file=sys.stderr)
-        return 130
+    return exit_code_of(lambda: benchmark(arguments))
 
 
 def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
@@ -255,13 +236,6 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--untimed", action="store_true", help="accuracy only")
     parser.add_argument("--json", action="store_true", help="print one JSON document: m and rad")
     return parser.parse_args(given)
-
-
-def positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
-    return value
 
 
 def benchmark(arguments: argparse.Namespace) -> int:
@@ -412,40 +386,28 @@ def time_command(
     ):
         path, result = Path(folder) / "config.yaml", Path(folder) / "result"
         path.write_text(dump_config(with_method(config, mode, kernel)), encoding="utf-8")
-        command = map(str, (COMMAND, "calibrate", path, "--out", result, "--force"))
-        launch = [sys.executable, "-I", "-S", "-c", LAUNCHER, *command]
         for _ in range(TIMED_RUNS):
-            launched = subprocess.run(launch, check=True, capture_output=True, text=True)
-            usage = json.loads(launched.stdout)
-            if usage["code"] not in (0, 3):
-                why = "; ".join(launched.stderr.strip().splitlines()[-2:])
-                raise CalivError(f"caliv-graph calibrate with solve.mode {mode}: {why}")
-            found.append((usage, read_log(result / "log.jsonl")))
+            usage = calibrate_measured(path, result)
+            found.append((usage, graph_seconds(result / "log.jsonl")))
             advance()
     return Timing(
         mode=mode,
         kernel=kernel,
-        wall_s=statistics.median(usage["wall_s"] for usage, _ in found),
-        cpu_s=statistics.median(usage["cpu_s"] for usage, _ in found),
-        peak_mb=statistics.median(usage["peak_mb"] for usage, _ in found),
-        graph_s=statistics.median(log["graph solves"] for _, log in found),
+        wall_s=statistics.median(usage.wall_s for usage, _ in found),
+        cpu_s=statistics.median(usage.cpu_s for usage, _ in found),
+        peak_mb=statistics.median(usage.peak_mb for usage, _ in found),
+        graph_s=statistics.median(graph_s for _, graph_s in found),
         stages_s={
-            stage: statistics.median(log[stage] for _, log in found)
-            for stage in found[0][1]
-            if stage != "graph solves"
+            stage: statistics.median(usage.stages_s[stage] for usage, _ in found)
+            for stage in found[0][0].stages_s
         },
     )
 
 
-def read_log(path: Path) -> dict[str, float]:
-    """Seconds of each stage, and of all graph solves together."""
-    seconds: dict[str, float] = {}
-    for line in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
-        if "stage" in line and line["depth"] == 0:
-            seconds[line["stage"]] = seconds.get(line["stage"], 0.0) + line["seconds"]
-        if "solution" in line:
-            seconds["graph solves"] = line["seconds"]["graph"]
-    return seconds
+def graph_seconds(log: Path) -> float:
+    """Seconds of all graph solves together."""
+    lines = map(json.loads, log.read_text(encoding="utf-8").splitlines())
+    return float(next(line["seconds"]["graph"] for line in lines if "solution" in line))
 
 
 def accuracy_verdicts(run: Runs, ground: bool = False) -> Iterator[Verdict]:

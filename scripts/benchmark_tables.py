@@ -34,26 +34,26 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per c
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
-import caliv_graph  # noqa: E402
-from caliv_graph.config import dump_config  # noqa: E402
-from caliv_graph.errors import CalivError  # noqa: E402
-from caliv_graph.progress import PlainProgress  # noqa: E402
-from caliv_graph.simulation.recording import simulate_drive  # noqa: E402
-from caliv_graph.simulation.scenario import (  # noqa: E402
+import caliv_graph
+from caliv_graph.config import dump_config
+from caliv_graph.errors import CalivError
+from caliv_graph.progress import PlainProgress
+from caliv_graph.simulation.recording import simulate_drive
+from caliv_graph.simulation.scenario import (
     InitialGuessModel,
     Scenario,
     dump_scenario,
     load_scenario,
 )
-from caliv_graph.simulation.thinned import (  # noqa: E402
+from caliv_graph.simulation.thinned import (
     BeamSelection,
     GroundWaves,
     ThinnedRecording,
     cached_selection,
     scenario_digest,
 )
-from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row  # noqa: E402
-from scripts._tables_statistics import (  # noqa: E402
+from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row
+from scripts._tables_statistics import (
     Line,
     comparison,
     other_systems,

@@ -23,20 +23,20 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: the matrices are 
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the filter beside this script, run from anywhere
 
-import numpy as np  # noqa: E402
-import pymap3d  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
-from scipy.stats import chi2  # noqa: E402
+import numpy as np
+import pymap3d
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from caliv_graph.config import Config, parse_config  # noqa: E402
-from caliv_graph.geometry.se3 import stack  # noqa: E402
-from caliv_graph.products import Array, IntArray, MotionData  # noqa: E402
-from caliv_graph.simulation import simulate_drive  # noqa: E402
-from caliv_graph.simulation.recording import SimulatedTruth  # noqa: E402
-from caliv_graph.simulation.scenario import Scenario, load_scenario  # noqa: E402
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory  # noqa: E402
-from caliv_graph.trajectory.smoothing import smooth_trajectory  # noqa: E402
-from scripts._ukf import filter_trajectory  # noqa: E402
+from caliv_graph.config import Config, parse_config
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, IntArray, MotionData
+from caliv_graph.simulation import simulate_drive
+from caliv_graph.simulation.recording import SimulatedTruth
+from caliv_graph.simulation.scenario import Scenario, load_scenario
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.smoothing import smooth_trajectory
+from scripts._ukf import filter_trajectory
 
 SCENARIOS = ("paper_arc", "figure_eight")
 LEFT_OUT_S = 2.0

@@ -37,16 +37,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per c
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from caliv_graph.errors import CalivError, ConfigError  # noqa: E402
-from caliv_graph.fusion.monitor import DOF, alarm_threshold  # noqa: E402
-from caliv_graph.products import Array  # noqa: E402
-from caliv_graph.results import read_calibration  # noqa: E402
-from caliv_graph.simulation.scenario import Scenario, load_scenario  # noqa: E402
-from scripts._localiser import FALSE_ALARMS_PER_HOUR  # noqa: E402
-from scripts._localiser_runs import KEYFRAME_S, VARIANTS, Run, Task, cached_runs  # noqa: E402
-from scripts.benchmark_compare import SCENARIOS, calibrated  # noqa: E402
+from caliv_graph.errors import CalivError, ConfigError
+from caliv_graph.fusion.monitor import DOF, alarm_threshold
+from caliv_graph.products import Array
+from caliv_graph.results import read_calibration
+from caliv_graph.simulation.scenario import Scenario, load_scenario
+from scripts._localiser import FALSE_ALARMS_PER_HOUR
+from scripts._localiser_runs import KEYFRAME_S, VARIANTS, Run, Task, cached_runs
+from scripts.benchmark_compare import SCENARIOS, calibrated
 
 OUT = REPOSITORY / "out" / "localiser"
 

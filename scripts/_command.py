@@ -1,0 +1,100 @@
+"""What the scripts have in common as commands: exit codes, numbers on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from caliv_graph.errors import CalivError
+
+COMMAND = Path(sys.executable).with_name("caliv-graph")
+
+# A process inherits the peak memory of the one that started it; this one is small.
+LAUNCHER = """
+import json, os, resource, subprocess, sys, time
+cores = int(sys.argv[1])
+if cores and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+start = time.monotonic()
+code = subprocess.run(sys.argv[2:], stdout=subprocess.DEVNULL).returncode
+seconds = time.monotonic() - start
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps({
+    "code": code, "wall_s": seconds, "cpu_s": used.ru_utime + used.ru_stime,
+    "peak_mb": used.ru_maxrss / 1024,
+}))
+"""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What one calibration took.
+
+    Attributes:
+        code: its exit code.
+        wall_s: from start to end.
+        cpu_s: of processor time.
+        peak_mb: largest resident memory.
+        stages_s: seconds per stage, from its log.
+    """
+
+    code: int
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    stages_s: Mapping[str, float]
+
+
+def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
+    """Runs `caliv-graph calibrate` in a process of its own.
+
+    Args:
+        config: to calibrate with.
+        result: folder for the result; an older one is replaced.
+        cores: that it may run on; 0: all.
+
+    Raises:
+        CalivError: it left no result.
+    """
+    command = map(str, (COMMAND, "calibrate", config, "--out", result, "--force"))
+    launch = [sys.executable, "-I", "-S", "-c", LAUNCHER, str(cores), *command]
+    launched = subprocess.run(launch, check=True, capture_output=True, text=True)
+    usage = json.loads(launched.stdout)
+    if usage["code"] not in (0, 3, 4):
+        why = "; ".join(launched.stderr.strip().splitlines()[-2:])
+        raise CalivError(f"caliv-graph calibrate, exit code {usage['code']}: {why}")
+    stages: dict[str, float] = {}
+    for line in map(json.loads, (result / "log.jsonl").read_text(encoding="utf-8").splitlines()):
+        if "stage" in line and line["depth"] == 0:
+            stages[line["stage"]] = stages.get(line["stage"], 0.0) + line["seconds"]
+    return Usage(stages_s=stages, **usage)
+
+
+def exit_code_of(work: Callable[[], int], interrupted: str = "interrupted") -> int:
+    """Does the work; what goes wrong with its input is one line on stderr and exit code 2.
+
+    Args:
+        work: returns its own exit code.
+        interrupted: what is said on an interrupt, whose exit code is 130.
+    """
+    try:
+        return work()
+    except (CalivError, OSError) as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"error: {interrupted}", file=sys.stderr)
+        return 130
+
+
+def positive(text: str) -> int:
+    """A number of the command line that is at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value

@@ -44,14 +44,24 @@ def key_drift(index: int) -> int:
     return int(gtsam.symbol("d", index))
 
 
+def key_imu(index: int) -> int:
+    """Key of T_map_imu at a node of a trajectory."""
+    return int(gtsam.symbol("i", index))
+
+
 def key_velocity(index: int) -> int:
-    """Key of the velocity of the vehicle frame's origin in the map, (3,) m/s, beside X_i."""
+    """Key of the velocity of the IMU's origin in the map, (3,) m/s, at a node of a trajectory."""
     return int(gtsam.symbol("v", index))
 
 
 def key_bias(index: int) -> int:
-    """Key of the IMU's `gtsam.imuBias.ConstantBias` (imu frame) beside X_i."""
+    """Key of the IMU's `gtsam.imuBias.ConstantBias` (imu frame) at a node of a trajectory."""
     return int(gtsam.symbol("b", index))
+
+
+def key_yaw_bias() -> int:
+    """Key of the turn about the vertical of a trajectory's orientation source, (1,) rad."""
+    return int(gtsam.symbol("y", 0))
 
 
 def key_mounting() -> int:

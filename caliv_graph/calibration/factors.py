@@ -7,7 +7,7 @@ axes, position in map axes). All Jacobians are analytic; the tests check them nu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
@@ -18,8 +18,6 @@ from caliv_graph.geometry.se3 import (
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
-
-ErrorFunction = Callable[[gtsam.CustomFactor, gtsam.Values, list[Array] | None], Array]
 
 
 def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Array]]:

@@ -33,6 +33,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from caliv_graph.config import Config
+from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import pose_from_mounting, stack
 from caliv_graph.products import Array, ImuSamples, IntArray, MotionData, Trajectory
@@ -121,21 +122,6 @@ BIAS_SIGMAS = 5.0
 WORST_TILT_RAD = 0.1
 WORST_YAW_RAD = 0.2
 WORST_POSITION_M = 10.0
-
-
-def _key_imu(i: int) -> int:
-    return int(gtsam.symbol("i", i))
-
-
-def _key_velocity(i: int) -> int:
-    return int(gtsam.symbol("v", i))
-
-
-def _key_bias(i: int) -> int:
-    return int(gtsam.symbol("b", i))
-
-
-KEY_YAW_BIAS = int(gtsam.symbol("y", 0))
 
 
 @dataclass(frozen=True)
@@ -618,19 +604,19 @@ def _graph(
     for i, measured in enumerate(preintegrate(data.inertial, nodes, biases, noise, gravity)):
         graph.add(
             gtsam.CombinedImuFactor(
-                _key_imu(i),
-                _key_velocity(i),
-                _key_imu(i + 1),
-                _key_velocity(i + 1),
-                _key_bias(i),
-                _key_bias(i + 1),
+                key_imu(i),
+                key_velocity(i),
+                key_imu(i + 1),
+                key_velocity(i + 1),
+                key_bias(i),
+                key_bias(i + 1),
                 measured,
             )
         )
     bias_sigmas = np.array([noise.force_bias] * 3 + [noise.gyro_bias] * 3)
     graph.add(
         gtsam.PriorFactorConstantBias(
-            _key_bias(0),
+            key_bias(0),
             gtsam.imuBias.ConstantBias(),
             gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas),
         )
@@ -680,8 +666,8 @@ def _add_positions(
         i = int(positions.nodes[k])
         graph.add(
             position_factor(
-                _key_imu(i),
-                _key_velocity(i),
+                key_imu(i),
+                key_velocity(i),
                 positions.position_map[k],
                 positions.offset_imu[k],
                 float(positions.delay_s[k]),
@@ -699,14 +685,14 @@ def _add_orientations(
         noise = gtsam.noiseModel.Gaussian.Covariance(orientations.cov[k])
         R = gtsam.Rot3(orientations.R_map_imu[k])
         if estimated:
-            graph.add(biased_orientation_factor(_key_imu(i), KEY_YAW_BIAS, R, noise))
+            graph.add(biased_orientation_factor(key_imu(i), key_yaw_bias(), R, noise))
         else:
-            graph.add(orientation_factor(_key_imu(i), R, noise))
+            graph.add(orientation_factor(key_imu(i), R, noise))
     if estimated:
         sigma = math.radians(data.config.imu.yaw_bias_sigma_deg)
         graph.add(
             gtsam.PriorFactorVector(
-                KEY_YAW_BIAS, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+                key_yaw_bias(), np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, sigma)
             )
         )
 
@@ -718,9 +704,7 @@ def _add_velocities(
         gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
         noise = gtsam.noiseModel.Gaussian.Covariance(velocities.cov[k])
         graph.add(
-            velocity_factor(
-                _key_imu(i), _key_velocity(i), velocities.velocity_imu[k], gained, noise
-            )
+            velocity_factor(key_imu(i), key_velocity(i), velocities.velocity_imu[k], gained, noise)
         )
 
 
@@ -729,7 +713,7 @@ def _add_gauge(graph: gtsam.NonlinearFactorGraph, data: _Data, states: States) -
     start = gtsam.Pose3(gtsam.Rot3(states.R_map_imu[0]), states.p_map_imu[0])
     graph.add(
         gtsam.PoseTranslationPrior3D(
-            _key_imu(0), start, gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_M)
+            key_imu(0), start, gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_M)
         )
     )
     if not data.orientation:
@@ -737,35 +721,33 @@ def _add_gauge(graph: gtsam.NonlinearFactorGraph, data: _Data, states: States) -
         # Loose in tilt, which gravity tells; in the imu's axes, as the factor's residual is.
         cov = R.T @ np.diag([1.0, 1.0, GAUGE_RAD**2]) @ R
         graph.add(
-            orientation_factor(
-                _key_imu(0), gtsam.Rot3(R), gtsam.noiseModel.Gaussian.Covariance(cov)
-            )
+            orientation_factor(key_imu(0), gtsam.Rot3(R), gtsam.noiseModel.Gaussian.Covariance(cov))
         )
 
 
 def _values(states: States, data: _Data) -> gtsam.Values:
     out = gtsam.Values()
     for i in range(len(states.p_map_imu)):
-        out.insert(_key_imu(i), gtsam.Pose3(gtsam.Rot3(states.R_map_imu[i]), states.p_map_imu[i]))
-        out.insert(_key_velocity(i), states.velocity_map[i])
+        out.insert(key_imu(i), gtsam.Pose3(gtsam.Rot3(states.R_map_imu[i]), states.p_map_imu[i]))
+        out.insert(key_velocity(i), states.velocity_map[i])
         out.insert(
-            _key_bias(i), gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
+            key_bias(i), gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
         )
     if data.orientation and data.config.imu.yaw_bias:
-        out.insert(KEY_YAW_BIAS, np.array([states.yaw_bias_rad]))
+        out.insert(key_yaw_bias(), np.array([states.yaw_bias_rad]))
     return out
 
 
 def _states(values: gtsam.Values, n: int, data: _Data) -> States:
-    R, p = stack([values.atPose3(_key_imu(i)) for i in range(n)])
-    biases = [values.atConstantBias(_key_bias(i)) for i in range(n)]
+    R, p = stack([values.atPose3(key_imu(i)) for i in range(n)])
+    biases = [values.atConstantBias(key_bias(i)) for i in range(n)]
     yaw_bias = 0.0
     if data.orientation and data.config.imu.yaw_bias:
-        yaw_bias = float(values.atVector(KEY_YAW_BIAS)[0])
+        yaw_bias = float(values.atVector(key_yaw_bias())[0])
     return States(
         R,
         p,
-        np.array([values.atVector(_key_velocity(i)) for i in range(n)]),
+        np.array([values.atVector(key_velocity(i)) for i in range(n)]),
         np.array([b.accelerometer() for b in biases]),
         np.array([b.gyroscope() for b in biases]),
         yaw_bias,
@@ -782,10 +764,10 @@ def _optimised(
     """
     ordering = gtsam.Ordering()
     for i in range(n):
-        for key in (_key_bias(i), _key_velocity(i), _key_imu(i)):
+        for key in (key_bias(i), key_velocity(i), key_imu(i)):
             ordering.push_back(key)
-    if values.exists(KEY_YAW_BIAS):
-        ordering.push_back(KEY_YAW_BIAS)
+    if values.exists(key_yaw_bias()):
+        ordering.push_back(key_yaw_bias())
     error = graph.error(values)
     damping = 0.0
     for _ in range(MOST_STEPS):
@@ -828,9 +810,9 @@ def _step(
     bias = np.diag([root / 0.1] * 3 + [root / 0.01] * 3)
     unit3, unit6 = gtsam.noiseModel.Unit.Create(3), gtsam.noiseModel.Unit.Create(6)
     for i in range(n):
-        damped.add(gtsam.JacobianFactor(_key_imu(i), pose, np.zeros(6), unit6))
-        damped.add(gtsam.JacobianFactor(_key_velocity(i), root * np.eye(3), np.zeros(3), unit3))
-        damped.add(gtsam.JacobianFactor(_key_bias(i), bias, np.zeros(6), unit6))
+        damped.add(gtsam.JacobianFactor(key_imu(i), pose, np.zeros(6), unit6))
+        damped.add(gtsam.JacobianFactor(key_velocity(i), root * np.eye(3), np.zeros(3), unit3))
+        damped.add(gtsam.JacobianFactor(key_bias(i), bias, np.zeros(6), unit6))
     try:
         return values.retract(damped.optimize(ordering))
     except RuntimeError:
@@ -842,9 +824,9 @@ def _chain(
 ) -> Chain:
     return Chain.from_graph(
         graph.linearize(values),
-        [(_key_imu(i), _key_velocity(i), _key_bias(i)) for i in range(n)],
+        [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(n)],
         (6, 3, 6),
-        [KEY_YAW_BIAS] if yaw_bias else [],
+        [key_yaw_bias()] if yaw_bias else [],
     )
 
 

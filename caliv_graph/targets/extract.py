@@ -41,6 +41,9 @@ GUESS_SIGMAS = 2.0
 """Standard deviations of the initial guess that the region is widened by; a uniform error ends at
 1.7 of them."""
 
+TRUSTED_MARGIN_M = 0.1
+"""The same for a mounting that is trusted: what the vehicle's poses may be off."""
+
 MAX_HEIGHT_M = 2.5
 """A target is at most 2 m high (SPEC 6); the rest is for a ground plane that is off at the rim."""
 
@@ -117,7 +120,7 @@ def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
     """How far the initial guess of a LiDAR may displace a target at `range_m`, in metres."""
     sigma = config.lidars[lidar].sigma
     if config.lidars[lidar].fixed:
-        return 0.1
+        return TRUSTED_MARGIN_M
     return GUESS_SIGMAS * (max(sigma.xyz_m()) + max(sigma.rpy_rad()) * range_m)
 
 
@@ -148,10 +151,10 @@ def _filtered(points: Array, extraction: ExtractionConfig) -> IntArray:
 
 
 def _azimuth_edges(points_lidar: Array) -> tuple[float, float] | None:
-    """First and last azimuth (rad) of a cloud's field of view, counted from its middle.
+    """Azimuths that a cloud's field of view spans.
 
     Returns:
-        (centre, half width), or None if it looks all around.
+        (centre, half width) in radians, or None if it looks all around.
     """
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
     # Tenths of a degree: finer than EDGE_RAD, and far cheaper than sorting every point.
@@ -492,8 +495,8 @@ def extract_targets(
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; of a target that
-        was moved while the vehicle stood, one per place. LiDARs that saw
-        the target in fewer than `extraction.min_scans` scans are left out with a warning.
+        was moved while the vehicle stood, one per place. LiDARs that saw the target in fewer than
+        `extraction.min_scans` scans are left out with a warning.
 
     Raises:
         TargetError: no LiDAR sees a target, or none was found.

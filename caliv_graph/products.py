@@ -249,8 +249,9 @@ class TargetObservation:
         placement: index of the placement; one latent target frame belongs to each.
         name: what to call it in messages.
         centre_map: (3,) metres, rough centre in the map of its drive.
-        clouds: in order of LiDAR, then stamp.
+        clouds: in order of LiDAR, then stamp; of many scans that see it, evenly chosen ones.
         warnings: what was left out, and why, a line each.
+        seen_ns: LiDAR -> stamps of all scans that were found to see it, ascending.
     """
 
     placement: int
@@ -258,6 +259,7 @@ class TargetObservation:
     centre_map: Array
     clouds: tuple[TargetCloud, ...]
     warnings: tuple[str, ...] = ()
+    seen_ns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

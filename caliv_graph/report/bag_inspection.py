@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording, TargetObservation
@@ -23,6 +25,7 @@ from caliv_graph.report.inspection import (
     inspect_recording,
     nearest_and_farthest,
     runs_of,
+    stamps_seen,
     summarise_drive,
     summarise_points,
 )
@@ -305,10 +308,14 @@ def _summarise_sighting(
     clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
     if not clouds:
         return Sighting(scans=0, frames=(), points=None, range_m=None, times_s=())
-    step_ns = round(_RUN_FACTOR * NANOSECONDS_PER_SECOND / rate_hz) if rate_hz else 0
-    runs = runs_of([cloud.stamp_ns for cloud in clouds], step_ns)
+    stamps_ns = stamps_seen(observation, lidar)
+    period_ns = NANOSECONDS_PER_SECOND / rate_hz if rate_hz else 0.0
+    if len(stamps_ns) > 2:
+        # Of a long drive not every scan is looked at.
+        period_ns = max(period_ns, float(np.median(np.diff(stamps_ns))))
+    runs = runs_of(stamps_ns, round(_RUN_FACTOR * period_ns))
     return Sighting(
-        scans=len(clouds),
+        scans=len(stamps_ns),
         frames=(),
         points=summarise_points([len(cloud.points_lidar) for cloud in clouds]),
         range_m=nearest_and_farthest([cloud.points_lidar for cloud in clouds]),

@@ -85,8 +85,10 @@ class Sighting:
     Attributes:
         scans: scans with enough points on the target.
         frames: runs of frames, in the LiDAR's rhythm, from first to last; none of a bag.
-        points: points on the target per scan; None if it is never seen.
-        range_m: nearest and farthest distance of the target from the LiDAR; None if never seen.
+        points: points on the target per scan, of the clouds that a calibration would use; None if
+            it is never seen.
+        range_m: nearest and farthest distance of the target from the LiDAR, of the same; None if
+            never seen.
         times_s: of a bag the same runs, in seconds from its first record time.
     """
 
@@ -221,12 +223,19 @@ def _summarise_sighting(observation: TargetObservation, lidar: str, step: int) -
     if not clouds:
         return Sighting(scans=0, frames=(), points=None, range_m=None)
     clouds_lidar = [cloud.points_lidar for cloud in clouds]
+    stamps_ns = stamps_seen(observation, lidar)
     return Sighting(
-        scans=len(clouds),
-        frames=runs_of([cloud.stamp_ns // FRAME_PERIOD_NS for cloud in clouds], step),
+        scans=len(stamps_ns),
+        frames=runs_of([stamp_ns // FRAME_PERIOD_NS for stamp_ns in stamps_ns], step),
         points=summarise_points([len(points) for points in clouds_lidar]),
         range_m=nearest_and_farthest(clouds_lidar),
     )
+
+
+def stamps_seen(observation: TargetObservation, lidar: str) -> list[int]:
+    """Stamps of the scans of a LiDAR that see a target; at least those of the clouds."""
+    of_clouds = {cloud.stamp_ns for cloud in observation.clouds if cloud.lidar == lidar}
+    return sorted(of_clouds.union(observation.seen_ns.get(lidar, ())))
 
 
 def nearest_and_farthest(clouds_lidar: Sequence[Array]) -> tuple[float, float]:

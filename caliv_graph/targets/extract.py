@@ -752,13 +752,16 @@ def _observation(
 ) -> TargetObservation:
     """Drops the LiDARs that saw too little, and says so."""
     warnings = list(hints)
-    kept = []
+    kept: list[TargetCloud] = []
+    seen_ns: dict[str, tuple[int, ...]] = {}
     seeing = sum(t.kept >= config.extraction.min_scans for t in extractor.tallies.values())
     most = config.extraction.max_scans
     most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
     for name, tally in extractor.tallies.items():
         if tally.kept >= config.extraction.min_scans:
-            kept += _thinned([c for c in found if c.lidar == name], most)
+            of_lidar = [c for c in found if c.lidar == name]
+            seen_ns[name] = tuple(sorted(c.stamp_ns for c in of_lidar))
+            kept += _thinned(of_lidar, most)
         elif not tally.scans:
             warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
         else:
@@ -770,4 +773,6 @@ def _observation(
             )
     if not kept:
         warnings = [_complain(label, config, extractor.tallies)]
-    return TargetObservation(placement, label, extractor.centre_map, tuple(kept), tuple(warnings))
+    return TargetObservation(
+        placement, label, extractor.centre_map, tuple(kept), tuple(warnings), seen_ns
+    )

@@ -189,6 +189,36 @@ def test_a_bag_with_a_config_tells_times_of_sightings(
     assert "0.0 to 0.2, 1.1 to 1.2" in table
 
 
+def test_sightings_are_told_though_a_calibration_uses_some_of_the_clouds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def extract(recordings: Sequence[Recording], *_: object) -> tuple[TargetObservation, ...]:
+        stamps = recordings[0].scan_stamps_ns("front")
+        clouds = tuple(
+            TargetCloud("front", 0, stamps[k], np.full((60, 3), 4.0), "a cloud") for k in (8, 24)
+        )
+        # A long drive: every other scan was looked at.
+        seen_ns = {"front": tuple(stamps[k] for k in (8, 10, 12, 14, 22, 24, 26))}
+        return (TargetObservation(0, "target", np.zeros(3), clouds, seen_ns=seen_ns),)
+
+    monkeypatch.setattr("caliv_graph.targets.extract_targets", extract)
+    bag = write_bag(tmp_path / "drive", bag_messages(30))
+    lidars = {"front": {"topic": "/lidar/front/points", "initial": {"xyz": [0, 0, 0]}}}
+    config = write_config(
+        tmp_path / "config.yaml",
+        data={"format": "rosbag"},
+        topics={"pose": "/odom"},
+        lidars=lidars,
+    )
+
+    (target,) = json.loads(inspect(bag, "--config", config, "--json").stdout)["targets"]
+
+    front = target["lidars"]["front"]
+    assert front["scans"] == 7
+    # Two clouds are missing from the bag before these.
+    assert [round(t, 1) for run in front["times_s"] for t in run] == [1.0, 1.6, 2.4, 2.8]
+
+
 def test_a_bag_that_is_cut_off_is_named(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     path.touch()

@@ -610,6 +610,19 @@ def test_without_a_region_the_target_is_searched_for() -> None:
         extracted_from({"front": empty}, config_of())
 
 
+def test_of_many_scans_some_are_kept_and_all_are_told() -> None:
+    scene = chair_at_10()
+    config = config_of(tight_region(scene.world))
+    few = config.extraction.model_copy(update={"max_scans": 8})
+
+    (observation,) = extracted_from(
+        {"front": [scene.points_lidar] * 20}, config.model_copy(update={"extraction": few})
+    )
+
+    assert len(observation.clouds) <= 10
+    assert observation.seen_ns == {"front": tuple(range(20))}
+
+
 def test_a_region_that_nothing_enters_says_how_near_it_came() -> None:
     # 4 m above the flat ground that is all there is below it.
     scene = chair_at_10()

@@ -53,6 +53,7 @@ def prepare(
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations)
+        del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(recordings, config, stamps, motions)
     warnings = [w for r in recordings for w in r.warnings()]
     warnings += [w for t in trajectories for w in t.warnings]

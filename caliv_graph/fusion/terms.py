@@ -43,6 +43,9 @@ _LEAST_EIGENVALUE = 1e-12
 digits."""
 
 
+_DIGESTED_ROWS = 65_536
+
+
 def drive_digest(motion: MotionData) -> str:
     """Digest of a drive, the same for whatever is calibrated from it.
 
@@ -68,7 +71,10 @@ def _feed(digest: hashlib._Hash, value: object) -> None:
     elif isinstance(value, gtsam.Pose3):
         digest.update(np.ascontiguousarray(value.matrix()).tobytes())
     elif isinstance(value, np.ndarray):
-        digest.update(np.ascontiguousarray(value).tobytes())
+        # In parts: bytes are a copy, and of what repeats one covariance they are all of it.
+        rows = np.atleast_1d(value)
+        for begin in range(0, len(rows), _DIGESTED_ROWS):
+            digest.update(np.ascontiguousarray(rows[begin : begin + _DIGESTED_ROWS]).tobytes())
     else:
         digest.update(repr(value).encode())
 

@@ -113,10 +113,41 @@ class _Rows:
 
     def sorted(self) -> tuple[IntArray, Array]:
         """Stamps (n,) strictly increasing and their rows (n, width); of equal stamps the first."""
-        stamps = np.array(self._stamps, dtype=np.int64)
-        values = np.array(self._values, dtype=np.float64).reshape(-1, self._width)
+        return self.ordered()[:2]
+
+    def ordered(self) -> tuple[IntArray, Array, IntArray]:
+        """As `sorted`, and which of the rows that were added they are, (n,)."""
+        # Views of what was collected, for a moment: what is handed out is a copy.
+        stamps = np.frombuffer(self._stamps, dtype=np.int64)
+        values = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
         stamps, first = np.unique(stamps, return_index=True)
-        return stamps, values[first]
+        return stamps, values[first], first
+
+
+class _Stated:
+    """Rows of numbers that mostly are those of the row before, as covariances in messages are.
+
+    They are kept whenever they change: at 200 Hz, repeated, they would be most of what a long drive
+    takes in memory.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._values = array("d")
+        self._which = array("i")
+        self._last = b""
+
+    def add(self, *parts: npt.NDArray[np.float64]) -> None:
+        row = b"".join(np.asarray(part, np.float64).tobytes() for part in parts)
+        if row != self._last or not self._which:
+            self._values.frombytes(row)
+            self._last = row
+        self._which.append(len(self._values) // self._width - 1)
+
+    def distinct(self) -> tuple[Array, IntArray]:
+        """The rows that were kept (d, width), and for each that was added which of them it is."""
+        values = np.array(self._values, dtype=np.float64).reshape(-1, self._width)
+        return values, np.array(self._which, dtype=np.int64)
 
 
 class _Losses:
@@ -143,44 +174,48 @@ class ImuCollector:
     """`sensor_msgs/Imu`."""
 
     def __init__(self) -> None:
-        self._rows = _Rows(37)
+        self._rows = _Rows(10)
+        self._stated = _Stated(27)
         self._losses = _Losses()
 
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
         w, f, q = message.angular_velocity, message.linear_acceleration, message.orientation
-        self._rows.add(
-            stamp_ns,
-            (
-                *(w.x, w.y, w.z, f.x, f.y, f.z, q.x, q.y, q.z, q.w),
-                *message.orientation_covariance.tolist(),
-                *message.angular_velocity_covariance.tolist(),
-                *message.linear_acceleration_covariance.tolist(),
-            ),
+        self._rows.add(stamp_ns, (w.x, w.y, w.z, f.x, f.y, f.z, q.x, q.y, q.z, q.w))
+        self._stated.add(
+            message.orientation_covariance,
+            message.angular_velocity_covariance,
+            message.linear_acceleration_covariance,
         )
 
     def finish(self) -> ImuSamples | None:
         """The samples; None if there are none."""
         self._losses = _Losses()
-        stamps, rows = self._rows.sorted()
+        stamps, rows, added = self._rows.ordered()
+        stated, which = self._stated.distinct()
         kept = self._losses.keep(np.isfinite(rows[:, :6]).all(axis=1), "with NaN or infinity")
-        stamps, rows = stamps[kept], rows[kept]
-        if not len(stamps):
+        if not kept.any():
             return None
-        orientation, cov = self._orientation(rows)
+        if not kept.all():
+            stamps, rows, added = stamps[kept], rows[kept], added[kept]
+        which = which[added]
+        orientation, cov = self._orientation(rows[:, 6:10].copy(), stated[:, :9], which)
         return ImuSamples(
             stamps_ns=stamps,
-            angular_velocity=rows[:, :3],
-            specific_force=rows[:, 3:6],
+            # Copies: a view would keep the whole rows alive.
+            angular_velocity=rows[:, :3].copy(),
+            specific_force=rows[:, 3:6].copy(),
             orientation_xyzw=orientation,
             orientation_cov=cov,
-            angular_velocity_cov=_common(_covariances(rows[:, 19:28])),
-            specific_force_cov=_common(_covariances(rows[:, 28:37])),
+            angular_velocity_cov=_common(_covariances(stated[:, 9:18]), which),
+            specific_force_cov=_common(_covariances(stated[:, 18:27]), which),
         )
 
-    def _orientation(self, rows: Array) -> tuple[Array | None, Array | None]:
-        q, stated = rows[:, 6:10].copy(), rows[:, 10:19]
-        has_any = stated[:, 0] != -1.0
+    def _orientation(
+        self, q: Array, stated: Array, which: IntArray
+    ) -> tuple[Array | None, Array | None]:
+        """Unit quaternions (n, 4) and their covariances, from the kinds (d, 9) of the latter."""
+        has_any = (stated[:, 0] != -1.0)[which]
         norms = np.linalg.norm(q, axis=1)
         is_rotation = np.abs(norms - 1.0) <= _NORM_TOLERANCE  # False for NaN
         broken = int(np.count_nonzero(has_any & ~is_rotation))
@@ -199,7 +234,11 @@ class ImuCollector:
             return None, None
         q[good] /= norms[good, None]
         q[~good] = np.nan
-        cov = _covariances(stated)
+        kinds = _covariances(stated)
+        if good.all() and (which == which[0]).all():
+            # One for all: a view that takes no memory.
+            return q, _or_none(np.broadcast_to(kinds[which[0]], (len(q), 3, 3)))
+        cov = kinds[which]
         cov[~good] = np.nan
         return q, _or_none(cov)
 
@@ -490,8 +529,14 @@ def _or_none(cov: Array) -> Array | None:
     return None if np.isnan(cov).all() else cov
 
 
-def _common(cov: Array) -> Array | None:
-    """One covariance for all samples: the median of each element."""
+def _common(kinds: Array, which: IntArray) -> Array | None:
+    """One covariance for all samples: the median of each element.
+
+    Args:
+        kinds: (d, 3, 3) that were stated.
+        which: (n,) of them each sample has.
+    """
+    cov = kinds[which[:1]] if (which == which[0]).all() else kinds[which]
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     return np.asarray(np.median(known, axis=0)) if len(known) else None
 

@@ -8,7 +8,7 @@ seconds for what is done here in tenths.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -23,6 +23,9 @@ STATE = 15
 """Rotation, position (right perturbation of the pose), velocity, accelerometer and gyro bias."""
 
 POSE = 6
+
+FACTORS_AT_A_TIME = 1000
+"""Of a graph, while it becomes a chain."""
 
 
 @dataclass(frozen=True)
@@ -66,30 +69,29 @@ class Chain:
                 at += dim
         for j, key in enumerate(common_keys):
             place[key] = (STATE * n + j, 1)
-        # GTSAM's columns are in ascending order of the keys; the last one is the right-hand side.
-        order = np.concatenate([np.arange(a, a + d) for _, (a, d) in sorted(place.items())])
-        rows, columns, entries = np.asarray(graph.sparseJacobian_())
-        keep = columns <= size
-        J = scipy.sparse.csr_array(
-            (
-                entries[keep],
-                (rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]),
-            ),
-            shape=(int(rows.max()), size),
-        )
-        H = (J.T @ J).tocsr()
-        body = scipy.sparse.bsr_array(H[: STATE * n, : STATE * n], blocksize=(STATE, STATE))
-        block_row = np.repeat(np.arange(n), np.diff(body.indptr))
         diagonal = np.zeros((n, STATE, STATE))
         coupling = np.zeros((max(n - 1, 0), STATE, STATE))
-        on = body.indices == block_row
-        diagonal[block_row[on]] = body.data[on]
-        above = body.indices == block_row + 1
-        coupling[block_row[above]] = body.data[above]
-        if (np.abs(body.indices - block_row) > 1).any():
-            raise ValueError("a factor touches states that are not neighbours")
-        border = H[: STATE * n, STATE * n :].toarray().reshape(n, STATE, k)
-        return Chain(diagonal, coupling, border, H[STATE * n :, STATE * n :].toarray())
+        border, corner = np.zeros((n, STATE, k)), np.zeros((k, k))
+        # In parts: triplets take ten times what they add up to, gigabytes on a drive of hours.
+        for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
+            some = gtsam.GaussianFactorGraph()
+            for i in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
+                some.push_back(graph.at(i))
+            J = _jacobian(some, place, size)
+            H = (J.T @ J).tocoo()
+            row, column = (np.asarray(index, np.int64) for index in H.coords)
+            (i, r), (j, c), value = divmod(row, STATE), divmod(column, STATE), H.data
+            state, other = row < STATE * n, column < STATE * n
+            if (np.abs(j - i)[state & other] > 1).any():
+                raise ValueError("a factor touches states that are not neighbours")
+            # Each place of a matrix comes once.
+            on, above = state & (j == i) & other, state & (j == i + 1) & other
+            diagonal[i[on], r[on], c[on]] += value[on]
+            coupling[i[above], r[above], c[above]] += value[above]
+            edge, common = state & ~other, ~state & ~other
+            border[i[edge], r[edge], column[edge] - STATE * n] += value[edge]
+            corner[row[common] - STATE * n, column[common] - STATE * n] += value[common]
+        return Chain(diagonal, coupling, border, corner)
 
     def _factored(self) -> list[Array]:
         """Inverse of each state's information given all before it are eliminated.
@@ -208,6 +210,28 @@ class Chain:
             left = chain.corner - border_other.T @ solved[:, m * POSE :]
             information -= edge @ _inverse(left) @ edge.T
         return np.asarray(0.5 * (information + information.T))
+
+
+def _jacobian(
+    graph: gtsam.GaussianFactorGraph, place: Mapping[int, tuple[int, int]], size: int
+) -> scipy.sparse.csr_array:
+    """The Jacobian of a linear graph, its columns where `place` (first, how many) has each key."""
+    rows, columns, entries = np.asarray(graph.sparseJacobian_())
+    # GTSAM's columns are in ascending order of the keys; the last one is the right-hand side.
+    order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in _keys(graph))])
+    keep = columns <= len(order)
+    return scipy.sparse.csr_array(
+        (
+            entries[keep],
+            (rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]),
+        ),
+        shape=(int(rows.max()), size),
+    )
+
+
+def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
+    """The keys of a graph, ascending."""
+    return sorted({key for i in range(graph.size()) for key in graph.at(i).keys()})
 
 
 _UNDETERMINED = "the motion data do not determine the trajectory"

@@ -7,6 +7,7 @@ be measured. Velocities the same. GNSS fixes stay single, since each may be an o
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import gtsam
@@ -16,6 +17,9 @@ from caliv_graph.products import Array, ImuSamples, IntArray, TwistSamples
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.noise import BoolArray, ImuNoise
+
+SAMPLES_AT_A_TIME = 16_384
+"""Of the IMU, while orientations are turned to their nodes."""
 
 
 @dataclass(frozen=True)
@@ -114,16 +118,43 @@ def orientations_at_nodes(
         return None
     usable = usable_orientations(imu)
     usable &= (imu.stamps_ns >= nodes_ns[0]) & (imu.stamps_ns <= nodes_ns[-1])
-    if not usable.any():
+    samples = np.flatnonzero(usable)
+    if not len(samples):
         return None
-    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[usable]
-    R = rotations_of(imu.orientation_xyzw[usable])
-    node = nearest_node(nodes_ns, stamps)
+    node = nearest_node(nodes_ns, np.asarray(imu.stamps_ns, dtype=np.int64)[samples])
+    # Node by node, many at a time: a sample takes a kilobyte on the way, of a long drive too many.
+    starts = np.flatnonzero(np.diff(node, prepend=-1))
+    some = np.unique(starts // SAMPLES_AT_A_TIME, return_index=True)[1]
+    cuts = [*starts[some].tolist(), len(samples)]
+    parts = [
+        _oriented(imu, cov, nodes_ns, dead, noise, samples[a:b], node[a:b])
+        for a, b in itertools.pairwise(cuts)
+    ]
+    return NodeOrientations(
+        np.concatenate([part.nodes for part in parts]),
+        np.concatenate([part.R_map_imu for part in parts]),
+        np.concatenate([part.cov for part in parts]),
+    )
+
+
+def _oriented(
+    imu: ImuSamples,
+    cov: Array,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    noise: ImuNoise,
+    samples: IntArray,
+    node: IntArray,
+) -> NodeOrientations:
+    """As `orientations_at_nodes`, from some samples (m,) that have one and their nodes (m,)."""
+    assert imu.orientation_xyzw is not None
+    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples]
+    R = rotations_of(imu.orientation_xyzw[samples])
     at_node = nodes_ns[node]
     dR, _, _ = dead.between(stamps, at_node)
     R_node = R @ dR
     late_s = np.abs(stamps - at_node) * 1e-9
-    cov_node = _turned(np.swapaxes(dR, 1, 2), cov[usable])
+    cov_node = _turned(np.swapaxes(dR, 1, 2), cov[samples])
     cov_node = cov_node + late_s[:, None, None] * noise.gyro_density
     # Averaged about the sample nearest to the node: the differences are small.
     order = np.lexsort((late_s, node))

@@ -68,14 +68,23 @@ def stated(cov: Array) -> BoolArray:
 def _per_message(
     count: int, configured: Array | None, messages: Array | None, table: Array
 ) -> tuple[Array, str]:
-    """(n, d, d) covariances and where they are from; the first of the three that says something."""
+    """(n, d, d) covariances and where they are from; the first of the three that says something.
+
+    One that holds for all is a read-only view: a drive of hours has a million messages.
+    """
     d = len(table)
     if configured is not None:
-        return np.broadcast_to(configured, (count, d, d)).copy(), "config"
-    out = np.broadcast_to(table, (count, d, d)).copy()
+        return np.broadcast_to(configured, (count, d, d)), "config"
+    out = np.broadcast_to(table, (count, d, d))
     if messages is None:
         return out, "the paper's table"
+    if count and messages.strides[0] == 0:
+        # Likewise from the reader: what one says, all say.
+        if stated(messages[:1])[0]:
+            return messages, "messages"
+        return out, "the paper's table"
     said = stated(messages)
+    out = out.copy()
     out[said] = messages[said]
     if said.all():
         return out, "messages"
@@ -139,6 +148,7 @@ def gnss_covariances(gnss: GnssFixes, config: Config) -> tuple[Array, str]:
     table = np.array([PAPER_GNSS_HORIZONTAL_M] * 2 + [PAPER_GNSS_VERTICAL_M])
     horizontal, vertical = config.noise.gnss_horizontal_m, config.noise.gnss_vertical_m
     cov, source = _per_message(len(gnss.stamps_ns), None, gnss.cov_enu, np.diag(table**2))
+    cov = cov.copy()
     if horizontal is not None:
         cov[:, :2, :] = 0.0
         cov[:, :, :2] = 0.0

@@ -1,0 +1,131 @@
+"""One run of the command line in a process of its own: time, CPU and memory without our own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from caliv_graph.errors import CalivError
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+# A process inherits the peak memory of the one that started it; this one is small.
+_LAUNCHER = """
+import json, os, resource, subprocess, sys
+cores, report = int(sys.argv[1]), sys.argv[2]
+if cores and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+code = subprocess.run(sys.argv[3:], stdout=subprocess.DEVNULL).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+unit = 1024 if sys.platform == "linux" else 1024**2
+with open(report, "w") as file:
+    json.dump({
+        "code": code, "process_cpu_s": used.ru_utime + used.ru_stime,
+        "peak_mb": used.ru_maxrss / unit,
+    }, file)
+"""
+
+# Start-up is what a user waits for whatever the drive: the interpreter and the imports.
+_RUN = """
+import json, sys, time
+from caliv_graph.cli.main import run
+import caliv_graph.pipeline, caliv_graph.readers.rosbag, caliv_graph.results
+wall, cpu = time.perf_counter(), time.process_time()
+code = run(sys.argv[2:])
+document = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu,
+            "start_up_cpu_s": cpu}
+with open(sys.argv[1], "w") as file:
+    json.dump(document, file)
+sys.exit(code)
+"""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What one run took.
+
+    Attributes:
+        code: its exit code.
+        wall_s: from the end of the imports to the end, results written.
+        cpu_s: processor time of the same, all threads.
+        start_up_cpu_s: processor time of the interpreter and the imports.
+        peak_mb: largest resident memory of the process, imports included; MiB.
+        stages: per stage of log.jsonl: wall time and processor time, seconds.
+    """
+
+    code: int
+    wall_s: float
+    cpu_s: float
+    start_up_cpu_s: float
+    peak_mb: float
+    stages: Mapping[str, tuple[float, float]]
+
+    def stage_s(self, *names: str) -> float:
+        """Wall time of some stages together; those that did not take place count nothing."""
+        return sum(self.stages[name][0] for name in names if name in self.stages)
+
+
+def calibrate(config: Path, result: Path, cores: int, data: Sequence[Path] = ()) -> Usage:
+    """Runs `caliv-graph calibrate`.
+
+    Args:
+        config: config file.
+        result: folder to write to; replaced.
+        cores: that it may use.
+        data: drives instead of that of the config.
+
+    Raises:
+        CalivError: it wrote no result.
+    """
+    arguments = ["calibrate", str(config.resolve()), "--out", str(result.resolve()), "--force"]
+    for path in data:
+        arguments += ["--data", str(path.resolve())]
+    code, usage = run(arguments, cores)
+    if code not in (0, 3, 4):
+        raise CalivError(f"caliv-graph {' '.join(arguments)}: exit code {code}")
+    return Usage(code=code, stages=read_stages(result / "log.jsonl"), **usage)
+
+
+def run(arguments: Sequence[str], cores: int) -> tuple[int, dict[str, float]]:
+    """Runs `caliv-graph` with these arguments; its exit code, and times and memory.
+
+    Raises:
+        CalivError: exit code 2, with what it said; or it did not come to an end.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        inner, outer = Path(name) / "inner.json", Path(name) / "outer.json"
+        command = [sys.executable, "-c", _RUN, str(inner), *arguments]
+        launch = [sys.executable, "-I", "-S", "-c", _LAUNCHER, str(cores), str(outer), *command]
+        done = subprocess.run(
+            launch, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True, check=False
+        )
+        if not (inner.is_file() and outer.is_file()):
+            raise CalivError(f"caliv-graph {arguments[0]}: killed; {_last(done.stderr)}")
+        usage = json.loads(inner.read_text(encoding="utf-8"))
+        outside = json.loads(outer.read_text(encoding="utf-8"))
+    if outside["code"] == 2:
+        raise CalivError(f"caliv-graph {arguments[0]}: {_last(done.stderr)}")
+    usage["peak_mb"] = outside["peak_mb"]
+    return int(outside["code"]), usage
+
+
+def read_stages(log: Path) -> dict[str, tuple[float, float]]:
+    """Wall and processor seconds of each stage of a log.jsonl; NaN where it tells none."""
+    stages: dict[str, tuple[float, float]] = {}
+    for line in map(json.loads, log.read_text(encoding="utf-8").splitlines()):
+        if "stage" in line and line["depth"] == 0 and line["seconds"] is not None:
+            before = stages.get(line["stage"], (0.0, 0.0))
+            cpu_s = line.get("cpu_seconds")
+            more = (line["seconds"], float("nan") if cpu_s is None else cpu_s)
+            stages[line["stage"]] = (before[0] + more[0], before[1] + more[1])
+    return stages
+
+
+def _last(stderr: str) -> str:
+    lines = stderr.strip().splitlines()
+    return lines[-1] if lines else "it said nothing"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import caliv_graph
 from caliv_graph.calibration.contrasts import (
@@ -93,6 +94,16 @@ def calibrate(
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
+    # Matrices are small, and threads that share a sum add it up in another order: the same result
+    # on any number of cores.
+    with threadpool_limits(limits=1):
+        return _calibrate(recordings, config, progress, prior)
+
+
+def _calibrate(
+    recordings: Sequence[Recording], config: Config, progress: Progress, prior: Calibration | None
+) -> CalibrationRun:
+    """One statement per stage; see `calibrate`."""
     # What goes by is looked at in the report; nothing is read for it.
     sampled = [SampledRecording(recording) for recording in recordings]
     recordings = sampled

@@ -147,7 +147,7 @@ class Recording(Protocol):
         """Stamps of the clouds of one LiDAR, ascending, without reading a cloud."""
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in order of their stamps; never more than one in memory.
+        """The clouds of one LiDAR in order of their stamps; never more than a few in memory.
 
         Args:
             lidar: its name.

@@ -59,6 +59,7 @@ class StageRecord:
         done: steps done.
         note: the last note.
         seconds: how long it took; None while it runs, or if it was left by an exception.
+        cpu_seconds: of processor time, all threads of the process together; None likewise.
     """
 
     name: str
@@ -67,6 +68,7 @@ class StageRecord:
     done: int = 0
     note: str = ""
     seconds: float | None = None
+    cpu_seconds: float | None = None
 
 
 class SilentProgress:
@@ -91,7 +93,7 @@ class SilentProgress:
             record.note = note or record.note
             self._show(record)
 
-        start = time.monotonic()
+        start, cpu = time.monotonic(), time.process_time()
         self._depth += 1
         self._show_start(record)
         try:
@@ -99,6 +101,7 @@ class SilentProgress:
         finally:
             self._depth -= 1
         record.seconds = time.monotonic() - start
+        record.cpu_seconds = time.process_time() - cpu
         self._show_end(record)
 
     def _show_start(self, record: StageRecord) -> None:

@@ -8,7 +8,7 @@ every cloud by its whitened residual, solve again.
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from caliv_graph.config import RobustConfig
 from caliv_graph.products import Array
@@ -86,7 +86,7 @@ class RobustWeights:
 
     def _graduated(self, squared: Array) -> Array:
         """Truncated least squares by graduated non-convexity (Yang et al. 2020, eq. 14)."""
-        c2 = float(chi2.isf(self._config.tls_p_value, DOF))
+        c2 = float(chdtri(DOF, self._config.tls_p_value))
         if self._annealed:
             return np.where(squared < c2, 1.0, 0.0)
         if self._mu is None:

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import norm
+from scipy.special import chdtrc, ndtr
 
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.terms import arranged, guess_of, own_term
@@ -306,7 +305,7 @@ def _movement(lidars: tuple[str, ...], names: Sequence[str], told: tuple[_Told, 
     )
     lost = np.any([_lost_axes(J, t) for J, t in parts], axis=0)
     sigma = np.sqrt(variance)
-    p_axes = np.where(lost, 1.0, 2.0 * norm.sf(np.abs(movement) / sigma))
+    p_axes = np.where(lost, 1.0, 2.0 * ndtr(-np.abs(movement) / sigma))
     return Movement(
         lidars=lidars,
         movement=movement,
@@ -372,7 +371,7 @@ def _test(difference: Array, parts: Sequence[tuple[Array, _Told]]) -> tuple[floa
     whitened = (whiten @ turn[:, share < _LEAK_SHARE]).T @ (difference / unit)
     dof = len(whitened)
     chi2 = float(whitened @ whitened)
-    return chi2, dof, float(chi2_distribution.sf(chi2, dof)) if dof else 1.0
+    return chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0
 
 
 def _squared(root: Array) -> Array:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from caliv_graph.fusion.factors import lidar_pose_error
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
@@ -117,7 +117,7 @@ def alarm_threshold(scans_per_hour: float, false_alarms_per_hour: float) -> floa
     if not (scans_per_hour > 0.0 and false_alarms_per_hour > 0.0):
         raise ValueError("alarm_threshold: both rates have to be above zero")
     p_value = min(1.0, false_alarms_per_hour / (scans_per_hour * len(WINDOWS)))
-    return float(chi2_distribution.isf(p_value, DOF))
+    return float(chdtri(DOF, p_value))
 
 
 class MountMonitor:

@@ -21,6 +21,7 @@ import numpy as np
 from caliv_graph.config import LidarConfig, read_yaml
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import GivenPoses, LidarScan, MotionData
+from caliv_graph.readers.ahead import worked_ahead
 from caliv_graph.readers.pcd import read_pcd
 from caliv_graph.readers.returns import is_return
 
@@ -110,7 +111,7 @@ class CalivFolder:
         return [frame * FRAME_PERIOD_NS for frame in self._clouds[lidar]]
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """Reads the clouds of one LiDAR in order of their frames, one at a time.
+        """Reads the clouds of one LiDAR in order of their frames, never more than a few ahead.
 
         Those whose stamp is not in `wanted` are not read, unless it is None.
 
@@ -120,13 +121,15 @@ class CalivFolder:
         Raises:
             RecordingError: a cloud is missing, empty, cut off or damaged.
         """
-        for frame, path in self._clouds[lidar].items():
-            if wanted is not None and frame * FRAME_PERIOD_NS not in wanted:
-                continue
-            # No name for the scan here: it would keep it alive while the next one is read.
-            yield self._read_scan(lidar, frame, path)
+        frames = (
+            (lidar, frame, path)
+            for frame, path in self._clouds[lidar].items()
+            if wanted is None or frame * FRAME_PERIOD_NS in wanted
+        )
+        yield from worked_ahead(self._read_scan, frames)
 
-    def _read_scan(self, lidar: str, frame: int, path: Path) -> LidarScan:
+    def _read_scan(self, cloud: tuple[str, int, Path]) -> LidarScan:
+        lidar, frame, path = cloud
         config = self._lidars[lidar]
         points = read_pcd(path)
         return LidarScan(

@@ -21,6 +21,7 @@ from caliv_graph.config import LidarConfig, TopicsConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData
+from caliv_graph.readers.ahead import worked_ahead
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
 from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
 from caliv_graph.readers.frames import TF_TYPES, clean_frame
@@ -218,7 +219,7 @@ class RosbagRecording:
         return list(self._index().scans[lidar])
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in the order of their stamps, one at a time.
+        """The clouds of one LiDAR in the order of their stamps, never more than a few decoded.
 
         NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
         than its `max_range`. A cloud that is damaged is left out and counted in `warnings`. Clouds
@@ -240,17 +241,23 @@ class RosbagRecording:
                 if wanted is None or stamp_ns in wanted
             }
         )
+        found = ((lidar, stamp_ns, raw) for stamp_ns, raw in self._found(topic, queue))
+        for decoded in worked_ahead(self._decoded, found):
+            scan = self._scan(lidar, *decoded)
+            del decoded  # not kept alive while the next one is read
+            if scan is not None:
+                yield scan
+            del scan
+
+    def _found(self, topic: str, queue: _Queue) -> Iterator[tuple[int, bytes]]:
+        """Stamps and clouds that a queue asks for, still serialised, in the order of the stamps."""
         for start_ns, stop_ns in _windows(queue.records_ns.values()):
             for _, record_ns, raw in self._bag.messages([topic], start_ns, stop_ns):
                 try:
                     stamp_ns = self._bag.header(raw).stamp_ns or record_ns
                 except DamagedMessageError:
                     continue  # counted by the first pass
-                for found_ns, found in queue.take(stamp_ns, record_ns, raw):
-                    scan = self._scan(lidar, found_ns, found)
-                    if scan is not None:
-                        yield scan
-                    del scan, found  # not kept alive while the next one is read
+                yield from queue.take(stamp_ns, record_ns, raw)
 
     def motion(self) -> MotionData:
         """What the bag tells of the vehicle's motion, of the topics that the config names.
@@ -398,23 +405,32 @@ class RosbagRecording:
                 self._warnings.append(f"{where}: {check.rate_problem}")
         return motion
 
-    def _scan(self, lidar: str, stamp_ns: int, raw: bytes) -> LidarScan | None:
+    def _decoded(self, found: tuple[str, int, bytes]) -> tuple[int, DecodedCloud | str]:
+        """Stamp and cloud, or what is wrong with its message; changes nothing here: see `scans`."""
+        lidar, stamp_ns, raw = found
         config = self._lidars[lidar]
         topic = self._topics[lidar]
-        source = f"{topic.name} at {_seconds(stamp_ns)} s"
         limits = (stamp_ns, config.min_range, config.max_range)
         try:
             if topic.type in LIVOX_TYPES:
-                cloud = decode_livox(raw, self._bag.is_ros1, *limits)
-            else:
-                cloud = decode_pointcloud2(self._bag.decode(topic.name, raw), *limits)
+                return stamp_ns, decode_livox(raw, self._bag.is_ros1, *limits)
+            return stamp_ns, decode_pointcloud2(self._bag.decode(topic.name, raw), *limits)
         except UnusableCloudsError as e:
             raise RecordingError(
-                f"{self._bag.name}: clouds of {source}: {e}. Set lidars.{lidar}.topic to clouds "
-                "with coordinates"
+                f"{self._bag.name}: clouds of {self._source(lidar, stamp_ns)}: {e}. Set "
+                f"lidars.{lidar}.topic to clouds with coordinates"
             ) from None
         except DamagedMessageError as e:
-            self._damage = self._damage or f"{source} {e}"
+            return stamp_ns, str(e)
+
+    def _source(self, lidar: str, stamp_ns: int) -> str:
+        return f"{self._topics[lidar].name} at {_seconds(stamp_ns)} s"
+
+    def _scan(self, lidar: str, stamp_ns: int, cloud: DecodedCloud | str) -> LidarScan | None:
+        """The scan of a decoded cloud; counts what is to be told of it."""
+        source = self._source(lidar, stamp_ns)
+        if isinstance(cloud, str):
+            self._damage = self._damage or f"{source} {cloud}"
             self._damaged_clouds[lidar].add(stamp_ns)
             return None
         if stamp_ns not in self._looked_at[lidar]:

@@ -321,14 +321,26 @@ def _about(shape: _Shape, axis: Array, identity: _Comparison) -> Symmetry | None
     """The smallest turn about an axis after which the shape is the same, or None."""
     limit = identity.contradicted + MOST_CONTRADICTED
 
-    def looked_at(angle_rad: float) -> _Turn | None:
-        """A turn and its opposite, the worse of the two; None if either was hardly seen."""
-        both = (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad)
-        turns = [turn for signed in both if (turn := shape.turned(axis, signed)) is not None]
-        seen = [t for t in turns if t.comparison.compared > FEWEST_COMPARED * identity.compared]
-        if len(seen) < len(both):
-            return None
-        return max(seen, key=lambda turn: turn.comparison.contradicted)
+    def seen(signed_rad: float) -> _Turn | None:
+        """A turn; None if it was hardly seen at both ends."""
+        turn = shape.turned(axis, signed_rad)
+        least = FEWEST_COMPARED * identity.compared
+        return None if turn is None or turn.comparison.compared <= least else turn
+
+    def looked_at(angle_rad: float, most: float = math.inf) -> _Turn | None:
+        """A turn and its opposite, the worse of the two.
+
+        None if either was hardly seen, or is contradicted by more than `most`: then the other need
+        not be looked at.
+        """
+        worst: _Turn | None = None
+        for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
+            turn = seen(signed)
+            if turn is None or turn.comparison.contradicted > most:
+                return None
+            if worst is None or turn.comparison.contradicted > worst.comparison.contradicted:
+                worst = turn
+        return worst
 
     turns: list[_Turn] = []
     for degrees in BETWEEN_DEG:
@@ -344,8 +356,8 @@ def _about(shape: _Shape, axis: Array, identity: _Comparison) -> Symmetry | None
         wide = max(turns, key=lambda t: abs(t.angle_rad))
         return _symmetry(replace(worst, axis=wide.axis, centre=wide.centre), 0.0, wide.angle_rad)
     for order in sorted(ORDERS, reverse=True):
-        turn = looked_at(2.0 * math.pi / order)
-        if turn is not None and turn.comparison.contradicted <= limit:
+        turn = looked_at(2.0 * math.pi / order, limit)
+        if turn is not None:
             return _symmetry(turn, 2.0 * math.pi / order, turn.angle_rad)
     return None
 
@@ -407,7 +419,9 @@ class _Shape:
         """
         low, high = np.percentile(self.means, [2, 98], axis=0)
         centre = np.asarray(0.5 * (low + high), np.float64)
-        fits = [self.fit(axis, angle_rad, centre, spacings) for spacings in MATCH_SPACINGS]
+        # Where components are dense, several of them come to the same gates.
+        gates = {tuple(np.maximum(MATCH_M, s * self.spacing_m).tolist()): s for s in MATCH_SPACINGS}
+        fits = [self.fit(axis, angle_rad, centre, spacings) for spacings in gates.values()]
         turns = []
         for R, t in (fit for fit in fits if fit is not None):
             own, place = _axis_and_centre(R, t, axis, centre)

@@ -7,14 +7,18 @@ its marker or dash as well, for print.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import plotly.graph_objects as go
+from plotly.io import templates
+from plotly.io.json import to_json_plotly
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
@@ -73,6 +77,30 @@ class Figure:
     caption: str
     figure: go.Figure
     solid: bool = False
+
+
+@contextmanager
+def without_template() -> Iterator[None]:
+    """Figures made inside have no template yet: plotly would check all of it again at each step."""
+    before = templates.default
+    templates.default = None
+    try:
+        yield
+    finally:
+        templates.default = before
+
+
+def figure_json(figure: Figure) -> str:
+    """What plotly.js draws: data, layout, and the template of the page."""
+    document = figure.figure.to_plotly_json()
+    document["layout"]["template"] = _template()
+    return str(to_json_plotly(document))
+
+
+@cache
+def _template() -> Mapping[str, Any]:
+    found: Mapping[str, Any] = templates["plotly_white"].to_plotly_json()
+    return found
 
 
 def label(text: str) -> str:
@@ -825,7 +853,6 @@ def finish(figure: go.Figure, height: int) -> None:
         height: pixels.
     """
     figure.update_layout(
-        template="plotly_white",
         width=WIDTH,
         height=height,
         margin={"l": 60, "r": 20, "t": 40, "b": 50},

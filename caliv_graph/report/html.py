@@ -99,7 +99,10 @@ def render_report(
     pages = environment()
     pages.globals["figures_of"] = figures_of
     pages.globals["median"] = lambda values: float(np.median(np.abs(values)))
-    sections = _sections(calibration, solution, evidence)
+    from caliv_graph.report.figures import without_template
+
+    with without_template():
+        sections = _sections(calibration, solution, evidence)
     figures = {f.name: f for figures in sections.values() for f in figures}
     clouds = down_weighted(solution, config.robust)
     template = pages.get_template("report.html.j2")

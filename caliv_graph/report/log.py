@@ -33,6 +33,7 @@ def stage_documents(stages: Sequence[StageRecord]) -> list[dict[str, Any]]:
             "stage": stage.name,
             "depth": stage.depth,
             "seconds": None if stage.seconds is None else round(stage.seconds, 4),
+            "cpu_seconds": None if stage.cpu_seconds is None else round(stage.cpu_seconds, 4),
             "done": stage.done,
             "total": stage.total,
             "note": stage.note,

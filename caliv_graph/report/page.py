@@ -24,5 +24,7 @@ def environment() -> jinja2.Environment:
 
 def script_data(figure: Figure) -> Markup:
     """A figure's data for a script element: no text in it can end the element."""
-    text: str = figure.figure.to_json()
+    from caliv_graph.report.figures import figure_json
+
+    text = figure_json(figure)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

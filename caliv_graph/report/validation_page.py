@@ -14,7 +14,15 @@ from markupsafe import Markup
 import caliv_graph
 from caliv_graph.products import Array, IntArray
 from caliv_graph.repeatability import Repeatability
-from caliv_graph.report.figures import SYMBOLS, Figure, colours, finish, label, small
+from caliv_graph.report.figures import (
+    SYMBOLS,
+    Figure,
+    colours,
+    finish,
+    label,
+    small,
+    without_template,
+)
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.validation import repeatability_sentences, tables
 from caliv_graph.validation.validate import AFTER, BEFORE, Validation
@@ -39,7 +47,8 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     """
     from plotly.offline import get_plotlyjs
 
-    figures = validation_figures(found)
+    with without_template():
+        figures = validation_figures(found)
     return (
         environment()
         .get_template("validation.html.j2")

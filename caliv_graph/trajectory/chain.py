@@ -75,21 +75,21 @@ class Chain:
         # In parts: triplets take ten times what they add up to, gigabytes on a drive of hours.
         for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
             some = gtsam.GaussianFactorGraph()
-            for i in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
-                some.push_back(graph.at(i))
+            for number in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
+                some.push_back(graph.at(number))
             J = _jacobian(some, place, size)
             H = (J.T @ J).tocoo()
             row, column = (np.asarray(index, np.int64) for index in H.coords)
-            (i, r), (j, c), value = divmod(row, STATE), divmod(column, STATE), H.data
+            (a, r), (b, c), value = np.divmod(row, STATE), np.divmod(column, STATE), H.data
             state, other = row < STATE * n, column < STATE * n
-            if (np.abs(j - i)[state & other] > 1).any():
+            if (np.abs(b - a)[state & other] > 1).any():
                 raise ValueError("a factor touches states that are not neighbours")
             # Each place of a matrix comes once.
-            on, above = state & (j == i) & other, state & (j == i + 1) & other
-            diagonal[i[on], r[on], c[on]] += value[on]
-            coupling[i[above], r[above], c[above]] += value[above]
+            on, above = state & other & (b == a), state & other & (b == a + 1)
+            diagonal[a[on], r[on], c[on]] += value[on]
+            coupling[a[above], r[above], c[above]] += value[above]
             edge, common = state & ~other, ~state & ~other
-            border[i[edge], r[edge], column[edge] - STATE * n] += value[edge]
+            border[a[edge], r[edge], column[edge] - STATE * n] += value[edge]
             corner[row[common] - STATE * n, column[common] - STATE * n] += value[common]
         return Chain(diagonal, coupling, border, corner)
 
@@ -231,7 +231,7 @@ def _jacobian(
 
 def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
     """The keys of a graph, ascending."""
-    return sorted({key for i in range(graph.size()) for key in graph.at(i).keys()})
+    return sorted(set(graph.keyVector()))
 
 
 _UNDETERMINED = "the motion data do not determine the trajectory"

@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from caliv_graph.config import Config
 from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
@@ -512,7 +512,7 @@ def _honest_noise(
         squares = _position_residuals(data, nodes, states)
         if (squares > _final_limit(data.config)).mean() <= REJECTED_PART:
             break
-        factor = float(np.median(squares) / chi2.ppf(0.5, 3))
+        factor = float(np.median(squares) / chdtri(3, 0.5))
         total *= factor
         assert data.positions is not None
         positions = replace(data.positions, cov_map=data.positions.cov_map * factor)
@@ -530,7 +530,7 @@ def _honest_noise(
 def _final_limit(config: Config) -> float:
     """Squared whitened residual of a fix beyond which it is dropped."""
     p = config.robust.tls_p_value if config.robust.kernel == "tls" else JUMP_P_VALUE
-    return float(chi2.isf(p, 3))
+    return float(chdtri(3, p))
 
 
 def _outliers(squares: Array, config: Config, limit: float | None) -> tuple[IntArray, float]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import binom, chi2, norm
+from scipy.special import bdtrc, chdtrc, ndtr, ndtri
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
@@ -24,7 +24,7 @@ from caliv_graph.uncertainty.observability import UNIT, scaling
 SIGMAS = 5.0
 """SPEC 5."""
 
-CHANCE = float(2.0 * norm.sf(SIGMAS))
+CHANCE = float(2.0 * ndtr(-SIGMAS))
 """Of a false alarm, per test."""
 
 BIAS = np.array([1e-3] * 3 + [5e-3] * 3)
@@ -274,7 +274,7 @@ def misfits(counts: Sequence[CloudCount]) -> list[str]:
         f"{_down(count)}; at most {OUTLIERS:.0%} may. The result goes by the others, which may be "
         "the wrong ones: check its stamps, its mount and the target"
         for count in counts
-        if binom.sf(count.down - 1, count.clouds, OUTLIERS) < CHANCE
+        if bdtrc(count.down - 1, count.clouds, OUTLIERS) < CHANCE
     ]
 
 
@@ -337,13 +337,14 @@ def chance(contrast: Contrast) -> float:
     """
     if contrast.kind == "clock":
         late_s, sigma_s = _lateness(contrast)
-        return float(2.0 * norm.sf(abs(late_s) / sigma_s))
+        return float(2.0 * ndtr(-abs(late_s) / sigma_s))
     d, cov, V = difference(contrast)
     if not V.shape[1]:
         return 1.0
     along = V.T @ (d / UNIT)
     spread = V.T @ (cov / np.outer(UNIT, UNIT)) @ V
-    return float(chi2.sf(float(along @ np.linalg.solve(spread, along)), len(along)))
+    squares = max(float(along @ np.linalg.solve(spread, along)), 0.0)
+    return float(chdtrc(len(along), squares))
 
 
 def contrasted(contrast: Contrast) -> str:
@@ -361,7 +362,7 @@ def contrasted(contrast: Contrast) -> str:
 
 def _asked(contrast: Contrast) -> str:
     """What a contrast asks for, and how sure it is."""
-    overall = float(norm.isf(0.5 * max(chance(contrast), 1e-300)))
+    overall = float(-ndtri(0.5 * max(chance(contrast), 1e-300)))
     if contrast.kind == "clock":
         late_s, sigma_s = _lateness(contrast)
         return (

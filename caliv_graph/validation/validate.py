@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.noise import first_pose_noise
@@ -511,8 +511,8 @@ def _verdict(
     if tested:
         offsets = np.concatenate([s.apart[AFTER][pair].offset_m for s, pair in tested])
         cov = offset_covariance([(s.expected, pair) for s, pair in tested], errors)
-        chi2 = float(offsets @ np.linalg.solve(cov, offsets))
-        p_value = float(chi2_distribution.sf(chi2, dof))
+        chi2 = max(float(offsets @ np.linalg.solve(cov, offsets)), 0.0)
+        p_value = float(chdtrc(dof, chi2))
     shared = [pair for pair in pairs if pair.surfaces]
     measure = "distance" if shared else "thickness"
     if shared:

@@ -17,6 +17,7 @@ from caliv_graph.config import Config, parse_config
 from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import Array, GivenPoses, LidarScan, Recording
 from caliv_graph.readers import open_recording
+from caliv_graph.readers.ahead import AHEAD
 from caliv_graph.readers.caliv_folder import CalivFolder
 from caliv_graph.readers.pcd import read_pcd
 
@@ -197,23 +198,29 @@ def test_poses_without_a_cloud_are_skipped_and_counted(tmp_path: Path) -> None:
     assert len(list(recording.scans("front"))) == 2
 
 
-def test_one_cloud_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = write_drive(tmp_path, {"sensor_1": [entry(1), entry(2)]})
-    clouds: list[weakref.ref[Array]] = []
+@pytest.mark.parametrize("cores", [1, 2])
+def test_only_a_few_clouds_are_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    drive = write_drive(tmp_path, {"sensor_1": [entry(k) for k in range(20)]})
+    handed: list[weakref.ref[Array]] = []
+    read: list[Path] = []
 
     def read_watched(path: Path) -> Array:
-        points = read_pcd(path)
-        clouds.append(weakref.ref(points))
-        return points
+        read.append(path)
+        return read_pcd(path)
 
+    monkeypatch.setattr("caliv_graph.readers.ahead.cores", lambda: cores)
     monkeypatch.setattr("caliv_graph.readers.caliv_folder.read_pcd", read_watched)
     scans = open_drive(drive).scans("front")
-    assert clouds == []  # nothing is read before it is asked for
-    clouds.append(weakref.ref(next(scans).points_lidar))
-    gc.collect()
-    assert [cloud() for cloud in clouds] == [None, None]  # the one read, and the one handed over
-    assert len(list(scans)) == 1
-    assert len(clouds) == 3  # nothing is read twice
+    assert read == []  # nothing is read before it is asked for
+    for _ in range(20):
+        handed.append(weakref.ref(next(scans).points_lidar))
+        gc.collect()
+        assert handed[-1]() is None  # nobody but the caller holds on to it
+        assert len(read) <= len(handed) + (AHEAD if cores > 1 else 0)
+    assert next(scans, None) is None
+    assert len(read) == 20  # nothing is read twice
 
 
 def test_foreign_files_beside_the_clouds(tmp_path: Path) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,6 +93,25 @@ def calibrate(config: Path, result: Path, cores: int, data: Sequence[Path] = ())
     return Usage(code=code, stages=read_stages(result / "log.jsonl"), **usage)
 
 
+def middle(usages: Sequence[Usage]) -> Usage:
+    """The run whose processor time is the median (the lower of two)."""
+    return sorted(usages, key=lambda usage: usage.cpu_s)[(len(usages) - 1) // 2]
+
+
+def help_s(arguments: Sequence[str], runs: int) -> float:
+    """Wall time of a whole process that only prints its help, the quickest of some, seconds.
+
+    The quickest, for what others do on the machine can only slow it down.
+    """
+    command = [sys.executable, "-m", "caliv_graph", *arguments, "--help"]
+    times = []
+    for _ in range(runs):
+        begun = time.perf_counter()
+        subprocess.run(command, cwd=REPOSITORY, check=True, stdout=subprocess.DEVNULL)
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
 def run(arguments: Sequence[str], cores: int) -> tuple[int, dict[str, float]]:
     """Runs `caliv-graph` with these arguments; its exit code, and times and memory.
 
@@ -101,8 +122,15 @@ def run(arguments: Sequence[str], cores: int) -> tuple[int, dict[str, float]]:
         inner, outer = Path(name) / "inner.json", Path(name) / "outer.json"
         command = [sys.executable, "-c", _RUN, str(inner), *arguments]
         launch = [sys.executable, "-I", "-S", "-c", _LAUNCHER, str(cores), str(outer), *command]
+        # As a user starts it; scripts set this for themselves.
+        environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
         done = subprocess.run(
-            launch, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True, check=False
+            launch,
+            cwd=REPOSITORY,
+            env=environment,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
         )
         if not (inner.is_file() and outer.is_file()):
             raise CalivError(f"caliv-graph {arguments[0]}: killed; {_last(done.stderr)}")

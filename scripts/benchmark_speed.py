@@ -1,0 +1,505 @@
+"""Where the time of a calibration goes, and how it grows.
+
+Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_speed.py
+
+Every calibration is `caliv-graph calibrate` in a process of its own, report and files included, and
+is timed from the end of its imports (start-up is told apart); memory is that of the whole process.
+Bags are simulated with `--seed` into a temporary folder and deleted. Measured are
+
+- the drive that the CaLiV authors published (`--data`) and simulated bags, on 2 cores and on 1:
+  each stage, the rest (first pass over a bag, report, files), and peak memory;
+- how processor time grows with clouds, points per cloud, LiDARs and components of the mixture,
+  each 1, 2 and 4 times;
+- the paper's own estimator, written anew (`benchmark_paper.py`), on the same clouds from the same
+  guesses in the same process as ours, one thread each: end to end, and the optimisation alone;
+- `--help` of the program and of every command.
+
+Growth and ratios are of processor time: wall time also measures what else the machine does.
+`--quick` leaves out all repetitions, the larger bag and the paper's estimator on it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one thread for both estimators
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
+
+from caliv_graph._open3d import import_open3d  # noqa: E402
+from caliv_graph.config import Config, dump_config, load_config  # noqa: E402
+from caliv_graph.errors import CalivError, ConfigError  # noqa: E402
+from caliv_graph.progress import PlainProgress, Progress, SilentProgress  # noqa: E402
+from scripts import _child, benchmark_bag, benchmark_paper  # noqa: E402
+from scripts import benchmark_released as released  # noqa: E402
+
+BAGS = ("demo_arc", "figure_eight")
+QUICK_BAGS = ("demo_arc",)
+REPEATED = 3
+CORES = (2, 1)
+
+CLOUD_STEPS = (4, 2, 1)
+"""Every so manieth cloud of the authors' drive."""
+
+POINTS = (12_000, 24_000, 48_000)
+LIDARS = (1, 2, 4)
+COMPONENTS = (300, 600, 1200)
+MOST_COMPONENTS = 1000
+"""Beside 300, the two that the limit is about."""
+
+MINUTES = 1.0
+"""Of the bags in which points and LiDARs vary: one figure-eight."""
+
+READING = ("reading clouds", "reading the ground")
+
+TOTAL_LIMIT_S = 8.0
+READING_LIMIT_S = 3.0
+DOUBLE_LIMIT = 2.2
+COMPONENTS_LIMIT = 2.0
+HELP_LIMIT_S = 0.4
+COMMANDS = (
+    *("init", "simulate", "inspect", "observability", "plan", "calibrate"),
+    *("evaluate", "validate", "compare", "merge", "export"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One drive, calibrated on some numbers of cores.
+
+    Attributes:
+        name: what to call it.
+        clouds: in the recording.
+        usages: by number of cores.
+    """
+
+    name: str
+    clouds: int
+    usages: Mapping[int, _child.Usage]
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How a calibration grows with one quantity.
+
+    Attributes:
+        what: the quantity.
+        sizes: it had.
+        usages: for each; on one core.
+    """
+
+    what: str
+    sizes: tuple[int, ...]
+    usages: tuple[_child.Usage, ...]
+
+    def ratios(self) -> tuple[float, ...]:
+        """Processor time over that of the first."""
+        return tuple(usage.cpu_s / self.usages[0].cpu_s for usage in self.usages)
+
+    def doubled(self) -> float:
+        """Processor time of the last over that of the last but one."""
+        return self.usages[-1].cpu_s / self.usages[-2].cpu_s
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The paper's estimator beside ours on the same clouds.
+
+    Attributes:
+        name: of the drive.
+        paper: seconds of its `total`, `cpu`, `registration` and `optimisation`.
+        ours: likewise.
+    """
+
+    name: str
+    paper: Mapping[str, float]
+    ours: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A limit, and whether it is kept."""
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def kept(self) -> bool:
+        return self.value <= self.limit
+
+
+@dataclass(frozen=True)
+class Found:
+    """Everything that was measured."""
+
+    cases: tuple[Case, ...]
+    growths: tuple[Growth, ...]
+    more_components: float | None
+    baselines: tuple[Baseline, ...]
+    helps_s: Mapping[str, float]
+
+
+def main() -> int:
+    arguments = parse_arguments()
+    progress = SilentProgress() if arguments.json else PlainProgress(say)
+    try:
+        with tempfile.TemporaryDirectory(prefix="caliv_speed_", dir=arguments.folder) as name:
+            found = benchmark(arguments, Path(name), progress)
+    except (CalivError, OSError) as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        return 130
+    limits = verdicts(found)
+    if arguments.json:
+        say(json.dumps(document(arguments, found, limits), indent=2))
+    else:
+        say(f"\n{text(found, limits)}")
+    return 0 if all(verdict.kept for verdict in limits) else 3
+
+
+def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description="Times calibrations stage by stage, and how they grow with clouds, points, "
+        "LiDARs and components; beside the paper's own estimator.",
+        epilog="Exit codes: 0 all limits are kept; 3 one is not; 2 it could not be tried.",
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=REPOSITORY / "../shared/data/caliv_released",
+        help="the authors' drive (default: ../shared/data/caliv_released beside the repository); "
+        "what needs it is left out, and said, where it is not there",
+    )
+    parser.add_argument("--seed", type=released.positive, default=1, help="default: 1")
+    parser.add_argument("--folder", type=Path, help="for temporary files (default: the system's)")
+    parser.add_argument("--quick", action="store_true", help="less of everything, in minutes")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    return parser.parse_args(given)
+
+
+def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -> Found:
+    repeated = 1 if arguments.quick else REPEATED
+    names = QUICK_BAGS if arguments.quick else BAGS
+    data = arguments.data.resolve()
+    has_data = (data / "input").is_dir()
+    if not has_data:
+        print(f"{data}: is not there: the authors' drive is left out", file=sys.stderr)
+    bags = {name: simulated(name, arguments.seed, folder, progress) for name in names}
+    drives = {"authors' drive": authors(data, folder)} if has_data else {}
+    drives |= bags
+    cases = []
+    for name, config in drives.items():
+        with progress.stage(f"calibrating: {name}", len(CORES) * repeated) as advance:
+            usages = {cores: timed(config, cores, repeated, advance) for cores in CORES}
+        cases.append(Case(name, cloud_count(config), usages))
+    growths = []
+    more_components = None
+    if has_data:
+        growths.append(with_clouds(data, folder, repeated, progress))
+        of_components, more_components = with_components(data, folder, repeated, progress)
+        growths.append(of_components)
+    growths += [
+        with_bags("points per cloud", POINTS, arguments, folder, progress),
+        with_bags("LiDARs", LIDARS, arguments, folder, progress),
+    ]
+    baselines = []
+    if has_data:
+        job = benchmark_paper.Job(
+            "authors' drive", 1, benchmark_paper.published(data, arguments.seed)
+        )
+        baselines.append(beside(job, progress))
+    if not arguments.quick:
+        for name in names[-1:]:
+            opened = benchmark_paper.simulated(name, arguments.seed)
+            baselines.append(beside(benchmark_paper.Job(name, arguments.seed, opened), progress))
+    with progress.stage("asking for help"):
+        helps = {"caliv-graph": _child.help_s([], 5)}
+        helps |= {command: _child.help_s([command], 3) for command in COMMANDS}
+    return Found(tuple(cases), tuple(growths), more_components, tuple(baselines), helps)
+
+
+def timed(config: Path, cores: int, repeated: int, advance: Callable[[], object]) -> _child.Usage:
+    """The median of some calibrations."""
+    usages = []
+    for _ in range(repeated):
+        usages.append(_child.calibrate(config, config.parent / "result", cores))
+        advance()
+    return _child.middle(usages)
+
+
+def cloud_count(config: Path) -> int:
+    """Clouds in the recording of a config."""
+    from caliv_graph.readers import open_recording
+
+    recording = open_recording(load_config(config))
+    return sum(len(recording.scan_stamps_ns(lidar)) for lidar in recording.lidars)
+
+
+def simulated(name: str, seed: int, folder: Path, progress: Progress) -> Path:
+    """Config of a simulated bag."""
+    scenario, out = REPOSITORY / f"configs/scenarios/{name}.yaml", folder / name
+    with progress.stage(f"simulating {name}"):
+        _child.run(["simulate", str(scenario), "--out", str(out), "--seed", str(seed)], 0)
+    return out / "config.yaml"
+
+
+def authors(data: Path, folder: Path, **registration: Any) -> Path:
+    """Config of the authors' drive, with the guesses that the repository's config has."""
+    config = load_config(released.CONFIG)
+    if not (data / "input").is_dir():
+        raise ConfigError(f"{data}: the drive that the CaLiV authors published is not there")
+    settings = config.registration.model_copy(update=registration)
+    where = config.data.model_copy(update={"path": data})
+    return written(config.model_copy(update={"registration": settings, "data": where}), folder)
+
+
+def written(config: Config, folder: Path) -> Path:
+    path = Path(tempfile.mkdtemp(dir=folder)) / "config.yaml"
+    path.write_text(dump_config(config), encoding="utf-8")
+    return path
+
+
+def with_clouds(data: Path, folder: Path, repeated: int, progress: Progress) -> Growth:
+    """The authors' drive with every fourth of its clouds, every second, and all."""
+    sizes, usages = [], []
+    with progress.stage("growth with clouds", len(CLOUD_STEPS) * repeated) as advance:
+        for step in CLOUD_STEPS:
+            config = authors(part_of(data, step, folder), folder)
+            sizes.append(cloud_count(config))
+            usages.append(timed(config, 1, repeated, advance))
+    return Growth("clouds of the authors' drive", tuple(sizes), tuple(usages))
+
+
+def part_of(data: Path, step: int, folder: Path) -> Path:
+    """A CaLiV folder with every so manieth cloud of another, as links."""
+    part = Path(tempfile.mkdtemp(dir=folder))
+    (part / "input").mkdir()
+    poses = data / "input/ego_poses.yaml"
+    (part / "input/ego_poses.yaml").write_bytes(poses.read_bytes())
+    for sensor in sorted(entry for entry in (data / "input").iterdir() if entry.is_dir()):
+        (part / "input" / sensor.name).mkdir()
+        clouds = sorted(sensor.glob("*.pcd"), key=lambda path: int(path.stem))
+        for cloud in clouds[::step]:
+            (part / "input" / sensor.name / cloud.name).symlink_to(cloud.resolve())
+    return part
+
+
+def with_components(
+    data: Path, folder: Path, repeated: int, progress: Progress
+) -> tuple[Growth, float]:
+    """The authors' drive with mixtures of several sizes; and 1,000 components over 300."""
+    counts = sorted({*COMPONENTS, MOST_COMPONENTS})
+    usages = {}
+    with progress.stage("growth with components", len(counts) * repeated) as advance:
+        for count in counts:
+            config = authors(data, folder, components=count)
+            usages[count] = timed(config, 1, repeated, advance)
+    growth = Growth(
+        "components, authors' drive", COMPONENTS, tuple(usages[count] for count in COMPONENTS)
+    )
+    return growth, usages[MOST_COMPONENTS].cpu_s / usages[COMPONENTS[0]].cpu_s
+
+
+def with_bags(
+    what: str,
+    sizes: tuple[int, ...],
+    arguments: argparse.Namespace,
+    folder: Path,
+    progress: Progress,
+) -> Growth:
+    """Bags of one figure-eight, with several numbers of points or of LiDARs."""
+    usages = []
+    for size in sizes:
+        model = argparse.Namespace(
+            minutes=MINUTES,
+            lidars=size if what == "LiDARs" else 2,
+            points=POINTS[0] if what == "LiDARs" else size,
+            zstd=False,
+            search=False,
+        )
+        recording = benchmark_bag.LapsRecording(
+            benchmark_bag.scenario_of(model), arguments.seed, len(os.sched_getaffinity(0))
+        )
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            benchmark_bag.check_disk(recording, model.points, Path(name))
+            benchmark_bag.write_laps(recording, Path(name), SilentProgress())
+            with progress.stage(f"growth with {what}: {size}") as advance:
+                usages.append(timed(Path(name) / "config.yaml", 1, 1, advance))
+    return Growth(f"{what}, a figure-eight", sizes, tuple(usages))
+
+
+def beside(job: benchmark_paper.Job, progress: Progress) -> Baseline:
+    """Both estimators on the same clouds from the same guess.
+
+    Raises:
+        CalivError: one of them has no result.
+    """
+    import_open3d()  # a second that belongs to neither
+    recording, config, truth = job.open()
+    outcomes = {}
+    for estimator in (benchmark_paper.PAPER, benchmark_paper.OURS):
+        with progress.stage(f"{job.drive}: {estimator}"):
+            outcome = benchmark_paper.run_once(job, "guess", estimator, recording, config, truth)
+        if outcome.failure:
+            raise CalivError(f"{job.drive}, {estimator}: {outcome.failure}")
+        outcomes[estimator] = outcome.seconds
+    return Baseline(job.drive, outcomes[benchmark_paper.PAPER], outcomes[benchmark_paper.OURS])
+
+
+def verdicts(found: Found) -> list[Verdict]:
+    """What the project promises, against what was measured."""
+    out = []
+    for case in found.cases:
+        if case.name == "authors' drive":
+            usage = case.usages[CORES[0]]
+            out += [
+                Verdict(f"{case.clouds} clouds, 2 cores, wall", usage.wall_s, TOTAL_LIMIT_S, "s"),
+                Verdict("of which reading", usage.stage_s(*READING), READING_LIMIT_S, "s"),
+            ]
+    for growth in found.growths:
+        if growth.what.startswith("clouds"):
+            out.append(
+                Verdict("twice the clouds, CPU", growth.doubled(), DOUBLE_LIMIT, "times as much")
+            )
+    if found.more_components is not None:
+        what = f"{MOST_COMPONENTS} components against {COMPONENTS[0]}, CPU"
+        out.append(Verdict(what, found.more_components, COMPONENTS_LIMIT, "times as much"))
+    slowest = max(found.helps_s, key=lambda name: found.helps_s[name])
+    out.append(Verdict(f"--help, slowest ({slowest})", found.helps_s[slowest], HELP_LIMIT_S, "s"))
+    return out
+
+
+def text(found: Found, limits: Sequence[Verdict]) -> str:
+    """The result for a person."""
+    parts = [*map(case_text, found.cases)]
+    parts += ["\n".join(["Growth, CPU on one core", *map(growth_text, found.growths)])]
+    parts += map(baseline_text, found.baselines)
+    lines = ["Limits"]
+    for verdict in limits:
+        kept = "kept" if verdict.kept else "MISSED"
+        lines.append(
+            f"  {verdict.what:42}{verdict.value:8.2f} {verdict.unit}, at most {verdict.limit:g}: "
+            f"{kept}"
+        )
+    return "\n\n".join([*parts, "\n".join(lines)])
+
+
+def case_text(case: Case) -> str:
+    """Stages in rows, cores in columns."""
+    lines = [f"{case.name}: {case.clouds} clouds", f"  {'seconds':48}"]
+    headings = {n: f"{n} cores" if n > 1 else "1 core" for n in case.usages}
+    lines[-1] += "".join(f"{heading:>10}{'CPU':>8}" for heading in headings.values())
+    stages = dict.fromkeys(name for usage in case.usages.values() for name in usage.stages)
+    nothing = (0.0, 0.0)
+    for name in stages:
+        cells = [usage.stages.get(name, nothing) for usage in case.usages.values()]
+        lines.append(f"  {name:48}" + "".join(f"{wall:10.2f}{cpu:8.2f}" for wall, cpu in cells))
+    rests = [rest(usage) for usage in case.usages.values()]
+    lines.append(
+        f"  {'first pass over a bag, tests, report, files':48}"
+        + "".join(f"{wall:10.2f}{cpu:8.2f}" for wall, cpu in rests)
+    )
+    lines.append(
+        f"  {'all after start-up':48}"
+        + "".join(f"{usage.wall_s:10.2f}{usage.cpu_s:8.2f}" for usage in case.usages.values())
+    )
+    usage = case.usages[CORES[0]]
+    reading = usage.stage_s(*READING)
+    lines.append(
+        f"  reading and cutting out: {100 * reading / usage.wall_s:.0f} percent; start-up "
+        f"{usage.start_up_cpu_s:.2f} s of CPU; peak memory {usage.peak_mb:.0f} MB"
+    )
+    return "\n".join(lines)
+
+
+def rest(usage: _child.Usage) -> tuple[float, float]:
+    """Wall and processor time that no stage has."""
+    walls, cpus = zip(*usage.stages.values(), strict=True)
+    return usage.wall_s - sum(walls), usage.cpu_s - sum(cpus)
+
+
+def growth_text(growth: Growth) -> str:
+    cells = [
+        f"{size}: {usage.cpu_s:.1f} s, {usage.peak_mb:.0f} MB ({ratio:.2f}x)"
+        for size, usage, ratio in zip(growth.sizes, growth.usages, growth.ratios(), strict=True)
+    ]
+    return f"  {growth.what:30}{'; '.join(cells)}"
+
+
+def baseline_text(baseline: Baseline) -> str:
+    lines = [f"The paper's estimator, written anew, and ours: {baseline.name}"]
+    lines.append(f"  {'seconds, one thread':30}{'paper':>9}{'ours':>9}{'ratio':>9}")
+    for name, label in benchmark_paper.TIMES.items():
+        paper, ours = baseline.paper[name], baseline.ours[name]
+        lines.append(f"  {label:30}{paper:9.2f}{ours:9.2f}{paper / max(ours, 1e-9):9.2f}")
+    return "\n".join(lines)
+
+
+def document(
+    arguments: argparse.Namespace, found: Found, limits: Sequence[Verdict]
+) -> dict[str, Any]:
+    """Everything as plain values, seconds and MB."""
+    return {
+        "seed": arguments.seed,
+        "quick": arguments.quick,
+        "cases": [
+            {
+                "name": case.name,
+                "clouds": case.clouds,
+                "by_cores": {str(n): usage_document(u) for n, u in case.usages.items()},
+            }
+            for case in found.cases
+        ],
+        "growth": [
+            {
+                "what": growth.what,
+                "sizes": list(growth.sizes),
+                "usages": [usage_document(usage) for usage in growth.usages],
+                "cpu_ratios": list(growth.ratios()),
+            }
+            for growth in found.growths
+        ],
+        "components_1000_over_300": found.more_components,
+        "paper": [
+            {
+                "drive": baseline.name,
+                "paper_s": dict(baseline.paper),
+                "ours_s": dict(baseline.ours),
+            }
+            for baseline in found.baselines
+        ],
+        "help_s": dict(found.helps_s),
+        "limits": [{**vars(verdict), "kept": verdict.kept} for verdict in limits],
+    }
+
+
+def usage_document(usage: _child.Usage) -> dict[str, Any]:
+    return {
+        "wall_s": usage.wall_s,
+        "cpu_s": usage.cpu_s,
+        "start_up_cpu_s": usage.start_up_cpu_s,
+        "peak_mb": usage.peak_mb,
+        "stages": {
+            name: {"wall_s": wall, "cpu_s": cpu} for name, (wall, cpu) in usage.stages.items()
+        },
+    }
+
+
+def say(line: str) -> None:
+    print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
 
-from caliv_graph.errors import OutputError
+from caliv_graph.errors import ConfigError, OutputError
 
 
 def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
@@ -241,3 +241,21 @@ def _uninterrupted() -> Iterator[None]:
         for number, handler in before.items():
             # None: it was not set from Python, and cannot be set back from here.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def each_once(paths: Sequence[Path], where: str, what: str) -> None:
+    """Checks that no path is given twice, under whatever names.
+
+    Args:
+        paths: as given.
+        where: what the message begins with before the path: an option and a space, or nothing.
+        what: the paths are of, "a drive".
+
+    Raises:
+        ConfigError: one is.
+    """
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise ConfigError(f"{where}{path}: given twice; {what} counts once")
+        seen.add(path.resolve())

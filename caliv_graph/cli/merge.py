@@ -9,7 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import INCONSISTENT
-from caliv_graph.cli.options import P_VALUE, Force, PValue, ResultAsJson, each_once
+from caliv_graph.cli.options import P_VALUE, Force, PValue, ResultAsJson
 
 
 def merge(
@@ -33,7 +33,7 @@ def merge(
     Example: caliv-graph merge monday/calibration.yaml friday/calibration.yaml --out vehicle.yaml
     """
     from caliv_graph.errors import ConfigError
-    from caliv_graph.files import check_output_file
+    from caliv_graph.files import check_output_file, each_once
     from caliv_graph.fusion.merge import merge as merge_calibrations
     from caliv_graph.report.comparison import agreement_document, merger_table
     from caliv_graph.results import (

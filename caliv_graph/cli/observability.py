@@ -6,7 +6,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.exits import UNMET
-from caliv_graph.cli.options import AsJson, ConfigArgument, Drives, open_drives
+from caliv_graph.cli.options import AsJson, ConfigArgument, Drives
 
 
 def observability(
@@ -26,11 +26,12 @@ def observability(
     Example: caliv-graph observability config.yaml --data drive/
     """
     from caliv_graph.config import load_config
+    from caliv_graph.jobs import open_recordings
     from caliv_graph.report.outlook import survey_document, survey_table
     from caliv_graph.survey import survey
 
     settings = load_config(config)
-    recordings = open_drives(settings, data)
+    recordings = open_recordings(settings, data or ())
     with streams.progress_on_stdout(as_json) as progress:
         found = survey(recordings, settings, progress)
     if as_json:

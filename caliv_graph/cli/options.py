@@ -1,16 +1,11 @@
-"""Arguments and options that several commands have, and what is checked of them."""
+"""Arguments and options that several commands have."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from caliv_graph.config import Config
-    from caliv_graph.products import Recording
 
 ConfigArgument = Annotated[
     Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' drafts one.")
@@ -49,36 +44,3 @@ ResultAsJson = Annotated[
     bool,
     typer.Option("--json", help="Print one JSON document, calibration.yaml's content and more."),
 ]
-
-
-def each_once(paths: Sequence[Path], where: str, what: str) -> None:
-    """Checks that no path is given twice, under whatever names.
-
-    Args:
-        paths: as given.
-        where: what the message begins with before the path: an option and a space, or nothing.
-        what: the paths are of, "a drive".
-
-    Raises:
-        ConfigError: one is.
-    """
-    from caliv_graph.errors import ConfigError
-
-    seen: set[Path] = set()
-    for path in paths:
-        if path.resolve() in seen:
-            raise ConfigError(f"{where}{path}: given twice; {what} counts once")
-        seen.add(path.resolve())
-
-
-def open_drives(config: Config, data: Sequence[Path] | None) -> list[Recording]:
-    """The recordings that `--data` names, or else the config.
-
-    Raises:
-        ConfigError: a drive is given twice, or none at all.
-        RecordingError: one cannot be read.
-    """
-    from caliv_graph.readers import open_recording
-
-    each_once(data or (), "--data ", "a drive")
-    return [open_recording(config, path) for path in data or (None,)]

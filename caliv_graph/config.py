@@ -366,13 +366,13 @@ def _nearest(key: str, known: list[str]) -> str:
     return hint
 
 
-def _section_at(location: tuple[int | str, ...]) -> type[BaseModel]:
+def _section_at(location: tuple[int | str, ...], root: type[BaseModel]) -> type[BaseModel]:
     """The model that owns the key at `location` (its last item is the key itself)."""
-    annotation: Any = Config
+    annotation: Any = root
     for item in location[:-1]:
         annotation = _inner(annotation, item)
     model = _model_in(annotation)
-    return model or Config
+    return model or root
 
 
 def _inner(annotation: Any, item: int | str) -> Any:
@@ -397,7 +397,7 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _one_line(error: ValidationError) -> str:
+def _one_line(error: ValidationError, root: type[BaseModel]) -> str:
     """The first thing wrong, as one line a person can act upon; a typo before what it hides."""
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
@@ -413,7 +413,7 @@ def _one_line(error: ValidationError) -> str:
     others = len({tuple(e["loc"])[: len(location)] for e in alike}) - 1
     rest = f" (and {others} more)" if others > 0 else ""
     if first["type"] == "extra_forbidden":
-        known = list(_section_at(location).model_fields)
+        known = list(_section_at(location, root).model_fields)
         return f"unknown key '{where}': {_nearest(str(location[-1]), known)}{rest}"
     if first["type"] == "missing":
         return f"'{where}' is missing{rest}"
@@ -485,7 +485,7 @@ def parse_config(raw: Any, source: str, base: Path) -> Config:
     try:
         config = Config.model_validate(raw)
     except ValidationError as e:
-        raise ConfigError(f"{source}: {_one_line(e)}") from None
+        raise ConfigError(f"{source}: {_one_line(e, Config)}") from None
     if config.data.path is None:
         return config
     data = config.data.model_copy(update={"path": (base / config.data.path).absolute()})

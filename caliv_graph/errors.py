@@ -39,3 +39,7 @@ class ExportError(CalivError):
 
 class OutputError(CalivError):
     """A result could not be written where it was asked for."""
+
+
+class BatchError(CalivError):
+    """A batch cannot run: Dask is missing, or its scheduler or workers are of no use."""

@@ -18,6 +18,7 @@ import typer
 
 from caliv_graph import __version__
 from caliv_graph.cli import streams
+from caliv_graph.cli.batch import batch
 from caliv_graph.cli.calibrate import calibrate
 from caliv_graph.cli.compare import compare
 from caliv_graph.cli.evaluate import evaluate
@@ -57,7 +58,7 @@ def _paragraphs(docstring: str) -> str:
 
 for _command in (
     *(init, simulate, inspect, observability, plan),
-    *(calibrate, evaluate, validate, compare, merge, export),
+    *(calibrate, evaluate, validate, compare, merge, export, batch),
 ):
     app.command(help=_paragraphs(_command.__doc__ or ""))(_command)
 

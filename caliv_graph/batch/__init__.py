@@ -1,0 +1,1 @@
+"""Many drives and vehicles on Dask: resumable, and one page for the fleet."""

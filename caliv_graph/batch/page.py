@@ -1,0 +1,189 @@
+"""index.html: one page for the fleet, without any network; and the same in short for a terminal."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+import jinja2
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+import caliv_graph
+from caliv_graph.batch.summary import Deviation, Row, Spread, Summary
+from caliv_graph.products import LidarResult
+from caliv_graph.report.html import _mounting_row
+from caliv_graph.report.tables import _SHOWN_AXES, _STATUS_STYLES, _sentences, _table, _titled
+from caliv_graph.results import REPORT_FILE
+
+FAR_SIGMAS = 3.0
+"""From which a drive counts as far from the others, to the eye: the verdict is a test's."""
+
+_UNTOLD = "-"
+
+
+def render_index(summary: Summary) -> str:
+    """The page: every job with its mountings, and per vehicle how much its drives differ.
+
+    Args:
+        summary: of the batch.
+
+    Returns:
+        A whole HTML document. Its links are relative: the folder can be moved, or packed.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("caliv_graph.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("batch.html.j2").render(
+        headline=_headline(summary),
+        style=_style(summary),
+        counts=summary.counts,
+        rows=[_row(row) for row in summary.rows],
+        spreads=[_spread(spread) for spread in summary.spreads()],
+        axes=_SHOWN_AXES,
+        manifest=summary.manifest,
+        written=summary.written,
+        exit=summary.exit,
+        far=FAR_SIGMAS,
+        version=caliv_graph.__version__,
+    )
+
+
+def summary_table(summary: Summary) -> RenderableType:
+    """The closing words of `batch`."""
+    table = _table("job", "exit", "time\ns", "status", "determined", "vehicle")
+    for row in summary.rows:
+        table.add_row(
+            Text(row.job),
+            "-" if row.exit is None else str(row.exit),
+            "-" if row.seconds is None else f"{row.seconds:.1f}",
+            Text(row.status, style=_STATUS_STYLES.get(row.status, "bold red")),
+            Text(_determined(row)),
+            Text(row.vehicle or ""),
+        )
+    parts: list[RenderableType] = [Text(_headline(summary), style="bold")]
+    parts += _titled("Jobs", table)
+    parts += _sentences(
+        "What is wrong:", (f"{row.job}: {row.note}" for row in summary.rows if row.note)
+    )
+    parts += _sentences("Vehicles:", (_spread_line(s) for s in summary.spreads()))
+    return Group(*parts)
+
+
+def _headline(summary: Summary) -> str:
+    counts = summary.counts
+    text = f"{counts['done']} of {counts['jobs']} jobs have a result"
+    for key, words in (
+        ("failed", "failed"),
+        ("waiting", "not done yet"),
+        ("not_good_enough", "of the results not good enough"),
+        ("inconsistent", "of them contradict themselves"),
+    ):
+        if counts[key]:
+            text += f", {counts[key]} {words}"
+    return f"{text}."
+
+
+def _style(summary: Summary) -> str:
+    """A class of the page's style."""
+    counts = summary.counts
+    if counts["inconsistent"] or counts["failed"]:
+        return "inconsistent"
+    return "partial" if summary.exit or counts["waiting"] else "ok"
+
+
+def _determined(row: Row) -> str:
+    """Axes that were determined, of all LiDARs."""
+    if row.calibration is None:
+        return _UNTOLD
+    told = [t for lidar in row.calibration.lidars.values() for t in lidar.determined.values()]
+    return f"{sum(told)} of {len(told)}"
+
+
+def _row(row: Row) -> dict[str, Any]:
+    lidars = {} if row.calibration is None else row.calibration.lidars
+    folder = quote(row.job)
+    return {
+        "job": row.job,
+        "vehicle": row.vehicle or "",
+        "status": row.status,
+        "exit": _UNTOLD if row.exit is None else row.exit,
+        "seconds": _UNTOLD if row.seconds is None else f"{row.seconds:.1f}",
+        "reused": row.reused,
+        "note": row.note,
+        "report": str(PurePosixPath(folder) / REPORT_FILE),
+        "folder": f"{folder}/",
+        "warnings": len(row.warnings),
+        "lidars": [{"name": n, **_mounting_cells(lidar)} for n, lidar in lidars.items()],
+        "undetermined": []
+        if row.calibration is None
+        else [direction.text for direction in row.calibration.undetermined],
+    }
+
+
+def _mounting_cells(lidar: LidarResult) -> dict[str, Any]:
+    cells = _mounting_row(lidar)
+    trusted = not cells["estimated"]
+    # A value that the drive did not tell is in the report of its job, as the guess that it is.
+    shown = [
+        {
+            "told": cell.determined and not trusted,
+            "value": "fixed" if trusted else cell.value if cell.determined else "not determined",
+            "below": cell.below if cell.determined and not trusted else "",
+        }
+        for cell in cells["cells"]
+    ]
+    return {"cells": shown, "scans": cells["scans"]}
+
+
+def _spread(spread: Spread) -> dict[str, Any]:
+    return {
+        "vehicle": spread.vehicle,
+        "jobs": spread.jobs,
+        "left_out": spread.left_out,
+        "reason": spread.reason,
+        "moved": spread.moved,
+        "rows": [
+            {
+                "name": names[0] if len(names) == 1 else f"{names[0]} to {names[1]}",
+                "cells": [_deviation(axes[axis]) for axis in _SHOWN_AXES],
+            }
+            for names, axes in spread.deviations.items()
+        ],
+    }
+
+
+def _deviation(deviation: Deviation | None) -> dict[str, Any]:
+    if deviation is None:
+        return {"value": "not determined", "job": "", "far": False, "told": False}
+    return {
+        "value": f"{deviation.sigmas:.1f}",
+        "job": deviation.job,
+        "far": deviation.sigmas > FAR_SIGMAS,
+        "told": True,
+    }
+
+
+def _spread_line(spread: Spread) -> str:
+    """How much the drives of a vehicle differ, in a sentence."""
+    if spread.reason:
+        return f"{spread.vehicle}: not compared: {spread.reason}"
+    found = [
+        (deviation.sigmas, " to ".join(names), axis, deviation.job)
+        for names, axes in spread.deviations.items()
+        for axis, deviation in axes.items()
+        if deviation is not None
+    ]
+    drives = f"{spread.vehicle}: {len(spread.jobs)} drives"
+    if not found:
+        return f"{drives}: there is no axis that they determine in common"
+    sigmas, name, axis, job = max(found)
+    most = f"largest difference {sigmas:.1f} sigma ({axis} of {name}, {job})"
+    if spread.moved:
+        return f"{drives} disagree: {', '.join(spread.moved)}; {most}"
+    return f"{drives} agree; {most}"

@@ -9,6 +9,8 @@ import asyncio
 import logging
 import multiprocessing
 import re
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
@@ -31,6 +33,10 @@ _LOGGERS = (
     *("distributed", "distributed.client", "distributed.gc", "distributed.nanny", "asyncio"),
     *("distributed.worker.memory", "tornado", "tornado.application", "bokeh"),
 )
+
+_RETRY_S = 0.5
+
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?P<host>[\w.-]+|\[[0-9a-fA-F:.]+\]):(?P<port>\d{1,5})")
 
 _DEATH = re.compile(r"Worker process (\d+) (was killed by .*|exited with .*)")
 _MEMORY = re.compile(r"\(pid=(\d+)\) exceeded (\d+)% memory")
@@ -87,19 +93,21 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
         BatchError: Dask is not installed, nobody answers within CONNECT_S, or there is no worker.
     """
     distributed = _distributed()
+    _await_answer(address)
+    client: Any = None
     with _heard_quietly() as deaths, ExitStack() as stack:
-        try:
+        # A client waits for the wrong kind of server without end, and its clean-up does so too.
+        with suppress(Exception):
+            asyncio.run(asyncio.wait_for(_identify(address), CONNECT_S))
             client = distributed.Client(
                 address, timeout=CONNECT_S, set_as_default=False, name="caliv-graph"
             )
-        except Exception as e:
-            # A wrong scheme, a name that is not known, nobody there, another protocol: all of them.
-            reason = str(e).splitlines()[0] if isinstance(e, ValueError) and str(e) else ""
+        if client is None:
             raise BatchError(
-                f"--scheduler {address}: no Dask scheduler answers there within {CONNECT_S:g} s"
-                f"{f' ({reason})' if reason else ''}. Start one with 'dask scheduler', or leave "
-                "the option out"
-            ) from None
+                f"--scheduler {address}: something is there, but does not answer within "
+                f"{CONNECT_S:g} s as a Dask scheduler would. Look at the address, and whether "
+                "its version is this environment's"
+            )
         stack.callback(_close, client)
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
@@ -208,6 +216,43 @@ def _distributed() -> Any:
             "batch: needs Dask, which is not installed. Install it with "
             "'pip install caliv-graph[batch]'"
         ) from None
+
+
+def _await_answer(address: str) -> None:
+    """Waits until somebody listens there: Dask itself would do so with a processor of its own."""
+    parts = _ADDRESS.fullmatch(address)
+    if parts is None or int(parts["port"]) > 65535:
+        raise BatchError(
+            f"--scheduler {address}: is no address of a scheduler: expected tcp://host:port, as "
+            "'dask scheduler' prints it"
+        )
+    host, port = parts["host"].strip("[]"), int(parts["port"])
+    end = time.monotonic() + CONNECT_S
+    while True:
+        try:
+            socket.create_connection((host, port), timeout=CONNECT_S).close()
+            return
+        except OSError as e:
+            reason = e.strerror or str(e)
+        if time.monotonic() > end - _RETRY_S:
+            raise BatchError(
+                f"--scheduler {address}: no Dask scheduler answers there within {CONNECT_S:g} s "
+                f"({reason}). Start one with 'dask scheduler', or leave the option out"
+            )
+        time.sleep(_RETRY_S)
+
+
+async def _identify(address: str) -> None:
+    """Asks a scheduler who it is, and drops the line at once if it is none."""
+    core: Any = import_module("distributed.core")
+    comm = await core.connect(address, timeout=CONNECT_S)
+    try:
+        await comm.write({"op": "identity", "reply": True})
+        answer = await comm.read()
+        if answer["type"] != "Scheduler":
+            raise ValueError(answer["type"])
+    finally:
+        comm.abort()
 
 
 def _share_of_memory(count: int) -> int:

@@ -214,7 +214,7 @@ def _distributed() -> Any:
     except ImportError:
         raise BatchError(
             "batch: needs Dask, which is not installed. Install it with "
-            "'pip install caliv-graph[batch]'"
+            "pip install 'caliv-graph[batch]'"
         ) from None
 
 

@@ -314,7 +314,7 @@ def _spread_document(spread: Spread) -> dict[str, Any]:
 
 def _spread(vehicle: str, rows: Sequence[Row]) -> Spread:
     results: dict[str, Calibration] = {}
-    left_out = {}
+    left_out: dict[str, str] = {}
     for row in rows:
         if row.calibration is None:
             left_out[row.job] = row.state

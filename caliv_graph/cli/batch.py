@@ -52,7 +52,7 @@ def batch(
         bool, typer.Option("--json", help="Print one JSON document, summary.json's content.")
     ] = False,
 ) -> None:
-    """Calibrate many drives and vehicles, on all processors or on a Dask cluster.
+    r"""Calibrate many drives and vehicles, on all processors or on a Dask cluster.
 
     DIR gets a folder per job with what 'calibrate' writes, and index.html (every job, its mountings
     and, per vehicle, how much its drives differ), summary.csv and summary.json, which are rewritten
@@ -61,7 +61,7 @@ def batch(
     The same command again resumes: a result that was made from the same bytes of data and prior,
     the same config and version is left as it is, also after a kill; all else is done again. One
     failure does not stop the others; a job whose worker dies is tried once more. Needs the extra:
-    pip install caliv-graph[batch]
+    pip install 'caliv-graph\[batch]'
 
     Exit code: that of the worst job. 4: the data of one contradict each other; 3: one failed (a bad
     config or drive too), or did not reach what its config requires; 0: all are done and good. 2:

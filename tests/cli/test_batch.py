@@ -360,7 +360,7 @@ def test_without_dask_it_says_how_to_get_it(fleet: Path, tmp_path: Path) -> None
     assert result.returncode == 2
     assert result.stderr == (
         "error: batch: needs Dask, which is not installed. Install it with "
-        "'pip install caliv-graph[batch]'\n"
+        "pip install 'caliv-graph[batch]'\n"
     )
     assert not (tmp_path / "out").exists()
 
@@ -402,7 +402,7 @@ def test_help_explains_it_without_importing_anything_heavy() -> None:
         "import sys\n"
         "from caliv_graph.cli.main import run\n"
         "run(['batch', '--help'])\n"
-        "heavy = {'gtsam', 'dask', 'distributed', 'numpy', 'pydantic'} & set(sys.modules)\n"
+        "heavy = {'gtsam', 'dask', 'numpy', 'caliv_graph.config'} & set(sys.modules)\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)\n"
     )
     result = subprocess.run(
@@ -411,3 +411,4 @@ def test_help_explains_it_without_importing_anything_heavy() -> None:
 
     assert (result.returncode, result.stderr) == (0, "")
     assert "Example: caliv-graph batch fleet.yaml --out fleet/" in result.stdout
+    assert "'caliv-graph[batch]'" in " ".join(result.stdout.split()), "no markup"

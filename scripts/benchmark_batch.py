@@ -1,0 +1,334 @@
+"""How much faster a batch is on two workers than on one, and whether a killed one ends the same.
+
+Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_batch.py
+
+Simulates 16 drives (`--drives`) of the demo's arc with different seeds, once: they stay in
+out/batch_drives. Then `caliv-graph batch` runs on them with 1 and with 2 workers (`--workers`), in
+turn, `--rounds` times each; what counts is the shortest time of each, for other programs can only
+make it longer. With `--kills N` a batch is killed (SIGKILL to all its processes) at a random moment
+and started again, N times; after each kill every result that was finished has to be there,
+untouched, and in the end all of them have to be those of the batch that was never killed, byte for
+byte, but for what says when and how long: job.json (times and sizes), log.jsonl (seconds) and the
+table of times in report.html.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from caliv_graph.config import load_config
+from caliv_graph.errors import CalivError
+from caliv_graph.files import output_folder
+from caliv_graph.simulation import load_scenario, simulate_caliv
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENARIO = ROOT / "configs/scenarios/demo_arc.yaml"
+DRIVES = ROOT / "out/batch_drives"
+
+LEAST_RATIO = 1.8
+"""Issue 7, of two workers against one."""
+
+_TIMES_IN_REPORT = re.compile(rb"<h3>Time</h3>.*?</table>", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One batch.
+
+    Attributes:
+        workers: how many.
+        wall_s: from start to end.
+        cpu_s: processor time of all its processes.
+        load: of the machine, of the minute before.
+    """
+
+    workers: int
+    wall_s: float
+    cpu_s: float
+    load: float
+
+
+@dataclass(frozen=True)
+class Kills:
+    """Kills, and what became of the results.
+
+    Attributes:
+        kills: how often the batch was killed.
+        finished: results that were finished at each kill.
+        touched: finished results that a later run has made again, lost or changed.
+        different: files that are not those of the batch that was never killed.
+    """
+
+    kills: int
+    finished: tuple[int, ...]
+    touched: tuple[str, ...]
+    different: tuple[str, ...]
+
+
+def main() -> int:
+    arguments = parse_arguments()
+    try:
+        return benchmark(arguments)
+    except (CalivError, OSError) as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        return 130
+
+
+def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description="Runs batches with one and with more workers, and kills some.",
+        epilog="Exit codes: 0 fast enough and never different; 3 not; 2 it could not be tried.",
+    )
+    number = parser.add_argument
+    number("--drives", type=_count(1, 1000), default=16, help="default: 16")
+    number("--workers", type=_count(2, 64), default=2, help="against one (default: 2)")
+    number("--rounds", type=_count(0, 100), default=2, help="of each (default: 2); 0: no times")
+    number("--kills", type=_count(0, 1000), default=0, help="default: 0")
+    number("--seed", type=_count(0, 2**31), default=1, help="of the moments of the kills")
+    number("--folder", type=Path, help="for results (default: a temporary one, removed)")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    return parser.parse_args(given)
+
+
+def _count(least: int, most: int) -> Callable[[str], int]:
+    def integer(text: str) -> int:
+        value = int(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"must be {least} to {most}")
+        return value
+
+    return integer
+
+
+def benchmark(arguments: argparse.Namespace) -> int:
+    def tell(text: str) -> None:
+        if not arguments.json:
+            print(text, flush=True)
+
+    drives = make_drives(arguments.drives, tell)
+    with tempfile.TemporaryDirectory(prefix="caliv_batch_", dir=arguments.folder) as name:
+        folder = Path(name)
+        manifest = write_manifest(folder / "fleet.yaml", drives)
+        runs = []
+        for _ in range(arguments.rounds):
+            for workers in (1, arguments.workers):
+                runs.append(time_batch(manifest, folder / f"out_{workers}", workers))
+                tell(_text(runs[-1]))
+        kills = None
+        if arguments.kills:
+            whole = folder / f"out_{arguments.workers}"
+            if not runs:
+                time_batch(manifest, whole, arguments.workers)
+            kills = kill_often(manifest, whole, folder / "killed", arguments, tell)
+    ratio = ratio_of(runs, "wall_s", arguments.workers) if runs else None
+    good = (ratio is None or ratio >= LEAST_RATIO) and (
+        kills is None or not (kills.touched or kills.different)
+    )
+    if arguments.json:
+        document: dict[str, Any] = {
+            "drives": len(drives),
+            "runs": [asdict(run) for run in runs],
+            "ratio": ratio,
+            "kills": None if kills is None else asdict(kills),
+            "good": good,
+        }
+        print(json.dumps(document, indent=2))
+    else:
+        if ratio is not None:
+            cpu = ratio_of(runs, "cpu_s", arguments.workers)
+            print(
+                f"{len(drives)} drives: {arguments.workers} workers are {ratio:.2f} times as fast "
+                f"as one (wanted: {LEAST_RATIO:g}), for {1.0 / cpu:.2f} times the processor time"
+            )
+        if kills is not None:
+            print(
+                f"Killed {kills.kills} times, with {', '.join(map(str, kills.finished))} results "
+                f"finished: {len(kills.touched)} of these touched later, {len(kills.different)} "
+                "files different in the end"
+            )
+            for what in (*kills.touched, *kills.different):
+                print(f"  {what}")
+    return 0 if good else 3
+
+
+def make_drives(count: int, tell: Callable[[str], None]) -> list[Path]:
+    """Configs of the drives; those that are missing are simulated."""
+    scenario = load_scenario(SCENARIO)
+    configs = []
+    for seed in range(1, count + 1):
+        drive = DRIVES / f"drive_{seed:03d}"
+        if not (drive / "config.yaml").is_file():
+            tell(f"simulating drive {seed} of {count}")
+            # A drive that was simulated by half would be one for ever.
+            with output_folder(drive, ("config.yaml",)) as fresh:
+                simulate_caliv(scenario, fresh / "drive", seed, threads=1)
+                for file in (fresh / "drive").iterdir():
+                    file.rename(fresh / file.name)
+                (fresh / "drive").rmdir()
+        load_config(drive / "config.yaml")
+        configs.append(drive / "config.yaml")
+    return configs
+
+
+def write_manifest(path: Path, configs: Sequence[Path]) -> Path:
+    jobs = [
+        {"name": config.parent.name, "vehicle": "van", "config": str(config)} for config in configs
+    ]
+    path.write_text(yaml.safe_dump({"jobs": jobs}), encoding="utf-8")
+    return path
+
+
+def command(manifest: Path, out: Path, workers: int) -> list[str]:
+    return [
+        *(sys.executable, "-m", "caliv_graph", "batch", str(manifest)),
+        *("--out", str(out), "--workers", str(workers), "--json"),
+    ]
+
+
+def time_batch(manifest: Path, out: Path, workers: int) -> Run:
+    """Runs a batch from nothing."""
+    shutil.rmtree(out, ignore_errors=True)
+    load = os.getloadavg()[0]
+    used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    done = subprocess.run(
+        command(manifest, out, workers), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    wall_s = time.monotonic() - start
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise CalivError(f"batch ended with {done.returncode}: {done.stderr.strip()[:500]}")
+    cpu_s = after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime
+    return Run(workers, wall_s, cpu_s, load)
+
+
+def ratio_of(runs: Sequence[Run], what: str, workers: int) -> float:
+    """Best of one worker over best of several."""
+    best = {n: min(getattr(run, what) for run in runs if run.workers == n) for n in (1, workers)}
+    return float(best[1] / best[workers])
+
+
+def kill_often(
+    manifest: Path,
+    whole: Path,
+    out: Path,
+    arguments: argparse.Namespace,
+    tell: Callable[[str], None],
+) -> Kills:
+    """Kills a batch again and again, lets it end, and compares.
+
+    A batch that has ended before the wanted number of kills begins anew.
+    """
+    rng = random.Random(arguments.seed)
+    before: dict[str, str] = {}
+    counts: list[int] = []
+    touched: list[str] = []
+    different: set[str] = set()
+    # The moments are spread over about one job, from the first breath on.
+    longest_s = max(json.loads(text)["seconds"] for text in results(whole).values())
+    while len(counts) < arguments.kills:
+        process = subprocess.Popen(
+            command(manifest, out, arguments.workers),
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            process.wait(timeout=rng.uniform(0.0, 10.0 + 1.5 * longest_s))
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            counts.append(len(results(out)))
+            tell(f"kill {len(counts)} of {arguments.kills}: {counts[-1]} results are finished")
+        after = results(out)
+        touched += [f"{job}: not as it was" for job in before if after.get(job) != before[job]]
+        before = after
+        if process.returncode != -signal.SIGKILL:
+            different |= compare(whole, out)
+            shutil.rmtree(out)
+            before = {}
+    subprocess.run(
+        command(manifest, out, arguments.workers),
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+    after = results(out)
+    touched += [f"{job}: not as it was" for job in before if after.get(job) != before[job]]
+    different |= compare(whole, out)
+    return Kills(len(counts), tuple(counts), tuple(touched), tuple(sorted(different)))
+
+
+def results(out: Path) -> dict[str, str]:
+    """Per finished job its record, which says when it was made."""
+    found = {}
+    for file in sorted(out.glob("*/job.json")):
+        record = file.read_text(encoding="utf-8")
+        sizes = {name: (file.parent / name).stat().st_size for name in json.loads(record)["files"]}
+        if sizes != json.loads(record)["files"]:
+            raise CalivError(f"{file.parent}: is there, but not whole")
+        found[file.parent.name] = record
+    return found
+
+
+def compare(whole: Path, out: Path) -> set[str]:
+    """Files that differ, but for what says when it was, and how long it took."""
+    names = {
+        str(file.relative_to(folder)) for folder in (whole, out) for file in folder.glob("[!.]*/*")
+    }
+    different = set()
+    for name in sorted(names):
+        files = (whole / name, out / name)
+        if not all(file.is_file() for file in files):
+            different.add(f"{name}: is only in one of them")
+        elif len({_timeless(file) for file in files}) > 1:
+            different.add(f"{name}: differs")
+    return different
+
+
+def _timeless(file: Path) -> bytes:
+    content = file.read_bytes()
+    if file.name == "report.html":
+        return _TIMES_IN_REPORT.sub(b"", content)
+    if file.name == "log.jsonl":
+        lines = [json.loads(line) for line in content.splitlines()]
+        for line in lines:
+            line.pop("seconds", None)
+        return json.dumps(lines).encode()
+    if file.name == "job.json":
+        record = json.loads(content)
+        for key in ("written", "seconds", "files"):
+            record.pop(key)
+        return json.dumps(record).encode()
+    return content
+
+
+def _text(run: Run) -> str:
+    return (
+        f"{run.workers} worker{'s' if run.workers > 1 else ''}: {run.wall_s:.1f} s, "
+        f"{run.cpu_s:.1f} s of processor time (load before: {run.load:.1f})"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -24,6 +24,12 @@ from pydantic import (
 )
 
 from caliv_graph.errors import ConfigError
+from caliv_graph.inputs import read_input
+from caliv_graph.yaml_text import YamlProblemError, parse_yaml
+
+_MOST_BYTES = 200_000_000
+"""Of a YAML file. The poses of a drive of hours take a tenth of it, and a recording that is given
+by mistake is not read to its end."""
 
 
 def _finite(value: float) -> float:
@@ -43,6 +49,24 @@ RobustKernel = Literal["huber", "tls", "trimmed", "none"]
 Requirement = Literal["s2s", "s2v_rotation", "s2v"]
 
 LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
+
+
+_MOST_CHARACTERS = 100
+"""Of a LiDAR's name, which stands in the columns of tables."""
+
+
+def name_problem(name: str) -> str:
+    """What is wrong with a name for a LiDAR; empty: nothing.
+
+    Names go to tables, terminals and other programs' files, where a line end or an escape would do
+    what nobody asked for.
+    """
+    if name.strip() == name != "" and name.isprintable() and len(name) <= _MOST_CHARACTERS:
+        return ""
+    return (
+        f"{name[:40]!r} cannot be the name of a LiDAR: give it 1 to {_MOST_CHARACTERS} printable "
+        "characters, without blanks around them"
+    )
 
 
 class _Section(BaseModel):
@@ -324,6 +348,15 @@ class Config(_Section):
             limits = {**limits, **given}
         return {**raw, "require": names, "limits": limits}
 
+    @field_validator("lidars")
+    @classmethod
+    def _names_can_be_shown(cls, lidars: dict[str, LidarConfig]) -> dict[str, LidarConfig]:
+        for name in lidars:
+            problem = name_problem(name)
+            if problem:
+                raise ValueError(problem)
+        return lidars
+
     @field_validator("target", mode="before")
     @classmethod
     def _one_region_or_many(cls, raw: Any) -> Any:
@@ -401,12 +434,15 @@ def _one_line(error: ValidationError, root: type[BaseModel]) -> str:
     """The first thing wrong, as one line a person can act upon; a typo before what it hides."""
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    # Pydantic names the branches of a union too: they are no keys of the file.
+    # Pydantic names the branches of a union too: they are no keys of the file. An unknown key is
+    # one of the file, whatever it looks like.
+    unknown = first["loc"][-1:] if first["type"] == "extra_forbidden" else ()
     location = tuple(
         item
-        for item in first["loc"]
+        for item in first["loc"][: len(first["loc"]) - len(unknown)]
         if not (isinstance(item, str) and (item == "float" or "[" in item))
     )
+    location += unknown
     where = ".".join(str(item) for item in location)
     # What a typo leaves missing is no second error.
     alike = [e for e in errors if e["type"] == first["type"] or first["type"] != "extra_forbidden"]
@@ -425,33 +461,14 @@ def _one_line(error: ValidationError, root: type[BaseModel]) -> str:
     return f"'{where}': {message}{shown}{rest}"
 
 
-class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A safe loader to which a key that stands twice is an error, not the last one's victory."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        """Builds a dictionary."""
-        seen = set()
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            if isinstance(key_node, yaml.ScalarNode):
-                if key_node.value in seen:
-                    raise yaml.MarkedYAMLError(
-                        problem=f"key '{key_node.value}' stands twice",
-                        problem_mark=key_node.start_mark,
-                    )
-                seen.add(key_node.value)
-        return super().construct_mapping(node, deep=deep)
-
-
 def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
     """Reads a YAML file with the safe loader.
 
     Raises:
-        error: the file is missing, unreadable, or not YAML; names the line.
+        error: the file is missing, unreadable, too large, or not YAML; names the line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_input(path, _MOST_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -461,12 +478,10 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
     except OSError as e:
         raise error(f"{path}: {e.strerror}") from None
     try:
-        return yaml.load(text, Loader=_UniqueKeys)
-    except yaml.MarkedYAMLError as e:
-        line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
-        raise error(f"{path}: not valid YAML{line}: {e.problem}") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as e:
-        raise error(f"{path}: not valid YAML: {str(e).splitlines()[0]}") from None
+        return parse_yaml(text)
+    except YamlProblemError as e:
+        where = " " if str(e).startswith("in line ") else ": "
+        raise error(f"{path}: not valid YAML{where}{e}") from None
 
 
 def parse_config(raw: Any, source: str, base: Path) -> Config:

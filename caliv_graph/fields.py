@@ -16,6 +16,9 @@ from caliv_graph.products import Array
 _NORM_TOLERANCE = 1e-3
 """Of a quaternion, as in the readers: what rounding to three decimals does, and no more."""
 
+_MOST = 1e15
+"""Whole numbers up to here are exact as floats."""
+
 _SYMMETRY_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-6
 """Both of a matrix scaled to ones on its diagonal: well above what writing twelve digits, or six by
@@ -95,16 +98,26 @@ class Field:
                 pass
         self.fail(f"expected a number, got {shorten(self.value)}")
 
+    def finite(self) -> float:
+        """A number that is finite."""
+        value = self.number()
+        if not math.isfinite(value):
+            self.fail(f"expected a finite number, got {shorten(self.value)}")
+        return value
+
+    def count(self) -> int:
+        """A whole number, 0 or more."""
+        value = self.number()
+        if not (0.0 <= value <= _MOST and value == int(value)):
+            self.fail(f"expected a whole number, 0 or more, got {shorten(self.value)}")
+        return int(value)
+
     def vector(self, size: int) -> Array:
         """(size,) finite numbers."""
         items = self.items()
         if len(items) != size:
             self.fail(f"expected {size} numbers, got {len(items)}")
-        values = np.array([item.number() for item in items])
-        for item, value in zip(items, values, strict=True):
-            if not math.isfinite(value):
-                item.fail(f"expected a finite number, got {shorten(item.value)}")
-        return values
+        return np.array([item.finite() for item in items])
 
     def symmetric(self, size: int) -> Array:
         """A covariance or information matrix, (size, size): symmetric and positive semidefinite."""

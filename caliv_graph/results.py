@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 from scipy.linalg import block_diag
 
-from caliv_graph.config import Config, dump_config, read_yaml
+from caliv_graph.config import Config, dump_config, name_problem, read_yaml
 from caliv_graph.conventions import AXES
 from caliv_graph.fields import Field
 from caliv_graph.files import atomic_write
@@ -234,6 +234,8 @@ def read_calibration_file(path: Path) -> CalibrationFile:
     lidars = root.child("lidars").names()
     if not lidars:
         root.child("lidars").fail("holds no LiDAR")
+    for problem in filter(None, map(name_problem, lidars)):
+        root.child("lidars").fail(problem)
     order = root.child("joint").child("order")
     names = [str(item.value) for item in order.items()]
     if sorted(names) != sorted(lidars):
@@ -431,12 +433,12 @@ def _read_lidar(node: Field, has_data: bool) -> LidarResult:
         T_vehicle_lidar=node.child("T_vehicle_lidar").pose(),
         cov=node.child("covariance").symmetric(6),
         determined={axis: determined.child(axis).flag() for axis in AXES},
-        scans_used=int(node.get("scans_used", 0).number()),
+        scans_used=node.get("scans_used", 0).count(),
         # What a LiDAR saw is in the data's information, also where the file is not one of ours.
         saw_target=node.get("saw_target", has_data).flag(),
         time_offset=None
         if offset.value is None
-        else (offset.child("value").number(), offset.child("sigma").number()),
+        else (offset.child("value").finite(), offset.child("sigma").finite()),
         guess=_read_guess(node),
     )
 

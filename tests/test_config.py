@@ -135,6 +135,24 @@ def test_what_is_not_valid_is_named_with_its_place(sections: dict[str, Any], par
     assert part in error_of(**sections)
 
 
+@pytest.mark.parametrize("name", ["", " front", "a\nb", "\x1b[31mred", "\u2028", "x" * 101, "\t"])
+def test_a_name_that_no_table_could_show(name: str) -> None:
+    message = error_of(lidars={name: lidar()["front"]})
+
+    assert f"{name[:40]!r} cannot be the name of a LiDAR" in message
+    assert message.isprintable()
+
+
+@pytest.mark.parametrize("name", ["front", "Ouster OS-1", "../../x", "<b>", "vorn-rechts é", "1"])
+def test_names_that_are_only_odd(name: str) -> None:
+    assert list(parse(lidars={name: lidar()["front"]}).lidars) == [name]
+
+
+def test_an_unknown_key_with_brackets_is_named() -> None:
+    """It looks like one of pydantic's own, which are left out of the place."""
+    assert "unknown key 'lidars.front.xyz[0]'" in error_of(lidars=lidar(**{"xyz[0]": 1}))
+
+
 def test_several_errors_are_counted() -> None:
     assert error_of(solv={}, robst={}).endswith("(and 1 more)")
 

@@ -523,3 +523,24 @@ def test_a_guess_that_is_none(tmp_path: Path, old: str, new: str, complaint: str
 
     with pytest.raises(ConfigError, match=complaint):
         read_calibration(path)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1, 2.5, 1e300, "many", None])
+def test_scans_are_counted_in_whole_numbers(written: Path, value: Any) -> None:
+    edit(written, set_at("lidars", "front", "scans_used", value=value))
+
+    assert "lidars.front.scans_used: expected a" in error_of(written)
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf])
+def test_a_time_offset_is_finite(written: Path, value: float) -> None:
+    for part in ({"value": value, "sigma": 0.1}, {"value": 0.1, "sigma": value}):
+        edit(written, set_at("lidars", "front", "time_offset", value=part))
+
+        assert "expected a finite number" in error_of(written)
+
+
+def test_a_name_that_no_table_could_show(written: Path) -> None:
+    written.write_text(written.read_text().replace("front", '"a\\e[31m"'))
+
+    assert "cannot be the name of a LiDAR" in error_of(written)

@@ -20,8 +20,12 @@ _PLAIN_WIDTH = 120
 
 
 def one_line(text: str) -> str:
-    """A message as the one line that it has to be, whatever names are quoted in it."""
-    return " ".join(text.split())
+    """A message as the one line that it has to be, whatever names are quoted in it.
+
+    What a terminal would obey, such as the escapes of colours, is shown instead.
+    """
+    line = " ".join(text.split())
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def error(message: str) -> None:

@@ -12,8 +12,12 @@ import yaml
 from caliv_graph.errors import ExportError
 from caliv_graph.export.request import Base
 from caliv_graph.export.wording import number
+from caliv_graph.inputs import read_input
 
 _BOM = "\ufeff"
+
+_MOST_BYTES = 100_000_000
+"""Of a file that people edit by hand."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ def read_base(path: Path) -> Base:
     """
     try:
         # Not read_text: it would change the ends of lines.
-        return Base(path, path.read_bytes().decode("utf-8"))
+        return Base(path, read_input(path, _MOST_BYTES).decode("utf-8"))
     except FileNotFoundError:
         raise ExportError(f"{path}: no such file. Give --base an existing one, or none") from None
     except UnicodeDecodeError:

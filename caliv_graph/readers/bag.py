@@ -10,19 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from caliv_graph.config import read_yaml
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 _METADATA = "metadata.yaml"
+
+_LATEST_NS = 2**62
+"""Of a record time: the year 2116. The difference of two times up to here fits 64 bits."""
 
 _RECOVERY = {
     ".mcap": "Recover it with 'mcap recover', or record the drive again",
@@ -166,8 +169,9 @@ class Bag:
                     # Not around the yield: what the caller does wrong is not the bag's damage.
                     with self._errors_named(reader.path):
                         message = next(source, None)
-                    if message is None:
-                        break
+                        if message is None:
+                            break
+                        _check_time(message[1])
                     yield message[0].topic, message[1], message[2]
 
     def first_message(self, topic: str) -> bytes | None:
@@ -261,7 +265,8 @@ class Bag:
                 with self._errors_named(file):
                     reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
                     reader.open()
-                readers.opened.append(reader)
+                    readers.opened.append(reader)
+                    _check_index(reader)
         except BaseException:
             readers.close()
             raise
@@ -305,6 +310,26 @@ class _Readers:
                 self.opened.pop().close()
 
 
+def _check_index(reader: Reader1 | Reader2) -> None:
+    """Raises ValueError where a damaged file led `rosbags` to values that cannot be.
+
+    SQLite keeps a value of any type in a column of any other.
+    """
+    for connection in reader.connections:
+        names = (connection.topic, connection.msgtype)
+        if not all(isinstance(name, str) for name in names):
+            raise ValueError(f"a topic is {names[0]!r} of type {names[1]!r}")
+    if reader.message_count:
+        _check_time(reader.start_time)
+        _check_time(reader.end_time)
+
+
+def _check_time(record_ns: Any) -> None:
+    """Raises ValueError if a record time is none, or so late that differences overflow."""
+    if not isinstance(record_ns, int) or not 0 <= record_ns < _LATEST_NS:
+        raise ValueError(f"a message was recorded at {str(record_ns)[:40]} ns")
+
+
 def _has_all_fields(store: Typestore, standard: Typestore) -> bool:
     """Whether types that go by the name of a standard one have its fields: code relies on them."""
     return all(
@@ -328,6 +353,8 @@ def _find_files(path: Path) -> list[Path]:
             )
         if path.is_dir():
             return _find_files_in(path)
+        if not path.is_file():
+            raise RecordingError(f"{path}: is a pipe or a device. Give a bag on a disk")
     except OSError as e:
         raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
     if path.suffix not in BAG_SUFFIXES:
@@ -345,7 +372,9 @@ def _find_files_in(folder: Path) -> list[Path]:
     if metadata.is_file():
         return _listed_files(metadata)
     # A recorder that died leaves no metadata, but the files are there; so is a split ROS 1 bag.
-    files = sorted(entry for entry in folder.iterdir() if entry.suffix in BAG_SUFFIXES)
+    files = sorted(
+        entry for entry in folder.iterdir() if entry.suffix in BAG_SUFFIXES and entry.is_file()
+    )
     if not files:
         caliv = (folder / "input").is_dir() or (folder / "ego_poses.yaml").is_file()
         hint = "For a CaLiV folder set data.format: caliv" if caliv else "Give the folder of a bag"
@@ -360,10 +389,10 @@ def _find_files_in(folder: Path) -> list[Path]:
 
 def _listed_files(metadata: Path) -> list[Path]:
     try:
-        information = yaml.safe_load(metadata.read_text(encoding="utf-8"))
-        information = information["rosbag2_bagfile_information"]
+        information = read_yaml(metadata, RecordingError)["rosbag2_bagfile_information"]
         names = [Path(name).name for name in information["relative_file_paths"]]
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+        packed = information.get("compression_mode", "").lower() in ("file", "message")
+    except (RecordingError, LookupError, TypeError, AttributeError):
         raise RecordingError(
             f"{metadata}: is not the description of a ROS 2 bag. Make it anew with "
             "'ros2 bag reindex', or give the .mcap or .db3 itself"
@@ -374,7 +403,7 @@ def _listed_files(metadata: Path) -> list[Path]:
             f"{metadata}: names the file '{', '.join(missing) or 'none'}', which is not there. "
             "Copy the bag completely, or make the description anew with 'ros2 bag reindex'"
         )
-    if information.get("compression_mode", "").lower() in ("file", "message"):
+    if packed:
         return [metadata.parent]  # `rosbags` unpacks what is packed as a whole
     # One by one: opened as a folder, topics whose QoS the description tells otherwise than the
     # file come out empty.

@@ -13,11 +13,15 @@ import gtsam
 import numpy as np
 
 from caliv_graph.errors import ConfigError
+from caliv_graph.inputs import read_input
 
 VEHICLE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle")
 """Names of the vehicle frame, the usual one first (REP-105)."""
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_MOST_BYTES = 100_000_000
+"""Of a URDF, which names meshes but holds none."""
 
 _NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision and a few digits of text are off by less."""
@@ -125,7 +129,7 @@ def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
         ConfigError: the file is missing, not a URDF, or a xacro that was not expanded.
     """
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = read_input(path, _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file. Give --urdf the vehicle's URDF") from None
     except UnicodeDecodeError:

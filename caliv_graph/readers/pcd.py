@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from caliv_graph.errors import RecordingError
+from caliv_graph.inputs import read_input
 from caliv_graph.products import Array
 
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
@@ -110,7 +111,7 @@ def read_pcd(path: Path) -> Array:
         RecordingError: the file is missing, empty, cut off or damaged, or has no x, y, z.
     """
     try:
-        data = path.read_bytes()
+        data = read_input(path)
     except OSError as e:
         raise RecordingError(f"{path}: cannot be read: {e.strerror}") from None
     try:

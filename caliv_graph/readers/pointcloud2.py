@@ -111,9 +111,11 @@ def decode_pointcloud2(
         raise UnusableCloudsError(
             f"x, y, z as float32 or float64 are needed, its fields are {shown}"
         )
-    points = np.empty((message.height * message.width, 3))
-    for column, axis in enumerate("xyz"):
-        points[:, column] = _column(message, fields[axis])
+    # Before room is made for the points: a damaged size can be any.
+    columns = [_column(message, fields[axis]) for axis in "xyz"]
+    points = np.empty((len(columns[0]), 3))
+    for axis_number, values in enumerate(columns):
+        points[:, axis_number] = values
     kept = is_return(points, min_range, max_range)
     times = [
         (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name])[kept])

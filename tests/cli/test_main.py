@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from caliv_graph import __version__
+from caliv_graph.cli import streams
 from tests.cli.commands import ROOT, run, start, write_config, write_drive
 
 SUCCEEDS = """
@@ -251,3 +252,11 @@ def test_a_full_disk_behind_stdout_is_one_line(config: Path) -> None:
 
     assert result.returncode == 2
     assert result.stderr == "error: standard output: cannot be written: No space left on device\n"
+
+
+def test_a_message_shows_what_a_terminal_would_obey(capsys: pytest.CaptureFixture[str]) -> None:
+    streams.error("/tmp/x\x1b[31m: a\r\nb\x07\u202e\ufeff é \ud800\x85c")
+
+    assert capsys.readouterr().err == (
+        "error: /tmp/x\\x1b[31m: a b\\x07\\u202e\\ufeff é \\ud800 c\n"
+    )

@@ -267,3 +267,27 @@ def test_a_standard_type_with_a_damaged_definition(tmp_path: Path) -> None:
 
     (raw,) = (raw for _, _, raw in bag.messages(["/points"]))
     assert bag.decode("/points", raw).point_step == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("UPDATE topics SET name = x'00'", "a topic is b'"),
+        ("UPDATE topics SET type = x'ff00'", "of type b'"),
+        ("UPDATE messages SET timestamp = 'noon'", "'str'"),
+        ("UPDATE messages SET timestamp = 9223372036854775807", "recorded at 9223372036854775807"),
+        ("UPDATE messages SET timestamp = -1", "was recorded at -1"),
+        ("UPDATE messages SET timestamp = 1.5", "was recorded at 1.5"),
+    ],
+)
+def test_values_that_no_bag_can_have(tmp_path: Path, change: str, said: str) -> None:
+    """SQLite keeps a value of any type in a column of any other."""
+    path = file_of(write_bag(tmp_path / "drive", messages(4), "sqlite3"))
+    with sqlite3.connect(path) as database:
+        database.execute(change)
+    database.close()
+
+    with pytest.raises(RecordingError, match="damaged") as caught:
+        list(Bag(path).messages(["/imu"]))
+
+    assert said in str(caught.value)

@@ -237,3 +237,11 @@ def test_livox_zero_returns_and_damage() -> None:
     for part in (raw[:10], raw[:40], raw[:-10], raw + bytes(40)):
         with pytest.raises(DamagedMessageError):
             decode_livox(part, False, STAMP, 0.0, FAR)
+
+
+def test_a_damaged_size_makes_no_room_for_its_points() -> None:
+    """2^32 by 2^32 points: more memory than there is, and more than 64 bits of it."""
+    for width, height in ((2**32 - 1, 2**32 - 1), (2**31, 1), (1, 2**31)):
+        message = cloud(STAMP, POINTS) | {"width": width, "height": height, "row_step": 2**32 - 1}
+        with pytest.raises(DamagedMessageError):
+            decode(message)

@@ -1,0 +1,36 @@
+"""Files that somebody gives us: read whole, of a size that fits, and never waited for."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+MOST_BYTES = 4 * 1024**3
+"""Of a file that is read whole. No cloud is so large; a recording given by mistake may be."""
+
+
+def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
+    """Reads a file whole.
+
+    A pipe without a writer would be waited for without end, a device read without end.
+
+    Args:
+        path: the file.
+        most_bytes: a larger one is refused.
+
+    Raises:
+        OSError: it is missing, a folder, a pipe or a device, too large or unreadable; `strerror`
+            says so in a few words.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "is a pipe or a device, expected a file", str(path))
+    if status.st_size > most_bytes:
+        size, most = status.st_size / 1e6, most_bytes / 1e6
+        message = f"has {size:.0f} MB, expected at most {most:.0f} MB. Is it the right file?"
+        raise OSError(errno.EFBIG, message, os.fspath(path))
+    return path.read_bytes()

@@ -38,6 +38,9 @@ _NORM_TOLERANCE = 1e-3
 """Of a quaternion. Numbers rounded to three decimals are off by no more; beyond it they are no
 rotation that was rounded, but something else."""
 
+_MOST_M = 1e8
+"""No map is wider: the earth is 12,742 km wide."""
+
 _AGREEMENT_M = 1e-4
 _AGREEMENT_RAD = 1e-5
 """How far the sensors' poses of one frame may differ: above what rounding to six decimals does to
@@ -229,6 +232,11 @@ def _parse_pose(values: Any, where: str) -> gtsam.Pose3:
         raise RecordingError(
             f"{where}: {_shorten(values)} has a value that is not finite. Remove the entry and "
             "its cloud, or mend the pose"
+        )
+    if np.abs(pose[:3]).max() > _MOST_M:
+        raise RecordingError(
+            f"{where}: {_shorten(values)} is farther than {_MOST_M:g} m from the origin. Mend the "
+            "pose"
         )
     x, y, z, qx, qy, qz, qw = pose
     norm = math.hypot(qx, qy, qz, qw)

@@ -23,6 +23,9 @@ TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _MOST_BYTES = 100_000_000
 """Of a URDF, which names meshes but holds none."""
 
+_MOST_M = 1e8
+"""No frame is farther from another: the earth is 12,742 km wide."""
+
 _NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision and a few digits of text are off by less."""
 
@@ -117,7 +120,7 @@ def pose_from_ros(translation: Any, rotation: Any) -> gtsam.Pose3 | None:
     q = np.array([rotation.w, rotation.x, rotation.y, rotation.z], dtype=np.float64)
     t = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     norm = float(np.linalg.norm(q))
-    if not np.isfinite(t).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
+    if not (np.abs(t) <= _MOST_M).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
         return None
     return gtsam.Pose3(gtsam.Rot3.Quaternion(*(q / norm)), t)
 

@@ -61,6 +61,14 @@ that is not m/s^2 does more."""
 _FAST_RAD_S = 6.0
 """No road vehicle turns as fast for a twentieth of a drive; in degrees per second it seems to."""
 
+_MOST_RAD_S = 200.0
+_MOST_M_S2 = 2000.0
+_MOST_M_S = 1000.0
+_MOST_ALTITUDE_M = 1e5
+_MOST_M = 1e8
+"""Beyond what any sensor on a vehicle measures, and any map is wide: a value that is not a
+measurement. Its square may be more than a float holds."""
+
 _FIXED_AXES = ("map", "odom", "world", "earth", "enu", "utm")
 """Frames whose axes do not turn with the vehicle: a velocity stated in them is not in its axes."""
 
@@ -194,10 +202,12 @@ class ImuCollector:
         stamps, rows, added = self._rows.ordered()
         stated, which = self._stated.distinct()
         kept = self._losses.keep(np.isfinite(rows[:, :6]).all(axis=1), "with NaN or infinity")
-        if not kept.any():
+        stamps, rows, added = stamps[kept], rows[kept], added[kept]
+        possible = _below(rows[:, :3], _MOST_RAD_S) & _below(rows[:, 3:6], _MOST_M_S2)
+        kept = self._losses.keep(possible, f"beyond {_MOST_RAD_S:g} rad/s or {_MOST_M_S2:g} m/s^2")
+        stamps, rows, added = stamps[kept], rows[kept], added[kept]
+        if not len(stamps):
             return None
-        if not kept.all():
-            stamps, rows, added = stamps[kept], rows[kept], added[kept]
         which = which[added]
         orientation, cov = self._orientation(rows[:, 6:10].copy(), stated[:, :9], which)
         return ImuSamples(
@@ -276,6 +286,10 @@ class GnssCollector:
                 "at latitude and longitude 0 or out of their range",
                 lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
             ),
+            (
+                f"beyond {_MOST_ALTITUDE_M:g} m of altitude",
+                lambda r: _below(r[:, 2:3], _MOST_ALTITUDE_M),
+            ),
         )
         for why, test in reasons:
             kept = self._losses.keep(test(rows), why)
@@ -326,6 +340,8 @@ class TwistCollector:
         self._losses = _Losses()
         stamps, rows = self._rows.sorted()
         kept = self._losses.keep(np.isfinite(rows[:, :3]).all(axis=1), "with NaN or infinity")
+        stamps, rows = stamps[kept], rows[kept]
+        kept = self._losses.keep(_below(rows[:, :3], _MOST_M_S), f"beyond {_MOST_M_S:g} m/s")
         for frame in sorted(self._frames):
             if frame.strip("/").lower() in _FIXED_AXES:
                 self._losses.say(
@@ -367,6 +383,7 @@ class PoseCollector:
         stamps, rows = self._rows.sorted()
         reasons: tuple[_Reason, ...] = (
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :7]).all(1)),
+            (f"beyond {_MOST_M:g} m from the origin", lambda r: _below(r[:, :3], _MOST_M)),
             (
                 "whose orientation is no unit quaternion",
                 lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
@@ -539,6 +556,11 @@ def _common(kinds: Array, which: IntArray) -> Array | None:
     cov = kinds[which[:1]] if (which == which[0]).all() else kinds[which]
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     return np.asarray(np.median(known, axis=0)) if len(known) else None
+
+
+def _below(vectors: Array, most: float) -> npt.NDArray[np.bool_]:
+    """(n,) of (n, k): whether all values are within plus and minus a limit."""
+    return np.asarray((np.abs(vectors) <= most).all(axis=1))
 
 
 def _poses(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:

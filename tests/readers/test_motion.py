@@ -310,3 +310,18 @@ def test_transforms_without_the_vehicle() -> None:
 
     assert collector.finish() is None
     assert "none of the frames base_link, base_footprint" in collector.notes()[0]
+
+
+def test_what_no_sensor_measures_is_left_out() -> None:
+    """Finite, but its square is not: it would spoil every sum that it enters."""
+    samples = fed(ImuCollector(), imu(START, rate=(0, 1e300, 0)), imu(START + 1)).finish()
+    assert samples.stamps_ns.tolist() == [START + 1]
+    samples = fed(ImuCollector(), imu(START, force=(0, 0, -1e200)), imu(START + 1)).finish()
+    assert samples.stamps_ns.tolist() == [START + 1]
+    speeds = fed(TwistCollector(), twist(START, (1e300, 0, 0)), twist(START + 1, (2, 0, 0)))
+    assert speeds.finish().velocity.tolist() == [[2, 0, 0]]
+    assert speeds.notes() == ["of 2 messages not used: 1 beyond 1000 m/s"]
+    fixes = fed(GnssCollector(), fix(START, altitude=1e300), fix(START + 1))
+    assert fixes.finish().stamps_ns.tolist() == [START + 1]
+    poses = fed(PoseCollector(), odometry(START, (0, -1e9, 0)), odometry(START + 1, (1, 2, 3)))
+    assert poses.finish().stamps_ns.tolist() == [START + 1]

@@ -32,16 +32,44 @@ _MOST_BYTES = 200_000_000
 by mistake is not read to its end."""
 
 
+_LEAST, _MOST = 1e-12, 1e12
+"""Of any quantity of the config in its unit, far beyond all that is meant: squares and their
+inverses stay numbers."""
+
+_MOST_OF_A_VEHICLE_M = 100.0
+
+_LEAST_SIGMA = 1e-6
+"""Of a guess, metres or degrees: GTSAM takes much less for a constraint."""
+
+
 def _finite(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError("must be a finite number")
+    if abs(value) > _MOST:
+        raise ValueError(f"must be within +-{_MOST:g}")
     return value
 
 
+def _not_tiny(value: float) -> float:
+    if 0.0 < value < _LEAST:
+        raise ValueError(f"must be at least {_LEAST:g}")
+    return value
+
+
+def _on_a_vehicle(xyz: tuple[float, float, float]) -> tuple[float, float, float]:
+    if max(map(abs, xyz)) > _MOST_OF_A_VEHICLE_M:
+        raise ValueError(
+            f"must be within {_MOST_OF_A_VEHICLE_M:g} m of the vehicle frame: in metres, not "
+            "millimetres"
+        )
+    return xyz
+
+
 Finite = Annotated[float, AfterValidator(_finite)]
-Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite)]
+Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0.0), AfterValidator(_finite)]
 Triple = tuple[Finite, Finite, Finite]
+Place = Annotated[Triple, AfterValidator(_on_a_vehicle)]
 PositiveTriple = tuple[Positive, Positive, Positive]
 
 SolveMode = Literal["auto", "staged", "joint"]
@@ -76,7 +104,7 @@ class _Section(BaseModel):
 class Mounting(_Section):
     """A pose as people measure it: `T_parent_child`."""
 
-    xyz: Triple = Field(description="metres, in the parent frame")
+    xyz: Place = Field(description="metres, in the parent frame")
     rpy_deg: Triple = Field(
         (0.0, 0.0, 0.0), description="roll, pitch, yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll)"
     )
@@ -89,6 +117,15 @@ class MountingSigma(_Section):
     rpy_deg: Positive | PositiveTriple = Field(
         1.73, description="degrees; 1.73 is a uniform +-3 degrees"
     )
+
+    @field_validator("xyz", "rpy_deg")
+    @classmethod
+    def _not_a_certainty(cls, sigma: Any) -> Any:
+        if min(sigma if isinstance(sigma, tuple) else (sigma,)) < _LEAST_SIGMA:
+            raise ValueError(
+                f"must be at least {_LEAST_SIGMA:g}. To trust the guess, set 'fixed: true'"
+            )
+        return sigma
 
     def xyz_m(self) -> tuple[float, float, float]:
         """Sigma of x, y, z in metres."""
@@ -185,7 +222,7 @@ class ImuConfig(_Section):
 class GnssConfig(_Section):
     """Mounting of the GNSS antenna."""
 
-    lever_arm: Triple = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
+    lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
 
 
 class NoiseConfig(_Section):

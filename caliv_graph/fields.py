@@ -19,6 +19,12 @@ _NORM_TOLERANCE = 1e-3
 _MOST = 1e15
 """Whole numbers up to here are exact as floats."""
 
+_MOST_M = 1e8
+"""No frame is farther from another: the earth is 12,742 km wide."""
+
+_MOST_OF_A_MATRIX = 1e60
+"""Of a covariance or an information: what is done with them stays far below what a float holds."""
+
 _SYMMETRY_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-6
 """Both of a matrix scaled to ones on its diagonal: well above what writing twelve digits, or six by
@@ -125,6 +131,9 @@ class Field:
         if len(rows) != size:
             self.fail(f"expected {size} rows of {size} numbers, got {len(rows)} rows")
         matrix = np.array([row.vector(size) for row in rows])
+        if np.abs(matrix).max() > _MOST_OF_A_MATRIX:
+            i, j = divmod(int(np.abs(matrix).argmax()), size)
+            self.fail(f"has {matrix[i, j]:g} in row {i + 1}, column {j + 1}, which nothing can be")
         diagonal = np.diag(matrix)
         if np.any(diagonal < 0.0):
             i = int(np.argmin(diagonal))
@@ -152,6 +161,8 @@ class Field:
     def pose(self) -> gtsam.Pose3:
         """A pose of `translation` and `quaternion_xyzw`."""
         translation = self.child("translation").vector(3)
+        if np.abs(translation).max() > _MOST_M:
+            self.child("translation").fail(f"is farther than {_MOST_M:g} m: {translation.tolist()}")
         node = self.child("quaternion_xyzw")
         xyzw = node.vector(4)
         norm = float(np.linalg.norm(xyzw))

@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 
 from caliv_graph.config import Config, dump_config, name_problem, read_yaml
 from caliv_graph.conventions import AXES
-from caliv_graph.fields import Field
+from caliv_graph.fields import Field, shorten
 from caliv_graph.files import atomic_write
 from caliv_graph.fusion.archive import calibration_graph, write_archive
 from caliv_graph.geometry.covariance import parent_axes_covariance
@@ -230,7 +230,7 @@ def read_calibration_file(path: Path) -> CalibrationFile:
     root = Field(read_yaml(path), str(path))
     schema = root.child("schema")
     if schema.value != SCHEMA:
-        schema.fail(f"{schema.value!r} is not known; this version reads {SCHEMA!r}")
+        schema.fail(f"{shorten(schema.value)} is not known; this version reads {SCHEMA!r}")
     lidars = root.child("lidars").names()
     if not lidars:
         root.child("lidars").fail("holds no LiDAR")

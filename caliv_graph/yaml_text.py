@@ -21,6 +21,9 @@ written out: poses that two sensors share are an alias to some writers."""
 MOST_DIGITS = 400
 """Of a whole number. Python itself refuses to write one of more than 4300."""
 
+_MOST_CHARACTERS = 200
+"""Of what the parser says, which quotes tags and keys whole."""
+
 
 class YamlProblemError(Exception):
     """What is wrong with a text, with its line where that is known: `in line 3: ...`."""
@@ -69,12 +72,15 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as e:
         line = f"in line {e.problem_mark.line + 1}: " if e.problem_mark else ""
-        raise YamlProblemError(f"{line}{e.problem or e.context or 'cannot be read'}") from None
+        problem = e.problem or e.context or "cannot be read"
+        raise YamlProblemError(f"{line}{problem[:_MOST_CHARACTERS]}") from None
     except yaml.YAMLError as e:
-        raise YamlProblemError((str(e).splitlines() or ["cannot be read"])[0]) from None
+        said = (str(e).splitlines() or ["cannot be read"])[0]
+        raise YamlProblemError(said[:_MOST_CHARACTERS]) from None
     except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as e:
         # The loader takes a tag at its word: !!int of nothing, !!timestamp of no time.
-        raise YamlProblemError(f"a value is not what it seems to be ({e})") from None
+        said = str(e)[:_MOST_CHARACTERS]
+        raise YamlProblemError(f"a value is not what it seems to be ({said})") from None
 
 
 def _check_size(text: str) -> None:

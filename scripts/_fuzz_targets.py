@@ -274,7 +274,7 @@ def _base(folder: Path) -> Callable[[bytes], None]:
         text = made.content.decode("utf-8")
         # What was one document of its kind has to stay one.
         if consumer in ("autoware", "lio-sam", "fast-lio", "mola"):
-            assert isinstance(yaml.safe_load(text), dict)
+            assert isinstance(yaml.compose(text), yaml.MappingNode)
         if consumer == "urdf":
             ET.fromstring(text)
 

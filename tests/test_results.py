@@ -544,3 +544,25 @@ def test_a_name_that_no_table_could_show(written: Path) -> None:
     written.write_text(written.read_text().replace("front", '"a\\e[31m"'))
 
     assert "cannot be the name of a LiDAR" in error_of(written)
+
+
+def test_numbers_whose_square_no_float_holds(written: Path) -> None:
+    """Two of them beside each other made the check of symmetry compare NaN."""
+    for at, value in (((0, 0), 1e308), ((0, 1), 1.7e308)):
+        for row, column in {at, at[::-1]}:
+            keys = ("lidars", "front", "covariance", row, column)
+            edit(written, set_at(*keys, value=value))
+
+        assert "lidars.front.covariance: has 1" in error_of(written)
+
+
+def test_a_lidar_beyond_the_earth(written: Path) -> None:
+    edit(written, set_at("lidars", "rear", "T_vehicle_lidar", "translation", 1, value=-1e200))
+
+    assert "translation: is farther than 1e+08 m" in error_of(written)
+
+
+def test_a_long_schema_is_not_repeated_whole(written: Path) -> None:
+    edit(written, set_at("schema", value="9" * 100_000))
+
+    assert len(error_of(written)) < 500

@@ -48,6 +48,7 @@ def bomb(levels: int) -> str:
         ("a: 1\na: 2\n", "'a' stands twice"),
         ("a: 1\n---\nb: 2\n", "another document"),
         ("a: *b", "undefined alias"),
+        (f"a: !{'x' * 5000} b", "could not determine a constructor"),
         ('a: "\\ud800"', "invalid Unicode"),
         ("a\x00b", "control characters"),
     ],

@@ -185,6 +185,12 @@ class YamlFile:
     def _replace(self, node: yaml.Node, text: str) -> None:
         # The end of a plain scalar may lie behind the blanks that follow it.
         start, stop = node.start_mark.index, node.end_mark.index
+        if start == stop:
+            # Where nothing stands, the mark may be anywhere up to the next key.
+            raise ExportError(
+                f"{self._base.path}: a value is missing in or above line "
+                f"{node.start_mark.line + 1}. Write one there, such as 0.0"
+            )
         piece = self._base.text[start:stop]
         self._edits.append(Edit(start, start + len(piece.rstrip()), text))
 

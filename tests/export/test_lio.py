@@ -227,6 +227,10 @@ def test_glim_onto_a_base_without_comments() -> None:
     assert glim.export(request(base=base(made.content.decode()))).content == made.content
 
 
+NO_VALUE = "lio_sam:\n  extrinsicTrans: # [0, 0, 0]\n  extrinsicRot: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
+"""What took the place of nothing stood before the next key."""
+
+
 @pytest.mark.parametrize(
     ("consumer", "text", "message"),
     [
@@ -240,6 +244,7 @@ def test_glim_onto_a_base_without_comments() -> None:
             "old: 'extrinsicRot' stands in lines 6, 12",
         ),
         (fast_lio, VELODYNE.replace("    - 0\n", "", 1), "mapping.extrinsic_R in line 6: expected"),
+        (lio_sam, NO_VALUE, "old: a value is missing in or above line 3. Write one there"),
     ],
 )
 def test_what_is_wrong_with_a_base(consumer: Any, text: str, message: str) -> None:

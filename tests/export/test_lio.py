@@ -244,7 +244,7 @@ NO_VALUE = "lio_sam:\n  extrinsicTrans: # [0, 0, 0]\n  extrinsicRot: [1, 0, 0, 0
             "old: 'extrinsicRot' stands in lines 6, 12",
         ),
         (fast_lio, VELODYNE.replace("    - 0\n", "", 1), "mapping.extrinsic_R in line 6: expected"),
-        (lio_sam, NO_VALUE, "old: a value is missing in or above line 3. Write one there"),
+        (lio_sam, NO_VALUE, "old: a value is missing in or above line 2. Write one there"),
     ],
 )
 def test_what_is_wrong_with_a_base(consumer: Any, text: str, message: str) -> None:

@@ -28,7 +28,7 @@ def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
         OutputError: it exists and `force` is not set, or it cannot be written.
     """
     check_output_file(path, force)
-    target = path.resolve()
+    target = _resolved(path)
     with _errors_named(path), _new_parents(target):
         scratch = _beside(target)
         try:
@@ -48,7 +48,7 @@ def check_output_file(path: Path, force: bool = False) -> None:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     with _errors_named(path):
-        target = path.resolve()
+        target = _resolved(path)
         if target.is_dir():
             raise OutputError(f"{path}: is a folder. Give --out the name of a file")
         if target.exists() and not force:
@@ -77,7 +77,7 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
         OutputError: `path` exists and is not to be replaced, or something cannot be written.
     """
     check_output_folder(path, content, force)
-    target = path.resolve()
+    target = _resolved(path)
     with _errors_named(path), _new_parents(target):
         scratch = _beside(target)
         fresh, old = scratch / "new", scratch / "old"
@@ -107,7 +107,7 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
         OutputError: `path` exists and is not to be replaced, or cannot be written.
     """
     with _errors_named(path):
-        target = path.resolve()
+        target = _resolved(path)
         _check_parent_writable(path, target)
         if not target.exists():
             return
@@ -155,6 +155,15 @@ def _belongs(entry: Path, folder: Path, content: Sequence[str]) -> bool:
     return False
 
 
+def _resolved(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except RuntimeError:  # of links that lead to each other
+        raise OutputError(
+            f"{path}: cannot be written: links in a circle. Give another --out"
+        ) from None
+
+
 def _swap(fresh: Path, target: Path, old: Path) -> None:
     """Puts `fresh` in the place of `target`, which goes to `old` unless it is empty."""
     # A folder can be renamed onto an empty one, but not onto one with content.
@@ -175,15 +184,18 @@ def _beside(target: Path) -> Path:
 
 
 def _check_parent_writable(path: Path, target: Path) -> None:
-    parent = _nearest_folder(target)
+    parent = next(folder for folder in target.parents if os.path.lexists(folder))
+    if not parent.is_dir():
+        raise OutputError(f"{path}: cannot be written: {parent} is no folder. Give another --out")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(
             f"{path}: cannot be written: no permission to write in {parent}. Give another --out"
         )
-
-
-def _nearest_folder(target: Path) -> Path:
-    return next(folder for folder in target.parents if folder.is_dir())
+    # Not all file systems tell by permissions that they take nothing.
+    probe = _beside(parent / target.name)
+    probe.mkdir()
+    with _uninterrupted():
+        probe.rmdir()
 
 
 @contextmanager

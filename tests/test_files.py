@@ -11,7 +11,12 @@ from typing import Any
 import pytest
 
 from caliv_graph.errors import OutputError
-from caliv_graph.files import atomic_write, check_output_folder, output_folder
+from caliv_graph.files import (
+    atomic_write,
+    check_output_file,
+    check_output_folder,
+    output_folder,
+)
 
 CONTENT = ("calibration.yaml", "target_[0-9]*.ply", "log.jsonl")
 
@@ -295,3 +300,18 @@ def test_an_interrupt_does_not_split_the_swap(
     assert names(tmp_path) == ["result"]
     assert (result / "calibration.yaml").read_text() == "new"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_links_in_a_circle_and_files_on_the_way(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").write_text("mine")
+
+    for check in (check_output_file, lambda path: check_output_folder(path, CONTENT)):
+        with pytest.raises(OutputError, match="links in a circle"):
+            check(tmp_path / "loop" / "result")
+        with pytest.raises(OutputError, match="file is no folder"):
+            check(tmp_path / "file" / "a" / "result")
+        with pytest.raises(OutputError, match=r"^/proc/result: cannot be written"):
+            check(Path("/proc/result"))
+        check(tmp_path / "new" / "result")
+    assert names(tmp_path) == ["file", "loop"]

@@ -6,6 +6,7 @@ answer at once.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import traceback
@@ -131,6 +132,9 @@ def run(arguments: Sequence[str]) -> int:
 
 def _explain(problem: BaseException) -> int:
     """Says what went wrong, and with which exit code to leave."""
+    if isinstance(problem, typer.Abort) and isinstance(problem.__context__, EOFError):
+        # Typer takes it for the end of what a person types; here nobody is asked anything.
+        problem = problem.__context__
     if isinstance(problem, KeyboardInterrupt | typer.Abort):
         return INTERRUPTED
     if isinstance(problem, CalivError):
@@ -159,4 +163,10 @@ def _usage_message(problem: Any) -> str:
 
 def main() -> None:
     """Entry point of `caliv-graph`."""
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    if code == INTERRUPTED:
+        # Python remembers an interrupt that native code came across, and would end by the signal.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

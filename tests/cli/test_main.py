@@ -260,3 +260,14 @@ def test_a_message_shows_what_a_terminal_would_obey(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == (
         "error: /tmp/x\\x1b[31m: a b\\x07\\u202e\\ufeff é \\ud800 c\n"
     )
+
+
+def test_the_end_of_a_file_is_no_interrupt(config: Path) -> None:
+    """Typer takes an EOFError for the end of what a person types."""
+    pipeline = "def calibrate(*_): raise EOFError('marshal data too short')"
+
+    result = run("calibrate", config, "--out", config.parent / "out", pipeline=pipeline)
+
+    assert result.returncode == 1
+    assert "this is a defect of caliv-graph" in result.stderr
+    assert "EOFError: marshal data too short" in result.stderr

@@ -34,12 +34,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one thread for bo
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
 
-from caliv_graph._open3d import import_open3d  # noqa: E402
-from caliv_graph.config import Config, dump_config, load_config  # noqa: E402
-from caliv_graph.errors import CalivError, ConfigError  # noqa: E402
-from caliv_graph.progress import PlainProgress, Progress, SilentProgress  # noqa: E402
-from scripts import _child, benchmark_bag, benchmark_paper  # noqa: E402
-from scripts import benchmark_released as released  # noqa: E402
+from caliv_graph._open3d import import_open3d
+from caliv_graph.config import Config, dump_config, load_config
+from caliv_graph.errors import CalivError, ConfigError
+from caliv_graph.progress import PlainProgress, Progress, SilentProgress
+from scripts import _child, benchmark_bag, benchmark_paper
+from scripts import benchmark_released as released
 
 BAGS = ("demo_arc", "figure_eight")
 QUICK_BAGS = ("demo_arc",)

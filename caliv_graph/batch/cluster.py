@@ -9,12 +9,16 @@ import asyncio
 import logging
 import multiprocessing
 import re
+import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from caliv_graph.batch.worker import probe
@@ -28,6 +32,9 @@ _START_S = 120.0
 
 _END_S = 0.5
 """Seconds that a worker gets to end by itself. What it is at is of no more use."""
+
+_KILL_S = 10.0
+"""Seconds that Dask gets to end its workers, before they are killed over its head."""
 
 _LOGGERS = (
     *("distributed", "distributed.client", "distributed.gc", "distributed.nanny", "asyncio"),
@@ -99,16 +106,17 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
         # A client waits for the wrong kind of server without end, and its clean-up does so too.
         with suppress(Exception):
             asyncio.run(asyncio.wait_for(_identify(address), CONNECT_S))
-            client = distributed.Client(
-                address, timeout=CONNECT_S, set_as_default=False, name="caliv-graph"
-            )
+            with _interrupts_later():
+                client = distributed.Client(
+                    address, timeout=CONNECT_S, set_as_default=False, name="caliv-graph"
+                )
+                stack.callback(_close, client)
         if client is None:
             raise BatchError(
                 f"--scheduler {address}: something is there, but does not answer within "
                 f"{CONNECT_S:g} s as a Dask scheduler would. Look at the address, and whether "
                 "its version is this environment's"
             )
-        stack.callback(_close, client)
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
         except Exception:
@@ -152,22 +160,24 @@ def start(count: int, scratch: Path) -> Iterator[Workers]:
     with _heard_quietly() as deaths, dask.config.set(settings), ExitStack() as stack:
         stack.callback(_kill_children, before)
         try:
-            cluster = distributed.LocalCluster(
-                n_workers=0,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                worker_dashboard_address=None,
-                local_directory=str(scratch),
-                preload=["caliv_graph.batch.worker"],
-                memory_limit=_share_of_memory(count),
-                silence_logs=logging.CRITICAL,
-            )
-            stack.callback(_end, cluster)
+            with _interrupts_later():
+                cluster = distributed.LocalCluster(
+                    n_workers=0,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address=None,
+                    worker_dashboard_address=None,
+                    local_directory=str(scratch),
+                    preload=["caliv_graph.batch.worker"],
+                    memory_limit=_share_of_memory(count),
+                    silence_logs=logging.CRITICAL,
+                )
+                stack.callback(_end, cluster)
+                client = distributed.Client(cluster, set_as_default=False)
+                stack.callback(_close, client)
+            cluster.sync(_shield_children)
             cluster.scale(count)
-            client = distributed.Client(cluster, set_as_default=False)
-            stack.callback(_close, client)
             client.wait_for_workers(1, timeout=_START_S)
         except Exception as e:
             raise BatchError(
@@ -261,6 +271,39 @@ def _share_of_memory(count: int) -> int:
     return memory // count
 
 
+async def _shield_children() -> None:
+    """Has processes that are started from Dask's thread never hear of an interrupt.
+
+    A terminal sends it to all of them, and each would have something to say; the batch hears it in
+    its main thread, and ends them. The mask of a thread goes to what it starts.
+    """
+    # Python starts this with its first process, and takes the mask off the thread that does.
+    resource_tracker.ensure_running()
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Lets Dask's objects be made before an interrupt counts: those made by half never end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def remember(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+
+    before = {n: signal.signal(n, remember) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+    for number in came[:1]:
+        # Whoever asked to be told of it is told now.
+        signal.raise_signal(number)
+
+
 class _Listener(logging.Handler):
     """Hears how workers ended, and keeps what Dask says of itself off the terminal."""
 
@@ -299,12 +342,12 @@ def _end(cluster: Any) -> None:
     async def end() -> None:
         nannies = list(cluster.workers.values())
         closing = (nanny.close(timeout=_END_S, reason="the batch ends") for nanny in nannies)
-        await asyncio.gather(*closing, return_exceptions=True)
+        await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), _KILL_S)
 
     with suppress(Exception):
         cluster.sync(end)
     with suppress(Exception):
-        cluster.close(timeout=10)
+        cluster.close(timeout=_KILL_S)
 
 
 def _close(client: Any) -> None:

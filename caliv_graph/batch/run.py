@@ -126,6 +126,7 @@ class _Batch:
         self.rows = {job.name: Row(job.name, job.vehicle) for job in jobs}
         self.todo: dict[str, Task] = {}
         self._jobs = jobs
+        self._files: dict[str, set[str]] = {}
         self._force = force
         self._manifest = manifest
         self._last_write = -1e9
@@ -168,7 +169,6 @@ class _Batch:
     def _prepare(self, job: Job, config: Config) -> None:
         self.folder.check_place(job.name, self._force)
         record = None if self._force else self.folder.record(job.name)
-        known = DigestCache()
         try:
             inputs = job_inputs(config, job.data, job.prior, self.folder.path)
             if inputs is not None:
@@ -176,9 +176,7 @@ class _Batch:
                     digest = job_digest(config, inputs, self.folder.cache)
                     if digest == record.digest and self._take(job.name, record, reused=True):
                         return
-                entries = self.folder.cache.entries
-                wanted = {str(path) for path in inputs.files} & entries.keys()
-                known = DigestCache({path: entries[path] for path in wanted})
+                self._files[job.name] = {str(path) for path in inputs.files}
         except OSError:
             pass  # what is not there, the job itself will say
         self.todo[job.name] = Task(
@@ -188,7 +186,7 @@ class _Batch:
             data=job.data,
             prior=job.prior,
             recorded=None if record is None else record.digest,
-            cache=known.dump(),
+            cache="",
             out=self.folder.path,
             work=self.folder.work,
             version=caliv_graph.__version__,
@@ -215,7 +213,12 @@ class _Batch:
                 while workers.connected and queue and len(flying) < count:
                     name, submissions = queue.popleft()
                     key = f"{name}-{self.folder.work.name}-{submissions}"
-                    future = workers.client.submit(run_task, self.todo[name], key=key, pure=False)
+                    try:
+                        task = self._task(name)
+                        future = workers.client.submit(run_task, task, key=key, pure=False)
+                    except OSError:  # the scheduler went away a moment ago
+                        queue.append((name, submissions))
+                        break
                     flying[name] = _Flight(future, submissions + 1)
                 time.sleep(_POLL_S)
                 for name in [name for name, flight in flying.items() if flight.future.done()]:
@@ -226,6 +229,13 @@ class _Batch:
                     else:
                         queue.append((name, flight.submissions))
                 advance(0, self._note(flying))
+
+    def _task(self, name: str) -> Task:
+        """A job with what is known by now of its files: others may have read them."""
+        entries = self.folder.cache.entries
+        known = self._files.get(name, set()) & entries.keys()
+        cache = DigestCache({path: entries[path] for path in known})
+        return replace(self.todo[name], cache=cache.dump())
 
     def _land(self, name: str, flight: _Flight, workers: cluster.Workers) -> bool:
         """Takes what became of a job; False if it has to be done again."""

@@ -10,7 +10,6 @@ import ctypes
 import functools
 import json
 import os
-import signal
 import socket
 import threading
 import time
@@ -287,9 +286,6 @@ def probe(token: str, version: str) -> str:
 def dask_setup(worker: Any) -> None:
     """Prepares a worker of our own cluster (Dask calls this where the module is a preload).
 
-    An interrupt is for the batch, which ends its workers itself; and what native code prints is no
-    part of the batch's own output.
+    What native code prints is no part of the batch's own output.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
     os.dup2(2, 1)

@@ -24,7 +24,7 @@ STATE = 15
 
 POSE = 6
 
-FACTORS_AT_A_TIME = 1000
+FACTORS_AT_A_TIME = 100
 """Of a graph, while it becomes a chain."""
 
 

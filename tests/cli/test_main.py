@@ -15,6 +15,16 @@ from caliv_graph import __version__
 from caliv_graph.cli import streams
 from tests.cli.commands import ROOT, run, start, write_config, write_drive
 
+HEAVY = {
+    *("gtsam", "open3d", "numpy", "scipy", "yaml", "rosbags", "plotly", "jinja2"),
+    *("pandas", "matplotlib", "dask", "caliv_graph.config"),
+}
+"""What no help needs: each takes a twentieth of a second and more. (So does pydantic, but typer has
+a use for it.)"""
+
+LATE = {"open3d", "plotly", "jinja2", "rosbags", "pandas", "matplotlib", "scipy.stats"}
+"""What a calibration from a folder needs late, for its report, or not at all."""
+
 SUCCEEDS = """
 def calibrate(recordings, config, progress, prior):
     with progress.stage("solving", 2) as advance:
@@ -80,10 +90,30 @@ def test_help_names_only_what_there_is() -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
+        "import contextlib, io, sys\n"
+        "from caliv_graph.cli.main import app, run\n"
+        "commands = [c.name or c.callback.__name__ for c in app.registered_commands]\n"
+        "for arguments in ([], *([command] for command in commands)):\n"
+        "    with contextlib.redirect_stdout(io.StringIO()):\n"
+        "        code = run([*arguments, '--help'])\n"
+        f"    heavy = {HEAVY!r} & sys.modules.keys()\n"
+        "    if code or heavy:\n"
+        "        sys.exit(f'{arguments}: exit code {code}, imported {heavy}')\n"
+        "sys.exit(0 if len(commands) > 10 else f'only {commands}')\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_calibrating_a_folder_imports_only_what_it_uses() -> None:
+    code = (
         "import sys\n"
-        "from caliv_graph.cli.main import run\n"
-        "run(['calibrate', '--help'])\n"
-        "heavy = {'gtsam', 'open3d', 'numpy', 'scipy', 'caliv_graph.config'} & set(sys.modules)\n"
+        "import caliv_graph.pipeline, caliv_graph.readers, caliv_graph.results\n"
+        "import caliv_graph.report.log, caliv_graph.report.tables\n"
+        f"heavy = {LATE!r} & sys.modules.keys()\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)\n"
     )
     result = subprocess.run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -81,3 +82,61 @@ def test_what_nothing_determines_is_an_error() -> None:
 
     with pytest.raises(TrajectoryError, match="do not determine"):
         chain.covariances()
+
+
+def linear_graph(states: int, seed: int = 5) -> gtsam.GaussianFactorGraph:
+    """Random factors on states of three variables each, on neighbours, and with a common one."""
+    rng = np.random.default_rng(seed)
+    graph = gtsam.GaussianFactorGraph()
+    unit = gtsam.noiseModel.Unit.Create(4)
+
+    def add(*keys: int) -> None:
+        parts = [(key, rng.standard_normal((4, DIMS[key % 10]))) for key in keys]
+        terms = [term for part in parts for term in part]
+        graph.add(gtsam.JacobianFactor(*terms, rng.standard_normal(4), unit))
+
+    for i in range(states):
+        add(10 * i, 10 * i + 1)
+        add(10 * i + 1, 10 * i + 2)
+        add(10 * i, COMMON)
+        if i:
+            add(10 * i - 10, 10 * i)
+            add(10 * i - 8, 10 * i + 1)
+    return graph
+
+
+DIMS = {0: 6, 1: 3, 2: 6, 9: 1}
+COMMON = 1009
+STATES = 7
+KEYS = [(10 * i, 10 * i + 1, 10 * i + 2) for i in range(STATES)]
+
+
+@pytest.mark.parametrize("at_a_time", [1, 4, 1000])
+def test_a_graph_becomes_a_chain_in_parts(at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("caliv_graph.trajectory.chain.FACTORS_AT_A_TIME", at_a_time)
+    graph = linear_graph(STATES)
+    ordering = gtsam.Ordering()
+    for key in [key for keys in KEYS for key in keys] + [COMMON]:
+        ordering.push_back(key)
+    H, _ = graph.hessian(ordering)
+
+    chain = Chain.from_graph(graph, KEYS, (6, 3, 6), [COMMON])
+
+    dense = np.zeros_like(H)
+    for i in range(STATES):
+        at, after = slice(STATE * i, STATE * i + STATE), slice(STATE * i + STATE, STATE * (i + 2))
+        dense[at, at] = chain.diagonal[i]
+        if i + 1 < STATES:
+            dense[at, after], dense[after, at] = chain.coupling[i], chain.coupling[i].T
+        dense[at, -1:] = chain.border[i]
+        dense[-1:, at] = chain.border[i].T
+    dense[-1:, -1:] = chain.corner
+    np.testing.assert_allclose(dense, H, atol=1e-12)
+
+
+def test_a_graph_that_is_no_chain_is_refused() -> None:
+    graph = linear_graph(STATES)
+    unit = gtsam.noiseModel.Unit.Create(4)
+    graph.add(gtsam.JacobianFactor(0, np.ones((4, 6)), 20, np.ones((4, 6)), np.zeros(4), unit))
+    with pytest.raises(ValueError, match="not neighbours"):
+        Chain.from_graph(graph, KEYS, (6, 3, 6), [COMMON])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,3 +109,24 @@ def test_fixes_that_are_none_are_an_error() -> None:
 )
 def test_gravity_of_the_ellipsoid(latitude_deg: float, altitude_m: float, expected: float) -> None:
     assert normal_gravity(latitude_deg, altitude_m) == pytest.approx(expected, abs=1e-5)
+
+
+def test_one_statement_for_all_messages_is_as_good_as_many() -> None:
+    good, zero = np.diag([1e-6, 2e-6, 3e-6]), np.zeros((3, 3))
+    bare = ImuSamples(AT, np.zeros((N, 3)), np.zeros((N, 3)))
+    for one, expected in ((good, "messages"), (zero, "the paper's table")):
+        many = np.tile(one, (N, 1, 1))
+        same = np.broadcast_to(one, (N, 3, 3))  # what the reader of bags makes of it
+        out_many, source_many = orientation_covariances(replace(bare, orientation_cov=many), CONFIG)
+        out_same, source_same = orientation_covariances(replace(bare, orientation_cov=same), CONFIG)
+        assert source_same == source_many == expected
+        np.testing.assert_array_equal(out_same, out_many)
+
+
+def test_gnss_figures_of_the_config_leave_the_messages_alone() -> None:
+    stated_cov = np.broadcast_to(np.diag([0.04, 0.04, 0.09]), (N, 3, 3))
+    fixes = GnssFixes(AT, np.zeros(N), np.zeros(N), np.zeros(N), stated_cov)
+    out, _ = gnss_covariances(fixes, config_for(Sensors(), noise={"gnss_vertical_m": 3.0}))
+    assert out[:, 2, 2].tolist() == [9.0] * N
+    assert out[:, 0, 0].tolist() == [0.04] * N
+    assert stated_cov[0, 2, 2] == 0.09

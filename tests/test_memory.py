@@ -1,0 +1,75 @@
+"""Memory does not grow with the bag: a drive four times as long, each in a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from caliv_graph.progress import SilentProgress
+from scripts import benchmark_bag
+
+ROOT = Path(__file__).resolve().parents[1]
+
+MOST_MB = 30.0
+"""That three more minutes may take: samples of the IMU, and a pose every tenth of a second for the
+first two minutes, every half a second from then on. Their clouds are 175 MB as they stand in the
+bag."""
+
+# All that depends on the length of a drive: first pass, trajectory, clouds, ground.
+_STAGES = """
+import json, sys
+from pathlib import Path
+from caliv_graph.config import load_config
+from caliv_graph.progress import SilentProgress
+from caliv_graph.readers import open_recording
+from caliv_graph.readers.sampled import SampledRecording
+from caliv_graph.targets import extract_targets
+from caliv_graph.targets.ground_planes import measure_grounds
+from caliv_graph.trajectory.select import smooth_trajectories
+
+config = load_config(Path(sys.argv[1]))
+recordings = [SampledRecording(open_recording(config))]
+motions = {0: recordings[0].motion()}
+trajectories = smooth_trajectories(recordings, config, [[]], motions)
+observations = extract_targets(recordings, trajectories, config, SilentProgress())
+grounds, _ = measure_grounds(recordings, trajectories, observations, config, SilentProgress())
+status = dict(line.split(":") for line in open("/proc/self/status") if ":" in line)
+print(json.dumps({
+    "peak_mb": int(status["VmHWM"].split()[0]) / 1024,
+    "clouds": sum(len(o.clouds) for o in observations), "grounds": len(grounds),
+}))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads Linux's /proc")
+def test_a_drive_of_four_times_the_length_takes_hardly_more_memory(tmp_path: Path) -> None:
+    found = []
+    for minutes in (1.0, 4.0):
+        folder = tmp_path / f"{minutes:g}"
+        folder.mkdir()
+        asked = argparse.Namespace(minutes=minutes, lidars=1, points=6000, zstd=False, search=False)
+        recording = benchmark_bag.LapsRecording(benchmark_bag.scenario_of(asked), 1, 1)
+        size_mb = benchmark_bag.write_laps(recording, folder, SilentProgress())
+        config = folder / "config.yaml"
+        # A cloud this sparse has few points on a chair.
+        few = "extraction: {min_points: 12}\n"
+        config.write_text(config.read_text(encoding="utf-8") + few, encoding="utf-8")
+        done = subprocess.run(
+            [sys.executable, "-c", _STAGES, str(config)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        found.append((size_mb, json.loads(done.stdout)))
+
+    (short_mb, short), (long_mb, long) = found
+    assert long_mb - short_mb > 160.0
+    assert min(short["clouds"], short["grounds"]) > 20
+    assert min(long["clouds"], long["grounds"]) > 20
+    assert long["peak_mb"] - short["peak_mb"] < MOST_MB

@@ -1,0 +1,53 @@
+"""Measurements carried to nodes: the same however many are carried at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from caliv_graph.products import ImuSamples
+from caliv_graph.trajectory.imu import DeadReckoning
+from caliv_graph.trajectory.measurements import NodeOrientations, orientations_at_nodes
+from caliv_graph.trajectory.noise import imu_noise
+from tests.trajectory.motions import START_NS, Sensors, config_for
+
+SAMPLES = 400
+
+
+def carried(nodes_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> NodeOrientations:
+    """Orientations of a turning IMU, of which some are missing, at nodes."""
+    rng = np.random.default_rng(3)
+    stamps = START_NS + 10_000_000 * np.arange(SAMPLES, dtype=np.int64)
+    rate = np.array([0.02, -0.03, 0.2])
+    turns = Rotation.from_rotvec(rate * (stamps - START_NS)[:, None] * 1e-9)
+    noisy = turns * Rotation.from_rotvec(1e-3 * rng.standard_normal((SAMPLES, 3)))
+    q = noisy.as_quat()
+    q[rng.random(SAMPLES) < 0.1] = np.nan
+    rates = np.tile(rate, (SAMPLES, 1))
+    imu = ImuSamples(stamps, rates, np.tile([0.0, 0.0, 9.81], (SAMPLES, 1)), q)
+    cov = np.broadcast_to(1e-6 * np.eye(3), (SAMPLES, 3, 3))
+    dead = DeadReckoning(stamps, rates, imu.specific_force)
+    found = orientations_at_nodes(imu, cov, nodes_ns, dead, imu_noise(imu, config_for(Sensors())))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("at_a_time", [1, 7, 64])
+def test_orientations_in_parts_are_those_of_the_whole(
+    at_a_time: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes = START_NS + np.array([0, 3, 90, 1000, 1010, 2500, 3900], np.int64) * 1_000_000
+    whole = carried(nodes)
+
+    monkeypatch.setattr("caliv_graph.trajectory.measurements.SAMPLES_AT_A_TIME", at_a_time)
+    parts = carried(nodes)
+
+    assert len(whole.nodes) >= 5
+    # To the last bit: what is carried together must not show in a result.
+    np.testing.assert_array_equal(parts.nodes, whole.nodes)
+    np.testing.assert_array_equal(parts.R_map_imu, whole.R_map_imu)
+    np.testing.assert_array_equal(parts.cov, whole.cov)
+    # And they are orientations: the turn from the first node to the last.
+    turn = Rotation.from_matrix(whole.R_map_imu[0].T @ whole.R_map_imu[-1]).as_rotvec()
+    assert turn[2] == pytest.approx(0.2 * 3.9, abs=2e-3)

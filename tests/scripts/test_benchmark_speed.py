@@ -1,0 +1,138 @@
+"""The speed and memory benchmarks' arithmetic and verdicts, on runs made up here."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from caliv_graph.errors import CalivError
+from scripts import _child, check_memory
+from scripts import benchmark_speed as benchmark
+from scripts._child import Usage
+from tests.cli.commands import write_config, write_drive
+
+ROOT = Path(__file__).resolve().parents[2]
+
+STAGES: Mapping[str, tuple[float, float]] = {
+    "reading clouds": (1.5, 1.4),
+    "registering the clouds": (1.0, 1.2),
+}
+
+USAGE = Usage(code=0, wall_s=6.0, cpu_s=7.0, start_up_cpu_s=0.9, peak_mb=300.0, stages=STAGES)
+
+SECONDS = {"total": 60.0, "cpu": 60.0, "registration": 50.0, "optimisation": 10.0}
+
+GOOD = benchmark.Found(
+    cases=(benchmark.Case("authors' drive", 136, {2: USAGE, 1: replace(USAGE, wall_s=7.2)}),),
+    growths=(
+        benchmark.Growth(
+            "clouds of the authors' drive",
+            (34, 68, 136),
+            (replace(USAGE, cpu_s=2.5), replace(USAGE, cpu_s=4.0), USAGE),
+        ),
+        benchmark.Growth("points", (1, 2, 4), (USAGE, USAGE, replace(USAGE, cpu_s=14.0))),
+    ),
+    more_components=1.6,
+    baselines=(
+        benchmark.Baseline("authors' drive", SECONDS, {k: v / 8.0 for k, v in SECONDS.items()}),
+    ),
+    helps_s={"caliv-graph": 0.2, "init": 0.3},
+)
+
+
+def missed(found: benchmark.Found) -> list[str]:
+    return [verdict.what for verdict in benchmark.verdicts(found) if not verdict.kept]
+
+
+def with_usage(**changes: object) -> benchmark.Found:
+    usage = replace(USAGE, **changes)  # type: ignore[arg-type]
+    return replace(GOOD, cases=(benchmark.Case("authors' drive", 136, {2: usage, 1: usage}),))
+
+
+def test_every_limit_can_be_missed() -> None:
+    assert missed(GOOD) == []
+    assert missed(with_usage(wall_s=8.1)) == ["136 clouds, 2 cores, wall"]
+    slow_reading = {"reading clouds": (2.0, 2.0), "reading the ground": (1.1, 1.0)}
+    assert missed(with_usage(stages=slow_reading)) == ["of which reading"]
+    quarter, half, whole = GOOD.growths[0].usages
+    dear = replace(GOOD.growths[0], usages=(quarter, half, replace(whole, cpu_s=8.9)))
+    assert missed(replace(GOOD, growths=(dear,))) == ["twice the clouds, CPU"]
+    assert missed(replace(GOOD, more_components=2.1)) == ["1000 components against 300, CPU"]
+    slow_help = replace(GOOD, helps_s={"caliv-graph": 0.2, "init": 0.5})
+    assert missed(slow_help) == ["--help, slowest (init)"]
+
+
+def test_the_text_has_stages_rest_ratios_and_limits() -> None:
+    text = benchmark.text(GOOD, benchmark.verdicts(GOOD))
+
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "reading clouds 1.50 1.40 1.50 1.40" in lines
+    # What no stage has: 6.0 - 2.5 of wall, 7.0 - 2.6 of CPU; on one core 7.2 - 2.5.
+    assert "first pass over a bag, tests, report, files 3.50 4.40 4.70 4.40" in lines
+    assert any(line.startswith("reading and cutting out: 25 percent") for line in lines)
+    assert any("34: 2.5 s, 300 MB (1.00x); 68: 4.0 s, 300 MB (1.60x)" in line for line in lines)
+    assert any(line.endswith("optimisation alone 10.00 1.25 8.00") for line in lines)
+    assert any(line.endswith("s, at most 8: kept") for line in lines)
+    arguments = argparse.Namespace(seed=1, quick=True)
+    json.dumps(benchmark.document(arguments, GOOD, benchmark.verdicts(GOOD)), allow_nan=False)
+
+
+def test_the_middle_run_is_the_median() -> None:
+    runs = [replace(USAGE, cpu_s=cpu_s) for cpu_s in (9.0, 5.0, 7.0)]
+    assert _child.middle(runs).cpu_s == 7.0
+    assert _child.middle(runs[:2]).cpu_s == 5.0
+
+
+def test_part_of_a_folder_is_every_second_cloud_of_each_sensor(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "drive", frames=12)
+
+    part = benchmark.part_of(drive, 2, tmp_path)
+
+    for sensor in ("sensor_1", "sensor_2"):
+        names = {path.name for path in (part / "input" / sensor).iterdir()}
+        assert names == {f"{k}.pcd" for k in range(0, 12, 2)}  # by number: 10 is after 8
+    config = write_config(tmp_path / "config.yaml", data={"format": "caliv", "path": str(part)})
+    assert benchmark.cloud_count(config) == 12
+
+
+def test_a_child_is_measured_and_its_complaint_is_told(tmp_path: Path) -> None:
+    code, usage = _child.run(["--version"], 1)
+    assert code == 0
+    assert 0.0 < usage["cpu_s"] < 5.0
+    assert usage["start_up_cpu_s"] > 0.1  # imports are no part of the work
+    assert 50.0 < usage["peak_mb"] < 2000.0
+
+    with pytest.raises(CalivError, match="no such file"):
+        _child.calibrate(tmp_path / "absent.yaml", tmp_path / "result", 1)
+
+
+def test_growth_of_memory_is_per_minute_and_can_exceed_its_limit() -> None:
+    lengths = [
+        check_memory.Length(minutes, 230.0 * minutes, replace(USAGE, peak_mb=peak_mb))
+        for minutes, peak_mb in ((1, 270.0), (4, 300.0), (16, 345.0))
+    ]
+
+    assert check_memory.growth(lengths) == pytest.approx(5.0)
+    assert check_memory.growth(lengths[:1]) == 0.0
+    assert "5.00 MB per minute of drive (at most 6: kept)" in check_memory.text(lengths, 6.0)
+    assert "MISSED" in check_memory.text(lengths, 4.0)
+    assert check_memory.document(lengths, 4.0)["kept"] is False
+
+
+@pytest.mark.parametrize("script", ["benchmark_speed.py", "check_memory.py"])
+def test_scripts_run_from_anywhere(script: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / script), "--help"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "--json" in done.stdout

@@ -97,7 +97,7 @@ def test_covariances_that_change_go_with_their_messages() -> None:
 
 
 def test_covariances_that_never_change_take_no_memory() -> None:
-    stated = {"orientation_covariance": np.diag([1e-6, 2e-6, 3e-6]).ravel()}
+    stated: dict[str, Any] = {"orientation_covariance": np.diag([1e-6, 2e-6, 3e-6]).ravel()}
     message = as_object(imu(START, **stated))
     collector = ImuCollector()
     tracemalloc.start()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -281,6 +282,36 @@ def test_a_damaged_cloud_is_left_out_and_told(tmp_path: Path) -> None:
     (line,) = recording.warnings()
     assert "1 clouds of LiDAR 'front' are damaged and not used" in line
     assert "has 7 bytes of data, expected 480" in line
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_clouds_and_warnings_do_not_depend_on_the_number_of_cores(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = drive()
+    broken = [message for topic, _, message in messages if topic == FRONT][7]
+    broken["data"] = np.zeros(7, np.uint8)
+    path = write_bag(tmp_path / "drive", messages, kind)
+    found = []
+    for cores in (1, 2):
+        monkeypatch.setattr("caliv_graph.readers.ahead.cores", partial(int, cores))
+        whole, half = opened(path), opened(path)
+        scans = list(whole.scans("front"))
+        # Who stops before the damaged cloud has not seen it, whatever was decoded ahead.
+        early = [scan for scan, _ in zip(half.scans("front"), range(6), strict=False)]
+        found.append((scans, whole.warnings(), half.warnings(), len(early)))
+
+    (scans, told, told_early, _), (scans_2, told_2, told_early_2, _) = found
+    assert [s.stamp_ns for s in scans] == [s.stamp_ns for s in scans_2]
+    for one, other in zip(scans, scans_2, strict=True):
+        np.testing.assert_array_equal(one.points_lidar, other.points_lidar)
+        assert one.point_times_s is not None
+        assert other.point_times_s is not None
+        np.testing.assert_array_equal(one.point_times_s, other.point_times_s)
+    assert told == told_2
+    assert any("damaged" in line for line in told)
+    assert told_early == told_early_2
+    assert not any("damaged" in line for line in told_early)
 
 
 def test_clouds_without_coordinates(tmp_path: Path) -> None:

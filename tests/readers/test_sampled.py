@@ -43,7 +43,7 @@ def test_one_point_of_each_cell_is_kept_the_first() -> None:
         [-RANGE_M, 0.0, 0.0],
         [0.0, 0.0, -RANGE_M],
     ]  # outermost cells
-    times = np.arange(len(points)) * 1e-6
+    times = 1e-6 * np.arange(len(points), dtype=np.float64)
     first: dict[tuple[int, ...], int] = {}
     for i, point in enumerate(points):
         if np.linalg.norm(point) <= RANGE_M:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
@@ -89,11 +91,12 @@ def linear_graph(states: int, seed: int = 5) -> gtsam.GaussianFactorGraph:
     rng = np.random.default_rng(seed)
     graph = gtsam.GaussianFactorGraph()
     unit = gtsam.noiseModel.Unit.Create(4)
+    make: Any = gtsam.JacobianFactor
 
     def add(*keys: int) -> None:
         parts = [(key, rng.standard_normal((4, DIMS[key % 10]))) for key in keys]
         terms = [term for part in parts for term in part]
-        graph.add(gtsam.JacobianFactor(*terms, rng.standard_normal(4), unit))
+        graph.add(make(*terms, rng.standard_normal(4), unit))
 
     for i in range(states):
         add(10 * i, 10 * i + 1)

@@ -12,6 +12,7 @@ from caliv_graph.config import LidarConfig, Mounting, TopicsConfig, parse_config
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan
 from caliv_graph.readers import open_recording
+from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.rosbag import RosbagRecording
 from tests.readers.bags import (
     KINDS,
@@ -130,13 +131,15 @@ def test_livox_of_both_drivers(tmp_path: Path, package: str, kind: str) -> None:
 def test_only_what_is_wanted_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = opened(write_bag(tmp_path / "drive", drive(60)))
     decoded: list[int] = []
-    plain = RosbagRecording._scan
+    plain = RosbagRecording._decoded
 
-    def counted(self: RosbagRecording, name: str, stamp_ns: int, raw: bytes) -> LidarScan | None:
-        decoded.append(stamp_ns)
-        return plain(self, name, stamp_ns, raw)
+    def counted(
+        self: RosbagRecording, found: tuple[str, int, bytes]
+    ) -> tuple[int, DecodedCloud | str]:
+        decoded.append(found[1])
+        return plain(self, found)
 
-    monkeypatch.setattr(RosbagRecording, "_scan", counted)
+    monkeypatch.setattr(RosbagRecording, "_decoded", counted)
     assert len(recording.scan_stamps_ns("front")) == 60
     assert decoded == []
     wanted = {stamp_of(k) for k in (3, 4, 30, 59)} | {12345}

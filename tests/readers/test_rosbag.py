@@ -10,7 +10,6 @@ import pytest
 
 from caliv_graph.config import LidarConfig, Mounting, TopicsConfig, parse_config
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import LidarScan
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.rosbag import RosbagRecording

@@ -30,7 +30,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.progress import Progress
 from caliv_graph.targets.ground import fit_ground, height_above
-from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 BoolArray = npt.NDArray[np.bool_]
@@ -476,15 +476,16 @@ class GroundMeter:
         part = replace(
             scan, stamp_ns=at_ns, points_lidar=scan.points_lidar[near], point_times_s=times_s
         )
-        points = deskew(part, guess, self._trajectory).points_lidar
+        turned = [guess.retract(d) for d in MOUNTING_STEP_RAD * np.eye(3, 6)]
+        by_guess = deskewed(part, [guess, *turned], self._trajectory)
+        points = next(by_guess)
         plane, reason = _measure(points, up_lidar, self._sigma_range_m)
         if plane is None:
             self._without[scan.lidar][reason] += 1
             return None
         by_mounting = None
         if times_s.any():
-            turned = [guess.retract(d) for d in MOUNTING_STEP_RAD * np.eye(3, 6)]
-            moved = [deskew(part, T, self._trajectory).points_lidar - points for T in turned]
+            moved = [of_turned - points for of_turned in by_guess]
             by_mounting = (
                 _response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
                 / MOUNTING_STEP_RAD

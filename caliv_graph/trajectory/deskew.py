@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import gtsam
@@ -37,8 +38,23 @@ def deskew(
     Raises:
         TrajectoryError: the stamp is outside the trajectory's span, or the times are no times.
     """
+    (points,) = deskewed(scan, [T_vehicle_lidar], trajectory)
+    return replace(scan, points_lidar=points, point_times_s=None)
+
+
+def deskewed(
+    scan: LidarScan, T_vehicle_lidar: Iterable[gtsam.Pose3], trajectory: VehicleTrajectory
+) -> Iterator[Array]:
+    """Points (N, 3) of a scan moved as `deskew` does, for each of several mountings.
+
+    The vehicle's motion, which takes as long as all the rest, is asked for once.
+
+    Raises:
+        TrajectoryError: as `deskew`, when the first is asked for.
+    """
     if scan.point_times_s is None or not len(scan.points_lidar):
-        return replace(scan, point_times_s=None)
+        yield from (scan.points_lidar for _ in T_vehicle_lidar)
+        return
     if not np.isfinite(scan.point_times_s).all() or np.abs(scan.point_times_s).max() > 1.0:
         raise TrajectoryError(
             f"{scan.source}: per-point times from {scan.point_times_s.min():g} s to "
@@ -48,7 +64,8 @@ def deskew(
     offsets_ns: IntArray = np.round(1e9 * scan.point_times_s).astype(np.int64)
     first, last = int(offsets_ns.min()), int(offsets_ns.max())
     if last == first == 0:
-        return replace(scan, point_times_s=None)
+        yield from (scan.points_lidar for _ in T_vehicle_lidar)
+        return
     count = max((last - first) // KNOT_NS + 1, 1)
     knots = first + (last - first) * np.arange(count + 1) // count
     begin, end = trajectory.span_ns
@@ -59,17 +76,14 @@ def deskew(
         )
     at = np.clip(scan.stamp_ns + np.append(knots, 0), begin, end)
     R, t = trajectory.poses_at(at)
-    R_mount, t_mount = stack([T_vehicle_lidar])
-    R_lidar = R @ R_mount[0]
-    t_lidar = t + R @ t_mount[0]
-    back = R_lidar[-1].T
-    R_knots = back @ R_lidar[:-1]
-    t_knots = (t_lidar[:-1] - t_lidar[-1]) @ back.T
-    return replace(
-        scan,
-        points_lidar=_moved(scan.points_lidar, offsets_ns, knots, R_knots, t_knots),
-        point_times_s=None,
-    )
+    for mounting in T_vehicle_lidar:
+        R_mount, t_mount = stack([mounting])
+        R_lidar = R @ R_mount[0]
+        t_lidar = t + R @ t_mount[0]
+        back = R_lidar[-1].T
+        R_knots = back @ R_lidar[:-1]
+        t_knots = (t_lidar[:-1] - t_lidar[-1]) @ back.T
+        yield _moved(scan.points_lidar, offsets_ns, knots, R_knots, t_knots)
 
 
 def _moved(points: Array, offsets_ns: IntArray, knots: IntArray, R: Array, t: Array) -> Array:

@@ -106,7 +106,7 @@ def _check_size(text: str) -> None:
         elif isinstance(event, yaml.AliasEvent):
             if any(anchor == event.anchor for anchor, _ in open_nodes):
                 _refuse(event, f"'*{event.anchor}' stands for what it is part of")
-            size = sizes.get(event.anchor, 1)
+            size = sizes.get(event.anchor or "", 1)
             values += size
             aliased += size
             if aliased > MOST_VALUES_BY_ALIAS + 10 * (values - aliased):

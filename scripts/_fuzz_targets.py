@@ -275,10 +275,19 @@ def _base(folder: Path) -> Callable[[bytes], None]:
         # What was one document of its kind has to stay one.
         if consumer in ("autoware", "lio-sam", "fast-lio", "mola"):
             assert isinstance(yaml.compose(text), yaml.MappingNode)
-        if consumer == "urdf":
+        if consumer == "urdf" and _is_xml(data[1:]):
             ET.fromstring(text)
 
     return attempt
+
+
+def _is_xml(data: bytes) -> bool:
+    """Whether it is XML with namespaces, of which the export knows nothing."""
+    try:
+        ET.fromstring(data.decode("utf-8"))
+    except (ET.ParseError, ValueError):
+        return False
+    return True
 
 
 class _Stores:

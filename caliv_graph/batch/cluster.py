@@ -299,9 +299,9 @@ def _interrupts_later() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-    for number in came[:1]:
+    if came:
         # Whoever asked to be told of it is told now.
-        signal.raise_signal(number)
+        signal.raise_signal(came[0])
 
 
 class _Listener(logging.Handler):

@@ -284,6 +284,15 @@ def test_no_permission(tmp_path: Path) -> None:
         check_output_folder(tmp_path / "locked/result", CONTENT)
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """What runs in the background of a shell without job control has SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_does_not_split_the_swap(
     tmp_path: Path, result: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -231,31 +231,35 @@ def test_the_guesses_of_both_lidars_vote_on_the_height(quiet: list[Tried]) -> No
         assert sum(up) == pytest.approx(0.0, abs=1.0 * MM)
 
 
-@pytest.mark.parametrize("mode", ["joint", "staged"])
-def test_other_modes_agree_on_sensor_to_sensor(quiet: list[Tried], mode: str) -> None:
+def test_joint_agrees_on_sensor_to_sensor(quiet: list[Tried]) -> None:
     auto = quiet[0]
 
-    tried = try_out(auto.drive.asked(solve=SolveConfig.model_validate({"mode": mode})))
+    tried = try_out(auto.drive.asked(solve=SolveConfig(mode="joint")))
 
-    assert tried.run.solution.mode == mode
-    if mode == "joint":
-        # Its prior has a weight on everything, but next to the data none to speak of.
-        sigma = sigmas_s2s(auto.run.calibration, "front", "rear")
-        assert (np.abs(tried.s2s() - auto.s2s()) < 0.2 * sigma).all()
-        assert tried.lost("front") == {"x", "yaw", "z"}
-    else:
-        # The paper's procedure; the figures for it.
-        limits = np.array([4.9 * MRAD, 7.7 * MRAD, 1.5 * MRAD, 20 * MM, 20 * MM, 26 * MM])
-        assert (np.abs(tried.s2s()) < limits).all(), rounded(tried.s2s())
+    assert tried.run.solution.mode == "joint"
+    # Its prior has a weight on everything, but next to the data none to speak of.
+    sigma = sigmas_s2s(auto.run.calibration, "front", "rear")
+    assert (np.abs(tried.s2s() - auto.s2s()) < 0.2 * sigma).all()
+    assert tried.lost("front") == {"x", "yaw", "z"}
 
 
-def test_staged_holds_the_translation_of_the_reference(quiet: list[Tried]) -> None:
-    tried = try_out(quiet[0].drive.asked(solve=SolveConfig(mode="staged")))
+@pytest.fixture(scope="module")
+def staged(quiet: list[Tried]) -> Tried:
+    return try_out(quiet[0].drive.asked(solve=SolveConfig(mode="staged")))
 
-    assert tried.from_the_guess("rear")[3:] == pytest.approx(np.zeros(3), abs=1e-9)
-    for name in tried.poses:
-        assert tried.lost(name) == {"x", "y", "z", "yaw"}
-        sigma = sigmas_s2v(tried.run.calibration, name)
+
+def test_staged_is_as_good_as_the_paper_between_sensors(staged: Tried) -> None:
+    assert staged.run.solution.mode == "staged"
+    # SPEC 8's figures for the paper's procedure and its authors' code, the larger of both.
+    limits = np.array([4.9 * MRAD, 7.7 * MRAD, 1.5 * MRAD, 20 * MM, 20 * MM, 26 * MM])
+    assert (np.abs(staged.s2s()) < limits).all(), rounded(staged.s2s())
+
+
+def test_staged_holds_the_translation_of_the_reference(staged: Tried) -> None:
+    assert staged.from_the_guess("rear")[3:] == pytest.approx(np.zeros(3), abs=1e-9)
+    for name in staged.poses:
+        assert staged.lost(name) == {"x", "y", "z", "yaw"}
+        sigma = sigmas_s2v(staged.run.calibration, name)
         # What is held is as good as the guess was, and the yaw that follows it no better.
         assert (sigma[3:] > 0.9 * 57.7 * MM).all()
         assert sigma[2] > 0.9 * 57.7 * MM / RADIUS_M

@@ -13,7 +13,7 @@ from caliv_graph.config import Config, Mounting, parse_config
 from caliv_graph.pipeline import CalibrationRun, calibrate
 from caliv_graph.products import Array
 from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import (
     ChairModel,
     CropModel,
@@ -28,6 +28,7 @@ from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.kept import KeptDrive
 
 SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "moved_target.yaml"
 MM, MRAD = 1e-3, 1e-3
@@ -73,7 +74,7 @@ def standing(*places: tuple[float, float, float], phase_s: float = 0.0, seed: in
         world=WorldModel(objects={"chair": chair}, targets=("chair",), region_margin_m=1.0),
         crop=CropModel(margin_m=0.3, elsewhere_stride=10),
     )
-    recording = simulate_drive(scenario, seed)
+    recording = KeptDrive(scenario, seed)
     raw = config_of(recording, has_bag=True)
     raw |= {"registration": {"components": 200, "max_points": 160}}
     return Standing(recording, parse_config(raw, "config.yaml", Path("/nowhere")))
@@ -166,7 +167,7 @@ def test_a_chair_that_nobody_moves_is_one_placement() -> None:
 @pytest.mark.parametrize("name", ["front", "left"])
 def test_the_scenario_shows_the_chair_at_four_places(name: str) -> None:
     scenario = load_scenario(SCENARIO)
-    recording = simulate_drive(scenario, 1)
+    recording = KeptDrive(scenario, 1)
     chair = scenario.world.objects["chair"]
     assert len(chair.moves) == 3
     wanted = {

@@ -19,12 +19,13 @@ from caliv_graph.config import Config, parse_config
 from caliv_graph.pipeline import CalibrationRun, calibrate
 from caliv_graph.products import Array
 from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import Scenario, load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.kept import KeptDrive
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
 MM, MRAD = 1e-3, 1e-3
@@ -51,7 +52,7 @@ def swept_and_noisy() -> Scenario:
 
 @cache
 def drive() -> Drive:
-    recording = simulate_drive(swept_and_noisy(), 3)
+    recording = KeptDrive(swept_and_noisy(), 3)
     raw = config_of(recording, has_bag=True)
     raw |= {"solve": {"time_offset": True}, "registration": {"components": 400, "max_points": 300}}
     raw["extraction"] = {"max_scans": 40}

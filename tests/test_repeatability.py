@@ -8,8 +8,8 @@ from caliv_graph.config import parse_config
 from caliv_graph.products import TargetCloud, TargetObservation
 from caliv_graph.progress import SilentProgress
 from caliv_graph.repeatability import alternate, split, split_halves
-from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
+from tests.kept import KeptDrive
 from tests.test_survey import QUICK, scenario_of
 
 SECOND = 1_000_000_000
@@ -58,7 +58,7 @@ def test_scans_in_turns() -> None:
 
 
 def test_halves_of_a_drive_agree() -> None:
-    recording = simulate_drive(scenario_of("arc"), 2)
+    recording = KeptDrive(scenario_of("arc"), 2)
     config = parse_config(config_of(recording, has_bag=True), "arc", Path())
     config = config.model_copy(update={"registration": QUICK})
     found = split_halves(recording, config, SilentProgress(), 0.01)

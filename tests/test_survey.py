@@ -15,7 +15,6 @@ from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.predict import Ground
 from caliv_graph.preparation import Prepared, prepare
 from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.scenario import (
     ArcDrive,
     ChairModel,
@@ -30,6 +29,7 @@ from caliv_graph.simulation.scenario import (
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.survey import Survey, survey, survey_observations
 from tests.drives_with_chair import paper_lidar, paper_scenario
+from tests.kept import KeptDrive
 
 HEIGHT = "height of all LiDARs together"
 TURN = "rotation of all LiDARs about the turn centre: x and yaw together, "
@@ -70,7 +70,7 @@ class Extracted:
 
 @functools.cache
 def extracted(name: str, seed: int = 1) -> Extracted:
-    recording = simulate_drive(scenario_of(name), seed)
+    recording = KeptDrive(scenario_of(name), seed)
     config = parse_config(config_of(recording, has_bag=True), name, Path())
     prepared = prepare([recording], config, {0: recording.motion()}, SilentProgress())
     return Extracted(config, prepared)
@@ -141,7 +141,7 @@ def test_a_plan_predicts_what_the_recording_tells(name: str) -> None:
 
 
 def test_from_the_recording_on() -> None:
-    recording = simulate_drive(scenario_of("arc"), 2)
+    recording = KeptDrive(scenario_of("arc"), 2)
     raw = config_of(recording, has_bag=True) | {"require": ["s2s", "s2v"]}
     progress = SilentProgress()
 
@@ -189,7 +189,7 @@ def test_a_target_that_looks_the_same_after_any_turn_is_named() -> None:
     assert isinstance(chair, ChairModel)
     drum = CylinderModel(xy_m=chair.xy_m, radius_m=0.35, height_m=1.1)
     world = scenario.world.model_copy(update={"objects": {**scenario.world.objects, "chair": drum}})
-    recording = simulate_drive(scenario.model_copy(update={"world": world}), 1)
+    recording = KeptDrive(scenario.model_copy(update={"world": world}), 1)
     config = parse_config(config_of(recording, has_bag=True), "drum", Path())
     config = config.model_copy(update={"registration": QUICK})
 

@@ -16,7 +16,7 @@ from caliv_graph.pipeline import CalibrationRun, calibrate
 from caliv_graph.products import LidarScan, Recording
 from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.forwarding import ForwardingRecording
-from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import (
     ArcDrive,
     ChairModel,
@@ -30,6 +30,7 @@ from caliv_graph.simulation.scenario import (
 )
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.kept import KeptDrive
 
 MM, MRAD = 1e-3, 1e-3
 
@@ -81,13 +82,13 @@ def scenario(
 
 @cache
 def right() -> SimulatedRecording:
-    return simulate_drive(scenario(RIGHT, {**CHAIR}), 11)
+    return KeptDrive(scenario(RIGHT, {**CHAIR}), 11)
 
 
 @cache
 def left() -> SimulatedRecording:
     """In another country, on higher ground, past a chair of its own."""
-    return simulate_drive(scenario(LEFT, {**CHAIR_LEFT}, ground_m=3.0, datum_deg=51.0), 12)
+    return KeptDrive(scenario(LEFT, {**CHAIR_LEFT}, ground_m=3.0, datum_deg=51.0), 12)
 
 
 def config(*recordings: SimulatedRecording, use: tuple[str, ...] = ()) -> Config:
@@ -158,7 +159,7 @@ def test_drives_share_the_extrinsics_and_nothing_else() -> None:
 
 def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others() -> None:
     lidars = {**LIDARS, "side": lidar(1.0, -80.0, -0.8)}
-    three = simulate_drive(scenario(RIGHT, {**CHAIR}, lidars), 13)
+    three = KeptDrive(scenario(RIGHT, {**CHAIR}, lidars), 13)
 
     class Without(ForwardingRecording):
         """A drive in which one LiDAR of the config recorded nothing."""
@@ -189,7 +190,7 @@ def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others()
 
 
 def test_two_targets_in_a_drive() -> None:
-    recording = simulate_drive(scenario(RIGHT, {**TWO_CHAIRS}), 14)
+    recording = KeptDrive(scenario(RIGHT, {**TWO_CHAIRS}), 14)
     both = config(recording)
     assert both.target is not None
     assert len(both.target) == 2

@@ -153,7 +153,7 @@ def by_quantity(lines: Sequence[Line]) -> dict[str, Statistics]:
 
 
 def limits(scenario: str, quantity: str) -> tuple[float, ...] | None:
-    """Largest mean absolute errors of issue 4's table, mm and mrad, `SHOWN`; NaN: none."""
+    """Largest mean absolute errors that are good enough, mm and mrad, `SHOWN`; NaN: none."""
     return _LIMITS.get(scenario, {}).get(quantity[:3])
 
 
@@ -365,7 +365,7 @@ def row_table(
         text: what the row is.
         lines: its runs.
         predicted: the planner's sigmas per quantity, `AXES`, rad and m.
-        judged: whether the limits of issue 4 are meant for it.
+        judged: whether `limits` are meant for it.
     """
     done = [line for line in lines if not line.failure]
     out = [f"\n{scenario} · {text}: n = {len(done)} of {len(lines)}"]

@@ -140,13 +140,23 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Found:
-    """Everything that was measured."""
+    """Everything that was measured.
+
+    Attributes:
+        cases: drives, stage by stage.
+        growths: by quantity.
+        more_components: processor time with 1,000 components over that with 300; None: not asked.
+        baselines: the paper's estimator beside ours.
+        helps_s: wall time of `--help` by command.
+        load: processes that wanted a core before this began: wall times are longer by them.
+    """
 
     cases: tuple[Case, ...]
     growths: tuple[Growth, ...]
     more_components: float | None
     baselines: tuple[Baseline, ...]
     helps_s: Mapping[str, float]
+    load: float
 
 
 def main() -> int:
@@ -190,6 +200,7 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -> Found:
+    load = os.getloadavg()[0]
     repeated = 1 if arguments.quick else REPEATED
     names = QUICK_BAGS if arguments.quick else BAGS
     data = arguments.data.resolve()
@@ -227,7 +238,7 @@ def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -
     with progress.stage("asking for help"):
         helps = {"caliv-graph": _child.help_s([], 5)}
         helps |= {command: _child.help_s([command], 3) for command in COMMANDS}
-    return Found(tuple(cases), tuple(growths), more_components, tuple(baselines), helps)
+    return Found(tuple(cases), tuple(growths), more_components, tuple(baselines), helps, load)
 
 
 def timed(config: Path, cores: int, repeated: int, advance: Callable[[], object]) -> _child.Usage:
@@ -387,6 +398,10 @@ def text(found: Found, limits: Sequence[Verdict]) -> str:
     parts += ["\n".join(["Growth, CPU on one core", *map(growth_text, found.growths)])]
     parts += map(baseline_text, found.baselines)
     lines = ["Limits"]
+    if found.load > 0.5:
+        lines.append(
+            f"  (others kept {found.load:.1f} cores busy when this began: wall times are longer)"
+        )
     for verdict in limits:
         kept = "kept" if verdict.kept else "MISSED"
         lines.append(
@@ -435,7 +450,7 @@ def growth_text(growth: Growth) -> str:
         f"{size}: {usage.cpu_s:.1f} s, {usage.peak_mb:.0f} MB ({ratio:.2f}x)"
         for size, usage, ratio in zip(growth.sizes, growth.usages, growth.ratios(), strict=True)
     ]
-    return f"  {growth.what:30}{'; '.join(cells)}"
+    return f"  {growth.what:36}{'; '.join(cells)}"
 
 
 def baseline_text(baseline: Baseline) -> str:
@@ -481,6 +496,7 @@ def document(
             for baseline in found.baselines
         ],
         "help_s": dict(found.helps_s),
+        "load_before": found.load,
         "limits": [{**vars(verdict), "kept": verdict.kept} for verdict in limits],
     }
 

@@ -44,6 +44,7 @@ GOOD = benchmark.Found(
         benchmark.Baseline("authors' drive", SECONDS, {k: v / 8.0 for k, v in SECONDS.items()}),
     ),
     helps_s={"caliv-graph": 0.2, "init": 0.3},
+    load=0.1,
 )
 
 
@@ -80,6 +81,8 @@ def test_the_text_has_stages_rest_ratios_and_limits() -> None:
     assert any("34: 2.5 s, 300 MB (1.00x); 68: 4.0 s, 300 MB (1.60x)" in line for line in lines)
     assert any(line.endswith("optimisation alone 10.00 1.25 8.00") for line in lines)
     assert any(line.endswith("s, at most 8: kept") for line in lines)
+    assert "longer" not in text
+    assert "5.0 cores busy" in benchmark.text(replace(GOOD, load=5.0), [])
     arguments = argparse.Namespace(seed=1, quick=True)
     json.dumps(benchmark.document(arguments, GOOD, benchmark.verdicts(GOOD)), allow_nan=False)
 

@@ -14,8 +14,10 @@ tries one again and shows the traceback. The exit code is 1 if there were crashe
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import importlib
+import io
 import json
 import os
 import signal
@@ -135,7 +137,9 @@ def fuzz_each(options: argparse.Namespace) -> int:
 
     sys.path[:0] = [str(HERE), str(HERE.parent)]
     modules = {module for name in options.target for module in MODULES[name]}
-    with atheris.instrument_imports(include=sorted(modules)):
+    # It names each module on stderr, which is for what goes wrong.
+    quiet = contextlib.redirect_stderr(io.StringIO())
+    with quiet, atheris.instrument_imports(include=sorted(modules)):
         targets = importlib.import_module("_fuzz_targets")
     # In memory, where there is such a place: opening files would be most of the time.
     memory = Path("/dev/shm")

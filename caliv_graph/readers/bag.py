@@ -172,6 +172,8 @@ class Bag:
                         if message is None:
                             break
                         _check_time(message[1])
+                        if not isinstance(message[2], bytes | bytearray | memoryview):
+                            raise ValueError(f"a message of {message[0].topic} is no bytes")
                     yield message[0].topic, message[1], message[2]
 
     def first_message(self, topic: str) -> bytes | None:

@@ -278,6 +278,7 @@ def test_a_standard_type_with_a_damaged_definition(tmp_path: Path) -> None:
         ("UPDATE messages SET timestamp = 9223372036854775807", "recorded at 9223372036854775807"),
         ("UPDATE messages SET timestamp = -1", "was recorded at -1"),
         ("UPDATE messages SET timestamp = 1.5", "was recorded at 1.5"),
+        ("UPDATE messages SET data = 'text'", "a message of /imu is no bytes"),
     ],
 )
 def test_values_that_no_bag_can_have(tmp_path: Path, change: str, said: str) -> None:

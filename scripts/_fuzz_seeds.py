@@ -137,7 +137,7 @@ def small_calibration(*names: str) -> Calibration:
         lidars=lidars,
         cov_joint=cov,
         information_data=information,
-        undetermined=(Direction(vector, np.inf, 0.06, True, "x of all LiDARs"),),
+        undetermined=(Direction(vector, np.inf, 0.06, "x of all LiDARs", together=True),),
         weak=(),
         unmet=("front to rear: x",),
         provenance={"caliv_graph": "0.1.0", "recordings": ["drive"]},

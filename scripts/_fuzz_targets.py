@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import _fuzz_seeds as seeds
 import numpy as np
 import yaml
 from rosbags.typesys import Stores, get_typestore
@@ -54,6 +53,7 @@ from caliv_graph.readers.pointcloud2 import (
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.results import calibration_document, read_calibration_file, read_truth
 from caliv_graph.simulation.scenario import dump_scenario, load_scenario, parse_scenario
+from scripts import _fuzz_seeds as seeds
 
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
 
@@ -312,7 +312,11 @@ class _Stores:
 
 def _make_decoders_once() -> None:
     stores = _Stores()
-    Bag._typestore = lambda bag, type_name: stores(bag, type_name)  # type: ignore[method-assign]
+
+    def made_once(self: Bag, type_name: str) -> Typestore:
+        return stores(self, type_name)
+
+    Bag._typestore = made_once  # type: ignore[method-assign]
 
 
 def _bag(suffix: str) -> Callable[[Path], Callable[[bytes], None]]:

@@ -135,12 +135,12 @@ def fuzz_each(options: argparse.Namespace) -> int:
     """Forks for each target, for libFuzzer ends the process; prints what came of each."""
     import atheris
 
-    sys.path[:0] = [str(HERE), str(HERE.parent)]
+    sys.path.insert(0, str(HERE.parent))
     modules = {module for name in options.target for module in MODULES[name]}
     # It names each module on stderr, which is for what goes wrong.
     quiet = contextlib.redirect_stderr(io.StringIO())
     with quiet, atheris.instrument_imports(include=sorted(modules)):
-        targets = importlib.import_module("_fuzz_targets")
+        targets = importlib.import_module("scripts._fuzz_targets")
     # In memory, where there is such a place: opening files would be most of the time.
     memory = Path("/dev/shm")
     for name in options.target:
@@ -172,8 +172,8 @@ def fuzz_each(options: argparse.Namespace) -> int:
 
 
 def replay(name: str, file: Path) -> int:
-    sys.path.insert(0, str(HERE))
-    target = importlib.import_module("_fuzz_targets").TARGETS[name]
+    sys.path.insert(0, str(HERE.parent))
+    target = importlib.import_module("scripts._fuzz_targets").TARGETS[name]
     with tempfile.TemporaryDirectory() as folder:
         attempt = target.make(Path(folder))
         try:

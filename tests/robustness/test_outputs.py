@@ -162,7 +162,11 @@ def test_a_simulation_that_is_interrupted(number: int, tmp_path: Path) -> None:
 def test_quick_commands_that_are_interrupted(name: str, result: Path, tmp_path: Path) -> None:
     file = result / "calibration.yaml"
     out = tmp_path / "out.yaml"
-    arguments = {"merge": [file, file], "export": [file, "--to", "autoware"]}[name]
+    commands: dict[str, list[object]] = {
+        "merge": [file, file],
+        "export": [file, "--to", "autoware"],
+    }
+    arguments = commands[name]
     before = digest(result)
 
     for wait_s in (0.3, 0.9):

@@ -95,8 +95,10 @@ def test_a_mount_that_slips_in_the_middle_shows_in_the_halves_by_as_much() -> No
     d, cov, _ = difference(slipped)
     # Points farther left in the cloud: a LiDAR farther right, in the second half.
     assert d[4] == pytest.approx(0.04, abs=3.0 * math.sqrt(cov[4, 4]))
-    assert d[4] > 3.0 * math.sqrt(cov[4, 4])
-    assert chance(slipped) < chance(still)
+    # The slow error of the poses takes its part of so small a slip, but not the most of it.
+    assert d[4] > 0.02
+    assert d[4] > 2.5 * math.sqrt(cov[4, 4])
+    assert chance(slipped) < 0.5 * chance(still)
 
 
 def test_the_paper_s_stages_hold_the_translation_and_contradict_nothing() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from caliv_graph.geometry.se3 import skew, stack
+from caliv_graph.geometry.se3 import skew, tangent_axes, stack
 from caliv_graph.products import Array, IntArray, Mixture, Registration
 
 BoolArray = npt.NDArray[np.bool_]
@@ -434,7 +434,7 @@ class _Shape:
         """Rotation and translation of a turn that lay the shape best on itself, or None."""
         R = _rotation_vector(axis * angle_rad)
         t = centre - R @ centre
-        across = _across(axis)
+        across = tangent_axes(axis)
         for gate_m in np.maximum(MATCH_M, spacings * self.spacing_m):
             points, normals = self.means @ R.T + t, self.normals @ R.T
             distance, near = self.tree.query(
@@ -588,14 +588,6 @@ def _rotation_vector(vector: Array) -> Array:
         return np.eye(3)
     K = skew(np.asarray(vector / angle))
     return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
-
-
-def _across(axis: Array) -> Array:
-    """(2, 3) unit vectors at right angles to an axis and to each other."""
-    other = np.eye(3)[np.abs(axis).argmin()]
-    u = np.cross(other, axis)
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(axis, u)])
 
 
 def _axis_and_centre(R: Array, t: Array, axis: Array, centre: Array) -> tuple[Array, Array]:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 _PLAIN_WIDTH = 120
 """Columns of a table that goes to a file or a pipe, where nobody says how many there are."""
 
+_MOST_CHARACTERS = 1500
+"""Of a message. A damaged file may have names of megabytes."""
+
 
 def one_line(text: str) -> str:
     """A message as the one line that it has to be, whatever names are quoted in it.
@@ -25,6 +28,9 @@ def one_line(text: str) -> str:
     What a terminal would obey, such as the escapes of colours, is shown instead.
     """
     line = " ".join(text.split())
+    if len(line) > _MOST_CHARACTERS:
+        # What is wrong stands in front, what to do at the end; between them is what was quoted.
+        line = f"{line[: _MOST_CHARACTERS // 2]} ... {line[-_MOST_CHARACTERS // 4 :]}"
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 

@@ -294,3 +294,12 @@ def test_the_end_of_a_file_is_no_interrupt(config: Path) -> None:
     assert result.returncode == 1
     assert "this is a defect of caliv-graph" in result.stderr
     assert "EOFError: marshal data too short" in result.stderr
+
+
+def test_a_message_is_short_whatever_it_quotes(capsys: pytest.CaptureFixture[str]) -> None:
+    streams.error(f"/tmp/x: 'lidars.{'9' * 100_000}' is missing. Add it")
+
+    said = capsys.readouterr().err
+    assert len(said) < 1500
+    assert said.startswith("error: /tmp/x: 'lidars.999")
+    assert said.endswith("999' is missing. Add it\n")

@@ -172,6 +172,8 @@ class Bag:
                         if message is None:
                             break
                         _check_time(message[1])
+                        if message[0].topic not in topics:
+                            raise ValueError(f"{message[0].topic} goes by the number of another")
                         if not isinstance(message[2], bytes | bytearray | memoryview):
                             raise ValueError(f"a message of {message[0].topic} is no bytes")
                     yield message[0].topic, message[1], message[2]

@@ -292,3 +292,20 @@ def test_values_that_no_bag_can_have(tmp_path: Path, change: str, said: str) -> 
         list(Bag(path).messages(["/imu"]))
 
     assert said in str(caught.value)
+
+
+def test_two_topics_of_one_number(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "drive", messages(4), "ros1")
+    data = path.read_bytes()
+    first, other = (b"conn=" + struct.pack("<I", number) for number in (0, 1))
+    assert first in data
+    assert other in data
+    path.write_bytes(data.replace(other, first))
+
+    for topic in ("/imu", "/points"):
+        try:
+            found = {name for name, _, _ in Bag(path).messages([topic])}
+        except RecordingError as e:
+            assert "goes by the number of another" in str(e) or "damaged" in str(e)
+        else:
+            assert found <= {topic}

@@ -302,10 +302,10 @@ def test_two_topics_of_one_number(tmp_path: Path) -> None:
     assert other in data
     path.write_bytes(data.replace(other, first))
 
+    said = ""
     for topic in ("/imu", "/points"):
         try:
-            found = {name for name, _, _ in Bag(path).messages([topic])}
+            assert {name for name, _, _ in Bag(path).messages([topic])} <= {topic}
         except RecordingError as e:
-            assert "goes by the number of another" in str(e) or "damaged" in str(e)
-        else:
-            assert found <= {topic}
+            said += str(e)
+    assert "goes by the number of another" in said

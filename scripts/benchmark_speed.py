@@ -40,6 +40,7 @@ from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.progress import PlainProgress, Progress, SilentProgress
 from scripts import _child, benchmark_bag, benchmark_paper
 from scripts import benchmark_released as released
+from scripts._command import positive
 
 BAGS = ("demo_arc", "figure_eight")
 QUICK_BAGS = ("demo_arc",)
@@ -192,7 +193,7 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
         help="the authors' drive (default: ../shared/data/caliv_released beside the repository); "
         "what needs it is left out, and said, where it is not there",
     )
-    parser.add_argument("--seed", type=released.positive, default=1, help="default: 1")
+    parser.add_argument("--seed", type=positive, default=1, help="default: 1")
     parser.add_argument("--folder", type=Path, help="for temporary files (default: the system's)")
     parser.add_argument("--quick", action="store_true", help="less of everything, in minutes")
     parser.add_argument("--json", action="store_true", help="print one JSON document")

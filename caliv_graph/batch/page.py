@@ -6,15 +6,16 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-import jinja2
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 import caliv_graph
 from caliv_graph.batch.summary import Deviation, Row, Spread, Summary
 from caliv_graph.products import LidarResult
-from caliv_graph.report.html import _mounting_row
-from caliv_graph.report.tables import _SHOWN_AXES, _STATUS_STYLES, _sentences, _table, _titled
+from caliv_graph.report.html import mounting_row
+from caliv_graph.report.layout import SHOWN_AXES, new_table, sentences, titled
+from caliv_graph.report.page import environment
+from caliv_graph.report.tables import STATUS_STYLES
 from caliv_graph.results import REPORT_FILE
 
 FAR_SIGMAS = 3.0
@@ -32,20 +33,14 @@ def render_index(summary: Summary) -> str:
     Returns:
         A whole HTML document. Its links are relative: the folder can be moved, or packed.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("caliv_graph.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("batch.html.j2").render(
+    template = environment().get_template("batch.html.j2")
+    return template.render(
         headline=_headline(summary),
         style=_style(summary),
         counts=summary.counts,
         rows=[_row(row) for row in summary.rows],
         spreads=[_spread(spread) for spread in summary.spreads()],
-        axes=_SHOWN_AXES,
+        axes=SHOWN_AXES,
         manifest=summary.manifest,
         written=summary.written,
         exit=summary.exit,
@@ -56,22 +51,22 @@ def render_index(summary: Summary) -> str:
 
 def summary_table(summary: Summary) -> RenderableType:
     """The closing words of `batch`."""
-    table = _table("job", "exit", "time\ns", "status", "determined", "vehicle")
+    table = new_table("job", "exit", "time\ns", "status", "determined", "vehicle")
     for row in summary.rows:
         table.add_row(
             Text(row.job),
             "-" if row.exit is None else str(row.exit),
             "-" if row.seconds is None else f"{row.seconds:.1f}",
-            Text(row.status, style=_STATUS_STYLES.get(row.status, "bold red")),
+            Text(row.status, style=STATUS_STYLES.get(row.status, "bold red")),
             Text(_determined(row)),
             Text(row.vehicle or ""),
         )
     parts: list[RenderableType] = [Text(_headline(summary), style="bold")]
-    parts += _titled("Jobs", table)
-    parts += _sentences(
+    parts += titled("Jobs", table)
+    parts += sentences(
         "What is wrong:", (f"{row.job}: {row.note}" for row in summary.rows if row.note)
     )
-    parts += _sentences("Vehicles:", (_spread_line(s) for s in summary.spreads()))
+    parts += sentences("Vehicles:", (_spread_line(s) for s in summary.spreads()))
     return Group(*parts)
 
 
@@ -127,7 +122,7 @@ def _row(row: Row) -> dict[str, Any]:
 
 
 def _mounting_cells(lidar: LidarResult) -> dict[str, Any]:
-    cells = _mounting_row(lidar)
+    cells = mounting_row(lidar)
     trusted = not cells["estimated"]
     # A value that the drive did not tell is in the report of its job, as the guess that it is.
     shown = [
@@ -151,7 +146,7 @@ def _spread(spread: Spread) -> dict[str, Any]:
         "rows": [
             {
                 "name": names[0] if len(names) == 1 else f"{names[0]} to {names[1]}",
-                "cells": [_deviation(axes[axis]) for axis in _SHOWN_AXES],
+                "cells": [_deviation(axes[axis]) for axis in SHOWN_AXES],
             }
             for names, axes in spread.deviations.items()
         ],

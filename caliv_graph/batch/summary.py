@@ -24,7 +24,7 @@ from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, LidarResult
-from caliv_graph.report.tables import _SHOWN_AXES
+from caliv_graph.report.layout import SHOWN_AXES
 from caliv_graph.results import REPORT_FILE
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -176,7 +176,7 @@ def summary_json(summary: Summary) -> str:
 
 def summary_csv(summary: Summary) -> str:
     """summary.csv: a line per job and LiDAR, or one per job without a result."""
-    units = {axis: "m" if axis in "xyz" else "deg" for axis in _SHOWN_AXES}
+    units = {axis: "m" if axis in "xyz" else "deg" for axis in SHOWN_AXES}
     values = [f"{axis}_{unit}" for axis, unit in units.items()]
     columns = [
         *("job", "vehicle", "status", "exit", "seconds", "lidar", "scans_used"),
@@ -346,8 +346,8 @@ def _deviations(
     out: dict[tuple[str, ...], dict[str, Deviation | None]] = {}
     for job, comparison in agreement.items():
         for movement in comparison.movements:
-            axes = out.setdefault(movement.lidars, dict.fromkeys(_SHOWN_AXES))
-            for axis in _SHOWN_AXES:
+            axes = out.setdefault(movement.lidars, dict.fromkeys(SHOWN_AXES))
+            for axis in SHOWN_AXES:
                 sigmas = _sigmas(movement, AXES.index(axis))
                 before = axes[axis]
                 if sigmas is not None and (before is None or sigmas > before.sigmas):

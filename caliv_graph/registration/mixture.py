@@ -130,16 +130,14 @@ for _q, (_c, _d) in enumerate(zip(*np.triu_indices(3), strict=True)):
 
 _TWICE = np.where(_ROW == _COLUMN, 0.5, 1.0)
 
-_BLOCKS = np.einsum("ace,qcd,bdf->abqef", _MOVES, _SYMMETRIC, _MOVES)[_ROW, _COLUMN]
-_BLOCKS = _TWICE[:, None, None, None] * (_BLOCKS + np.swapaxes(_BLOCKS, 2, 3))
-_BLOCKS = _BLOCKS.reshape(60, 36)
+_TURNED = np.einsum("ace,qcd,bdf->abqef", _MOVES, _SYMMETRIC, _MOVES)[_ROW, _COLUMN]
+_BLOCKS = (_TWICE[:, None, None, None] * (_TURNED + np.swapaxes(_TURNED, 2, 3))).reshape(60, 36)
 """`J^T W J` of the ten moments times the six entries of W."""
 
-_PULLS = np.zeros((4, 4, 6, 6))
-_PULLS[:, 1:] = np.einsum("ace,qcd->adqe", _MOVES, _SYMMETRIC)
-_PULLS = (_TWICE[:, None, None] * (_PULLS + np.swapaxes(_PULLS, 0, 1))[_ROW, _COLUMN]).reshape(
-    60, 6
-)
+_PULLED = np.zeros((4, 4, 6, 6))
+_PULLED[:, 1:] = np.einsum("ace,qcd->adqe", _MOVES, _SYMMETRIC)
+_PULLED = (_PULLED + np.swapaxes(_PULLED, 0, 1))[_ROW, _COLUMN]
+_PULLS = (_TWICE[:, None, None] * _PULLED).reshape(60, 6)
 """`J^T W y` of the same."""
 
 _EVEN_PAIRS = np.einsum("ace,bcf->abef", _MOVES, _MOVES).reshape(16, 36)

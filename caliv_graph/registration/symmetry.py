@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from caliv_graph.geometry.se3 import skew, tangent_axes, stack
+from caliv_graph.geometry.se3 import skew, stack, tangent_axes
 from caliv_graph.products import Array, IntArray, Mixture, Registration
 
 BoolArray = npt.NDArray[np.bool_]

@@ -113,7 +113,7 @@ def render_report(
         conflicts=_conflicts(calibration, warnings),
         directions=_direction_rows(calibration),
         axes=SHOWN_AXES,
-        mountings={n: _mounting_row(r) for n, r in calibration.lidars.items()},
+        mountings={n: mounting_row(r) for n, r in calibration.lidars.items()},
         pairs=_pair_rows(calibration),
         moves=_move_rows(calibration),
         residuals=all_residuals(solution, evidence),
@@ -201,7 +201,8 @@ def _sigma_text(direction: Direction, sigma: float) -> str:
     return f"{figures_of(value)} {'mrad' if axis < 3 else 'mm'} in {AXES[axis]} of {name}"
 
 
-def _mounting_row(result: LidarResult) -> dict[str, Any]:
+def mounting_row(result: LidarResult) -> dict[str, Any]:
+    """One LiDAR's line in a table of mountings: per axis the value and its sigma."""
     estimated = not (result.guess is not None and result.guess.fixed)
     return {
         "cells": _cells(result.T_vehicle_lidar, result.cov, result.determined),

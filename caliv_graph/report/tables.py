@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _HELD = "held"
 
-_STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
+STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
 
 
 def calibration_table(
@@ -241,7 +241,7 @@ def _bag_lidar_cells(lidar: BagLidarSummary) -> list[Text | str]:
 
 def _status_line(calibration: Calibration) -> Text:
     names = ", ".join(calibration.lidars)
-    status = Text(calibration.status, style=_STATUS_STYLES.get(calibration.status, "bold"))
+    status = Text(calibration.status, style=STATUS_STYLES.get(calibration.status, "bold"))
     return Text.assemble(
         "Status: ", status, f". LiDARs: {names}; reference {calibration.reference}."
     )

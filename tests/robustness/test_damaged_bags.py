@@ -24,7 +24,7 @@ def flip(path: Path, seed: int, count: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_looking_at_a_bag_with_flipped_bits(seed: int, drive: Path, tmp_path: Path) -> None:
     path = damaged(drive, tmp_path)
     flip(path, seed, 1 if seed % 2 else 100)
@@ -51,7 +51,7 @@ def test_a_bag_that_is_cut_off(part: float, drive: Path, tmp_path: Path) -> None
     check_sound(done, tmp_path / "out", drive / "truth.yaml")
 
 
-@pytest.mark.parametrize(("seed", "count"), [(1, 30), (2, 1000)])
+@pytest.mark.parametrize(("seed", "count"), [(2, 1000)])
 def test_calibrating_from_a_bag_with_flipped_bits(
     seed: int, count: int, drive: Path, tmp_path: Path
 ) -> None:

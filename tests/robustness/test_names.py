@@ -179,7 +179,7 @@ def test_names_of_a_scenario_stay_in_its_folder(name: str, output: str, tmp_path
         assert list(load_config(tmp_path / "a/drive/config.yaml").lidars) == [name]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.text(max_size=30))
 def test_a_name_is_refused_or_comes_back(tmp_path_factory: Any, name: str) -> None:
     """Through the writer of calibrations, the reader, and the JSON of a command."""

@@ -77,8 +77,7 @@ def interrupted(
         (signal.SIGINT, 0, 0.3),  # modules are imported
         (signal.SIGTERM, 1, 0.0),  # the trajectory
         (signal.SIGINT, 3, 0.1),  # clouds
-        (signal.SIGTERM, 9, 0.1),  # registration
-        (signal.SIGINT, 16, 0.2),  # the graph, and the result is about to be written
+        (signal.SIGTERM, 16, 0.2),  # the graph, and the result is about to be written
         (signal.SIGKILL, 16, 0.2),
     ],
 )

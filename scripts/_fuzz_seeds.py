@@ -24,6 +24,8 @@ from caliv_graph.products import Calibration, DataTerm, Direction, Guess, LidarR
 from caliv_graph.results import write_calibration
 from caliv_graph.simulation.scenario import dump_scenario, parse_scenario
 
+REPOSITORY = Path(__file__).resolve().parents[1]
+
 START_NS = 1_700_000_000 * NANOSECONDS_PER_SECOND
 
 TYPES = {
@@ -159,6 +161,11 @@ def truth_text() -> str:
     pose = {"translation": [2.0, 0.0, 2.0], "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
     lidars = {name: {"T_vehicle_lidar": pose, "time_offset": 0.0} for name in ("front", "rear")}
     return str(yaml.safe_dump({"lidars": lidars}))
+
+
+def manifest_text() -> str:
+    """A batch's manifest with all its keys: the example that the repository has."""
+    return (REPOSITORY / "configs" / "batch.yaml").read_text(encoding="utf-8")
 
 
 def config_text() -> str:

@@ -17,6 +17,7 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from caliv_graph.batch.manifest import load_manifest
 from caliv_graph.cli import streams
 from caliv_graph.config import (
     LidarConfig,
@@ -98,6 +99,21 @@ def _config(folder: Path) -> Callable[[bytes], None]:
         text = dump_config(config)
         assert text.encode("utf-8")
         assert parse_config(yaml.safe_load(text), "dumped", folder) == config
+
+    return attempt
+
+
+def _manifest(folder: Path) -> Callable[[bytes], None]:
+    path = folder / "manifest.yaml"
+    here = folder.absolute()
+
+    def attempt(data: bytes) -> None:
+        path.write_bytes(data)
+        jobs = load_manifest(path)
+        # Every job has a folder of its own, in the batch's and nowhere else.
+        folders = {(here / job.name).resolve() for job in jobs}
+        assert len(folders) == len(jobs)
+        assert all(found.parent == here.resolve() for found in folders)
 
     return attempt
 
@@ -587,6 +603,7 @@ def _base_seeds(folder: Path) -> list[bytes]:
 
 TARGETS: Mapping[str, Target] = {
     "config": Target(_config, _of(seeds.config_text), "yaml"),
+    "manifest": Target(_manifest, _of(seeds.manifest_text), "yaml"),
     "scenario": Target(
         _scenario,
         _of(seeds.scenario_text),

@@ -39,6 +39,7 @@ _BAG_MODULES = ("caliv_graph.readers", "rosbags")
 
 MODULES: Mapping[str, Sequence[str]] = {
     "config": ("caliv_graph.config",),
+    "manifest": ("caliv_graph.batch.manifest", "caliv_graph.config"),
     "scenario": ("caliv_graph.config", "caliv_graph.simulation.scenario"),
     "calibration": ("caliv_graph.config", "caliv_graph.fields", "caliv_graph.results"),
     "truth": ("caliv_graph.config", "caliv_graph.fields", "caliv_graph.results"),

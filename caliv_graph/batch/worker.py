@@ -204,6 +204,7 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     from threadpoolctl import threadpool_limits
 
     from caliv_graph.batch.digests import DigestCache, job_digest, job_inputs
+    from caliv_graph.cores import on_one_core
     from caliv_graph.errors import RecordingError
     from caliv_graph.exits import exit_code
     from caliv_graph.jobs import check_guesses, open_recordings, run_job
@@ -229,7 +230,7 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
         digest = job_digest(task.config, inputs, cache)
     if digest == task.recorded:
         return Outcome("unchanged", digest=digest, cache=cache.dump())
-    with threadpool_limits(limits=1), warnings.catch_warnings():
+    with threadpool_limits(limits=1), on_one_core(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = run_job(recordings, task.config, progress, prior)
         with progress.stage("writing"):

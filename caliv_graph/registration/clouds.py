@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray, TargetObservation
 
@@ -38,9 +38,6 @@ GATE_SIGMAS = 3.0
 
 GATE_ROUNDS = 5
 """Plane fits per normal, while the gate narrows."""
-
-THREADS = 2
-"""Threads that share out work on clouds and points; the result does not depend on them."""
 
 RIDGE = 1e-6
 """Keeps plane fits solvable."""
@@ -225,8 +222,7 @@ def merged_normals(
             points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, sigma_range_m
         )
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(of_cloud, range(stack.count)))
+    share_out(of_cloud, range(stack.count))
     back = np.swapaxes(R, 1, 2)
     mixed = _towards_sensor(stack.rotated(back, normals), flatness, stack.beams)
     return replace(stack, normals=mixed, flatness=flatness)

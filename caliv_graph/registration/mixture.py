@@ -10,7 +10,6 @@ are those of SPEC 3.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +17,10 @@ import scipy.sparse
 from scipy.linalg import blas
 from scipy.spatial import cKDTree
 
+from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
-from caliv_graph.registration.clouds import THREADS, CloudStack, sampling_order
+from caliv_graph.registration.clouds import CloudStack, sampling_order
 
 NEIGHBOURS = 6
 """Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
@@ -239,9 +239,7 @@ def expect(
         near[part], alpha[part] = found, likelihood
 
     # Every part is computed by itself, so that the result is the same on any number of cores.
-    parts = [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)]
-    with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(of_part, parts))
+    share_out(of_part, [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)])
     inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
         np.append(stack.starts, len(stack.points))
     )

@@ -1,0 +1,59 @@
+"""How many cores the program uses, and how it shares out work on them.
+
+No result depends on it: what runs at the same time writes to places of its own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+THREADS = 2
+"""That share out work on clouds and points, at most: numpy holds the interpreter's lock between its
+operations, and more threads mostly wait for it."""
+
+_one_core = False
+
+
+def cores() -> int:
+    """How many this process may use."""
+    if _one_core:
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def on_one_core() -> Iterator[None]:
+    """Inside, the program works in one thread: other processes have the other cores."""
+    global _one_core
+    before = _one_core
+    _one_core = True
+    try:
+        yield
+    finally:
+        _one_core = before
+
+
+def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
+    """Does `work` on all items, several at a time.
+
+    Args:
+        work: spends its time where the interpreter's lock is released.
+        items: what to work on.
+
+    Raises:
+        Whatever `work` raises.
+    """
+    threads = min(THREADS, cores())
+    if threads < 2:
+        for item in items:
+            work(item)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(work, items):
+            pass

@@ -314,6 +314,7 @@ def _timeless(file: Path) -> bytes:
         lines = [json.loads(line) for line in content.splitlines()]
         for line in lines:
             line.pop("seconds", None)
+            line.pop("cpu_seconds", None)
         return json.dumps(lines).encode()
     if file.name == "job.json":
         record = json.loads(content)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -327,6 +327,20 @@ class RegistrationConfig(_Section):
     )
 
 
+def check_limit_keys(keys: Iterable[str]) -> None:
+    """Checks the names of limits on sigmas.
+
+    Raises:
+        ValueError: one is no `LIMIT_KEY`; the message says what they look like.
+    """
+    for key in keys:
+        if not LIMIT_KEY.match(key):
+            raise ValueError(
+                f"unknown limit '{key}': write s2s_ or s2v_, then roll_deg, pitch_deg, "
+                "yaw_deg, x_m, y_m or z_m"
+            )
+
+
 class Config(_Section):
     """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
 
@@ -402,12 +416,7 @@ class Config(_Section):
     @field_validator("limits")
     @classmethod
     def _known_limits(cls, limits: dict[str, float]) -> dict[str, float]:
-        for key in limits:
-            if not LIMIT_KEY.match(key):
-                raise ValueError(
-                    f"unknown limit '{key}': write s2s_ or s2v_, then roll_deg, pitch_deg, "
-                    "yaw_deg, x_m, y_m or z_m"
-                )
+        check_limit_keys(limits)
         return limits
 
     @model_validator(mode="after")

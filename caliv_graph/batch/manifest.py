@@ -12,13 +12,13 @@ from typing import Any
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from caliv_graph.config import (
-    LIMIT_KEY,
     Config,
     Positive,
     Requirement,
     SolveMode,
     _one_line,
     _Section,
+    check_limit_keys,
     parse_config,
     read_yaml,
 )
@@ -82,12 +82,7 @@ class _Settings(_Section):
     @field_validator("limits")
     @classmethod
     def _known_limits(cls, limits: dict[str, float] | None) -> dict[str, float] | None:
-        for key in limits or ():
-            if not LIMIT_KEY.match(key):
-                raise ValueError(
-                    f"unknown limit '{key[:40]}': write s2s_ or s2v_, then roll_deg, pitch_deg, "
-                    "yaw_deg, x_m, y_m or z_m"
-                )
+        check_limit_keys(limits or ())
         return limits
 
 

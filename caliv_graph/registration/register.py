@@ -8,7 +8,6 @@ put it: origin at the target's centre, axes of the map.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 import gtsam
@@ -91,9 +90,10 @@ class JointRegistration:
                 f"{observation.name}: {len(observation.clouds)} cloud(s) to register, needs 2"
             )
         self.observation = observation
+        most = config.registration.max_points
         self.clouds: CloudStack = stack_clouds(
             observation,
-            min(config.registration.max_points, ROUGH_POINTS if rough else sys.maxsize),
+            min(most, ROUGH_POINTS) if rough else most,
             config.noise.lidar_range_m,
             normals,
         )

@@ -98,3 +98,15 @@ def positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError("must be at least 1")
     return value
+
+
+def count_between(least: int, most: int) -> Callable[[str], int]:
+    """Reads a whole number of the command line that is in a range, ends included."""
+
+    def integer(text: str) -> int:
+        value = int(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"must be {least} to {most}")
+        return value
+
+    return integer

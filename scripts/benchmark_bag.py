@@ -47,7 +47,7 @@ from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import Scenario, parse_scenario
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
-from scripts._command import COMMAND, Usage, calibrate_measured, exit_code_of
+from scripts._command import COMMAND, Usage, calibrate_measured, count_between, exit_code_of
 
 RATE_HZ = 10.0
 LAP_S = 60
@@ -163,10 +163,17 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     )
     number = parser.add_argument
     number("--minutes", type=_between(0.5, 60.0), default=10.0, help="default: 10")
-    number("--lidars", type=_count(8), default=4, help="default: 4")
-    number("--points", type=_count(500_000), default=30_000, help="per cloud (default: 30000)")
-    number("--cores", type=_count(1024), default=2, help="for the calibration (default: 2)")
-    number("--seed", type=_count(2**31), default=1, help="default: 1")
+    number("--lidars", type=count_between(1, 8), default=4, help="default: 4")
+    number(
+        "--points",
+        type=count_between(1, 500_000),
+        default=30_000,
+        help="per cloud (default: 30000)",
+    )
+    number(
+        "--cores", type=count_between(1, 1024), default=2, help="for the calibration (default: 2)"
+    )
+    number("--seed", type=count_between(1, 2**31), default=1, help="default: 1")
     parser.add_argument(
         "--search", action="store_true", help="a config that does not say where the target is"
     )
@@ -187,16 +194,6 @@ def _between(least: float, most: float) -> Callable[[str], float]:
         return value
 
     return number
-
-
-def _count(most: int) -> Callable[[str], int]:
-    def integer(text: str) -> int:
-        value = int(text)
-        if not 1 <= value <= most:
-            raise argparse.ArgumentTypeError(f"must be 1 to {most}")
-        return value
-
-    return integer
 
 
 def benchmark(arguments: argparse.Namespace) -> int:

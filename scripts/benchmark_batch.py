@@ -33,12 +33,15 @@ from typing import Any
 
 import yaml
 
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # for the module beside this one, run from anywhere
+
 from caliv_graph.config import load_config
 from caliv_graph.errors import CalivError
 from caliv_graph.files import output_folder
 from caliv_graph.simulation import load_scenario, simulate_caliv
+from scripts._command import count_between
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "configs/scenarios/demo_arc.yaml"
 DRIVES = ROOT / "out/batch_drives"
 
@@ -100,24 +103,16 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
         epilog="Exit codes: 0 fast enough and never different; 3 not; 2 it could not be tried.",
     )
     number = parser.add_argument
-    number("--drives", type=_count(1, 1000), default=16, help="default: 16")
-    number("--workers", type=_count(2, 64), default=2, help="against one (default: 2)")
-    number("--rounds", type=_count(0, 100), default=2, help="of each (default: 2); 0: no times")
-    number("--kills", type=_count(0, 1000), default=0, help="default: 0")
-    number("--seed", type=_count(0, 2**31), default=1, help="of the moments of the kills")
+    number("--drives", type=count_between(1, 1000), default=16, help="default: 16")
+    number("--workers", type=count_between(2, 64), default=2, help="against one (default: 2)")
+    number(
+        "--rounds", type=count_between(0, 100), default=2, help="of each (default: 2); 0: no times"
+    )
+    number("--kills", type=count_between(0, 1000), default=0, help="default: 0")
+    number("--seed", type=count_between(0, 2**31), default=1, help="of the moments of the kills")
     number("--folder", type=Path, help="for results (default: a temporary one, removed)")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     return parser.parse_args(given)
-
-
-def _count(least: int, most: int) -> Callable[[str], int]:
-    def integer(text: str) -> int:
-        value = int(text)
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"must be {least} to {most}")
-        return value
-
-    return integer
 
 
 def benchmark(arguments: argparse.Namespace) -> int:

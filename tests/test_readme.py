@@ -12,7 +12,7 @@ import pytest
 import typer
 import yaml
 
-from caliv_graph.cli import exits
+from caliv_graph import exits
 from caliv_graph.cli.main import app
 from caliv_graph.config import Config, GroundConfig, LidarConfig, load_config
 from caliv_graph.results import read_calibration, read_truth

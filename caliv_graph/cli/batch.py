@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import DONE
+from caliv_graph.exits import DONE
 
 
 def batch(

@@ -23,7 +23,6 @@ from caliv_graph.cli.batch import batch
 from caliv_graph.cli.calibrate import calibrate
 from caliv_graph.cli.compare import compare
 from caliv_graph.cli.evaluate import evaluate
-from caliv_graph.cli.exits import DEFECT, DONE, INTERRUPTED, USAGE
 from caliv_graph.cli.export import export
 from caliv_graph.cli.init import init
 from caliv_graph.cli.inspect import inspect
@@ -33,6 +32,7 @@ from caliv_graph.cli.plan import plan
 from caliv_graph.cli.simulate import simulate
 from caliv_graph.cli.validate import validate
 from caliv_graph.errors import CalivError
+from caliv_graph.exits import DEFECT, DONE, INTERRUPTED, USAGE
 
 _PROGRAM = "caliv-graph"
 

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import INCONSISTENT
 from caliv_graph.cli.options import P_VALUE, Force, PValue, ResultAsJson
+from caliv_graph.exits import INCONSISTENT
 
 
 def merge(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import UNMET
 from caliv_graph.cli.options import AsJson, ConfigArgument, Drives
+from caliv_graph.exits import UNMET
 
 
 def observability(

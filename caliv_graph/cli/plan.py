@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import UNMET
 from caliv_graph.cli.options import AsJson, Force
+from caliv_graph.exits import UNMET
 
 
 def plan(

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.exits import INCONSISTENT, UNMET
 from caliv_graph.cli.options import P_VALUE, AsJson, CalibrationArgument, Force, PValue
+from caliv_graph.exits import INCONSISTENT, UNMET
 
 
 def validate(

@@ -34,15 +34,19 @@ NORMAL_CONCENTRATION = 4.0
 GRAZING = 0.05
 """Cosine between beam and surface at which visibility fades."""
 
+STEEP = 0.1
+"""Cosine between beam and surface below which it is no longer asked where the beam meets the
+surface: normals are not known well enough to tell."""
+
 PART_POINTS = 8192
 """Points of a part of the E-step: what belongs to them stays in the processor's cache."""
 
-ALONG_SURFACE = 0.1
+ALONG_SURFACE = 0.05
 """Part of what a point's position *along* the surface seems to say that is believed. Components
 are pieces of a surface, and how the beams fell on them differs from view to view: a LiDAR sees more
 of the side of a piece that is turned to it, so that with all of it every cloud seems to be too
 near, by 5 mm of a sparse LiDAR's mounting, with a precision that is not there. Edges and legs do
-say something, and normals there lean to the sensor: without any of it an exact arc is off by 6 mm.
+say something: without any of it three sparse LiDARs are a millimetre off, the other way.
 """
 
 PRIOR_COUNT = 1e-6
@@ -58,11 +62,14 @@ class Responsibilities:
         alpha: (N, k) responsibilities times the weight of the point's cloud; the rest of each row
             belongs to the outlier class.
         inlier_ratio: (J,) part of each cloud's points that components explain.
+        levers: (J, 3) what is missing in the rotations' part of a cloud's gradient if a point
+            stands for the place where its beam met the surface (`expect`).
     """
 
     component: IntArray
     alpha: Array
     inlier_ratio: Array
+    levers: Array
 
 
 @dataclass(frozen=True)
@@ -190,6 +197,17 @@ def expect(
 ) -> Responsibilities:
     """E-step: the responsibilities of SPEC 3, of the nearest components only.
 
+    How far along the surface a point is from a component is measured where its beam meets the
+    component's plane. The noise is along the beam; on a slanted surface it moves a point along the
+    surface too, and would choose the component: at the far edge of a face the last component would
+    get the points that the noise made too far, at the near edge those that it made too near, and
+    every face would turn about its middle, and with it a LiDAR by half a milliradian.
+
+    The lever on which a residual turns the cloud reaches to that place too. The point's own is
+    longer where the residual is larger, or shorter: least squares would turn all surfaces edge-on
+    to their beams, where the noise shows less. For a point y at height h above a plane of normal n,
+    seen along b, it reaches to `y - h b / (n^T b)`.
+
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
@@ -201,6 +219,7 @@ def expect(
     k = min(NEIGHBOURS, len(mixture.weights))
     near = np.empty((len(stack.points), k), dtype=np.int64)
     alpha = np.empty((len(stack.points), k))
+    levers = np.empty((len(stack.points), 3))
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
     constant = (
         np.log(mixture.weights)
@@ -208,8 +227,8 @@ def expect(
         - 0.5 * np.log(mixture.var_normal)
         - np.log(mixture.var_tangent)
     )
-    even = -0.5 / mixture.var_tangent
-    extra = -0.5 / mixture.var_normal - even
+    aside, above = -0.5 / mixture.var_tangent, -0.5 / mixture.var_normal
+    across = _across(mixture)
     means, directions = mixture.means_target.T.copy(), mixture.normals_target.T.copy()
 
     def of_part(part: slice) -> None:
@@ -220,30 +239,41 @@ def expect(
         beams = np.einsum("nij,nj->ni", turn, stack.beams[part])
         _, found = tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
         found = np.reshape(found, (-1, k))
-        along = np.zeros(found.shape)
-        all2, agreement, facing = along.copy(), along.copy(), along.copy()
+        height, all2, agreement, facing, depth = (np.zeros(found.shape) for _ in range(5))
         for axis in range(3):
             n = directions[axis][found]
             offset = points[:, axis, None] - means[axis][found]
-            along += offset * n
+            height += offset * n
             all2 += offset * offset
             agreement += n * normals[:, axis, None]
             facing -= n * beams[:, axis, None]
+            depth += offset * beams[:, axis, None]
+        # From the point along its beam to the surface.
+        slide = height * np.maximum(facing, 0.0) / np.maximum(facing, STEEP) ** 2
+        aside2 = all2 + slide * (2.0 * depth + slide) - (height - facing * slide) ** 2
         log_alpha = constant[found]
-        log_alpha += extra[found] * along**2
-        log_alpha += even[found] * np.maximum(all2, along**2)
+        log_alpha += above[found] * height**2
+        log_alpha += aside[found] * np.maximum(aside2, 0.0)
         log_alpha += NORMAL_CONCENTRATION * stack.flatness[part, None] * (agreement - 1.0)
         visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 1e-3, 1.0)
         likelihood = np.exp(log_alpha) * visible
         likelihood /= likelihood.sum(axis=1, keepdims=True) + outlier_density
         near[part], alpha[part] = found, likelihood
+        pull = likelihood * across[found] * height * slide
+        pulls = [np.einsum("nk,nk->n", pull, directions[axis][found]) for axis in range(3)]
+        levers[part] = _cross(beams, np.column_stack(pulls))
 
     # Every part is computed by itself, so that the result is the same on any number of cores.
     share_out(of_part, [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)])
     inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
         np.append(stack.starts, len(stack.points))
     )
-    return Responsibilities(near, alpha * cloud_weights[stack.cloud][:, None], inlier)
+    return Responsibilities(
+        near,
+        alpha * cloud_weights[stack.cloud][:, None],
+        inlier,
+        stack.sum_per_cloud(levers) * cloud_weights[:, None],
+    )
 
 
 def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:
@@ -282,8 +312,13 @@ def _carried(stack: CloudStack, R: Array, t: Array) -> Array:
     return np.asarray(_TWICE[:, None] * both[:, _ROW, _COLUMN])
 
 
+def _across(mixture: Mixture) -> Array:
+    """(K,) a of `W = a n n^T + b I`."""
+    return np.asarray(1.0 / mixture.var_normal - ALONG_SURFACE / mixture.var_tangent)
+
+
 def shape_quadratic(
-    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, levers: Array
 ) -> ShapeQuadratic:
     """The quadratic of `ShapeQuadratic` at the current poses, means eliminated.
 
@@ -296,6 +331,7 @@ def shape_quadratic(
         t: (J, 3) translations of current `T_target_lidar`.
         mixture: the components of the E-step.
         cells: (J, K, 13) `cell_moments` of its responsibilities.
+        levers: (J, 3) of the same.
     """
     count, K = stack.count, len(mixture.weights)
     moments = np.matmul(cells[..., :10], _carried(stack, R, t))
@@ -303,14 +339,14 @@ def shape_quadratic(
     first = moments[..., 1:4].sum(axis=0)
     means = (first + PRIOR_COUNT * mixture.means_target) / mass[:, None]
     n = mixture.normals_target
-    b = ALONG_SURFACE / mixture.var_tangent
-    a = 1.0 / mixture.var_normal - b
+    a, b = _across(mixture), ALONG_SURFACE / mixture.var_tangent
     W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
     upper = np.triu_indices(3)
     by_cloud = np.swapaxes(moments, 1, 2)
     against = (by_cloud @ W[:, upper[0], upper[1]]).reshape(count, 60)
     pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
     gradient = against @ _PULLS - np.einsum("jac,ace->je", pull, _MOVES)
+    gradient[:, :3] += levers
     sums = moments[..., :4].transpose(1, 0, 2)
     across = np.empty((K, count, 6))
     root = n * np.sqrt(np.abs(a) / mass)[:, None]

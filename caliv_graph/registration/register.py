@@ -148,7 +148,7 @@ class JointRegistration:
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
         self._inlier_ratio = who.inlier_ratio
         self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
-        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells)
+        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who.levers)
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new poses (R, t)."""

@@ -30,6 +30,10 @@ GAUGE = 1e-9
 """Relative ridge under which a dense system is solved: directions that nothing says anything
 about (the clouds' poses when all weights vanish) stay where they are."""
 
+ANCHOR = 1.0
+"""Information per radian^2 and metre^2 that holds the frame of a target where it is. The shape's
+own place and orientation are eliminated: what moves all clouds of a target alike is no quantity."""
+
 
 def drift_sigmas(noise: PoseNoise) -> Array:
     """(6,) stationary sigmas of the slow error."""
@@ -371,7 +375,11 @@ def add_shape(
         shape=(len(gradient), len(system.b)),
     )
     half = J.T @ H_clouds
-    return replace(system, H=system.H + (J.T @ half.T), b=system.b - J.T @ gradient)
+    H = system.H + (J.T @ half.T)
+    for target in {keys[0] for keys in lines.keys}:
+        frame = starts[target] + np.arange(6)
+        H[frame, frame] += ANCHOR
+    return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
 def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:

@@ -65,6 +65,7 @@ class CloudStack:
         flatness: (N,) 0 to 1, how far the normal can be trusted: 0 where the neighbourhood is
             sparse or noisy (there the normal is the direction to the sensor).
         whole: J clouds as they were before thinning, for the normals.
+        sigma_range_m: noise along the beams, metres.
     """
 
     points: Array
@@ -74,6 +75,7 @@ class CloudStack:
     normals: Array
     flatness: Array
     whole: tuple[Array, ...]
+    sigma_range_m: float
 
     @property
     def count(self) -> int:
@@ -181,12 +183,11 @@ def stack_clouds(
         normals=_towards_sensor(np.concatenate(normal), flat, beams),
         flatness=flat,
         whole=tuple(cloud.points_lidar for cloud in observation.clouds),
+        sigma_range_m=sigma_range_m,
     )
 
 
-def merged_normals(
-    stack: CloudStack, R: Array, t: Array, lidar: IntArray, sigma_range_m: float
-) -> CloudStack:
+def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> CloudStack:
     """Normals again, from all clouds of a LiDAR together, once they are aligned.
 
     One cloud has a column or two of points on a leg; a dozen of them show its faces.
@@ -197,7 +198,6 @@ def merged_normals(
         t: (J, 3) translations of it.
         lidar: (J,) which LiDAR each cloud is of. Clouds of different LiDARs are not merged: whether
             they are aligned is the question.
-        sigma_range_m: noise along the beam, metres.
 
     Returns:
         The same clouds with new normals and flatness.
@@ -219,7 +219,7 @@ def merged_normals(
         around = np.concatenate([whole[i] for i in near])
         own = slice(stack.starts[j], ends[j])
         normals[own], flatness[own] = _normals_across(
-            points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, sigma_range_m
+            points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, stack.sigma_range_m
         )
 
     share_out(of_cloud, range(stack.count))

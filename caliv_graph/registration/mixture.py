@@ -38,10 +38,14 @@ STEEP = 0.1
 """Cosine between beam and surface below which it is no longer asked where the beam meets the
 surface: normals are not known well enough to tell."""
 
+REACH_SIGMAS = 3.0
+"""Standard deviations of the noise along the beam beyond which a point is somewhere else. While
+poses are still wrong by more than that, most points are."""
+
 PART_POINTS = 8192
 """Points of a part of the E-step: what belongs to them stays in the processor's cache."""
 
-ALONG_SURFACE = 0.05
+ALONG_SURFACE = 0.07
 """Part of what a point's position *along* the surface seems to say that is believed. Components
 are pieces of a surface, and how the beams fell on them differs from view to view: a LiDAR sees more
 of the side of a piece that is turned to it, so that with all of it every cloud seems to be too
@@ -49,7 +53,10 @@ near, by 5 mm of a sparse LiDAR's mounting, with a precision that is not there. 
 say something: without any of it three sparse LiDARs are a millimetre off, the other way.
 """
 
-PRIOR_COUNT = 1e-6
+LEAST_LEVER_M = 1e-5
+"""Keeps the orientation of a component defined that has its points on a line, or one alone."""
+
+PRIOR_COUNT = 1e-12
 """Points' worth of weight that keeps an abandoned component defined."""
 
 
@@ -64,12 +71,14 @@ class Responsibilities:
         inlier_ratio: (J,) part of each cloud's points that components explain.
         levers: (J, 3) what is missing in the rotations' part of a cloud's gradient if a point
             stands for the place where its beam met the surface (`expect`).
+        component_levers: (K, 3) the same, summed over the points of each component.
     """
 
     component: IntArray
     alpha: Array
     inlier_ratio: Array
     levers: Array
+    component_levers: Array
 
 
 @dataclass(frozen=True)
@@ -78,12 +87,17 @@ class ShapeQuadratic:
 
     As a function of left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then
     translation) the negative log-likelihood is `d^T H d / 2 + g^T d`, where H is `blocks` on the
-    diagonal minus what is lost because the means of the components come from the same points: they
-    are eliminated. `blocks` alone, per-cloud information given the shape, claims more.
+    diagonal minus what is lost because place and orientation of the components come from the same
+    points: both are eliminated. `blocks` alone, per-cloud information given the shape, claims more.
 
     A cloud moves the mean of component k by `A_jk d_j / mass_k`, A_jk (3, 6) being the sum of
     `alpha [-skew(y), I]`. So the loss is the sum over k of `A_jk^T W_k A_j'k / mass_k`; since
     `W_k = a n n^T + b I` it is two matrix products, half the work of one with the root of W.
+
+    A component turned by v about its mean m would explain `v x (y - m)` of its points. With
+    G = -skew(y - m), what all its points say of v is C = sum of `alpha G^T W G`, and
+    `P_jk = sum of alpha G^T W [-skew(y), I]` couples it to the clouds: the loss is
+    `P_jk^T C_k^-1 P_j'k`. Clouds that share no component say nothing of each other's rotation then.
 
     Attributes:
         blocks: (J, 6, 6).
@@ -91,6 +105,8 @@ class ShapeQuadratic:
         across: (K, 6 J) of the loss across the surfaces, `sqrt(|a| / mass) n^T A`.
         sign: (K,) of a, which is negative where a component is thicker than it is wide.
         along: (K, 4 J) of the rest, `sqrt(b / mass)` times the sums of alpha and alpha y.
+        moments: (J, K, 10) sums of alpha h h^T, target frame.
+        turning: (K, 10, 18) that makes of them the `C^-1/2 P` (3, 6) of each cloud and component.
     """
 
     blocks: Array
@@ -98,15 +114,25 @@ class ShapeQuadratic:
     across: Array
     sign: Array
     along: Array
+    moments: Array
+    turning: Array
 
-    def joint(self) -> Array:
-        """H, (6 J, 6 J), symmetric positive semidefinite."""
+    def joint(self, given_orientations: bool = False) -> Array:
+        """H, (6 J, 6 J), symmetric positive semidefinite.
+
+        Args:
+            given_orientations: only the means are eliminated: half the work, for a step.
+        """
         count = len(self.blocks)
         # Transposed, their memory is in the order that BLAS wants; only a triangle comes back.
         flat = self.sign > 0.0
         H = blas.dsyrk(-1.0, self.across.T if flat.all() else self.across[flat].T)
         if not flat.all():
             H += blas.dsyrk(1.0, self.across[~flat].T)
+        if not given_orientations:
+            turns = np.matmul(self.moments.transpose(1, 0, 2), self.turning)
+            turns = turns.reshape(-1, count, 3, 6).transpose(0, 2, 1, 3)
+            H += blas.dsyrk(-1.0, turns.reshape(-1, 6 * count).T)
         even = blas.dsyrk(-1.0, self.along.T)
         for upper in (H, even):
             upper += upper.T
@@ -140,6 +166,12 @@ _TWICE = np.where(_ROW == _COLUMN, 0.5, 1.0)
 _TURNED = np.einsum("ace,qcd,bdf->abqef", _MOVES, _SYMMETRIC, _MOVES)[_ROW, _COLUMN]
 _BLOCKS = (_TWICE[:, None, None, None] * (_TURNED + np.swapaxes(_TURNED, 2, 3))).reshape(60, 36)
 """`J^T W J` of the ten moments times the six entries of W."""
+
+_TURNS = _BLOCKS.reshape(10, 6, 6, 6)[:, :, :3].transpose(1, 0, 2, 3).reshape(6, 180)
+"""The rows of the rotations of `J^T W J`, for all components at once."""
+
+_SPUN = np.einsum("ipa,jqb->pqijab", skew(np.eye(3)), skew(np.eye(3))).reshape(9, 81)
+"""`skew(v)^T W skew(v)` of W times `v v^T`."""
 
 _PULLED = np.zeros((4, 4, 6, 6))
 _PULLED[:, 1:] = np.einsum("ace,qcd->adqe", _MOVES, _SYMMETRIC)
@@ -219,7 +251,8 @@ def expect(
     k = min(NEIGHBOURS, len(mixture.weights))
     near = np.empty((len(stack.points), k), dtype=np.int64)
     alpha = np.empty((len(stack.points), k))
-    levers = np.empty((len(stack.points), 3))
+    pulls, seen = np.empty(alpha.shape), np.empty(stack.points.shape)
+    levers = np.empty(stack.points.shape)
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
     constant = (
         np.log(mixture.weights)
@@ -228,7 +261,7 @@ def expect(
         - np.log(mixture.var_tangent)
     )
     aside, above = -0.5 / mixture.var_tangent, -0.5 / mixture.var_normal
-    across = _across(mixture)
+    across, reach_m = _across(mixture), REACH_SIGMAS * stack.sigma_range_m
     means, directions = mixture.means_target.T.copy(), mixture.normals_target.T.copy()
 
     def of_part(part: slice) -> None:
@@ -250,6 +283,7 @@ def expect(
             depth += offset * beams[:, axis, None]
         # From the point along its beam to the surface.
         slide = height * np.maximum(facing, 0.0) / np.maximum(facing, STEEP) ** 2
+        slide = np.clip(slide, -reach_m, reach_m)
         aside2 = all2 + slide * (2.0 * depth + slide) - (height - facing * slide) ** 2
         log_alpha = constant[found]
         log_alpha += above[found] * height**2
@@ -259,20 +293,26 @@ def expect(
         likelihood = np.exp(log_alpha) * visible
         likelihood /= likelihood.sum(axis=1, keepdims=True) + outlier_density
         near[part], alpha[part] = found, likelihood
-        pull = likelihood * across[found] * height * slide
-        pulls = [np.einsum("nk,nk->n", pull, directions[axis][found]) for axis in range(3)]
-        levers[part] = _cross(beams, np.column_stack(pulls))
+        pull = likelihood * across[found] * height * slide * cloud_weights[cloud][:, None]
+        summed = [np.einsum("nk,nk->n", pull, directions[axis][found]) for axis in range(3)]
+        levers[part] = _cross(beams, np.column_stack(summed))
+        pulls[part], seen[part] = pull, beams
 
     # Every part is computed by itself, so that the result is the same on any number of cores.
     share_out(of_part, [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)])
     inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
         np.append(stack.starts, len(stack.points))
     )
+    pulled = [
+        np.bincount(near.ravel(), (pulls * seen[:, axis, None]).ravel(), len(mixture.weights))
+        for axis in range(3)
+    ]
     return Responsibilities(
-        near,
-        alpha * cloud_weights[stack.cloud][:, None],
-        inlier,
-        stack.sum_per_cloud(levers) * cloud_weights[:, None],
+        component=near,
+        alpha=alpha * cloud_weights[stack.cloud][:, None],
+        inlier_ratio=inlier,
+        levers=stack.sum_per_cloud(levers),
+        component_levers=_cross(np.column_stack(pulled), mixture.normals_target),
     )
 
 
@@ -318,9 +358,9 @@ def _across(mixture: Mixture) -> Array:
 
 
 def shape_quadratic(
-    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, levers: Array
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, who: Responsibilities
 ) -> ShapeQuadratic:
-    """The quadratic of `ShapeQuadratic` at the current poses, means eliminated.
+    """The quadratic of `ShapeQuadratic` at the current poses, means and orientations eliminated.
 
     A point y of cloud j contributes `alpha (y - mu)^T W (y - mu)`, with `dy = [-skew(y), I] d_j`
     and `W = n n^T / var_normal + ALONG_SURFACE (I - n n^T) / var_tangent` of its component.
@@ -330,8 +370,8 @@ def shape_quadratic(
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of current `T_target_lidar`.
         mixture: the components of the E-step.
-        cells: (J, K, 13) `cell_moments` of its responsibilities.
-        levers: (J, 3) of the same.
+        cells: (J, K, 13) `cell_moments` of the responsibilities.
+        who: these; their levers count.
     """
     count, K = stack.count, len(mixture.weights)
     moments = np.matmul(cells[..., :10], _carried(stack, R, t))
@@ -341,12 +381,15 @@ def shape_quadratic(
     n = mixture.normals_target
     a, b = _across(mixture), ALONG_SURFACE / mixture.var_tangent
     W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
-    upper = np.triu_indices(3)
     by_cloud = np.swapaxes(moments, 1, 2)
-    against = (by_cloud @ W[:, upper[0], upper[1]]).reshape(count, 60)
+    against = (by_cloud @ W[:, *np.triu_indices(3)]).reshape(count, 60)
     pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
     gradient = against @ _PULLS - np.einsum("jac,ace->je", pull, _MOVES)
-    gradient[:, :3] += levers
+    gradient[:, :3] += who.levers
+    coupling = _coupling(W, means)
+    half, turned = _orientations(moments.sum(axis=0), mass, means, W, who.component_levers)
+    pulled = np.einsum("kqae,ka->kqe", coupling, turned)
+    gradient -= moments.reshape(count, 10 * K) @ pulled.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
     across = np.empty((K, count, 6))
     root = n * np.sqrt(np.abs(a) / mass)[:, None]
@@ -358,7 +401,54 @@ def shape_quadratic(
         across=across.reshape(K, 6 * count),
         sign=np.sign(a),
         along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
+        moments=moments,
+        turning=np.matmul(half[:, None], coupling).reshape(K, 10, 18),
     )
+
+
+def _coupling(W: Array, means: Array) -> Array:
+    """(K, 10, 3, 6) that makes P of `ShapeQuadratic` of the moments of a cloud and component."""
+    K = len(means)
+    P = (W[:, *np.triu_indices(3)] @ _TURNS).reshape(K, 10, 3, 6)
+    # The turn is about the mean, not about the origin: first moments, which come first.
+    about = (-skew(means) @ W).reshape(-1, 3) @ _MOVES.transpose(1, 0, 2).reshape(3, 24)
+    P[:, :4] += about.reshape(K, 3, 4, 6).transpose(0, 2, 1, 3)
+    return np.asarray(P)
+
+
+def _orientations(
+    moments: Array, mass: Array, means: Array, W: Array, levers: Array
+) -> tuple[Array, Array]:
+    """`C^-1/2` (K, 3, 3) of `ShapeQuadratic`, and the turns (K, 3) that fit the points best.
+
+    Args:
+        moments: (K, 10) of all clouds together.
+        mass: (K,) of them.
+        means: (K, 3).
+        W: (K, 3, 3).
+        levers: (K, 3) of `Responsibilities`.
+    """
+    K = len(means)
+    scatter = _scatter(moments, means)
+    C = scatter.reshape(K, 1, 9) @ (W.reshape(K, 9) @ _SPUN).reshape(K, 9, 9)
+    C = C.reshape(K, 3, 3)
+    C += (LEAST_LEVER_M**2 * mass * np.trace(W, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    both = scatter @ W
+    torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + levers
+    return (
+        np.asarray(np.linalg.inv(np.linalg.cholesky(C))),
+        np.asarray(np.linalg.solve(C, torque[..., None])[..., 0]),
+    )
+
+
+def _scatter(moments: Array, means: Array) -> Array:
+    """(K, 3, 3) sums of `alpha (y - m) (y - m)^T` from (K, 10) moments and (K, 3) means."""
+    full = np.empty((len(means), 4, 4))
+    full[:, _ROW, _COLUMN] = full[:, _COLUMN, _ROW] = moments
+    offset = np.zeros((len(means), 3, 4))  # of y - m in h
+    offset[:, :, 0] = -means
+    offset[:, :, 1:] = np.eye(3)
+    return np.asarray(offset @ full @ np.swapaxes(offset, 1, 2))
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -397,12 +487,7 @@ def maximise_shape(
     trusted = np.matmul(cells[..., 10:], np.swapaxes(R, 1, 2)).sum(axis=0)
     normals = PRIOR_COUNT * mixture.normals_target + trusted
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    full = np.empty((len(mass), 4, 4))
-    full[:, _ROW, _COLUMN] = full[:, _COLUMN, _ROW] = moments
-    offset = np.zeros((len(mass), 3, 4))  # of y - mean in h
-    offset[:, :, 0] = -means
-    offset[:, :, 1:] = np.eye(3)
-    scatter = offset @ full @ np.swapaxes(offset, 1, 2)
+    scatter = _scatter(moments, means)
     along2 = np.einsum("ka,kab,kb->k", normals, scatter, normals)
     all2 = np.trace(scatter, axis1=1, axis2=2)
     floor = sigma_floor_m**2

@@ -57,6 +57,9 @@ MAX_STEP = 0.1
 STEP_TOLERANCE = (3e-4, 2e-4)
 """Radians and metres: a registration whose clouds move less has converged."""
 
+ROUGH_TOLERANCE = (1e-3, 6e-4)
+"""The same of a registration that another follows."""
+
 
 class JointRegistration:
     """The state of one placement's registration: clouds, mixture, and how fine it has become.
@@ -97,9 +100,9 @@ class JointRegistration:
             config.noise.lidar_range_m,
             normals,
         )
-        self._sigma_range = config.noise.lidar_range_m
         self._components = config.registration.components // (2 if rough else 1)
         self._gamma = config.registration.outlier_ratio
+        self.tolerance = ROUGH_TOLERANCE if rough else STEP_TOLERANCE
         self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
         self._floor = COARSE_SIGMA_M
         self._volume = 1.0
@@ -114,7 +117,7 @@ class JointRegistration:
         names = [cloud.lidar for cloud in self.observation.clouds]
         index = {name: i for i, name in enumerate(dict.fromkeys(names))}
         lidar = np.array([index[name] for name in names])
-        self.clouds = merged_normals(self.clouds, R, t, lidar, self._sigma_range)
+        self.clouds = merged_normals(self.clouds, R, t, lidar)
 
     @property
     def mixture(self) -> Mixture:
@@ -148,7 +151,7 @@ class JointRegistration:
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
         self._inlier_ratio = who.inlier_ratio
         self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
-        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who.levers)
+        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who)
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new poses (R, t)."""
@@ -213,7 +216,7 @@ def free_step(quadratic: ShapeQuadratic) -> Array:
         (J, 6) left perturbations; NaN if there is no solution.
     """
     count = len(quadratic.blocks)
-    H = quadratic.joint()
+    H = quadratic.joint(given_orientations=True)
     H4 = H.reshape(count, 6, count, 6)
     j = np.arange(count)
     H4[j, :, j, :] += DAMPING * quadratic.blocks
@@ -278,6 +281,7 @@ def register_jointly(
             float(np.median(np.abs(d[:, :3]).max(axis=1))),
             float(np.median(np.abs(d[:, 3:]).max(axis=1))),
         )
-        converged = state.finest and step[0] < STEP_TOLERANCE[0] and step[1] < STEP_TOLERANCE[1]
+        fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
+        converged = state.finest and fine
     quadratic = state.expect(R, t)
     return state.result(R, t, quadratic, iteration, converged, step)

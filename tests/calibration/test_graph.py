@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
+    ANCHOR,
     CloudLinearisation,
     DenseSystem,
     add_shape,
@@ -453,7 +454,10 @@ def test_cross_terms_between_clouds_are_kept() -> None:
     lines = linearise_clouds(case.problem, values)
     after = add_shape(before, lines, H, g)
     J = dense_jacobian(before, lines)
-    np.testing.assert_allclose(after.H, before.H + J.T @ H @ J, rtol=1e-9, atol=1e-6)
+    expected = before.H + J.T @ H @ J
+    frame = np.arange(6) + before.offset(key_target(0))
+    expected[frame, frame] += ANCHOR
+    np.testing.assert_allclose(after.H, expected, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(after.b, before.b - J.T @ g, rtol=1e-9, atol=1e-6)
 
 

@@ -245,7 +245,7 @@ def one_lidar(stack: CloudStack) -> IntArray:
 
 def test_aligned_clouds_show_the_face_of_a_leg() -> None:
     stack, R, t = leg_face(azimuth_deg=30.0, sigma_m=0.002)
-    merged = merged_normals(stack, R, t, one_lidar(stack), 0.002)
+    merged = merged_normals(stack, R, t, one_lidar(stack))
     assert np.median(merged.flatness) > 0.8
     assert np.median(angle_deg(merged.rotated(R, merged.normals), AHEAD)) < 5.0
     np.testing.assert_allclose(np.linalg.norm(merged.normals, axis=1), 1.0)
@@ -258,14 +258,14 @@ def test_aligned_clouds_show_the_face_of_a_leg() -> None:
 def test_aligned_clouds_trust_normals_that_a_single_cloud_cannot_see() -> None:
     # A cloud has 30 points on the leg, 3 cm apart, with 1 cm of noise.
     stack, R, t = leg_face(azimuth_deg=-6.0)
-    merged = merged_normals(stack, R, t, one_lidar(stack), 0.01)
+    merged = merged_normals(stack, R, t, one_lidar(stack))
     assert np.median(stack.flatness) < 0.45
     assert np.median(merged.flatness) > 0.55
 
 
 def test_noise_along_the_beams_does_not_turn_normals_to_the_sensor() -> None:
     stack, R, t = leg_face(azimuth_deg=49.0)
-    merged = merged_normals(stack, R, t, one_lidar(stack), 0.01)
+    merged = merged_normals(stack, R, t, one_lidar(stack))
     inner = (np.abs(stack.moved(R, t)[:, 1]) < 0.012) & (merged.flatness > 0.5)
     assert inner.sum() > 100
     mean = merged.rotated(R, merged.normals)[inner].mean(axis=0)
@@ -278,19 +278,19 @@ def test_clouds_of_another_lidar_are_not_merged() -> None:
     lidar = np.arange(stack.count) % 2
     off = t.copy()
     off[1::2] += [0.04, 0.0, 0.0]
-    aligned = merged_normals(stack, R, t, lidar, 0.01)
-    moved = merged_normals(stack, R, off, lidar, 0.01)
+    aligned = merged_normals(stack, R, t, lidar)
+    moved = merged_normals(stack, R, off, lidar)
     first = lidar[stack.cloud] == 0
     np.testing.assert_allclose(moved.normals[first], aligned.normals[first], atol=1e-12)
     np.testing.assert_allclose(moved.flatness[first], aligned.flatness[first], atol=1e-12)
     # Merged, those of the other would have a say.
-    together = merged_normals(stack, R, off, one_lidar(stack), 0.01)
+    together = merged_normals(stack, R, off, one_lidar(stack))
     assert np.median(angle_deg(together.normals[first], aligned.normals[first])) > 1.0
 
 
 def test_points_that_are_alone_have_no_normal_among_aligned_clouds() -> None:
     stack, R, t = leg_face(clouds=2)
-    merged = merged_normals(stack, R, t, one_lidar(stack), 0.01)
+    merged = merged_normals(stack, R, t, one_lidar(stack))
     points = stack.moved(R, t)
     near = np.linalg.norm(points[:, None] - points[None], axis=2) < 0.03
     alone = near.sum(axis=1) < 6

@@ -415,6 +415,8 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
         across=np.zeros((1, 6 * len(minima))),
         sign=np.ones(1),
         along=np.zeros((1, 4 * len(minima))),
+        moments=np.zeros((len(minima), 1, 10)),
+        turning=np.zeros((1, 10, 18)),
     )
 
 

@@ -3,11 +3,11 @@
 `estimate` is the one place that goes round. The paper's pipeline is its first half: register all
 clouds to the latent target, then solve the graph with one pose factor per cloud, robustly. `staged`
 stops there, in the paper's two stages. `joint` and `auto` go on: expectation-maximisation whose
-M-step is the graph solve, the clouds' quadratic (component means eliminated, all clouds coupled) in
-the place of the pose factors.
+M-step is the graph solve, the clouds' quadratic (places and orientations of the components
+eliminated, all clouds coupled) in the place of the pose factors.
 
-Gauge: the target frames are free, the map is held by the given poses, the extrinsics by the data or
-the guesses (SPEC 3, `auto`).
+Gauge: the target frames stay where they are, for the shapes are free; the map is held by the given
+poses, the extrinsics by the data or the guesses (SPEC 3, `auto`).
 """
 
 from __future__ import annotations
@@ -571,15 +571,15 @@ class _Shapes:
 
     def joint(self, scale: float) -> tuple[Array, Array]:
         """(6 J, 6 J) and (6 J,) of all placements."""
-        size = sum(q.gradient.size for q in self.quadratics)
-        H, gradient, start = np.zeros((size, size)), np.zeros(size), 0
-        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
-            part = slice(start, start + quadratic.gradient.size)
-            H[part, part], gradient[part] = quadratic.joint(), quadratic.gradient.ravel()
-            if turn is not None:
-                H[part, part], gradient[part] = forget_turns(H[part, part], gradient[part], turn)
-            start = part.stop
-        return H / scale**2, gradient / scale**2
+        each = [self.joint_of(m) for m in range(len(self.quadratics))]
+        H = block_diag(*[H for H, _ in each])
+        return H / scale**2, np.concatenate([gradient for _, gradient in each]) / scale**2
+
+    def joint_of(self, placement: int) -> tuple[Array, Array]:
+        """The same of one placement, before the scale of the registration."""
+        quadratic, turn = self.quadratics[placement], self.turns[placement]
+        H, gradient = quadratic.joint(), quadratic.gradient.ravel()
+        return (H, gradient) if turn is None else forget_turns(H, gradient, turn)
 
     def single(self) -> tuple[Array, Array]:
         """(J, 6, 6) and (J, 6): each cloud by itself, given the shape."""
@@ -629,7 +629,7 @@ def _hand_weights(state: SolveState, states: Sequence[JointRegistration]) -> Non
 
 @dataclass
 class _ShapeMeasurements:
-    """What each cloud by itself, given the shape, would have its pose be.
+    """What each cloud by itself, given the shape at its best, would have its pose be.
 
     Attributes:
         pull: (J, 6) left perturbations that lead there from the predicted poses.
@@ -772,13 +772,16 @@ def _refined_solution(
     else:
         cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
     pulls = _shape_measurements(state, shapes)
+    # The robust weights of the clouds are kept apart from what they say.
+    weighted = shapes.single()[0]
     registrations, measured, start = [], [], 0
-    for shape, (R, t), quadratic in zip(states, shapes.poses, shapes.quadratics, strict=True):
+    for m, (shape, (R, t)) in enumerate(zip(states, shapes.poses, strict=True)):
         part = slice(start, start + shape.clouds.count)
         start = part.stop
         R, t = left_step(R, t, pulls.pull[part])
-        quadratic = replace(quadratic, blocks=pulls.information[part] * state.scale**2)
-        result = shape.result(R, t, quadratic, iterations, converged, last_step)
+        blocks = pulls.information[part] * state.scale**2
+        joint = shapes.joint_of(m)[0] + block_diag(*(blocks - weighted[part]))
+        result = shape.result(R, t, blocks, joint, iterations, converged, last_step)
         registrations.append(result)
         measured += list(result.T_target_lidar)
     state.graph_seconds += time.perf_counter() - begun

@@ -355,6 +355,8 @@ def add_shape(
 ) -> DenseSystem:
     """Adds a quadratic on the poses of all clouds, `d^T H d / 2 + g^T d` (left perturbations).
 
+    It says nothing of a common motion of a target's clouds: their target frame is held (ANCHOR).
+
     Args:
         system: the rest of the graph.
         lines: how the clouds' poses move with the variables.

@@ -57,7 +57,17 @@ LEAST_LEVER_M = 1e-5
 """Keeps the orientation of a component defined that has its points on a line, or one alone."""
 
 PRIOR_COUNT = 1e-12
-"""Points' worth of weight that keeps an abandoned component defined."""
+"""Points' worth of weight that keeps an abandoned component defined. More would be information that
+a component has of its own place: a thousand times a millionth of a point are a quarter of a metre.
+"""
+
+POINTS_PER_COMPONENT = 10
+"""There are no more components than points for this many of each: a place and an orientation are
+known from three, and what they take the poses do not get."""
+
+FEW, ENOUGH = 2.0, 6.0
+"""Points of a component from which on its levers begin to count, and count fully: with points on
+one spot or a line its orientation could not take them up again."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +79,8 @@ class Responsibilities:
         alpha: (N, k) responsibilities times the weight of the point's cloud; the rest of each row
             belongs to the outlier class.
         inlier_ratio: (J,) part of each cloud's points that components explain.
-        levers: (J, 3) what is missing in the rotations' part of a cloud's gradient if a point
-            stands for the place where its beam met the surface (`expect`).
+        levers: (J, 3) what is missing in the rotations' part of a cloud's gradient, since the
+            lever of a residual ends where the beam meets the surface, not at the point (`expect`).
         component_levers: (K, 3) the same, summed over the points of each component.
     """
 
@@ -121,7 +131,8 @@ class ShapeQuadratic:
         """H, (6 J, 6 J), symmetric positive semidefinite.
 
         Args:
-            given_orientations: only the means are eliminated: half the work, for a step.
+            given_orientations: only the means are eliminated: half the work, and no less
+                information, so that a step is the same or shorter.
         """
         count = len(self.blocks)
         # Transposed, their memory is in the order that BLAS wants; only a triangle comes back.
@@ -193,11 +204,12 @@ def seed_mixture(stack: CloudStack, R: Array, t: Array, components: int, sigma_m
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of current `T_target_lidar`.
-        components: how many; fewer if there are fewer points.
+        components: how many; fewer if there are few points.
         sigma_m: first standard deviation along and across the normal.
     """
     points = stack.moved(R, t)
     normals = stack.rotated(R, stack.normals)
+    components = max(min(components, len(points) // POINTS_PER_COMPONENT), 1)
     usable = np.flatnonzero(stack.flatness > 0.5)
     if len(usable) < 2 * components:
         usable = np.arange(len(points))
@@ -251,7 +263,7 @@ def expect(
     k = min(NEIGHBOURS, len(mixture.weights))
     near = np.empty((len(stack.points), k), dtype=np.int64)
     alpha = np.empty((len(stack.points), k))
-    pulls, seen = np.empty(alpha.shape), np.empty(stack.points.shape)
+    forces, seen = np.empty(alpha.shape), np.empty(stack.points.shape)
     levers = np.empty(stack.points.shape)
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
     constant = (
@@ -261,7 +273,9 @@ def expect(
         - np.log(mixture.var_tangent)
     )
     aside, above = -0.5 / mixture.var_tangent, -0.5 / mixture.var_normal
-    across, reach_m = _across(mixture), REACH_SIGMAS * stack.sigma_range_m
+    reach_m = REACH_SIGMAS * stack.sigma_range_m
+    held = mixture.weights / mixture.weights.sum() * len(stack.points)
+    across = _across(mixture) * np.clip((held - FEW) / (ENOUGH - FEW), 0.0, 1.0)
     means, directions = mixture.means_target.T.copy(), mixture.normals_target.T.copy()
 
     def of_part(part: slice) -> None:
@@ -293,10 +307,10 @@ def expect(
         likelihood = np.exp(log_alpha) * visible
         likelihood /= likelihood.sum(axis=1, keepdims=True) + outlier_density
         near[part], alpha[part] = found, likelihood
-        pull = likelihood * across[found] * height * slide * cloud_weights[cloud][:, None]
-        summed = [np.einsum("nk,nk->n", pull, directions[axis][found]) for axis in range(3)]
+        force = likelihood * across[found] * height * slide * cloud_weights[cloud][:, None]
+        summed = [np.einsum("nk,nk->n", force, directions[axis][found]) for axis in range(3)]
         levers[part] = _cross(beams, np.column_stack(summed))
-        pulls[part], seen[part] = pull, beams
+        forces[part], seen[part] = force, beams
 
     # Every part is computed by itself, so that the result is the same on any number of cores.
     share_out(of_part, [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)])
@@ -304,7 +318,7 @@ def expect(
         np.append(stack.starts, len(stack.points))
     )
     pulled = [
-        np.bincount(near.ravel(), (pulls * seen[:, axis, None]).ravel(), len(mixture.weights))
+        np.bincount(near.ravel(), (forces * seen[:, axis, None]).ravel(), len(mixture.weights))
         for axis in range(3)
     ]
     return Responsibilities(
@@ -486,7 +500,7 @@ def maximise_shape(
     means = (moments[:, 1:4] + PRIOR_COUNT * mixture.means_target) / mass[:, None]
     trusted = np.matmul(cells[..., 10:], np.swapaxes(R, 1, 2)).sum(axis=0)
     normals = PRIOR_COUNT * mixture.normals_target + trusted
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     scatter = _scatter(moments, means)
     along2 = np.einsum("ka,kab,kb->k", normals, scatter, normals)
     all2 = np.trace(scatter, axis1=1, axis2=2)

@@ -81,7 +81,8 @@ class JointRegistration:
         Args:
             observation: the clouds.
             config: size of the mixture and of the clouds.
-            rough: fewer points and half the components, for a registration that another follows.
+            rough: fewer points, half the components and an earlier end, for a registration that
+                another follows.
             normals: False if `refine_normals` follows.
             shares: (J,) what each cloud counts beside others that saw the same; None: all fully.
 
@@ -163,20 +164,21 @@ class JointRegistration:
         self,
         R: Array,
         t: Array,
-        quadratic: ShapeQuadratic,
+        blocks: Array,
+        joint: Array,
         iterations: int,
         converged: bool,
         last_step: tuple[float, float],
     ) -> Registration:
-        """The registration at (R, t)."""
+        """The registration at (R, t), with information (J, 6, 6) of each cloud and of all."""
         # A cloud that no component explains has no information, but a matrix that can be inverted.
-        trace = float(np.median(np.trace(quadratic.blocks, axis1=1, axis2=2)))
+        trace = float(np.median(np.trace(blocks, axis1=1, axis2=2)))
         ridge = (1e-9 * trace + 1e-9) * np.eye(6)
         return Registration(
             observation=self.observation,
             T_target_lidar=unstack(R, t),
-            information=quadratic.blocks + ridge,
-            information_joint=quadratic.joint(),
+            information=blocks + ridge,
+            information_joint=joint,
             mixture=self.mixture,
             inlier_ratio=self.inlier_ratio,
             iterations=iterations,
@@ -284,4 +286,5 @@ def register_jointly(
         fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
         converged = state.finest and fine
     quadratic = state.expect(R, t)
-    return state.result(R, t, quadratic, iteration, converged, step)
+    joint = quadratic.joint()
+    return state.result(R, t, quadratic.blocks, joint, iteration, converged, step)

@@ -309,7 +309,9 @@ def against_a_known_shape(sigma_m: float) -> tuple[Array, Array]:
             quadratic = pupil.expect(R, t)
             d = -np.linalg.solve(quadratic.blocks, quadratic.gradient[..., None])[..., 0]
             R, t = left_step(R, t, np.asarray(d, dtype=np.float64))
-        result = pupil.result(R, t, pupil.expect(R, t), 10, True, (0.0, 0.0))
+        quadratic = pupil.expect(R, t)
+        joint = quadratic.joint()
+        result = pupil.result(R, t, quadratic.blocks, joint, 10, True, (0.0, 0.0))
         e.append(
             [
                 gtsam.Pose3.Logmap(est.compose(true.inverse()))

@@ -79,7 +79,7 @@ def seen(name: str, azimuths_deg: Sequence[float], seed: int = 0) -> Registratio
     while not state.finest:
         quadratic = state.expect(R, t)
         state.maximise(R, t)
-    return state.result(R, t, quadratic, 1, True, (0.0, 0.0))
+    return state.result(R, t, quadratic.blocks, quadratic.joint(), 1, True, (0.0, 0.0))
 
 
 def found(registration: Registration) -> tuple[Symmetry, ...]:

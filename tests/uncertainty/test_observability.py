@@ -219,10 +219,6 @@ def data_information(
     H = shape_information(problem, disjoint=disjoint)
     system = dense_system(problem, pose_graph(problem, noise), values)
     system = add_shape(system, linearise_clouds(problem, values), H, np.zeros(len(H)))
-    # The targets' frames are where their shapes are: free twice over, so one of the two is held.
-    start = 6 * len(problem.poses)
-    held = np.arange(start, start + 6 * problem.placements)
-    system.H[held, held] += 1.0
     D, _, _, _ = system.schur()
     to_tangent = np.linalg.inv(problem.to_vehicle_axes(values))
     D = to_tangent.T @ D @ to_tangent

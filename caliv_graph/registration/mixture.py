@@ -65,10 +65,6 @@ POINTS_PER_COMPONENT = 10
 """There are no more components than points for this many of each: a place and an orientation are
 known from three, and what they take the poses do not get."""
 
-FEW, ENOUGH = 2.0, 6.0
-"""Points of a component from which on its levers begin to count, and count fully: with points on
-one spot or a line its orientation could not take them up again."""
-
 
 @dataclass(frozen=True)
 class Responsibilities:
@@ -274,8 +270,7 @@ def expect(
     )
     aside, above = -0.5 / mixture.var_tangent, -0.5 / mixture.var_normal
     reach_m = REACH_SIGMAS * stack.sigma_range_m
-    held = mixture.weights / mixture.weights.sum() * len(stack.points)
-    across = _across(mixture) * np.clip((held - FEW) / (ENOUGH - FEW), 0.0, 1.0)
+    across = _across(mixture)
     means, directions = mixture.means_target.T.copy(), mixture.normals_target.T.copy()
 
     def of_part(part: slice) -> None:

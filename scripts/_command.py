@@ -9,8 +9,11 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from caliv_graph.errors import CalivError
+
+Number = TypeVar("Number", int, float)
 
 COMMAND = Path(sys.executable).with_name("caliv-graph")
 
@@ -100,13 +103,14 @@ def positive(text: str) -> int:
     return value
 
 
-def count_between(least: int, most: int) -> Callable[[str], int]:
-    """Reads a whole number of the command line that is in a range, ends included."""
+def between(kind: Callable[[str], Number], least: Number, most: Number) -> Callable[[str], Number]:
+    """Reads a number of the command line, int or float, that is in a range, ends included."""
 
-    def integer(text: str) -> int:
-        value = int(text)
+    def read(text: str) -> Number:
+        value = kind(text)
         if not least <= value <= most:
             raise argparse.ArgumentTypeError(f"must be {least} to {most}")
         return value
 
-    return integer
+    read.__name__ = "integer" if kind is int else "number"  # what argparse says is invalid
+    return read

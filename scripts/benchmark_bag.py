@@ -21,7 +21,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -47,7 +47,7 @@ from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.scenario import Scenario, parse_scenario
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
-from scripts._command import COMMAND, Usage, calibrate_measured, count_between, exit_code_of
+from scripts._command import COMMAND, Usage, between, calibrate_measured, exit_code_of
 
 RATE_HZ = 10.0
 LAP_S = 60
@@ -162,18 +162,18 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
         epilog="Exit codes: 0 fast and small enough; 3 not; 2 it could not be tried.",
     )
     number = parser.add_argument
-    number("--minutes", type=_between(0.5, 60.0), default=10.0, help="default: 10")
-    number("--lidars", type=count_between(1, 8), default=4, help="default: 4")
+    number("--minutes", type=between(float, 0.5, 60), default=10.0, help="default: 10")
+    number("--lidars", type=between(int, 1, 8), default=4, help="default: 4")
     number(
         "--points",
-        type=count_between(1, 500_000),
+        type=between(int, 1, 500_000),
         default=30_000,
         help="per cloud (default: 30000)",
     )
     number(
-        "--cores", type=count_between(1, 1024), default=2, help="for the calibration (default: 2)"
+        "--cores", type=between(int, 1, 1024), default=2, help="for the calibration (default: 2)"
     )
-    number("--seed", type=count_between(1, 2**31), default=1, help="default: 1")
+    number("--seed", type=between(int, 1, 2**31), default=1, help="default: 1")
     parser.add_argument(
         "--search", action="store_true", help="a config that does not say where the target is"
     )
@@ -184,16 +184,6 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     return parser.parse_args(given)
-
-
-def _between(least: float, most: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        value = float(text)
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"must be {least:g} to {most:g}")
-        return value
-
-    return number
 
 
 def benchmark(arguments: argparse.Namespace) -> int:

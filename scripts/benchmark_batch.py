@@ -40,7 +40,7 @@ from caliv_graph.config import load_config
 from caliv_graph.errors import CalivError
 from caliv_graph.files import output_folder
 from caliv_graph.simulation import load_scenario, simulate_caliv
-from scripts._command import count_between
+from scripts._command import between
 
 SCENARIO = ROOT / "configs/scenarios/demo_arc.yaml"
 DRIVES = ROOT / "out/batch_drives"
@@ -103,13 +103,13 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
         epilog="Exit codes: 0 fast enough and never different; 3 not; 2 it could not be tried.",
     )
     number = parser.add_argument
-    number("--drives", type=count_between(1, 1000), default=16, help="default: 16")
-    number("--workers", type=count_between(2, 64), default=2, help="against one (default: 2)")
+    number("--drives", type=between(int, 1, 1000), default=16, help="default: 16")
+    number("--workers", type=between(int, 2, 64), default=2, help="against one (default: 2)")
     number(
-        "--rounds", type=count_between(0, 100), default=2, help="of each (default: 2); 0: no times"
+        "--rounds", type=between(int, 0, 100), default=2, help="of each (default: 2); 0: no times"
     )
-    number("--kills", type=count_between(0, 1000), default=0, help="default: 0")
-    number("--seed", type=count_between(0, 2**31), default=1, help="of the moments of the kills")
+    number("--kills", type=between(int, 0, 1000), default=0, help="default: 0")
+    number("--seed", type=between(int, 0, 2**31), default=1, help="of the moments of the kills")
     number("--folder", type=Path, help="for results (default: a temporary one, removed)")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     return parser.parse_args(given)

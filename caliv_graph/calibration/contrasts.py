@@ -18,8 +18,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.calibration.graph import ANCHOR
-from caliv_graph.conventions import key_target
+from caliv_graph.calibration.graph import hold_targets
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, IntArray, Solution
@@ -189,10 +188,7 @@ class _System:
         J = _stacked(clouds, columns, size)
         self._coupled = J.T @ clouds.H
         self._H += J.T @ self._coupled.T
-        letter = gtsam.symbolChr(key_target(0))
-        for key, where in columns.items():
-            if gtsam.symbolChr(key) == letter:
-                self._H[where, where] += ANCHOR * np.eye(6)
+        hold_targets(self._H, {key: where.start for key, where in columns.items()})
         self._b -= J.T @ clouds.gradient
         self._clouds = clouds
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -571,16 +572,19 @@ class _Shapes:
 
     def joint(self, scale: float) -> tuple[Array, Array]:
         """(6 J, 6 J) and (6 J,) of all placements."""
-        each = [self.joint_of(m) for m in range(len(self.quadratics))]
-        H = block_diag(*[H for H, _ in each])
-        return H / scale**2, np.concatenate([gradient for _, gradient in each]) / scale**2
+        H = block_diag(*[H for H, _ in self.joints])
+        return H / scale**2, np.concatenate([gradient for _, gradient in self.joints]) / scale**2
 
-    def joint_of(self, placement: int) -> tuple[Array, Array]:
-        """The same of one placement, before the scale of the registration."""
-        quadratic, turn = self.quadratics[placement], self.turns[placement]
-        H, gradient = quadratic.joint(), quadratic.gradient.ravel()
-        return (H, gradient) if turn is None else forget_turns(H, gradient, turn)
+    @cached_property
+    def joints(self) -> list[tuple[Array, Array]]:
+        """The same of each placement, before the scale of the registration."""
+        out = []
+        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
+            H, gradient = quadratic.joint(), quadratic.gradient.ravel()
+            out.append((H, gradient) if turn is None else forget_turns(H, gradient, turn))
+        return out
 
+    @cached_property
     def single(self) -> tuple[Array, Array]:
         """(J, 6, 6) and (J, 6): each cloud by itself, given the shape."""
         blocks, gradients = [], []
@@ -643,7 +647,7 @@ class _ShapeMeasurements:
 def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurements:
     """The pose factors that the quadratic stands for, one per cloud."""
     weights = state.weights.values
-    blocks, gradient = shapes.single()
+    blocks, gradient = shapes.single
     information = blocks / weights[:, None, None] / state.scale**2
     # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
     ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
@@ -773,14 +777,14 @@ def _refined_solution(
         cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
     pulls = _shape_measurements(state, shapes)
     # The robust weights of the clouds are kept apart from what they say.
-    weighted = shapes.single()[0]
+    weighted = shapes.single[0]
     registrations, measured, start = [], [], 0
-    for m, (shape, (R, t)) in enumerate(zip(states, shapes.poses, strict=True)):
+    for shape, (R, t), (H, _) in zip(states, shapes.poses, shapes.joints, strict=True):
         part = slice(start, start + shape.clouds.count)
         start = part.stop
         R, t = left_step(R, t, pulls.pull[part])
         blocks = pulls.information[part] * state.scale**2
-        joint = shapes.joint_of(m)[0] + block_diag(*(blocks - weighted[part]))
+        joint = H + block_diag(*(blocks - weighted[part]))
         result = shape.result(R, t, blocks, joint, iterations, converged, last_step)
         registrations.append(result)
         measured += list(result.T_target_lidar)

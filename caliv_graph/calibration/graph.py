@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -378,10 +378,22 @@ def add_shape(
     )
     half = J.T @ H_clouds
     H = system.H + (J.T @ half.T)
-    for target in {keys[0] for keys in lines.keys}:
-        frame = starts[target] + np.arange(6)
-        H[frame, frame] += ANCHOR
+    hold_targets(H, starts)
     return replace(system, H=H, b=system.b - J.T @ gradient)
+
+
+def hold_targets(H: Array, starts: Mapping[int, int]) -> None:
+    """Adds ANCHOR to the frames of the targets.
+
+    Args:
+        H: (M, M) information, changed in place.
+        starts: first coordinate of each variable.
+    """
+    letter = gtsam.symbolChr(key_target(0))
+    for key, start in starts.items():
+        if gtsam.symbolChr(key) == letter:
+            frame = start + np.arange(6)
+            H[frame, frame] += ANCHOR
 
 
 def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:

@@ -57,8 +57,8 @@ LEAST_LEVER_M = 1e-5
 """Keeps the orientation of a component defined that has its points on a line, or one alone."""
 
 PRIOR_COUNT = 1e-12
-"""Points' worth of weight that keeps an abandoned component defined. More would be information that
-a component has of its own place: a thousand times a millionth of a point are a quarter of a metre.
+"""Points' worth of weight that keeps an abandoned component defined. More would add up over all
+components to information on where the target is, which no cloud has.
 """
 
 POINTS_PER_COMPONENT = 10
@@ -112,7 +112,8 @@ class ShapeQuadratic:
         sign: (K,) of a, which is negative where a component is thicker than it is wide.
         along: (K, 4 J) of the rest, `sqrt(b / mass)` times the sums of alpha and alpha y.
         moments: (J, K, 10) sums of alpha h h^T, target frame.
-        turning: (K, 10, 18) that makes of them the `C^-1/2 P` (3, 6) of each cloud and component.
+        coupling: (K, 10, 3, 6) that makes of them the P of each cloud and component.
+        turnable: (K, 3, 3) C of each component.
     """
 
     blocks: Array
@@ -121,7 +122,8 @@ class ShapeQuadratic:
     sign: Array
     along: Array
     moments: Array
-    turning: Array
+    coupling: Array
+    turnable: Array
 
     def joint(self, given_orientations: bool = False) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite.
@@ -137,7 +139,9 @@ class ShapeQuadratic:
         if not flat.all():
             H += blas.dsyrk(1.0, self.across[~flat].T)
         if not given_orientations:
-            turns = np.matmul(self.moments.transpose(1, 0, 2), self.turning)
+            root = np.linalg.inv(np.linalg.cholesky(self.turnable))
+            turning = np.matmul(root[:, None], self.coupling).reshape(-1, 10, 18)
+            turns = np.matmul(self.moments.transpose(1, 0, 2), turning)
             turns = turns.reshape(-1, count, 3, 6).transpose(0, 2, 1, 3)
             H += blas.dsyrk(-1.0, turns.reshape(-1, 6 * count).T)
         even = blas.dsyrk(-1.0, self.along.T)
@@ -384,9 +388,8 @@ def shape_quadratic(
     """
     count, K = stack.count, len(mixture.weights)
     moments = np.matmul(cells[..., :10], _carried(stack, R, t))
-    mass = moments[..., 0].sum(axis=0) + PRIOR_COUNT
-    first = moments[..., 1:4].sum(axis=0)
-    means = (first + PRIOR_COUNT * mixture.means_target) / mass[:, None]
+    total = moments.sum(axis=0)
+    mass, means = _mass_and_means(total, mixture)
     n = mixture.normals_target
     a, b = _across(mixture), ALONG_SURFACE / mixture.var_tangent
     W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
@@ -396,7 +399,7 @@ def shape_quadratic(
     gradient = against @ _PULLS - np.einsum("jac,ace->je", pull, _MOVES)
     gradient[:, :3] += who.levers
     coupling = _coupling(W, means)
-    half, turned = _orientations(moments.sum(axis=0), mass, means, W, who.component_levers)
+    turnable, turned = _orientations(total, mass, means, W, who.component_levers)
     pulled = np.einsum("kqae,ka->kqe", coupling, turned)
     gradient -= moments.reshape(count, 10 * K) @ pulled.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
@@ -411,7 +414,8 @@ def shape_quadratic(
         sign=np.sign(a),
         along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
         moments=moments,
-        turning=np.matmul(half[:, None], coupling).reshape(K, 10, 18),
+        coupling=coupling,
+        turnable=turnable,
     )
 
 
@@ -428,7 +432,7 @@ def _coupling(W: Array, means: Array) -> Array:
 def _orientations(
     moments: Array, mass: Array, means: Array, W: Array, levers: Array
 ) -> tuple[Array, Array]:
-    """`C^-1/2` (K, 3, 3) of `ShapeQuadratic`, and the turns (K, 3) that fit the points best.
+    """C (K, 3, 3) of `ShapeQuadratic`, and the turns (K, 3) that fit the points best.
 
     Args:
         moments: (K, 10) of all clouds together.
@@ -444,10 +448,13 @@ def _orientations(
     C += (LEAST_LEVER_M**2 * mass * np.trace(W, axis1=1, axis2=2))[:, None, None] * np.eye(3)
     both = scatter @ W
     torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + levers
-    return (
-        np.asarray(np.linalg.inv(np.linalg.cholesky(C))),
-        np.asarray(np.linalg.solve(C, torque[..., None])[..., 0]),
-    )
+    return C, np.asarray(np.linalg.solve(C, torque[..., None])[..., 0])
+
+
+def _mass_and_means(moments: Array, mixture: Mixture) -> tuple[Array, Array]:
+    """(K,) weight and (K, 3) mean of each component's points from their (K, 10) moments."""
+    mass = moments[:, 0] + PRIOR_COUNT
+    return mass, (moments[:, 1:4] + PRIOR_COUNT * mixture.means_target) / mass[:, None]
 
 
 def _scatter(moments: Array, means: Array) -> Array:
@@ -491,8 +498,7 @@ def maximise_shape(
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
     """
     moments = np.matmul(cells[..., :10], _carried(stack, R, t)).sum(axis=0)
-    mass = moments[:, 0] + PRIOR_COUNT
-    means = (moments[:, 1:4] + PRIOR_COUNT * mixture.means_target) / mass[:, None]
+    mass, means = _mass_and_means(moments, mixture)
     trusted = np.matmul(cells[..., 10:], np.swapaxes(R, 1, 2)).sum(axis=0)
     normals = PRIOR_COUNT * mixture.normals_target + trusted
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]

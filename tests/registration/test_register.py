@@ -418,7 +418,8 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
         sign=np.ones(1),
         along=np.zeros((1, 4 * len(minima))),
         moments=np.zeros((len(minima), 1, 10)),
-        turning=np.zeros((1, 10, 18)),
+        coupling=np.zeros((1, 10, 3, 6)),
+        turnable=np.eye(3)[None],
     )
 
 

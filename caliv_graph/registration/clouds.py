@@ -92,11 +92,14 @@ class CloudStack:
     def features(self) -> Array:
         """(N, 13) what the mixture sums up, in the lidar frame.
 
-        `h h^T`, upper triangle, h = (1, point less its cloud's centre); and flatness times normal.
+        `products` of the points less their cloud's centre; and flatness times normal.
         """
-        h = np.column_stack([np.ones(len(self.points)), self.points - self.centres[self.cloud]])
-        row, column = np.triu_indices(4)
-        return np.column_stack([h[:, row] * h[:, column], self.flatness[:, None] * self.normals])
+        return np.column_stack([products(self.centred), self.flatness[:, None] * self.normals])
+
+    @cached_property
+    def centred(self) -> Array:
+        """(N, 3) points less the centre of their cloud, lidar frame."""
+        return np.asarray(self.points - self.centres[self.cloud])
 
     def rotated(self, R: Array, vectors: Array) -> Array:
         """Rotates (N, 3) vectors of the points by the (J, 3, 3) rotation of their cloud."""
@@ -109,6 +112,13 @@ class CloudStack:
     def sum_per_cloud(self, values: Array) -> Array:
         """Sums (N, ...) values over the points of each cloud; (J, ...)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
+
+
+def products(points: Array) -> Array:
+    """(N, 10) `h h^T`, upper triangle, of h = (1, point)."""
+    h = np.column_stack([np.ones(len(points)), points])
+    row, column = np.triu_indices(4)
+    return np.asarray(h[:, row] * h[:, column])
 
 
 def sampling_order(points: Array) -> npt.NDArray[np.uint64]:

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
-from caliv_graph.registration.clouds import CloudStack, sampling_order
+from caliv_graph.registration.clouds import CloudStack, products, sampling_order
 
 NEIGHBOURS = 6
 """Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
@@ -53,6 +53,13 @@ near, by 5 mm of a sparse LiDAR's mounting, with a precision that is not there. 
 say something: without any of it three sparse LiDARs are a millimetre off, the other way.
 """
 
+NORMAL_SIGMA_RAD = 0.2
+"""How far the normal of a component may be from those of its points, which are blurred near edges
+and have their noise from the same points."""
+
+MAX_TURN_RAD = 0.2
+"""Largest turn of a component in one M-step that is not towards the normals of its points."""
+
 LEAST_LEVER_M = 1e-5
 """Keeps the orientation of a component defined that has its points on a line, or one alone."""
 
@@ -78,6 +85,7 @@ class Responsibilities:
         levers: (J, 3) what is missing in the rotations' part of a cloud's gradient, since the
             lever of a residual ends where the beam meets the surface, not at the point (`expect`).
         component_levers: (K, 3) the same, summed over the points of each component.
+        slides_m: (N,) how far along its beam the surface is from each point.
     """
 
     component: IntArray
@@ -85,6 +93,7 @@ class Responsibilities:
     inlier_ratio: Array
     levers: Array
     component_levers: Array
+    slides_m: Array
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,7 @@ class ShapeQuadratic:
         moments: (J, K, 10) sums of alpha h h^T, target frame.
         coupling: (K, 10, 3, 6) that makes of them the P of each cloud and component.
         turnable: (K, 3, 3) C of each component.
+        torque: (K, 3) the negative gradient in v.
     """
 
     blocks: Array
@@ -124,6 +134,7 @@ class ShapeQuadratic:
     moments: Array
     coupling: Array
     turnable: Array
+    torque: Array
 
     def joint(self, given_orientations: bool = False) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite.
@@ -264,7 +275,7 @@ def expect(
     near = np.empty((len(stack.points), k), dtype=np.int64)
     alpha = np.empty((len(stack.points), k))
     forces, seen = np.empty(alpha.shape), np.empty(stack.points.shape)
-    levers = np.empty(stack.points.shape)
+    levers, slides = np.empty(stack.points.shape), np.empty(len(stack.points))
     tree = cKDTree(np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target]))
     constant = (
         np.log(mixture.weights)
@@ -304,7 +315,9 @@ def expect(
         log_alpha += NORMAL_CONCENTRATION * stack.flatness[part, None] * (agreement - 1.0)
         visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 1e-3, 1.0)
         likelihood = np.exp(log_alpha) * visible
-        likelihood /= likelihood.sum(axis=1, keepdims=True) + outlier_density
+        explained = likelihood.sum(axis=1)
+        slides[part] = np.einsum("nk,nk->n", likelihood, slide) / np.maximum(explained, 1e-300)
+        likelihood /= explained[:, None] + outlier_density
         near[part], alpha[part] = found, likelihood
         force = likelihood * across[found] * height * slide * cloud_weights[cloud][:, None]
         summed = [np.einsum("nk,nk->n", force, directions[axis][found]) for axis in range(3)]
@@ -326,6 +339,7 @@ def expect(
         inlier_ratio=inlier,
         levers=stack.sum_per_cloud(levers),
         component_levers=_cross(np.column_stack(pulled), mixture.normals_target),
+        slides_m=slides,
     )
 
 
@@ -338,8 +352,9 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
         components: how many there are, K.
 
     Returns:
-        (J, K, 13): sums of `alpha h h^T`, upper triangle, h = (1, p), p the point in the frame of
-        its LiDAR less its cloud's centre; and of alpha times flatness times normal, lidar frame.
+        (J, K, 23): sums of `alpha h h^T`, upper triangle, h = (1, p), p the point in the frame of
+        its LiDAR less its cloud's centre; of alpha times flatness times normal, lidar frame; and as
+        the first ten with the place where the point's beam meets the surface for the point.
     """
     cells, width = stack.count * components, who.component.shape[1]
     # A column per point, an entry per component it may belong to: the product is one pass.
@@ -351,7 +366,9 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
         ),
         shape=(cells, len(stack.points)),
     )
-    return np.asarray(belongs @ stack.features).reshape(stack.count, components, 13)
+    met = products(stack.centred + who.slides_m[:, None] * stack.beams)
+    sums = belongs @ np.column_stack([stack.features, met])
+    return np.asarray(sums).reshape(stack.count, components, 23)
 
 
 def _carried(stack: CloudStack, R: Array, t: Array) -> Array:
@@ -376,30 +393,39 @@ def shape_quadratic(
     """The quadratic of `ShapeQuadratic` at the current poses, means and orientations eliminated.
 
     A point y of cloud j contributes `alpha (y - mu)^T W (y - mu)`, with `dy = [-skew(y), I] d_j`
-    and `W = n n^T / var_normal + ALONG_SURFACE (I - n n^T) / var_tangent` of its component.
+    and `W = n n^T / var_normal + ALONG_SURFACE (I - n n^T) / var_tangent` of its component. The
+    levers in what multiplies d reach to where the beam meets the surface: to the point, they would
+    be longer by the noise wherever a surface is slanted, and go with its residual.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of current `T_target_lidar`.
         mixture: the components of the E-step.
-        cells: (J, K, 13) `cell_moments` of the responsibilities.
+        cells: (J, K, 23) `cell_moments` of the responsibilities.
         who: these; their levers count.
     """
     count, K = stack.count, len(mixture.weights)
-    moments = np.matmul(cells[..., :10], _carried(stack, R, t))
-    total = moments.sum(axis=0)
+    carried = _carried(stack, R, t)
+    points, moments = np.matmul(cells[..., :10], carried), np.matmul(cells[..., 13:], carried)
+    total = points.sum(axis=0)
     mass, means = _mass_and_means(total, mixture)
     n = mixture.normals_target
     a, b = _across(mixture), ALONG_SURFACE / mixture.var_tangent
     W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
-    by_cloud = np.swapaxes(moments, 1, 2)
-    against = (by_cloud @ W[:, *np.triu_indices(3)]).reshape(count, 60)
+    halves = W[:, *np.triu_indices(3)]
+    by_cloud = np.swapaxes(points, 1, 2)
     pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
-    gradient = against @ _PULLS - np.einsum("jac,ace->je", pull, _MOVES)
+    gradient = (by_cloud @ halves).reshape(count, 60) @ _PULLS
+    gradient -= np.einsum("jac,ace->je", pull, _MOVES)
     gradient[:, :3] += who.levers
-    coupling = _coupling(W, means)
-    turnable, turned = _orientations(total, mass, means, W, who.component_levers)
+    met = moments.sum(axis=0)
+    middles = _mass_and_means(met, mixture)[1]
+    coupling = _coupling(W, middles)
+    both = _scatter(total, means) @ W
+    torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + who.component_levers
+    turnable = _turnable(_scatter(met, middles), mass, W)
+    turned = np.linalg.solve(turnable, torque[..., None])[..., 0]
     pulled = np.einsum("kqae,ka->kqe", coupling, turned)
     gradient -= moments.reshape(count, 10 * K) @ pulled.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
@@ -408,7 +434,9 @@ def shape_quadratic(
     across[..., :3] = _cross(sums[..., 1:], root[:, None])
     across[..., 3:] = sums[..., :1] * root[:, None]
     return ShapeQuadratic(
-        blocks=(against @ _BLOCKS).reshape(count, 6, 6),
+        blocks=((np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS).reshape(
+            count, 6, 6
+        ),
         gradient=np.asarray(gradient),
         across=across.reshape(K, 6 * count),
         sign=np.sign(a),
@@ -416,6 +444,7 @@ def shape_quadratic(
         moments=moments,
         coupling=coupling,
         turnable=turnable,
+        torque=np.asarray(torque),
     )
 
 
@@ -429,26 +458,19 @@ def _coupling(W: Array, means: Array) -> Array:
     return np.asarray(P)
 
 
-def _orientations(
-    moments: Array, mass: Array, means: Array, W: Array, levers: Array
-) -> tuple[Array, Array]:
-    """C (K, 3, 3) of `ShapeQuadratic`, and the turns (K, 3) that fit the points best.
+def _turnable(scatter: Array, mass: Array, W: Array) -> Array:
+    """C (K, 3, 3) of `ShapeQuadratic`.
 
     Args:
-        moments: (K, 10) of all clouds together.
-        mass: (K,) of them.
-        means: (K, 3).
+        scatter: (K, 3, 3) of the places where the beams meet the surface, about their mean.
+        mass: (K,) of all clouds together.
         W: (K, 3, 3).
-        levers: (K, 3) of `Responsibilities`.
     """
-    K = len(means)
-    scatter = _scatter(moments, means)
+    K = len(mass)
     C = scatter.reshape(K, 1, 9) @ (W.reshape(K, 9) @ _SPUN).reshape(K, 9, 9)
     C = C.reshape(K, 3, 3)
     C += (LEAST_LEVER_M**2 * mass * np.trace(W, axis1=1, axis2=2))[:, None, None] * np.eye(3)
-    both = scatter @ W
-    torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + levers
-    return C, np.asarray(np.linalg.solve(C, torque[..., None])[..., 0])
+    return np.asarray(C)
 
 
 def _mass_and_means(moments: Array, mixture: Mixture) -> tuple[Array, Array]:
@@ -486,30 +508,66 @@ def maximise_shape(
     mixture: Mixture,
     cells: Array,
     sigma_floor_m: float,
+    turnable: Array,
+    torque: Array,
 ) -> Mixture:
     """M-step of the components at new poses: means, normals, variances, priors.
+
+    A normal is where the points have the component turn, measured along their beams, and the
+    normals of the points are its prior. By these alone, slanted and frontal views of a narrow face
+    would not agree on where it is.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of the new `T_target_lidar`.
         t: (J, 3) translations of the new `T_target_lidar`.
         mixture: the components of the E-step.
-        cells: (J, K, 13) `cell_moments` of its responsibilities.
+        cells: (J, K, 23) `cell_moments` of its responsibilities.
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
+        turnable: (K, 3, 3) of the quadratic of the E-step.
+        torque: (K, 3) of it.
     """
-    moments = np.matmul(cells[..., :10], _carried(stack, R, t)).sum(axis=0)
+    carried = _carried(stack, R, t)
+    moments = np.matmul(cells[..., :10], carried).sum(axis=0)
     mass, means = _mass_and_means(moments, mixture)
-    trusted = np.matmul(cells[..., 10:], np.swapaxes(R, 1, 2)).sum(axis=0)
+    trusted = np.matmul(cells[..., 10:13], np.swapaxes(R, 1, 2)).sum(axis=0)
     normals = PRIOR_COUNT * mixture.normals_target + trusted
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    normals = _turned(mixture.normals_target, normals, turnable, torque)
     scatter = _scatter(moments, means)
     along2 = np.einsum("ka,kab,kb->k", normals, scatter, normals)
-    all2 = np.trace(scatter, axis1=1, axis2=2)
+    # Along the surface the noise of a slanted beam would make a component wider.
+    met = np.matmul(cells[..., 13:], carried).sum(axis=0)
+    scatter = _scatter(met, _mass_and_means(met, mixture)[1])
+    aside2 = np.trace(scatter, axis1=1, axis2=2) - np.einsum(
+        "ka,kab,kb->k", normals, scatter, normals
+    )
     floor = sigma_floor_m**2
     return Mixture(
         means_target=means,
         normals_target=normals,
         var_normal=np.maximum(along2 / mass, floor),
-        var_tangent=np.maximum((all2 - along2) / (2.0 * mass), floor),
+        var_tangent=np.maximum(aside2 / (2.0 * mass), floor),
         weights=mass / mass.sum(),
     )
+
+
+def _turned(normals: Array, trusted: Array, turnable: Array, torque: Array) -> Array:
+    """(K, 3) normals, turned to where they are most probable.
+
+    A turn v costs `v^T C v / 2 - torque^T v`, and `|v - w|^2 / 2` in units of the prior, w being
+    the turn that leads to the trusted normals.
+    """
+    axis = _cross(normals, trusted)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, np.einsum("ka,ka->k", normals, trusted))
+    turn = axis * (angle / np.maximum(sine, 1e-300))[:, None]
+    left = torque - np.einsum("kab,kb->ka", turnable, turn)
+    more = np.linalg.solve(turnable + np.eye(3) / NORMAL_SIGMA_RAD**2, left[..., None])[..., 0]
+    size = np.linalg.norm(more, axis=1)
+    turn += more * np.minimum(1.0, MAX_TURN_RAD / np.maximum(size, 1e-300))[:, None]
+    angle = np.linalg.norm(turn, axis=1)[:, None]
+    axis = turn / np.maximum(angle, 1e-300)
+    along = axis * np.einsum("ka,ka->k", axis, normals)[:, None]
+    turned = along + np.cos(angle) * (normals - along) + np.sin(angle) * _cross(axis, normals)
+    return np.asarray(turned / np.linalg.norm(turned, axis=1)[:, None])

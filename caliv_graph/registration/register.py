@@ -109,6 +109,7 @@ class JointRegistration:
         self._volume = 1.0
         self._mixture: Mixture | None = None
         self._cells: Array | None = None
+        self._turning: tuple[Array, Array] | None = None
         self._inlier_ratio: Array = np.ones(self.clouds.count)
         self._shares = np.ones(self.clouds.count) if shares is None else shares
         self.weights: Array = np.ones(self.clouds.count)
@@ -152,13 +153,17 @@ class JointRegistration:
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
         self._inlier_ratio = who.inlier_ratio
         self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
-        return shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who)
+        quadratic = shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who)
+        self._turning = quadratic.turnable, quadratic.torque
+        return quadratic
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new poses (R, t)."""
-        if self._cells is None:
+        if self._cells is None or self._turning is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
-        self._mixture = maximise_shape(self.clouds, R, t, self.mixture, self._cells, self._floor)
+        self._mixture = maximise_shape(
+            self.clouds, R, t, self.mixture, self._cells, self._floor, *self._turning
+        )
 
     def result(
         self,

@@ -94,7 +94,7 @@ UP = np.array([[0.0, 0.0, 1.0]])
 
 def held(component: IntArray, alpha: Array, clouds: int = 1) -> Responsibilities:
     nothing = np.zeros((clouds, 3)), np.zeros((int(component.max()) + 1, 3))
-    return Responsibilities(component, alpha, np.ones(clouds), *nothing)
+    return Responsibilities(component, alpha, np.ones(clouds), *nothing, np.zeros(len(alpha)))
 
 
 def quadratic_of(
@@ -108,7 +108,9 @@ def maximised(
     stack: CloudStack, R: Array, t: Array, mixture: Mixture, who: Responsibilities, floor_m: float
 ) -> Mixture:
     cells = cell_moments(stack, who, len(mixture.weights))
-    return maximise_shape(stack, R, t, mixture, cells, floor_m)
+    quadratic = shape_quadratic(stack, R, t, mixture, cells, who)
+    turning = quadratic.turnable, quadratic.torque
+    return maximise_shape(stack, R, t, mixture, cells, floor_m, *turning)
 
 
 # ------------------------------------------------------------------ E-step
@@ -219,6 +221,59 @@ def test_noise_along_the_beams_turns_no_surface() -> None:
     without = -np.linalg.solve(information, quadratic.gradient[0, :3] - who.levers[0])
     assert abs(turned[1]) < 3e-4
     assert abs(without[1]) > 1e-3
+
+
+def slanted(rng: np.random.Generator, noise_m: float, normal: Array) -> CloudStack:
+    """A patch of 80 x 80 mm about the origin in the plane z = 0, seen under 60 degrees."""
+    beam = np.array([math.sin(math.radians(60.0)), 0.0, -0.5])
+    points = np.column_stack([rng.uniform(-0.04, 0.04, (4000, 2)), np.zeros(4000)])
+    points += noise_m * rng.normal(size=(4000, 1)) * beam
+    return stack_of(points, np.tile(normal, (4000, 1)), beams=np.tile(beam, (4000, 1)))
+
+
+def test_levers_do_not_grow_with_the_noise() -> None:
+    # Noise of 10 mm moves the points by 8.7 mm along the surface, beside the 23 mm they spread.
+    flat = component((0.0, 0.0, 0.0), sigma_normal=0.01, sigma_tangent=0.03)
+    found = []
+    for noise_m in (1e-6, 0.01):
+        stack = slanted(np.random.default_rng(3), noise_m, UP[0])
+        who = expect(stack, *IDENTITY, flat, 1e-9, np.ones(1))
+        found.append((stack, who, quadratic_of(stack, *IDENTITY, flat, who)))
+    (_, _, still), (stack, who, noisy) = found
+    for axis in (0, 1):
+        expected = still.turnable[0, axis, axis]
+        assert noisy.turnable[0, axis, axis] == pytest.approx(expected, rel=0.02)
+        assert noisy.blocks[0, axis, axis] == pytest.approx(still.blocks[0, axis, axis], rel=0.02)
+    at_points = replace(who, slides_m=np.zeros(len(stack.points)))
+    longer = quadratic_of(stack, *IDENTITY, flat, at_points)
+    assert longer.turnable[0, 1, 1] > 1.1 * still.turnable[0, 1, 1]
+    # Nor does the component become wider.
+    after = maximised(stack, *IDENTITY, flat, who, 0.001)
+    assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.08 / math.sqrt(12.0), rel=0.02)
+
+
+def test_a_component_turns_into_the_plane_of_its_points() -> None:
+    # The normals of the points are 0.1 rad off; the points themselves tell to
+    # 5 mm / (23 mm sqrt(4000)) = 3 mrad.
+    wrong = np.array([math.sin(0.1), 0.0, math.cos(0.1)])
+    stack = slanted(np.random.default_rng(4), 0.01, wrong)
+    mixture = component((0, 0, 0), tuple(wrong), sigma_normal=0.01, sigma_tangent=0.03)
+    for _ in range(8):
+        who = expect(stack, *IDENTITY, mixture, 1e-9, np.ones(1))
+        mixture = maximised(stack, *IDENTITY, mixture, who, 0.001)
+    assert mixture.normals_target[0] == pytest.approx(UP[0], abs=0.012)
+    assert math.sqrt(mixture.var_normal[0]) == pytest.approx(0.005, rel=0.05)
+
+
+def test_points_on_a_line_leave_the_turn_about_it_to_their_normals() -> None:
+    rng = np.random.default_rng(6)
+    points = np.column_stack([np.zeros(200), rng.uniform(-0.05, 0.05, 200), np.zeros(200)])
+    leaning = np.array([math.sin(0.3), 0.0, math.cos(0.3)])
+    stack = stack_of(points, np.tile(leaning, (200, 1)), beams=np.tile(-UP, (200, 1)))
+    flat = component((0.0, 0.0, 0.0), sigma_normal=0.01, sigma_tangent=0.03)
+    who = expect(stack, *IDENTITY, flat, 1e-9, np.ones(1))
+    after = maximised(stack, *IDENTITY, flat, who, 0.001)
+    assert after.normals_target[0] == pytest.approx(leaning, abs=1e-3)
 
 
 def test_two_components_share_a_point_between_them() -> None:
@@ -548,7 +603,8 @@ def test_components_learn_the_surface_and_its_noise() -> None:
     after = maximised(stack, *IDENTITY, before, who, 0.001)
 
     assert after.means_target[0] == pytest.approx([1.0, 2.0, 3.0], abs=5e-3)
-    assert after.normals_target[0] == pytest.approx(normal, abs=1e-4)
+    # The points' own plane: 4 mm over 58 mm and the root of 4000 are 1.1 mrad.
+    assert after.normals_target[0] == pytest.approx(normal, abs=4e-3)
     assert math.sqrt(after.var_normal[0]) == pytest.approx(0.004, rel=0.05)
     # Uniform over 0.2 m: 0.2 / sqrt(12).
     assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.0577, rel=0.05)

@@ -420,6 +420,7 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
         moments=np.zeros((len(minima), 1, 10)),
         coupling=np.zeros((1, 10, 3, 6)),
         turnable=np.eye(3)[None],
+        torque=np.zeros((1, 3)),
     )
 
 

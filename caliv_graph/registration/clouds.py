@@ -116,9 +116,13 @@ class CloudStack:
 
 def products(points: Array) -> Array:
     """(N, 10) `h h^T`, upper triangle, of h = (1, point)."""
-    h = np.column_stack([np.ones(len(points)), points])
-    row, column = np.triu_indices(4)
-    return np.asarray(h[:, row] * h[:, column])
+    out = np.empty((len(points), 10))
+    out[:, 0] = 1.0
+    out[:, 1:4] = points
+    out[:, 4:7] = points[:, :1] * points
+    out[:, 7:9] = points[:, 1:2] * points[:, 1:]
+    out[:, 9] = points[:, 2] ** 2
+    return out
 
 
 def sampling_order(points: Array) -> npt.NDArray[np.uint64]:

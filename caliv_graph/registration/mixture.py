@@ -45,6 +45,9 @@ poses are still wrong by more than that, most points are."""
 PART_POINTS = 8192
 """Points of a part of the E-step: what belongs to them stays in the processor's cache."""
 
+PART_CLOUDS = 8
+"""The same of the sums over the points of each cloud."""
+
 ALONG_SURFACE = 0.07
 """Part of what a point's position *along* the surface seems to say that is believed. Components
 are pieces of a surface, and how the beams fell on them differs from view to view: a LiDAR sees more
@@ -356,19 +359,31 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
         its LiDAR less its cloud's centre; of alpha times flatness times normal, lidar frame; and as
         the first ten with the place where the point's beam meets the surface for the point.
     """
-    cells, width = stack.count * components, who.component.shape[1]
-    # A column per point, an entry per component it may belong to: the product is one pass.
-    belongs = scipy.sparse.csc_array(
-        (
-            who.alpha.ravel(),
-            (stack.cloud[:, None] * components + who.component).ravel().astype(np.int32),
-            np.arange(0, who.component.size + 1, width, dtype=np.int32),
-        ),
-        shape=(cells, len(stack.points)),
-    )
-    met = products(stack.centred + who.slides_m[:, None] * stack.beams)
-    sums = belongs @ np.column_stack([stack.features, met])
-    return np.asarray(sums).reshape(stack.count, components, 23)
+    width = who.component.shape[1]
+    ends = np.append(stack.starts, len(stack.points))
+    features = stack.features
+    sums = np.empty((stack.count, components, 23))
+
+    def of_clouds(first: int) -> None:
+        last = min(first + PART_CLOUDS, stack.count)
+        own, count = slice(ends[first], ends[last]), ends[last] - ends[first]
+        cells = (stack.cloud[own, None] - first) * components + who.component[own]
+        # A column per point, an entry per component it may belong to: the product is one pass.
+        belongs = scipy.sparse.csc_array(
+            (
+                who.alpha[own].ravel(),
+                cells.ravel().astype(np.int32),
+                np.arange(0, count * width + 1, width, dtype=np.int32),
+            ),
+            shape=((last - first) * components, count),
+        )
+        met = products(stack.centred[own] + who.slides_m[own, None] * stack.beams[own])
+        part = sums[first:last].reshape(-1, 23)
+        part[:, :13] = np.asarray(belongs @ features[own])
+        part[:, 13:] = np.asarray(belongs @ met)
+
+    share_out(of_clouds, range(0, stack.count, PART_CLOUDS))
+    return sums
 
 
 def _carried(stack: CloudStack, R: Array, t: Array) -> Array:

@@ -95,6 +95,16 @@ def exit_code_of(work: Callable[[], int], interrupted: str = "interrupted") -> i
         return 130
 
 
+def add_beams(parser: argparse.ArgumentParser) -> None:
+    """The option --beams, of the scripts that simulate thinned clouds."""
+    parser.add_argument(
+        "--beams",
+        type=Path,
+        default=Path(__file__).resolve().parents[1] / "out" / "tables" / "beams",
+        help="folder of the beams that matter, found once per scenario",
+    )
+
+
 def positive(text: str) -> int:
     """A number of the command line that is at least 1."""
     value = int(text)

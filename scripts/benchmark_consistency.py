@@ -43,6 +43,7 @@ from caliv_graph.simulation.thinned import (
     ThinnedRecording,
     cached_selection,
 )
+from scripts._command import add_beams
 from scripts._tables_rows import config_for
 from scripts.benchmark_tables import code_digest
 
@@ -141,12 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--summary", action="store_true", help="only print what is there")
     parser.add_argument("--any-version", action="store_true", help="count runs of older text too")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/consistency)")
-    parser.add_argument(
-        "--beams",
-        type=Path,
-        default=REPOSITORY / "out" / "tables" / "beams",
-        help="folder of the beams that matter, found once per scenario",
-    )
+    add_beams(parser)
     asked = parser.parse_args(arguments)
     path = asked.out / "runs.jsonl"
     if not asked.summary:

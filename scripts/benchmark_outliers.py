@@ -35,7 +35,7 @@ from caliv_graph.simulation.scenario import load_scenario
 from caliv_graph.simulation.thinned import GroundWaves, ThinnedRecording, cached_selection
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from scripts._command import exit_code_of, positive
+from scripts._command import add_beams, exit_code_of, positive
 from scripts._tables_rows import config_for
 
 SCENARIO = REPOSITORY / "configs" / "scenarios" / "noisy.yaml"
@@ -78,12 +78,7 @@ class Clouds:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=positive, default=5, help="1 to N (default: 5)")
-    parser.add_argument(
-        "--beams",
-        type=Path,
-        default=REPOSITORY / "out" / "tables" / "beams",
-        help="folder of the beams that matter, found once",
-    )
+    add_beams(parser)
     asked = parser.parse_args(arguments)
     scenario = load_scenario(SCENARIO)
     selection = cached_selection(scenario, asked.beams)

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from scipy.linalg import blas
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import skew
@@ -521,8 +522,8 @@ def maximise_shape(
     R: Array,
     t: Array,
     mixture: Mixture,
-    cells: Array,
     sigma_floor_m: float,
+    cells: Array,
     turnable: Array,
     torque: Array,
 ) -> Mixture:
@@ -537,8 +538,8 @@ def maximise_shape(
         R: (J, 3, 3) rotations of the new `T_target_lidar`.
         t: (J, 3) translations of the new `T_target_lidar`.
         mixture: the components of the E-step.
-        cells: (J, K, 23) `cell_moments` of its responsibilities.
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
+        cells: (J, K, 23) `cell_moments` of its responsibilities.
         turnable: (K, 3, 3) of the quadratic of the E-step.
         torque: (K, 3) of it.
     """
@@ -581,8 +582,5 @@ def _turned(normals: Array, trusted: Array, turnable: Array, torque: Array) -> A
     more = np.linalg.solve(turnable + np.eye(3) / NORMAL_SIGMA_RAD**2, left[..., None])[..., 0]
     size = np.linalg.norm(more, axis=1)
     turn += more * np.minimum(1.0, MAX_TURN_RAD / np.maximum(size, 1e-300))[:, None]
-    angle = np.linalg.norm(turn, axis=1)[:, None]
-    axis = turn / np.maximum(angle, 1e-300)
-    along = axis * np.einsum("ka,ka->k", axis, normals)[:, None]
-    turned = along + np.cos(angle) * (normals - along) + np.sin(angle) * _cross(axis, normals)
+    turned = Rotation.from_rotvec(turn).apply(normals)
     return np.asarray(turned / np.linalg.norm(turned, axis=1)[:, None])

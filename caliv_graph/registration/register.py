@@ -108,8 +108,7 @@ class JointRegistration:
         self._floor = COARSE_SIGMA_M
         self._volume = 1.0
         self._mixture: Mixture | None = None
-        self._cells: Array | None = None
-        self._turning: tuple[Array, Array] | None = None
+        self._expected: tuple[Array, Array, Array] | None = None
         self._inlier_ratio: Array = np.ones(self.clouds.count)
         self._shares = np.ones(self.clouds.count) if shares is None else shares
         self.weights: Array = np.ones(self.clouds.count)
@@ -152,17 +151,18 @@ class JointRegistration:
         density = self._gamma / (self._volume * (self._gamma + 1.0))
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
         self._inlier_ratio = who.inlier_ratio
-        self._cells = cell_moments(self.clouds, who, len(self.mixture.weights))
-        quadratic = shape_quadratic(self.clouds, R, t, self.mixture, self._cells, who)
-        self._turning = quadratic.turnable, quadratic.torque
+        cells = cell_moments(self.clouds, who, len(self.mixture.weights))
+        quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
+        # Not the quadratic itself: it is as large as all the rest.
+        self._expected = cells, quadratic.turnable, quadratic.torque
         return quadratic
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new poses (R, t)."""
-        if self._cells is None or self._turning is None:
+        if self._expected is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
         self._mixture = maximise_shape(
-            self.clouds, R, t, self.mixture, self._cells, self._floor, *self._turning
+            self.clouds, R, t, self.mixture, self._floor, *self._expected
         )
 
     def result(

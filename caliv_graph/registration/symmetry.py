@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from caliv_graph.geometry.se3 import skew, stack, tangent_axes
+from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray, Mixture, Registration
 
 BoolArray = npt.NDArray[np.bool_]
@@ -432,7 +433,7 @@ class _Shape:
         self, axis: Array, angle_rad: float, centre: Array, spacings: float
     ) -> tuple[Array, Array] | None:
         """Rotation and translation of a turn that lay the shape best on itself, or None."""
-        R = _rotation_vector(axis * angle_rad)
+        R = Rotation.from_rotvec(axis * angle_rad).as_matrix()
         t = centre - R @ centre
         across = tangent_axes(axis)
         for gate_m in np.maximum(MATCH_M, spacings * self.spacing_m):
@@ -454,7 +455,7 @@ class _Shape:
             # Shifts along the surface, and those that nothing resists, stay small.
             normal_matrix = (J * weight[:, None]).T @ J + 1e-3 * len(pair) * np.eye(5)
             step = np.linalg.solve(normal_matrix, (J * weight[:, None]).T @ off)
-            tilt = _rotation_vector(step[:2] @ across)
+            tilt = Rotation.from_rotvec(step[:2] @ across).as_matrix()
             R, t = tilt @ R, tilt @ (t - centre) + centre + step[2:]
         return R, t
 
@@ -579,15 +580,6 @@ def _angles(directions: Array, towards: Array) -> tuple[Array, Array]:
     azimuth = np.arctan2(directions[:, 1], directions[:, 0]) - level
     azimuth = (azimuth + math.pi) % (2.0 * math.pi) - math.pi
     return np.asarray(azimuth), np.arcsin(np.clip(directions[:, 2], -1.0, 1.0))
-
-
-def _rotation_vector(vector: Array) -> Array:
-    """(3, 3) turn by a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    K = skew(np.asarray(vector / angle))
-    return np.asarray(np.eye(3) + math.sin(angle) * K + (1.0 - math.cos(angle)) * (K @ K))
 
 
 def _axis_and_centre(R: Array, t: Array, axis: Array, centre: Array) -> tuple[Array, Array]:

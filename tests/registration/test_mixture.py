@@ -109,8 +109,8 @@ def maximised(
 ) -> Mixture:
     cells = cell_moments(stack, who, len(mixture.weights))
     quadratic = shape_quadratic(stack, R, t, mixture, cells, who)
-    turning = quadratic.turnable, quadratic.torque
-    return maximise_shape(stack, R, t, mixture, cells, floor_m, *turning)
+    expected = cells, quadratic.turnable, quadratic.torque
+    return maximise_shape(stack, R, t, mixture, floor_m, *expected)
 
 
 # ------------------------------------------------------------------ E-step

@@ -164,6 +164,9 @@ def _usage_message(problem: Any) -> str:
 def main() -> None:
     """Entry point of `caliv-graph`."""
     code = run(sys.argv[1:])
+    # What there is to do has been done and told. Python gives up its handlers before it ends, and
+    # a signal would then turn a success into a death by signal.
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     if code == INTERRUPTED:
         # Python remembers an interrupt that native code came across, and would end by the signal.
         sys.stdout.flush()

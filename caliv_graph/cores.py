@@ -5,6 +5,7 @@ No result depends on it: what runs at the same time writes to places of its own.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -37,6 +38,12 @@ def on_one_core() -> Iterator[None]:
         yield
     finally:
         _one_core = before
+
+
+def parts(count: int, number: int) -> list[slice]:
+    """`count` items in a row, cut into `number` parts of about the same size."""
+    ends = [count * i // number for i in range(number + 1)]
+    return [slice(first, last) for first, last in itertools.pairwise(ends) if first < last]
 
 
 def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -282,7 +283,10 @@ def _normals_across(
     along /= np.linalg.norm(along)
     plane = tangent_axes(along).T
     k = min(neighbours, len(around))
-    distance, near = cKDTree(around @ plane).query(points @ plane, k, distance_upper_bound=radius_m)
+    there, here = around @ plane, points @ plane
+    # Built for a few hundred questions, the building counts.
+    tree = cKDTree(there, compact_nodes=False, balanced_tree=False)
+    distance, near = tree.query(here, k, distance_upper_bound=radius_m)
     distance, near = np.reshape(distance, (-1, k)), np.reshape(near, (-1, k))
     inside = np.isfinite(distance)
     near = np.where(inside, near, 0)
@@ -290,27 +294,26 @@ def _normals_across(
     sigma_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius_m)
     sigma_m = np.maximum(sigma_m, 1e-6)
     kernel = np.where(inside, np.exp(-0.5 * (np.where(inside, distance, 0.0) / sigma_m) ** 2), 0.0)
-    offset = around[near] - points[:, None]
-    depth = offset @ along
-    A = np.concatenate([np.ones((*near.shape, 1)), (offset @ plane) / sigma_m[..., None]], axis=2)
-    ridge = RIDGE * np.eye(3)
+    depth = (around @ along)[near] - (points @ along)[:, None]
+    u, v = ((there[:, axis][near] - here[:, axis, None]) / sigma_m for axis in range(2))
+    across = (np.ones_like(u), u, v, u * u, u * v, v * v)
+    depths = (depth, u * depth, v * depth)
     residual = depth
     # A wide neighbourhood on a slanted surface is deep.
     first = np.maximum(DEPTH_GATE_M, GATE_SIGMAS * sigma_m)
     last = max(GATE_SIGMAS * sigma_range_m, 1e-3)
     for gate_m in first * (last / first) ** np.linspace(0.0, 1.0, GATE_ROUNDS)[:, None, None]:
         weight = kernel * np.maximum(1.0 - (residual / gate_m) ** 2, 0.0) ** 2
-        weighted = weight[..., None] * A
-        normal_matrix = np.swapaxes(weighted, 1, 2) @ A + ridge
-        right = np.einsum("nki,nk->ni", weighted, depth)
+        normal_matrix = _symmetric_sums(weight, across)
+        right = _sums(weight, depths)
         fit = np.linalg.solve(normal_matrix, right[..., None])[..., 0]
-        residual = depth - np.einsum("nki,ni->nk", A, fit)
+        residual = depth - fit[:, :1] - fit[:, 1:2] * u - fit[:, 2:] * v
     slope = fit[:, 1:] / sigma_m
     normals = slope @ plane.T - along
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     inverse = np.linalg.inv(normal_matrix)
     # The ridge is no observation: along a line of points the slope across it is unknown.
-    cov = inverse @ (np.swapaxes(weighted, 1, 2) @ weighted + ridge) @ inverse
+    cov = inverse @ _symmetric_sums(weight**2, across) @ inverse
     sigma_slope = sigma_range_m / sigma_m[:, 0] * np.sqrt(np.maximum(cov[:, 1, 1], cov[:, 2, 2]))
     # An angle changes by less than its tangent where the surface is slanted.
     angle = sigma_slope / (1.0 + np.sum(slope**2, axis=1))
@@ -318,3 +321,14 @@ def _normals_across(
     total, square = weight.sum(axis=1), np.sum(weight**2, axis=1)
     enough = total**2 >= FEWEST_NEIGHBOURS * square
     return normals, np.where(enough, flatness, 0.0)
+
+
+def _symmetric_sums(weight: Array, products: Sequence[Array]) -> Array:
+    """(n, 3, 3) of `_sums` of the upper triangle of a product, and a ridge."""
+    sums = _sums(weight, products)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return np.asarray(sums.reshape(-1, 3, 3) + RIDGE * np.eye(3))
+
+
+def _sums(weight: Array, values: Sequence[Array]) -> Array:
+    """(n, m) weighted sums of m values of (n, k) over the k neighbours of n points."""
+    return np.stack([np.einsum("nk,nk->n", weight, value) for value in values], axis=1)

@@ -10,7 +10,9 @@ are those of SPEC 3.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse
@@ -18,7 +20,7 @@ from scipy.linalg import blas
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.cores import share_out
+from caliv_graph.cores import parts, share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, products, sampling_order
@@ -48,6 +50,9 @@ PART_POINTS = 8192
 
 PART_CLOUDS = 8
 """The same of the sums over the points of each cloud."""
+
+PARTS_TURNED = 4
+"""Parts of the components in what is lost because they turn: the same on any number of cores."""
 
 ALONG_SURFACE = 0.07
 """Part of what a point's position *along* the surface seems to say that is believed. Components
@@ -148,18 +153,28 @@ class ShapeQuadratic:
                 information, so that a step is the same or shorter.
         """
         count = len(self.blocks)
-        # Transposed, their memory is in the order that BLAS wants; only a triangle comes back.
         flat = self.sign > 0.0
-        H = blas.dsyrk(-1.0, self.across.T if flat.all() else self.across[flat].T)
-        if not flat.all():
-            H += blas.dsyrk(1.0, self.across[~flat].T)
+        lost: list[Callable[[], Array]] = [
+            lambda: self.along,
+            lambda: self.across if flat.all() else self.across[flat],
+        ]
         if not given_orientations:
             root = np.linalg.inv(np.linalg.cholesky(self.turnable))
             turning = np.matmul(root[:, None], self.coupling).reshape(-1, 10, 18)
-            turns = np.matmul(self.moments.transpose(1, 0, 2), turning)
-            turns = turns.reshape(-1, count, 3, 6).transpose(0, 2, 1, 3)
-            H += blas.dsyrk(-1.0, turns.reshape(-1, 6 * count).T)
-        even = blas.dsyrk(-1.0, self.along.T)
+            lost += [partial(self._turns, turning, own) for own in parts(len(flat), PARTS_TURNED)]
+        squares = [np.empty(0)] * len(lost)
+
+        def square(i: int) -> None:
+            # Transposed, its memory is in the order that BLAS wants; only a triangle comes back.
+            squares[i] = blas.dsyrk(-1.0, lost[i]().T)
+
+        # The longest first: the others fill the gaps.
+        share_out(square, range(len(lost))[::-1])
+        even, H, *turns = squares
+        for turned in turns:
+            H += turned
+        if not flat.all():
+            H += blas.dsyrk(1.0, self.across[~flat].T)
         for upper in (H, even):
             upper += upper.T
             diagonal = np.arange(len(upper))
@@ -170,6 +185,12 @@ class ShapeQuadratic:
         j = np.arange(count)
         H4[j, :, j, :] += self.blocks
         return np.asarray(H)
+
+    def _turns(self, turning: Array, components: slice) -> Array:
+        """(3 k, 6 J) what is lost because components turn, of k of them."""
+        moments = self.moments[:, components].transpose(1, 0, 2)
+        turns = np.matmul(moments, turning[components]).reshape(-1, len(self.blocks), 3, 6)
+        return np.asarray(turns.transpose(0, 2, 1, 3).reshape(-1, 6 * len(self.blocks)))
 
 
 # A point's position in homogeneous coordinates, h = (1, y), makes all that follows linear in the
@@ -329,7 +350,7 @@ def expect(
         forces[part], seen[part] = force, beams
 
     # Every part is computed by itself, so that the result is the same on any number of cores.
-    share_out(of_part, [slice(s, s + PART_POINTS) for s in range(0, len(near), PART_POINTS)])
+    share_out(of_part, parts(len(near), len(near) // PART_POINTS + 1))
     inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
         np.append(stack.starts, len(stack.points))
     )
@@ -423,7 +444,13 @@ def shape_quadratic(
     """
     count, K = stack.count, len(mixture.weights)
     carried = _carried(stack, R, t)
-    points, moments = np.matmul(cells[..., :10], carried), np.matmul(cells[..., 13:], carried)
+    points, moments = np.empty((2, count, K, 10))
+
+    def carry(part: slice) -> None:
+        np.matmul(cells[part, :, :10], carried[part], out=points[part])
+        np.matmul(cells[part, :, 13:], carried[part], out=moments[part])
+
+    share_out(carry, parts(count, count // PART_CLOUDS + 1))
     total = points.sum(axis=0)
     mass, means = _mass_and_means(total, mixture)
     n = mixture.normals_target
@@ -445,10 +472,17 @@ def shape_quadratic(
     pulled = np.einsum("kqae,ka->kqe", coupling, turned)
     gradient -= moments.reshape(count, 10 * K) @ pulled.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
-    across = np.empty((K, count, 6))
+    across, along = np.empty((K, count, 6)), np.empty((K, count, 4))
     root = n * np.sqrt(np.abs(a) / mass)[:, None]
-    across[..., :3] = _cross(sums[..., 1:], root[:, None])
-    across[..., 3:] = sums[..., :1] * root[:, None]
+    level = np.sqrt(b / mass)
+
+    def lose(part: slice) -> None:
+        own, sign = sums[part], root[part, None]
+        across[part, :, :3] = _cross(own[..., 1:], sign)
+        across[part, :, 3:] = own[..., :1] * sign
+        along[part] = level[part, None, None] * own
+
+    share_out(lose, parts(K, PARTS_TURNED))
     return ShapeQuadratic(
         blocks=((np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS).reshape(
             count, 6, 6
@@ -456,7 +490,7 @@ def shape_quadratic(
         gradient=np.asarray(gradient),
         across=across.reshape(K, 6 * count),
         sign=np.sign(a),
-        along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
+        along=along.reshape(K, 4 * count),
         moments=moments,
         coupling=coupling,
         turnable=turnable,

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray, Mixture, Registration
 
@@ -199,7 +200,13 @@ def symmetries(
         return ()
     shape = _Shape.of(mixture, views, sigma_range_m)
     identity = shape.compare(np.eye(3), np.zeros(3))
-    found = [_about(shape, axis, identity) for axis in _axes(mixture)]
+    axes = _axes(mixture)
+    found: list[Symmetry | None] = [None] * len(axes)
+
+    def look(i: int) -> None:
+        found[i] = _about(shape, axes[i], identity)
+
+    share_out(look, range(len(axes)))
     return tuple(symmetry for symmetry in found if symmetry is not None)
 
 

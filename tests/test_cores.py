@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from caliv_graph.cores import cores, on_one_core, share_out
+from caliv_graph.cores import cores, on_one_core, parts, share_out
 
 
 def test_on_one_core_all_is_done_here_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,3 +45,12 @@ def test_one_core_is_given_back_after_an_error() -> None:
     with pytest.raises(ValueError, match="stop"), on_one_core():
         raise ValueError("stop")
     assert cores() == before
+
+
+@pytest.mark.parametrize(("count", "number"), [(0, 3), (2, 5), (10, 3), (9, 3), (7, 1)])
+def test_parts_are_all_of_it_in_order_and_about_equal(count: int, number: int) -> None:
+    cut = parts(count, number)
+    assert [i for part in cut for i in range(count)[part]] == list(range(count))
+    sizes = [part.stop - part.start for part in cut]
+    assert all(size > 0 for size in sizes)
+    assert not sizes or max(sizes) - min(sizes) <= 1

@@ -188,6 +188,22 @@ def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(tmp_path:
 # ------------------------------------------------------------------ the paper's arc
 
 
+@pytest.mark.parametrize("noise_m", [0.002, 0.03])
+def test_whatever_the_noise_of_the_range_the_solve_ends_where_it_stays(
+    noise_m: float, tmp_path: Path
+) -> None:
+    scenario = paper_scenario(rate_hz=2.5)
+    lidars = {
+        name: lidar.model_copy(update={"range_sigma_m": noise_m})
+        for name, lidar in scenario.lidars.items()
+    }
+    drive = simulated(scenario.model_copy(update={"lidars": lidars}), 3, tmp_path / "drive")
+    assert drive.config.noise.lidar_range_m == noise_m
+    solution = run_on(drive).solution
+    assert solution.converged
+    assert all(registration.converged for registration in solution.registrations)
+
+
 def test_sensor_to_sensor_is_at_the_noise(quiet: list[Tried]) -> None:
     errors = np.array([tried.s2s() for tried in quiet])
 

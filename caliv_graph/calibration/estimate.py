@@ -72,6 +72,7 @@ from caliv_graph.registration.mixture import ShapeQuadratic
 from caliv_graph.registration.register import (
     FINE_SIGMA_M,
     JointRegistration,
+    annealing_steps,
     left_step,
     register_jointly,
 )
@@ -99,11 +100,16 @@ REWEIGHTINGS = 12
 WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
 
-REFINEMENTS = 20
-"""Iterations of the joint loop at most."""
-
 SHAPES_BEGUN_AGAIN = 8
-"""Iteration after which normals and mixture begin anew, now that annealing has come to its end."""
+"""Iteration of the joint loop after which normals and mixture begin anew, now that annealing has
+come to its end, or near it."""
+
+REFINEMENTS = 20
+"""Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
+more."""
+
+LAST_REFINEMENTS = 4
+"""Iterations that are left at the noise level, at least."""
 
 DECIDED_AFTER = 9
 """Iterations after which the number of undetermined directions is no longer changed, so that one
@@ -224,8 +230,9 @@ def _estimate(
         with progress.stage("solving the graph in two stages", None):
             solution = _staged(solve, again)
     else:
-        with progress.stage("refining shape and graph together", REFINEMENTS) as advance:
-            solution = _refine(solve, states, advance)
+        most = _refinements(config.noise.lidar_range_m)
+        with progress.stage("refining shape and graph together", most) as advance:
+            solution = _refine(solve, states, most, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     return replace(solution, stage_times_s=times, warnings=warnings)
@@ -657,12 +664,19 @@ def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurement
     return _ShapeMeasurements(pull, information)
 
 
+def _refinements(sigma_range_m: float) -> int:
+    """How many iterations the joint loop may take, at this noise along the beam."""
+    annealed = SHAPES_BEGUN_AGAIN + annealing_steps(FINE_SIGMA_M, sigma_range_m)
+    return max(REFINEMENTS, annealed + LAST_REFINEMENTS)
+
+
 def _refine(
     state: SolveState,
     states: Sequence[JointRegistration],
+    most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve."""
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations."""
     problem, config = state.problem, state.config
     prior = problem.guess_information()
     steady = _steady_graph(state)
@@ -670,7 +684,7 @@ def _refine(
     undetermined: int | None = None
     course: list[Iteration] = []
     converged, iteration = False, 0
-    while iteration < REFINEMENTS and not converged:
+    while iteration < most and not converged:
         iteration += 1
         lines = linearise_clouds(problem, state.values)
         shapes = _expect(states, lines, state.turns)

@@ -8,6 +8,7 @@ put it: origin at the target's centre, axes of the map.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import gtsam
@@ -59,6 +60,12 @@ STEP_TOLERANCE = (3e-4, 2e-4)
 
 ROUGH_TOLERANCE = (1e-3, 6e-4)
 """The same of a registration that another follows."""
+
+
+def annealing_steps(sigma_m: float, sigma_range_m: float) -> int:
+    """E-steps until a mixture of width `sigma_m` is as fine as the noise along the beam lets it."""
+    left = FLOOR_PER_RANGE_SIGMA * sigma_range_m / sigma_m
+    return max(math.ceil(math.log(left) / math.log(ANNEALING)), 0)
 
 
 class JointRegistration:

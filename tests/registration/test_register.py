@@ -19,6 +19,7 @@ from caliv_graph.registration.mixture import ShapeQuadratic
 from caliv_graph.registration.register import (
     MAX_STEP,
     JointRegistration,
+    annealing_steps,
     centre_clouds,
     free_step,
     left_step,
@@ -508,3 +509,41 @@ def test_a_cloud_that_is_dropped_does_not_shape_the_target() -> None:
     difference = np.abs(second_mixture.means_target - first_mixture.means_target)[strong]
     assert difference.max() < 1e-4
     assert np.trace(first.blocks[3]) < 1e-4 * np.trace(first.blocks[4])
+
+
+def test_cores_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 13 clouds: not a multiple of what is summed up together.
+    scene = chair_scene(np.linspace(20.0, 110.0, 13).tolist(), [8.0] * 13, SIGMA_M, 1)
+    start = guesses(scene.T_target_lidar, 1)
+    results = []
+    for usable in ({0}, {0, 1}):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable)
+        state = JointRegistration(scene.observation, CONFIG, rough=True)
+        first = register_jointly(state, start, 6)
+        state.refine_normals(*matrices(first.T_target_lidar))
+        again = register_jointly(state, first.T_target_lidar, 3, coarse=False)
+        results.append(
+            [
+                state.clouds.normals,
+                *matrices(again.T_target_lidar),
+                again.information_joint,
+                again.mixture.means_target,
+                again.mixture.normals_target,
+            ]
+        )
+    for alone, shared in zip(*results, strict=True):
+        assert np.array_equal(alone, shared)
+
+
+def test_annealing_ends_after_the_steps_that_it_is_given() -> None:
+    # 0.85^12 x 20 mm = 2.8 mm > 0.6 x 4 mm; 0.85^13 = 2.42, 0.85^14 = 2.06.
+    assert annealing_steps(0.02, 0.004) == 14
+    assert annealing_steps(0.02, 0.05) == 0
+    state = JointRegistration(observe(clouds_of(chair())), config_of(lidar_range_m=0.004))
+    R, t = matrices(chair().T_target_lidar)
+    state.seed(R, t, 0.02)
+    for _ in range(14):
+        assert not state.finest
+        state.expect(R, t)
+        state.maximise(R, t)
+    assert state.finest

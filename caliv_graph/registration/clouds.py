@@ -93,9 +93,11 @@ class CloudStack:
     def features(self) -> Array:
         """(N, 13) what the mixture sums up, in the lidar frame.
 
-        `products` of the points less their cloud's centre; and flatness times normal.
+        `second_moments` of the points less their cloud's centre; and flatness times normal.
         """
-        return np.column_stack([products(self.centred), self.flatness[:, None] * self.normals])
+        return np.column_stack(
+            [second_moments(self.centred), self.flatness[:, None] * self.normals]
+        )
 
     @cached_property
     def centred(self) -> Array:
@@ -115,7 +117,7 @@ class CloudStack:
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
 
-def products(points: Array) -> Array:
+def second_moments(points: Array) -> Array:
     """(N, 10) `h h^T`, upper triangle, of h = (1, point)."""
     out = np.empty((len(points), 10))
     out[:, 0] = 1.0

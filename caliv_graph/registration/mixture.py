@@ -4,8 +4,8 @@ GMMCalib (Evangelidis & Horaud 2018 behind it) has isotropic components. A chair
 front by one LiDAR and from its back by another, 2 to 3 cm apart; isotropic components pull the two
 skins together, which on the CaLiV authors' drive is 36 mrad of roll between the LiDARs. So a
 component here has a normal, a variance along it and one across it, and explains only points whose
-beam came from the side that its normal points to. With equal variances and no normals the formulas
-are those of SPEC 3.
+beam came from the side that its normal points to. Without normals, slides along the beams and
+`ALONG_SURFACE`, and with equal variances, the formulas are those of SPEC 3.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from functools import partial
 
 import numpy as np
 import scipy.sparse
-from scipy.linalg import blas
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.cores import parts, share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
-from caliv_graph.registration.clouds import CloudStack, products, sampling_order
+from caliv_graph.registration.clouds import CloudStack, sampling_order, second_moments
 
 NEIGHBOURS = 6
 """Components that a point may belong to: the nearest. Farther ones have no weight to speak of."""
@@ -51,7 +50,7 @@ PART_POINTS = 8192
 PART_CLOUDS = 8
 """The same of the sums over the points of each cloud."""
 
-PARTS_TURNED = 4
+PARTS_TURNED = 2
 """Parts of the components in what is lost because they turn: the same on any number of cores."""
 
 ALONG_SURFACE = 0.07
@@ -113,6 +112,8 @@ class ShapeQuadratic:
     translation) the negative log-likelihood is `d^T H d / 2 + g^T d`, where H is `blocks` on the
     diagonal minus what is lost because place and orientation of the components come from the same
     points: both are eliminated. `blocks` alone, per-cloud information given the shape, claims more.
+    In all of H a point y is the place where its beam meets the surface; the residuals in `gradient`
+    and `torque` are those of the points themselves.
 
     A cloud moves the mean of component k by `A_jk d_j / mass_k`, A_jk (3, 6) being the sum of
     `alpha [-skew(y), I]`. So the loss is the sum over k of `A_jk^T W_k A_j'k / mass_k`; since
@@ -165,8 +166,9 @@ class ShapeQuadratic:
         squares = [np.empty(0)] * len(lost)
 
         def square(i: int) -> None:
-            # Transposed, its memory is in the order that BLAS wants; only a triangle comes back.
-            squares[i] = blas.dsyrk(-1.0, lost[i]().T)
+            # Of a matrix and its own transpose: half the work, and the interpreter's lock is free.
+            rows = lost[i]()
+            squares[i] = rows.T @ rows
 
         # The longest first: the others fill the gaps.
         share_out(square, range(len(lost))[::-1])
@@ -174,14 +176,11 @@ class ShapeQuadratic:
         for turned in turns:
             H += turned
         if not flat.all():
-            H += blas.dsyrk(1.0, self.across[~flat].T)
-        for upper in (H, even):
-            upper += upper.T
-            diagonal = np.arange(len(upper))
-            upper[diagonal, diagonal] *= 0.5
+            H -= self.across[~flat].T @ self.across[~flat]
         pairs = even.reshape(count, 4, count, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
+        np.negative(H, out=H)
         H4 = H.reshape(count, 6, count, 6)
-        H4 += (pairs @ _EVEN_PAIRS).reshape(count, count, 6, 6).transpose(0, 2, 1, 3)
+        H4 -= (pairs @ _EVEN_PAIRS).reshape(count, count, 6, 6).transpose(0, 2, 1, 3)
         j = np.arange(count)
         H4[j, :, j, :] += self.blocks
         return np.asarray(H)
@@ -399,7 +398,7 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
             ),
             shape=((last - first) * components, count),
         )
-        met = products(stack.centred[own] + who.slides_m[own, None] * stack.beams[own])
+        met = second_moments(stack.centred[own] + who.slides_m[own, None] * stack.beams[own])
         part = sums[first:last].reshape(-1, 23)
         part[:, :13] = np.asarray(belongs @ features[own])
         part[:, 13:] = np.asarray(belongs @ met)
@@ -444,13 +443,7 @@ def shape_quadratic(
     """
     count, K = stack.count, len(mixture.weights)
     carried = _carried(stack, R, t)
-    points, moments = np.empty((2, count, K, 10))
-
-    def carry(part: slice) -> None:
-        np.matmul(cells[part, :, :10], carried[part], out=points[part])
-        np.matmul(cells[part, :, 13:], carried[part], out=moments[part])
-
-    share_out(carry, parts(count, count // PART_CLOUDS + 1))
+    points, moments = np.matmul(cells[..., :10], carried), np.matmul(cells[..., 13:], carried)
     total = points.sum(axis=0)
     mass, means = _mass_and_means(total, mixture)
     n = mixture.normals_target
@@ -472,17 +465,10 @@ def shape_quadratic(
     pulled = np.einsum("kqae,ka->kqe", coupling, turned)
     gradient -= moments.reshape(count, 10 * K) @ pulled.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
-    across, along = np.empty((K, count, 6)), np.empty((K, count, 4))
+    across = np.empty((K, count, 6))
     root = n * np.sqrt(np.abs(a) / mass)[:, None]
-    level = np.sqrt(b / mass)
-
-    def lose(part: slice) -> None:
-        own, sign = sums[part], root[part, None]
-        across[part, :, :3] = _cross(own[..., 1:], sign)
-        across[part, :, 3:] = own[..., :1] * sign
-        along[part] = level[part, None, None] * own
-
-    share_out(lose, parts(K, PARTS_TURNED))
+    across[..., :3] = _cross(sums[..., 1:], root[:, None])
+    across[..., 3:] = sums[..., :1] * root[:, None]
     return ShapeQuadratic(
         blocks=((np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS).reshape(
             count, 6, 6
@@ -490,7 +476,7 @@ def shape_quadratic(
         gradient=np.asarray(gradient),
         across=across.reshape(K, 6 * count),
         sign=np.sign(a),
-        along=along.reshape(K, 4 * count),
+        along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
         moments=moments,
         coupling=coupling,
         turnable=turnable,
@@ -563,9 +549,9 @@ def maximise_shape(
 ) -> Mixture:
     """M-step of the components at new poses: means, normals, variances, priors.
 
-    A normal is where the points have the component turn, measured along their beams, and the
-    normals of the points are its prior. By these alone, slanted and frontal views of a narrow face
-    would not agree on where it is.
+    A normal is where the points have the component turn, measured along their beams where the
+    E-step saw them, and the normals of the points are its prior. By these alone, slanted and
+    frontal views of a narrow face would not agree on where it is.
 
     Args:
         stack: the clouds.

@@ -13,6 +13,7 @@ from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.mixture import (
     ALONG_SURFACE,
+    MAX_TURN_RAD,
     Responsibilities,
     ShapeQuadratic,
     cell_moments,
@@ -161,6 +162,19 @@ def test_a_point_belongs_where_its_beam_meets_the_surface() -> None:
     assert near.alpha[0, 0] == pytest.approx(aside / (aside + density), rel=1e-6)
 
 
+def test_a_beam_nearly_along_the_surface_is_hardly_followed() -> None:
+    # 1.7 degrees off it, 10 mm below: the beam meets the surface 0.33 m away, and a normal that is
+    # off by a degree would make 0.2 m of it. Followed are 0.01 x 0.03 / 0.1^2 = 30 mm; a beam that
+    # flat sees the surface for 0.8.
+    beam = np.array([[math.sqrt(1.0 - 0.03**2), 0.0, -0.03]])
+    flat = component((0.0, 0.0, 0.0), sigma_normal=0.02, sigma_tangent=0.05)
+    stack = stack_of(np.array([[0.0, 0.0, -0.01]]), UP, beams=beam, sigma_range_m=0.05)
+    who = expect(stack, *IDENTITY, flat, 100.0, np.ones(1))
+    squares = (0.01 / 0.02) ** 2 + (0.03 * beam[0, 0] / 0.05) ** 2
+    expected = 0.8 * math.exp(-0.5 * squares) / ((2 * math.pi) ** 1.5 * 0.02 * 0.05**2)
+    assert who.alpha[0, 0] == pytest.approx(expected / (expected + 100.0), rel=1e-6)
+
+
 def test_levers_are_those_of_the_residual_along_the_beam() -> None:
     # Half the squared distance to the surface along the beam, over what that has for a variance:
     # its derivative by a rotation is that of the distance across the surface, plus the levers.
@@ -194,33 +208,61 @@ def test_a_turn_of_all_clouds_changes_nothing() -> None:
     assert np.abs(quadratic.gradient.sum(axis=0)).max() < 1e-3 * scale
 
 
-def test_noise_along_the_beams_turns_no_surface() -> None:
-    # 0.6 x 0.4 m, seen under 40 degrees, a centimetre of noise: what would it turn by at the truth?
-    rng = np.random.default_rng(5)
-    flat = rectangle_points(
-        rng, 20000, np.array([-0.3, -0.2, 0.0]), np.array([0.6, 0, 0]), np.array([0, 0.4, 0])
-    )
+def half_turned(seed: int, levers: float) -> float:
+    """Turn (rad) of a cloud that sees a face at a slant against one that sees it head-on.
+
+    0.6 x 0.4 m, under 40 degrees with a centimetre of noise and head-on with 2 mm, from the truth.
+
+    Args:
+        seed: of the noise.
+        levers: factor on what is missing in the levers.
+    """
+    rng = np.random.default_rng(seed)
     tilt = gtsam.Rot3.Ry(math.radians(50.0)).matrix()
-    sensor = np.array([8.0, 0.0, 0.0])
-    beams = flat @ tilt.T - sensor
-    beams /= np.linalg.norm(beams, axis=1)[:, None]
-    normals = np.tile(tilt[:, 2], (len(flat), 1))
-    points = flat @ tilt.T + 0.01 * rng.normal(size=(len(flat), 1)) * beams
-    stack = stack_of(points, normals, beams=beams)
-    places = flat[:300] @ tilt.T
+    normal, count = tilt[:, 2], 8000
+    points, beams = [], []
+    for sensor, noise_m in ((8.0 * normal, 0.002), (np.array([8.0, 0.0, 0.0]), 0.01)):
+        corner, sides = np.array([-0.3, -0.2, 0.0]), (np.array([0.6, 0, 0]), np.array([0, 0.4, 0]))
+        face = rectangle_points(rng, count, corner, *sides) @ tilt.T
+        beam = face - sensor
+        beam /= np.linalg.norm(beam, axis=1)[:, None]
+        points.append(face + noise_m * rng.normal(size=(count, 1)) * beam)
+        beams.append(beam)
+    stack = stack_of(
+        np.vstack(points),
+        np.tile(normal, (2 * count, 1)),
+        beams=np.vstack(beams),
+        starts=(0, count),
+    )
+    R, t = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
     shape = together(
         *[
-            component(tuple(p), tuple(tilt[:, 2]), sigma_normal=0.01, sigma_tangent=0.012)
-            for p in places
+            component(tuple(p), tuple(normal), sigma_normal=0.01, sigma_tangent=0.012)
+            for p in points[0][:300]
         ]
     )
-    who = expect(stack, *IDENTITY, shape, 1e-3, np.ones(1))
-    quadratic = quadratic_of(stack, *IDENTITY, shape, who)
-    information = quadratic.blocks[0, :3, :3]
-    turned = -np.linalg.solve(information, quadratic.gradient[0, :3])
-    without = -np.linalg.solve(information, quadratic.gradient[0, :3] - who.levers[0])
-    assert abs(turned[1]) < 3e-4
-    assert abs(without[1]) > 1e-3
+
+    def expected() -> Responsibilities:
+        who = expect(stack, R, t, shape, 1e-3, np.ones(2))
+        missing = levers * who.levers, levers * who.component_levers
+        return replace(who, levers=missing[0], component_levers=missing[1])
+
+    for _ in range(4):
+        shape = maximised(stack, R, t, shape, expected(), 0.006)
+    quadratic = quadratic_of(stack, R, t, shape, expected())
+    apart = np.vstack([-0.5 * np.eye(6), 0.5 * np.eye(6)])
+    # A plane leaves three directions open: they stay.
+    H = apart.T @ quadratic.joint() @ apart + np.diag([1e3] * 3 + [1e4] * 3)
+    return float(-np.linalg.solve(H, apart.T @ quadratic.gradient.ravel())[1])
+
+
+def test_noise_along_the_beams_turns_no_surface() -> None:
+    def mean(levers: float) -> float:
+        return float(np.mean([half_turned(seed, levers) for seed in range(6)]))
+
+    assert abs(mean(1.0)) < 0.6e-3
+    # Levers that end at the points would turn every slanted surface edge-on to its beams.
+    assert abs(mean(0.0)) > 1.2e-3
 
 
 def slanted(rng: np.random.Generator, noise_m: float, normal: Array) -> CloudStack:
@@ -263,6 +305,17 @@ def test_a_component_turns_into_the_plane_of_its_points() -> None:
         mixture = maximised(stack, *IDENTITY, mixture, who, 0.001)
     assert mixture.normals_target[0] == pytest.approx(UP[0], abs=0.012)
     assert math.sqrt(mixture.var_normal[0]) == pytest.approx(0.005, rel=0.05)
+
+
+def test_a_component_turns_no_further_at_once_than_where_it_is_nearly_linear() -> None:
+    # The points' normals agree with the component's, and the points stand 0.6 rad off them.
+    wrong = np.array([math.sin(0.6), 0.0, math.cos(0.6)])
+    stack = slanted(np.random.default_rng(4), 0.001, wrong)
+    mixture = component((0, 0, 0), tuple(wrong), sigma_normal=0.02, sigma_tangent=0.03)
+    who = expect(stack, *IDENTITY, mixture, 1e-9, np.ones(1))
+    after = maximised(stack, *IDENTITY, mixture, who, 0.001)
+    turned = math.acos(float(after.normals_target[0] @ wrong))
+    assert turned == pytest.approx(MAX_TURN_RAD, abs=1e-6)
 
 
 def test_points_on_a_line_leave_the_turn_about_it_to_their_normals() -> None:
@@ -433,8 +486,16 @@ def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
     assert quadratic.gradient.ravel() / scale == pytest.approx(numerical / scale, abs=2e-4)
 
 
-def test_joint_is_the_square_of_the_numerical_jacobian() -> None:
+@pytest.mark.parametrize("thick", [False, True])
+def test_joint_is_the_square_of_the_numerical_jacobian(thick: bool) -> None:
     case = random_case(1)
+    if thick:
+        # Half of the components are so much thicker than wide that they hold along, not across.
+        stack, R, t, mixture, who = case
+        var_tangent = mixture.var_tangent.copy()
+        var_tangent[::2] = 0.03 * mixture.var_normal[::2]
+        case = stack, R, t, replace(mixture, var_tangent=var_tangent), who
+        assert (quadratic_of(*case).sign < 0.0).sum() == 4
     step = 1e-5
     J = np.array(
         [(whitened(case, d) - whitened(case, -d)) / (2.0 * step) for d in step * np.eye(18)]

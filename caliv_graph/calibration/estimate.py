@@ -53,7 +53,7 @@ from caliv_graph.calibration.noise import (
     squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem, usable
-from caliv_graph.calibration.robust import RobustWeights, explained_part
+from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_offset, key_target, key_vehicle
 from caliv_graph.errors import SolveError
@@ -123,8 +123,12 @@ what 100 clouds of a chair can tell. Or else in joint standard deviations of the
 OFFSET_TOLD_S = 0.005
 """A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
 
-COUPLED_STEPS = 4
-"""Gauss-Newton steps with the joint information: the problem is nearly linear there."""
+COUPLED_STEPS = 20
+"""Gauss-Newton steps with the joint information at most: the problem is nearly linear there, and
+three or four are usual."""
+
+COUPLED_SIGMAS = 0.01
+"""Step in joint standard deviations of the extrinsics at which they have converged."""
 
 
 @dataclass
@@ -431,17 +435,17 @@ def _reweight(
 
 def _joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
     """(6J, 6J) information of all registered poses, with what they share and their weights."""
-    root = np.repeat(np.sqrt(state.weights.values), 6)
     turns = state.turns or [None] * len(registrations)
-    H = block_diag(
-        *[
-            r.information_joint
-            if turn is None
-            else forget_turns(r.information_joint, np.zeros(len(r.information_joint)), turn)[0]
-            for r, turn in zip(registrations, turns, strict=True)
-        ]
-    )
-    return np.asarray(H * np.outer(root, root) / state.scale**2)
+    blocks = _measured(registrations, state.turns)[1]
+    out, start = [], 0
+    for r, turn in zip(registrations, turns, strict=True):
+        part = slice(start, start + len(r.information))
+        start = part.stop
+        H = r.information_joint
+        if turn is not None:
+            H = forget_turns(H, np.zeros(len(H)), turn)[0]
+        out.append(weighted_joint(H, blocks[part], state.weights.values[part]))
+    return np.asarray(block_diag(*out) / state.scale**2)
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
@@ -488,15 +492,23 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
         r = _residuals(lines, measured).ravel()
         return _reduce(problem, state.values, steady, (H, H @ r), lines)
 
-    for _ in range(COUPLED_STEPS):
-        reduced = reduce()
-        state.values = reduced.move(reduced.step_with(prior, _offset(state)))
+    def settled(step: Callable[[Reduced], Array]) -> tuple[Reduced, Array, bool]:
+        """Repeats a step until it is small; the last linearisation, the step, and whether it is."""
+        for _ in range(COUPLED_STEPS):
+            reduced = reduce()
+            d = step(reduced)
+            state.values = reduced.move(d)
+            if d @ (reduced.D + prior) @ d < COUPLED_SIGMAS**2:
+                return reduced, d, True
+        return reduced, d, False
+
+    reduced, last, converged = settled(lambda reduced: reduced.step_with(prior, _offset(state)))
     first, information_data = state.values, reduced.D
 
     guess = problem.guesses[problem.reference]
     certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
-    for _ in range(COUPLED_STEPS):
-        reduced = reduce()
+
+    def turn(reduced: Reduced) -> Array:
         E = state.values.atPose3(key_mounting())
         R = E.rotation().matrix()
         Q = problem.to_vehicle_axes(state.values)[:, :6]
@@ -505,7 +517,17 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
         # data's error over the rotation.
         A[3:, 3:] += R.T @ np.diag(certainty) @ R
         b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
-        state.values = reduced.move(Q @ np.linalg.solve(A, b))
+        return np.asarray(Q @ np.linalg.solve(A, b))
+
+    reduced, second, turned = settled(turn)
+    if not (converged and turned):
+        last, converged = (second if converged else last), False
+        moved = np.abs(last.reshape(-1, 6))
+        step = float(moved[:, :3].max()), float(moved[:, 3:].max())
+        registrations = [
+            replace(r, converged=False, last_step=step, iterations=COUPLED_STEPS)
+            for r in registrations
+        ]
     solved = state.values.atPose3(key_mounting())
     state.values = gtsam.Values(state.values)
     state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
@@ -523,7 +545,7 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
         cov,
         held=("x", "y", "z"),
         iterations=1,
-        converged=True,
+        converged=converged,
         time_offsets=offsets,
         gradient_data=gradient_data,
     )

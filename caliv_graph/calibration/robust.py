@@ -8,6 +8,7 @@ every cloud by its whitened residual, solve again.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from caliv_graph.config import RobustConfig
@@ -100,3 +101,27 @@ class RobustWeights:
         self._mu = mu * GNC_FACTOR
         self._annealed = self._mu > 1e3
         return np.clip(middle, 0.0, 1.0)
+
+
+def weighted_joint(H: Array, blocks: Array, weights: Array) -> Array:
+    """Joint information of clouds whose say is weighted.
+
+    A cloud of weight w is one whose pose is known with an error more, of information
+    `w / (1 - w)` times its own: by itself it then says w times as much, at 0 it is free, and a
+    common motion of all clouds, of which H says nothing, stays unsaid. Scaled by the roots of the
+    weights, H would tie clouds of different weights to where the shape happens to lie.
+
+    Args:
+        H: (6 J, 6 J) of all clouds, the shape eliminated.
+        blocks: (J, 6, 6) of each cloud by itself, given the shape.
+        weights: (J,) from 0 to 1.
+    """
+    less = np.flatnonzero(weights < 1.0)
+    if len(less) == 0:
+        return H
+    # As good as none, so that a cloud that nothing else ties down has an inverse.
+    w = np.clip(weights[less], 1e-9, 1.0 - 1e-12)
+    rows = (6 * less[:, None] + np.arange(6)).ravel()
+    inner = H[np.ix_(rows, rows)] + block_diag(*(blocks[less] * (w / (1.0 - w))[:, None, None]))
+    out = H - H[:, rows] @ np.linalg.solve(inner, H[rows])
+    return np.asarray(0.5 * (out + out.T))

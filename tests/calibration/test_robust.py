@@ -6,9 +6,16 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from caliv_graph.calibration.robust import DOF, GNC_FACTOR, MIN_WEIGHT, RobustWeights
+from caliv_graph.calibration.robust import (
+    DOF,
+    GNC_FACTOR,
+    MIN_WEIGHT,
+    RobustWeights,
+    weighted_joint,
+)
 from caliv_graph.config import RobustConfig
 from caliv_graph.products import Array
 
@@ -174,3 +181,43 @@ def test_gross_outliers_lose_their_say_under_every_kernel_that_has_a_cut() -> No
     assert means["huber"] < 1.0
     assert means["tls"] < 1e-3
     assert means["trimmed"] < 1e-3
+
+
+def shared_shape(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+    """Blocks (J, 6, 6), and their joint information (6 J, 6 J) about a shape with a free place."""
+    roots = rng.normal(size=(count, 6, 6))
+    blocks = roots @ np.swapaxes(roots, 1, 2) + np.eye(6)
+    pull = np.vstack(list(blocks))
+    return blocks, block_diag(*blocks) - pull @ np.linalg.solve(blocks.sum(axis=0), pull.T)
+
+
+def test_a_weight_is_that_part_of_a_cloud_s_own_information() -> None:
+    blocks, _ = shared_shape(np.random.default_rng(1), 3)
+    weights = np.array([1.0, 0.3, 1e-6])
+    found = weighted_joint(block_diag(*blocks), blocks, weights)
+    assert found == pytest.approx(block_diag(*(blocks * weights[:, None, None])), abs=1e-7)
+
+
+def test_a_cloud_without_weight_is_free() -> None:
+    blocks, H = shared_shape(np.random.default_rng(2), 4)
+    found = weighted_joint(H, blocks, np.array([1.0, 1.0, 0.0, 1.0]))
+    kept, free = np.r_[0:12, 18:24], np.r_[12:18]
+    left = H[np.ix_(kept, free)] @ np.linalg.solve(H[np.ix_(free, free)], H[np.ix_(free, kept)])
+    assert found[np.ix_(kept, kept)] == pytest.approx(H[np.ix_(kept, kept)] - left, abs=1e-6)
+    assert np.abs(found[free]).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_weights_say_nothing_of_a_common_motion(seed: int) -> None:
+    # Else the frame of the target is tied by a little, and moves by metres along it.
+    rng = np.random.default_rng(seed)
+    blocks, H = shared_shape(rng, 5)
+    common = np.tile(np.eye(6), (5, 1))
+    assert np.abs(H @ common).max() < 1e-9
+    for weights in (rng.uniform(0.0, 1.0, 5), np.ones(5), 1.0 - 1e-4 * rng.uniform(size=5)):
+        found = weighted_joint(H, blocks, weights)
+        assert np.abs(found @ common).max() < 1e-6
+        assert found == pytest.approx(found.T, abs=1e-9)
+        assert np.linalg.eigvalsh(found).min() > -1e-7
+        # No more than without weights.
+        assert np.linalg.eigvalsh(H - found).min() > -1e-7

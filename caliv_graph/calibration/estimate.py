@@ -53,7 +53,7 @@ from caliv_graph.calibration.noise import (
     squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem, usable
-from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
+from caliv_graph.calibration.robust import MIN_WEIGHT, RobustWeights, explained_part, weighted_joint
 from caliv_graph.config import Config, RobustConfig
 from caliv_graph.conventions import key_mounting, key_offset, key_target, key_vehicle
 from caliv_graph.errors import SolveError
@@ -126,6 +126,12 @@ OFFSET_TOLD_S = 0.005
 COUPLED_STEPS = 20
 """Gauss-Newton steps with the joint information at most: the problem is nearly linear there, and
 three or four are usual."""
+
+FAR_OFF = 0.5
+"""Robust weight below which the joint information takes a cloud for lost. Huber's is that at 7
+sigma, where no noise comes to: such a cloud was registered to the wrong place (cut off by the field
+of view, it slid along the shape). Judged are clouds by what the graph of single pose factors leaves
+of them; what they share with others has a longer lever, and half a say would still bend all."""
 
 COUPLED_SIGMAS = 0.01
 """Step in joint standard deviations of the extrinsics at which they have converged."""
@@ -436,7 +442,6 @@ def _reweight(
 def _joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
     """(6J, 6J) information of all registered poses, with what they share and their weights."""
     turns = state.turns or [None] * len(registrations)
-    blocks = _measured(registrations, state.turns)[1]
     out, start = [], 0
     for r, turn in zip(registrations, turns, strict=True):
         part = slice(start, start + len(r.information))
@@ -444,7 +449,7 @@ def _joint_information(state: SolveState, registrations: Sequence[Registration])
         H = r.information_joint
         if turn is not None:
             H = forget_turns(H, np.zeros(len(H)), turn)[0]
-        out.append(weighted_joint(H, blocks[part], state.weights.values[part]))
+        out.append(weighted_joint(H, state.weights.values[part]))
     return np.asarray(block_diag(*out) / state.scale**2)
 
 
@@ -483,6 +488,7 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
     begun = time.perf_counter()
     problem = state.problem
     measured, information = _measured(registrations, state.turns)
+    state.weights.values[state.weights.values < FAR_OFF] = MIN_WEIGHT
     H = _joint_information(state, registrations)
     steady = _steady_graph(state)
     prior = problem.guess_information()

@@ -103,17 +103,16 @@ class RobustWeights:
         return np.clip(middle, 0.0, 1.0)
 
 
-def weighted_joint(H: Array, blocks: Array, weights: Array) -> Array:
+def weighted_joint(H: Array, weights: Array) -> Array:
     """Joint information of clouds whose say is weighted.
 
     A cloud of weight w is one whose pose is known with an error more, of information
-    `w / (1 - w)` times its own: by itself it then says w times as much, at 0 it is free, and a
-    common motion of all clouds, of which H says nothing, stays unsaid. Scaled by the roots of the
-    weights, H would tie clouds of different weights to where the shape happens to lie.
+    `w / (1 - w)` times what the others let it say: it then says w times as much, at 0 it is free,
+    and a common motion of all clouds, of which H says nothing, stays unsaid. Scaled by the roots of
+    the weights, H would tie clouds of different weights to where the shape happens to lie.
 
     Args:
         H: (6 J, 6 J) of all clouds, the shape eliminated.
-        blocks: (J, 6, 6) of each cloud by itself, given the shape.
         weights: (J,) from 0 to 1.
     """
     less = np.flatnonzero(weights < 1.0)
@@ -122,6 +121,8 @@ def weighted_joint(H: Array, blocks: Array, weights: Array) -> Array:
     # As good as none, so that a cloud that nothing else ties down has an inverse.
     w = np.clip(weights[less], 1e-9, 1.0 - 1e-12)
     rows = (6 * less[:, None] + np.arange(6)).ravel()
-    inner = H[np.ix_(rows, rows)] + block_diag(*(blocks[less] * (w / (1.0 - w))[:, None, None]))
-    out = H - H[:, rows] @ np.linalg.solve(inner, H[rows])
+    own = H.reshape(len(weights), 6, len(weights), 6)[less, :, less, :]
+    more = block_diag(*(own * (w / (1.0 - w))[:, None, None]))
+    ridge = (1e-12 * float(np.trace(H)) / len(H) + 1e-300) * np.eye(len(rows))
+    out = H - H[:, rows] @ np.linalg.solve(H[np.ix_(rows, rows)] + more + ridge, H[rows])
     return np.asarray(0.5 * (out + out.T))

@@ -194,13 +194,22 @@ def shared_shape(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
 def test_a_weight_is_that_part_of_a_cloud_s_own_information() -> None:
     blocks, _ = shared_shape(np.random.default_rng(1), 3)
     weights = np.array([1.0, 0.3, 1e-6])
-    found = weighted_joint(block_diag(*blocks), blocks, weights)
+    found = weighted_joint(block_diag(*blocks), weights)
     assert found == pytest.approx(block_diag(*(blocks * weights[:, None, None])), abs=1e-7)
 
 
+def test_a_weight_is_that_part_of_what_the_others_let_a_cloud_say() -> None:
+    # With all others held; the shape takes a good part of what it says by itself.
+    _, H = shared_shape(np.random.default_rng(4), 4)
+    own = np.r_[6:12]
+    found = weighted_joint(H, np.array([1.0, 0.2, 1.0, 1.0]))
+    expected = 0.2 * H[np.ix_(own, own)]
+    assert found[np.ix_(own, own)] == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
 def test_a_cloud_without_weight_is_free() -> None:
-    blocks, H = shared_shape(np.random.default_rng(2), 4)
-    found = weighted_joint(H, blocks, np.array([1.0, 1.0, 0.0, 1.0]))
+    _, H = shared_shape(np.random.default_rng(2), 4)
+    found = weighted_joint(H, np.array([1.0, 1.0, 0.0, 1.0]))
     kept, free = np.r_[0:12, 18:24], np.r_[12:18]
     left = H[np.ix_(kept, free)] @ np.linalg.solve(H[np.ix_(free, free)], H[np.ix_(free, kept)])
     assert found[np.ix_(kept, kept)] == pytest.approx(H[np.ix_(kept, kept)] - left, abs=1e-6)
@@ -211,11 +220,11 @@ def test_a_cloud_without_weight_is_free() -> None:
 def test_weights_say_nothing_of_a_common_motion(seed: int) -> None:
     # Else the frame of the target is tied by a little, and moves by metres along it.
     rng = np.random.default_rng(seed)
-    blocks, H = shared_shape(rng, 5)
+    _, H = shared_shape(rng, 5)
     common = np.tile(np.eye(6), (5, 1))
     assert np.abs(H @ common).max() < 1e-9
     for weights in (rng.uniform(0.0, 1.0, 5), np.ones(5), 1.0 - 1e-4 * rng.uniform(size=5)):
-        found = weighted_joint(H, blocks, weights)
+        found = weighted_joint(H, weights)
         assert np.abs(found @ common).max() < 1e-6
         assert found == pytest.approx(found.T, abs=1e-9)
         assert np.linalg.eigvalsh(found).min() > -1e-7

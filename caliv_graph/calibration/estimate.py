@@ -527,8 +527,7 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
 
     reduced, second, turned = settled(turn)
     if not (converged and turned):
-        last, converged = (second if converged else last), False
-        moved = np.abs(last.reshape(-1, 6))
+        moved = np.abs((second if converged else last).reshape(-1, 6))
         step = float(moved[:, :3].max()), float(moved[:, 3:].max())
         registrations = [
             replace(r, converged=False, last_step=step, iterations=COUPLED_STEPS)
@@ -551,7 +550,7 @@ def _staged(state: SolveState, registrations: Sequence[Registration]) -> Solutio
         cov,
         held=("x", "y", "z"),
         iterations=1,
-        converged=converged,
+        converged=converged and turned,
         time_offsets=offsets,
         gradient_data=gradient_data,
     )
@@ -704,7 +703,7 @@ def _refine(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve, `most` iterations."""
+    """Expectation-maximisation whose M-step is the graph solve; no more than `most` of them."""
     problem, config = state.problem, state.config
     prior = problem.guess_information()
     steady = _steady_graph(state)

@@ -13,16 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.estimate import (
+from caliv_graph.calibration.estimate import prealigned, turns_of_targets
+from caliv_graph.calibration.problem import pose_problem, usable
+from caliv_graph.calibration.solve import (
     OFFSET_TOLD_S,
     SolveState,
-    prealigned,
     reduced_registered,
     solve_registered,
-    turns_of_targets,
     with_determined_offsets,
 )
-from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.config import Config
 from caliv_graph.geometry.se3 import pose_from_mounting, sigmas_from_mounting
 from caliv_graph.preparation import prepare

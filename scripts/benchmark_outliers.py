@@ -21,7 +21,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
 
 import numpy as np
-import numpy.typing as npt
 import pymap3d
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -29,7 +28,7 @@ sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run f
 
 from caliv_graph.config import Config
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.progress import SilentProgress
 from caliv_graph.simulation.scenario import load_scenario
 from caliv_graph.simulation.thinned import GroundWaves, ThinnedRecording, cached_selection
@@ -114,7 +113,7 @@ def fixes_of(drive: ThinnedRecording, config: Config) -> Fixes:
     for j in model.jumps:
         jump |= (seconds >= j.start_s) & (seconds < j.start_s + j.duration_s)
 
-    def counted(which: npt.NDArray[np.bool_]) -> tuple[int, int]:
+    def counted(which: BoolArray) -> tuple[int, int]:
         return int(which.sum()), int((which & dropped).sum())
 
     return Fixes(counted(jump), counted(off & ~jump), counted(~off & ~jump))

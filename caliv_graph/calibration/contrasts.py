@@ -19,6 +19,7 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.calibration.graph import hold_targets
+from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, IntArray, Solution
@@ -30,10 +31,6 @@ LEAST_TURN_RAD_S = 0.02
 
 LEAST_CLOUDS = 4
 """Of each of two parts, for a difference between them to be one."""
-
-FAR_OFF = 54.0
-"""Squared whitened residual, 6 degrees of freedom, of a cloud that is beyond three sigma per axis:
-chance gives it once in a thousand million. Where a kernel weighs nothing down, this tells."""
 
 _CLOUD, _GUESS = ("c", "x", "e"), (("e",), ("e", "s"))
 """Letters of the keys of a cloud's factor, time offset and S_a aside, and of a guess's."""

@@ -363,7 +363,16 @@ def add_shape(
         H_clouds: (6 J, 6 J).
         gradient: (6 J,).
     """
-    starts = dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
+    J = cloud_rows(system, lines)
+    half = J.T @ H_clouds
+    H = system.H + (J.T @ half.T)
+    hold_targets(H, _starts(system))
+    return replace(system, H=H, b=system.b - J.T @ gradient)
+
+
+def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.csr_array:
+    """(6 J, M) how the poses of all clouds move with the variables of a system."""
+    starts = _starts(system)
     rows, columns, entries = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
@@ -372,14 +381,51 @@ def add_shape(
             columns.append((starts[key] + column).ravel())
             entries.append(jacobian.ravel())
     # Every cloud depends on four or five variables of hundreds.
-    J = scipy.sparse.csr_array(
+    return scipy.sparse.csr_array(
         (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(len(gradient), len(system.b)),
+        shape=(6 * len(lines.keys), len(system.b)),
     )
-    half = J.T @ H_clouds
-    H = system.H + (J.T @ half.T)
-    hold_targets(H, starts)
-    return replace(system, H=H, b=system.b - J.T @ gradient)
+
+
+def left_over(
+    system: DenseSystem, lines: CloudLinearisation, H_clouds: Array, residuals: Array
+) -> tuple[Array, Array]:
+    """What measured poses of clouds are off, once all variables have made up for what they can.
+
+    With H the clouds' information, r their residuals and A the information of all variables: the
+    gradient `v = H (r + J d)` at the solution d, and its covariance `W = H - H J A^-1 J^T H`. W is
+    the information on an error in the measured poses; of what poses, targets and extrinsics would
+    take up, it says nothing.
+
+    Args:
+        system: the rest of the graph, which determines all variables together with the clouds.
+        lines: how the clouds' poses move with the variables.
+        H_clouds: (6 J, 6 J) joint information of the measured poses.
+        residuals: (J, 6) `Log(predicted measured^-1)`.
+
+    Returns:
+        (6 J, 6 J) W and (6 J,) v.
+
+    Raises:
+        SolveError: some variable is not determined.
+    """
+    r = residuals.ravel()
+    J = cloud_rows(system, lines)
+    full = add_shape(system, lines, H_clouds, H_clouds @ r)
+    seen = J.T @ H_clouds
+    try:
+        factor = scipy.linalg.cho_factor(full.H, lower=True)
+    except scipy.linalg.LinAlgError:
+        raise SolveError(
+            "the graph of the registered clouds is singular: a pose or a target is tied to nothing"
+        ) from None
+    W = H_clouds - seen.T @ scipy.linalg.cho_solve(factor, seen)
+    return W, H_clouds @ r + seen.T @ scipy.linalg.cho_solve(factor, full.b)
+
+
+def _starts(system: DenseSystem) -> dict[int, int]:
+    """First coordinate of each variable."""
+    return dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
 
 
 def hold_targets(H: Array, starts: Mapping[int, int]) -> None:

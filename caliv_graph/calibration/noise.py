@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 from scipy.optimize import minimize
 
@@ -22,7 +21,7 @@ from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config import NoiseConfig
 from caliv_graph.conventions import key_drift, key_vehicle
-from caliv_graph.products import Array, IntArray, PoseNoise
+from caliv_graph.products import Array, BoolArray, IntArray, PoseNoise
 
 TYPICAL = PoseNoise(
     white_rotation_rad=2e-4,
@@ -85,7 +84,7 @@ def sound_clouds(
     information: Array,
     values: gtsam.Values,
     noise: PoseNoise,
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """Which clouds are not far off: (J,), those to estimate noise levels from.
 
     A cloud is judged where the given pose puts it. The solved pose would not do: it follows a cloud
@@ -116,7 +115,7 @@ def fit_pose_noise(
     problem: Problem,
     measured: Sequence[gtsam.Pose3],
     information: Array,
-    sound: npt.NDArray[np.bool_],
+    sound: BoolArray,
     values: gtsam.Values,
     config: NoiseConfig,
 ) -> tuple[PoseNoise, float]:
@@ -206,7 +205,7 @@ def fit_pose_noise(
     return noise, float(value[4])
 
 
-def _spread(problem: Problem, sound: npt.NDArray[np.bool_]) -> IntArray:
+def _spread(problem: Problem, sound: BoolArray) -> IntArray:
     """Indices of at most CLOUDS_USED of the sound clouds, evenly over the drives.
 
     In the order of their poses: which LiDAR comes first in the config does not matter.

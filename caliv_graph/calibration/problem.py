@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.config import Config
 from caliv_graph.conventions import (
@@ -27,7 +26,7 @@ from caliv_graph.geometry.se3 import (
     sigmas_from_mounting,
     unstack,
 )
-from caliv_graph.products import Array, IntArray, TargetObservation
+from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.views import view_shares
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -157,7 +156,7 @@ class Problem:
         first = self.poses[0][1]
         return np.array([(stamp - first) / NANOSECONDS_PER_SECOND for _, stamp in self.poses])
 
-    def given(self) -> npt.NDArray[np.bool_]:
+    def given(self) -> BoolArray:
         """(n,) whether each pose was given, not smoothed from motion data."""
         return ~np.isin(self.drives(), list(self.motion))
 

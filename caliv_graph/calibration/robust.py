@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from caliv_graph.config import RobustConfig
-from caliv_graph.products import Array
+from caliv_graph.products import Array, BoolArray, IntArray
 
 DOF = 6
 """Degrees of freedom of a cloud's residual."""
@@ -23,6 +23,15 @@ GNC_FACTOR = 1.4
 MIN_WEIGHT = 1e-6
 """A dropped cloud keeps this weight, so that its information stays invertible."""
 
+FAR_OFF = 54.0
+"""Squared whitened residual beyond which a cloud is lost, whatever the kernel: three sigma on each
+of six axes, which chance gives once in a thousand million. Such a cloud was registered to the wrong
+place (cut off by the field of view, it slid along the shape), and half a say, as Huber's kernel
+leaves it, would still bend all."""
+
+CONTROLLED = 1e-4
+"""Least part of what a cloud says that the rest of the data must control for its error to be
+noticed; of what controls less, nothing can be said."""
 
 EXPLAINED = (0.4, 0.8)
 """A cloud of which the target explains less than the first part of what it explains of the median
@@ -70,6 +79,36 @@ class RobustWeights:
         self.values = np.maximum(self._weights(squared) * explained, MIN_WEIGHT)
         return float(np.abs(self.values - before).max())
 
+    def snoop(self, W: Array, v: Array, own: Array, explained: Array | float = 1.0) -> BoolArray:
+        """New weights by what each cloud is off from all the others together.
+
+        Data snooping (Baarda 1968): a cloud that is far off bends the solution, and its neighbours
+        seem to be off as well. So the worst is dropped alone, and the others are judged without it,
+        until none is far off, or half are gone: then it is not they that are wrong. Kernel `none`
+        drops nothing.
+
+        Args:
+            W: (6 J, 6 J) and
+            v: (6 J,) of `graph.left_over`, with full weights.
+            own: (J, 6, 6) what each cloud says, the others held.
+            explained: (J,) factors for what the residuals do not show (`explained_part`).
+
+        Returns:
+            (J,) the clouds that are not lost. The kernel may have taken more out.
+        """
+        squared = np.zeros(len(own))
+        kept = np.ones(len(own), dtype=bool)
+        while True:
+            squared[kept] = deletion_squares(W, v, own)[0][kept]
+            worst = int(np.where(kept, squared, -1.0).argmax())
+            lost = squared[worst] > FAR_OFF and self._config.kernel != "none"
+            if not lost or 2 * kept.sum() <= len(kept):
+                self.update(squared, explained)
+                return kept
+            kept[worst] = False
+            squared[worst] = np.inf
+            W, v = _without(W, v, worst)
+
     def _weights(self, squared: Array) -> Array:
         kernel = self._config.kernel
         if kernel == "none":
@@ -91,7 +130,8 @@ class RobustWeights:
         if self._annealed:
             return np.where(squared < c2, 1.0, 0.0)
         if self._mu is None:
-            worst = float(squared.max())
+            # Lost clouds are infinitely far off, and are no measure.
+            worst = float(np.where(np.isfinite(squared), squared, 0.0).max())
             if 2.0 * worst <= c2:
                 self._annealed = True
                 return np.ones_like(squared)
@@ -103,23 +143,61 @@ class RobustWeights:
         return np.clip(middle, 0.0, 1.0)
 
 
+def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
+    """Squares of what each cloud is off from all others together, in its own sigmas.
+
+    By as much the sum of squares falls if the cloud is left out: the test of an outlier by Baarda
+    (1968), for six coordinates at once.
+
+    Args:
+        W: (6 J, 6 J) and
+        v: (6 J,) of `graph.left_over`.
+        own: (J, 6, 6) what each cloud says, the others held.
+
+    Returns:
+        (J,) the squares, of a chi-squared distribution if only noise is in them; and (J,) its
+        degrees of freedom: six, or fewer where the rest of the data does not control all of a
+        cloud.
+    """
+    each = np.arange(len(own))
+    blocks = W.reshape(len(own), 6, len(own), 6)[each, :, each, :]
+    values, axes = np.linalg.eigh(own)
+    some = values > 1e-12 * values[:, -1:]
+    roots = np.where(some, 1.0 / np.sqrt(np.where(some, values, 1.0)), 0.0)
+    white = axes * roots[:, None, :]
+    part, axes = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, blocks, white))
+    along = np.einsum("jxk,jax,ja->jk", axes, white, v.reshape(-1, 6))
+    controlled = part > CONTROLLED
+    squares = np.where(controlled, along**2 / np.where(controlled, part, 1.0), 0.0).sum(axis=1)
+    return squares, controlled.sum(axis=1)
+
+
+def _without(W: Array, v: Array, cloud: int) -> tuple[Array, Array]:
+    """W and v of `graph.left_over` with the pose of one cloud left free."""
+    mine = np.arange(6 * cloud, 6 * cloud + 6)
+    inverse = np.linalg.pinv(W[np.ix_(mine, mine)], rcond=1e-9, hermitian=True)
+    pull = W[:, mine] @ inverse
+    return W - pull @ W[mine], v - pull @ v[mine]
+
+
 def weighted_joint(H: Array, weights: Array) -> Array:
     """Joint information of clouds whose say is weighted.
 
     A cloud of weight w is one whose pose is known with an error more, of information
-    `w / (1 - w)` times what the others let it say: it then says w times as much, at 0 it is free,
-    and a common motion of all clouds, of which H says nothing, stays unsaid. Scaled by the roots of
-    the weights, H would tie clouds of different weights to where the shape happens to lie.
+    `w / (1 - w)` times what the others let it say: it then says w times as much, at MIN_WEIGHT it
+    is as good as free, and a common motion of all clouds, of which H says nothing, stays unsaid.
+    Scaled by the roots of the weights, H would tie clouds of different weights to where the shape
+    happens to lie.
 
     Args:
         H: (6 J, 6 J) of all clouds, the shape eliminated.
-        weights: (J,) from 0 to 1.
+        weights: (J,) from 0, which counts as MIN_WEIGHT, to 1.
     """
     less = np.flatnonzero(weights < 1.0)
     if len(less) == 0:
         return H
-    # As good as none, so that a cloud that nothing else ties down has an inverse.
-    w = np.clip(weights[less], 1e-9, 1.0 - 1e-12)
+    # At least, so that a cloud that nothing else ties down has an inverse.
+    w = np.clip(weights[less], MIN_WEIGHT, 1.0 - 1e-12)
     rows = (6 * less[:, None] + np.arange(6)).ravel()
     own = H.reshape(len(weights), 6, len(weights), 6)[less, :, less, :]
     more = block_diag(*(own * (w / (1.0 - w))[:, None, None]))

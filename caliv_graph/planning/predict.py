@@ -15,10 +15,10 @@ from typing import Literal
 
 import numpy as np
 
-from caliv_graph.calibration.estimate import OFFSET_TOLD_S
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
+from caliv_graph.calibration.solve import OFFSET_TOLD_S
 from caliv_graph.config import ExtractionConfig, Mounting, MountingSigma
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError

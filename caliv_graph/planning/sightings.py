@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.config import ExtractionConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.simulation.drives import Drive
 from caliv_graph.simulation.motion import sample_stamps
 from caliv_graph.simulation.scenario import LidarModel, ObjectModel, Scenario, WorldModel
@@ -313,7 +312,7 @@ def _elevations_deg(model: LidarModel) -> Array:
     return np.linspace(*model.vertical_fov_deg, model.channels)
 
 
-def _within(model: LidarModel, points_lidar: Array) -> tuple[npt.NDArray[np.bool_], Array]:
+def _within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
     """What of (m, k, 3) points is in the field of view and the range of a LiDAR.
 
     Returns:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from caliv_graph.products import (
     Array,
+    BoolArray,
     GivenPoses,
     GnssFixes,
     ImuSamples,
@@ -165,7 +166,7 @@ class _Losses:
         self._counts: Counter[str] = Counter()
         self._others: list[str] = []
 
-    def keep(self, kept: Any, why: str) -> npt.NDArray[np.bool_]:
+    def keep(self, kept: Any, why: str) -> BoolArray:
         """Counts what is not kept; returns `kept`."""
         self._counts[why] += int(np.count_nonzero(~kept))
         return np.asarray(kept)
@@ -558,7 +559,7 @@ def _common(kinds: Array, which: IntArray) -> Array | None:
     return np.asarray(np.median(known, axis=0)) if len(known) else None
 
 
-def _below(vectors: Array, most: float) -> npt.NDArray[np.bool_]:
+def _below(vectors: Array, most: float) -> BoolArray:
     """(n,) of (n, k): whether all values are within plus and minus a limit."""
     return np.asarray((np.abs(vectors) <= most).all(axis=1))
 

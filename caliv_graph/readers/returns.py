@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from caliv_graph.products import Array
+from caliv_graph.products import Array, BoolArray
 
 
-def is_return(points_lidar: Array, min_range: float, max_range: float) -> npt.NDArray[np.bool_]:
+def is_return(points_lidar: Array, min_range: float, max_range: float) -> BoolArray:
     """Which points are returns within the ranges.
 
     NaN compares false, infinity exceeds any `max_range`, and (0, 0, 0) is a beam without a return

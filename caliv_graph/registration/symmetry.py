@@ -18,15 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import stack, tangent_axes
-from caliv_graph.products import Array, IntArray, Mixture, Registration
+from caliv_graph.products import Array, BoolArray, IntArray, Mixture, Registration
 
-BoolArray = npt.NDArray[np.bool_]
+BoolArray = BoolArray
 
 MOST_VIEWS = 24
 """Clouds that the shape is compared in, from sides that are as different as they can be."""

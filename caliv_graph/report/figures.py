@@ -22,7 +22,7 @@ from plotly.io.json import to_json_plotly
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.calibration.estimate import STEP_SIGMAS, STEP_TOLERANCE
+from caliv_graph.calibration.refine import STEP_SIGMAS, STEP_TOLERANCE
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.covariance import parent_axes_covariance

@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.simulation.scenario import CropModel, EdgeModel, LidarModel
 from caliv_graph.simulation.worlds import GROUND, NO_OBJECT, RayCaster, World
 
-BoolArray = npt.NDArray[np.bool_]
 SingleArray = npt.NDArray[np.float32]
 
 

@@ -71,8 +71,6 @@ OTHERS = 10
 NEIGHBOUR_NS = 110_000_000
 """Clouds of the other LiDARs this near to one that matters are kept: the ground is read in them."""
 
-BoolArray = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class GroundWaves:

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -23,6 +22,7 @@ from caliv_graph.errors import TargetError
 from caliv_graph.geometry.se3 import pose_from_mounting, skew
 from caliv_graph.products import (
     Array,
+    BoolArray,
     IntArray,
     LidarScan,
     Recording,
@@ -635,7 +635,7 @@ class _FieldOfView:
             density = max(density, float(np.unique(cells, return_counts=True)[1].max()))
         return cls(_azimuth_edges(np.concatenate(clouds)), density / math.radians(CELL_DEG) ** 2)
 
-    def may_see(self, towards: Array, margin_m: Array, min_points: int) -> npt.NDArray[np.bool_]:
+    def may_see(self, towards: Array, margin_m: Array, min_points: int) -> BoolArray:
         """Whether something as large as a target may have enough points, (m,).
 
         Args:

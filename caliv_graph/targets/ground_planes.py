@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.config import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import pose_from_mounting, tangent_axes
 from caliv_graph.products import (
     Array,
+    BoolArray,
     GroundObservation,
     IntArray,
     LidarScan,
@@ -33,7 +33,7 @@ from caliv_graph.targets.ground import fit_ground, height_above
 from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.select import VehicleTrajectory
 
-BoolArray = npt.NDArray[np.bool_]
+BoolArray = BoolArray
 
 NORMAL_FLOOR_RAD = 0.5e-3
 DISTANCE_FLOOR_M = 2e-3

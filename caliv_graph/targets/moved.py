@@ -15,9 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 VEHICLE_STANDS_M = 0.15
@@ -142,7 +141,7 @@ def _members(
     return np.flatnonzero(kept)
 
 
-def _outside(stamps_ns: IntArray, standing: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+def _outside(stamps_ns: IntArray, standing: Sequence[tuple[int, int]]) -> BoolArray:
     """(n,) which stamps are not within the times at which the vehicle stood."""
     out = np.ones(len(stamps_ns), dtype=bool)
     for first, last in standing:

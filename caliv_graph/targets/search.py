@@ -17,13 +17,12 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from caliv_graph.config import Config, TargetRegion
 from caliv_graph.errors import TargetError
 from caliv_graph.geometry.se3 import pose_from_mounting
-from caliv_graph.products import Array, IntArray, Recording
+from caliv_graph.products import Array, BoolArray, IntArray, Recording
 from caliv_graph.progress import Advance, Progress
 from caliv_graph.targets.objects import AZIMUTH_BIN_RAD, WIDE_M, SeenObject, SeenScan, see_objects
 from caliv_graph.trajectory.deskew import deskew
@@ -100,7 +99,7 @@ EDGE_RAD = math.radians(0.6)
 REGION_MARGIN_M = 0.3
 """The region is larger than the object by this on each side."""
 
-BoolArray = npt.NDArray[np.bool_]
+BoolArray = BoolArray
 
 
 @dataclass(frozen=True)

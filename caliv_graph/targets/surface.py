@@ -10,12 +10,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array, csr_array, diags_array, vstack
 from scipy.spatial import cKDTree
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.targets.ground import fit_ground, height_above
 
 HALF_SIZE_M = 35.0
@@ -73,10 +72,10 @@ class GroundSurface:
         after = nodes[node] + part[:, 1] * (nodes[node + 1] - nodes[node])
         return np.asarray(before + part[:, 0] * (after - before))
 
-    def is_seen_at(self, xy: Array) -> npt.NDArray[np.bool_]:
+    def is_seen_at(self, xy: Array) -> BoolArray:
         """(k,) whether ground was seen within `SUPPORT_M` of places (k, 2)."""
         distance, _ = cKDTree(self.cells).query(xy, distance_upper_bound=SUPPORT_M)
-        seen: npt.NDArray[np.bool_] = np.isfinite(distance)
+        seen: BoolArray = np.isfinite(distance)
         return seen
 
 

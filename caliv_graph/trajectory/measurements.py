@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from caliv_graph.products import Array, ImuSamples, IntArray, TwistSamples
+from caliv_graph.products import Array, BoolArray, ImuSamples, IntArray, TwistSamples
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_so3
-from caliv_graph.trajectory.noise import BoolArray, ImuNoise
+from caliv_graph.trajectory.noise import ImuNoise
 
 SAMPLES_AT_A_TIME = 16_384
 """Of the IMU, while orientations are turned to their nodes."""

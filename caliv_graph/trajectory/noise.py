@@ -10,12 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.config import Config
-from caliv_graph.products import Array, GnssFixes, ImuSamples, TwistSamples
-
-BoolArray = npt.NDArray[np.bool_]
+from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, TwistSamples
 
 # Table I of the paper, 1 sigma per sample.
 PAPER_FORCE_M_S2 = 0.05

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import skew
-from caliv_graph.products import Array, Direction, Uncertainty
+from caliv_graph.products import Array, BoolArray, Direction, Uncertainty
 
 UNIT = np.array([1e-3] * 3 + [1e-2] * 3)
 """One scaled unit: 1 mrad, 10 mm."""
@@ -63,8 +62,8 @@ class Spectrum:
     information: Array
     sigma_data: Array
     sigma_prior: Array
-    undetermined: npt.NDArray[np.bool_]
-    weak: npt.NDArray[np.bool_]
+    undetermined: BoolArray
+    weak: BoolArray
 
 
 def scaling(lidars: int) -> Array:
@@ -175,7 +174,7 @@ def assess(
 
 def _directions(
     split: Spectrum,
-    mask: npt.NDArray[np.bool_],
+    mask: BoolArray,
     D: Array,
     prior: Array,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],

@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.config import Config, TargetRegion
 from caliv_graph.errors import RecordingError, TargetError
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array, IntArray, LidarScan, Recording
+from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
 from caliv_graph.progress import Progress
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.surface import HALF_SIZE_M, fit_surface
@@ -56,7 +55,7 @@ TURN_M = 5.0
 CREEP_M_S = 0.02
 """Standing still counts as this speed, so that a drive without any motion has scans too."""
 
-BoolArray = npt.NDArray[np.bool_]
+BoolArray = BoolArray
 
 
 @dataclass(frozen=True)

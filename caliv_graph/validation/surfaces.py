@@ -10,10 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import label
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 
 SEED_CELL_M = 1.5
 """Cells in which flat pieces are looked for: a wall seen by one point in 0.4 m fills them."""
@@ -66,7 +65,7 @@ MIN_SCANS = 5
 POLE_STEPS = 15
 """Of Gauss-Newton for a pole."""
 
-BoolArray = npt.NDArray[np.bool_]
+BoolArray = BoolArray
 
 
 @dataclass(frozen=True)

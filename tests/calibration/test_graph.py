@@ -18,6 +18,7 @@ from caliv_graph.calibration.graph import (
     dense_system,
     drift_sigmas,
     initial_values,
+    left_over,
     linearise_clouds,
     merged,
     optimise,
@@ -504,6 +505,46 @@ def test_the_step_of_the_quadratic_leads_to_the_measurements() -> None:
     for name, true in case.problem.guesses.items():
         found = case.problem.mounting(values, name)
         assert vehicle_axes_difference(found, true) == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+def test_what_is_left_over_moves_with_an_error_of_the_clouds_by_its_information() -> None:
+    case = make_case(count=6)
+    count = len(case.measured)
+    H = np.asarray(
+        np.kron(np.eye(count) - 1.0 / count, correlated_information(np.random.default_rng(15)))
+    )
+    graph = merged(pose_graph(case.problem, NOISE), prior_graph(case.problem, case.problem.lidars))
+    system = dense_system(case.problem, graph, case.truth)
+    lines = linearise_clouds(case.problem, case.truth)
+    r = 1e-3 * np.random.default_rng(16).normal(size=(count, 6))
+    W, v = left_over(system, lines, H, r)
+
+    # Gauss-Newton's step by itself, and the gradient there.
+    full = add_shape(system, lines, H, H @ r.ravel())
+    d = np.linalg.solve(full.H, full.b)
+    expected = H @ (r.ravel() + dense_jacobian(system, lines) @ d)
+    scale = np.abs(v).max()
+    np.testing.assert_allclose(v, expected, atol=1e-6 * scale)
+    error = 1e-3 * np.random.default_rng(17).normal(size=6 * count)
+    _, after = left_over(system, lines, H, r + error.reshape(-1, 6))
+    np.testing.assert_allclose(after - v, W @ error, atol=1e-6 * scale)
+    # A turn of the target's frame is taken up by it.
+    common = np.tile(np.eye(6), (count, 1))
+    assert np.abs(W @ common).max() < 1e-6 * np.abs(W).max()
+    # Without any error nothing is left.
+    assert np.abs(left_over(system, lines, H, 0.0 * r)[1]).max() < 1e-9 * scale
+
+
+def test_what_is_left_over_of_poses_that_nothing_ties_is_a_solve_error() -> None:
+    case = make_case(count=4)
+    H = block_diagonal(case.information)
+    with pytest.raises(SolveError, match="tied to nothing"):
+        left_over(
+            empty_system(case, case.truth),
+            linearise_clouds(case.problem, case.truth),
+            H,
+            np.zeros((len(case.measured), 6)),
+        )
 
 
 def test_poses_that_are_off_are_told_from_mountings_that_are() -> None:

@@ -1,0 +1,303 @@
+"""Shape and graph together, for `joint` and `auto`.
+
+Expectation-maximisation whose M-step is the graph solve, the clouds' quadratic (places and
+orientations of the components eliminated, all clouds coupled) in the place of the pose factors.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.noise import squares_without_own_pose
+from caliv_graph.calibration.robust import explained_part
+from caliv_graph.calibration.solve import (
+    WEIGHT_TOLERANCE,
+    SolveState,
+    offset_from_guesses,
+    packed_solution,
+    reduce_to_extrinsics,
+    steady_graph,
+)
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, Iteration, Solution
+from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.register import (
+    FINE_SIGMA_M,
+    JointRegistration,
+    annealing_steps,
+    left_step,
+)
+from caliv_graph.registration.symmetry import Symmetry, forget_turns, refit
+from caliv_graph.uncertainty.observability import respectful_covariance, respectful_step, spectrum
+
+SHAPES_BEGUN_AGAIN = 8
+"""Iteration of the joint loop after which normals and mixture begin anew, now that annealing has
+come to its end, or near it."""
+
+REFINEMENTS = 20
+"""Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
+more."""
+
+LAST_REFINEMENTS = 4
+"""Iterations that are left at the noise level, at least."""
+
+DECIDED_AFTER = 9
+"""Iterations after which the number of undetermined directions is no longer changed, so that one
+at the threshold does not make the estimate jump for ever."""
+
+STEP_TOLERANCE = (5e-5, 3e-4)
+STEP_SIGMAS = 0.1
+"""Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
+what 100 clouds of a chair can tell. Or else in joint standard deviations of the extrinsics."""
+
+
+def refinements(sigma_range_m: float) -> int:
+    """How many iterations the joint loop may take, at this noise along the beam (metres)."""
+    annealed = SHAPES_BEGUN_AGAIN + annealing_steps(FINE_SIGMA_M, sigma_range_m)
+    return max(REFINEMENTS, annealed + LAST_REFINEMENTS)
+
+
+def refined(
+    state: SolveState,
+    states: Sequence[JointRegistration],
+    most: int,
+    advance: Callable[..., None],
+) -> Solution:
+    """Expectation-maximisation whose M-step is the graph solve.
+
+    Args:
+        state: of `solve_registered`, taken along.
+        states: the registration of each placement, taken along.
+        most: iterations at most.
+        advance: called after each.
+
+    Raises:
+        SolveError: a pose or a target is tied to nothing.
+    """
+    problem, config = state.problem, state.config
+    prior = problem.guess_information()
+    steady = steady_graph(state)
+    _begin_shapes(state, states, normals=False)
+    undetermined: int | None = None
+    course: list[Iteration] = []
+    converged, iteration = False, 0
+    while iteration < most and not converged:
+        iteration += 1
+        lines = linearise_clouds(problem, state.values)
+        shapes = _expect(states, lines, state.turns)
+        clouds = shapes.joint(state.scale)
+        begun = time.perf_counter()
+        reduced = reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
+        lost: int | None = None
+        if config.solve.mode == "auto":
+            split = spectrum(reduced.D, prior, undetermined)
+            lost = int(split.undetermined.sum())
+            if iteration >= DECIDED_AFTER:
+                undetermined = int(split.undetermined.sum())
+            step = respectful_step(reduced.D, reduced.c, prior, offset_from_guesses(state), split)
+        else:
+            step = reduced.step_with(prior, offset_from_guesses(state))
+        wanted = _shape_measurements(state, shapes)
+        single = wanted.information / problem.cloud_shares()[:, None, None]
+        squared = squares_without_own_pose(
+            problem, lines, -wanted.pull, single, state.values, state.noise
+        )
+        state.values = reduced.move(step)
+        state.graph_seconds += time.perf_counter() - begun
+        new = linearise_clouds(problem, state.values)
+        for shape, (R, t) in zip(states, per_placement(states, new), strict=True):
+            shape.maximise(R, t)
+        change = 0.0
+        if config.robust.kernel != "tls":
+            # Truncated weights stay as the annealed solve of the pose factors left them: a cloud
+            # that is dropped has no say in the shape that it would then be judged by.
+            explained = np.concatenate([explained_part(shape.inlier_ratio) for shape in states])
+            change = state.weights.update(squared, explained)
+        _hand_weights(state, states)
+        if iteration == SHAPES_BEGUN_AGAIN:
+            _begin_shapes(state, states, normals=True)
+        size = np.abs(step.reshape(-1, 6))
+        sigmas = float(np.sqrt(step @ (reduced.D + prior) @ step))
+        small = size[:, :3].max() < STEP_TOLERANCE[0] and size[:, 3:].max() < STEP_TOLERANCE[1]
+        converged = bool(
+            iteration > SHAPES_BEGUN_AGAIN
+            and all(s.finest for s in states)
+            and (small or sigmas < STEP_SIGMAS)
+            and change < 10.0 * WEIGHT_TOLERANCE
+        )
+        last_step = (float(size[:, :3].max()), float(size[:, 3:].max()))
+        course.append(Iteration(*last_step, sigmas, change, lost))
+        advance()
+    solution = _refined_solution(
+        state, states, steady, prior, undetermined, iteration, converged, last_step
+    )
+    return replace(solution, course=tuple(course))
+
+
+def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
+    """A new mixture, and if asked for new normals, where the graph puts the clouds.
+
+    EM ends near where it starts: what it starts from shall not depend on the way that the
+    registration took from the initial guess.
+    """
+    lines = linearise_clouds(state.problem, state.values)
+    for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
+        if normals:
+            shape.refine_normals(R, t)
+        shape.seed(R, t, FINE_SIGMA_M)
+    _hand_weights(state, states)
+
+
+def _expect(
+    states: Sequence[JointRegistration],
+    lines: CloudLinearisation,
+    turns: Sequence[Symmetry | None],
+) -> _Shapes:
+    """E-step of every placement at the poses that the graph predicts."""
+    poses = per_placement(states, lines)
+    quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
+    fitted = [
+        None if turn is None else refit(turn, state.mixture)
+        for turn, state in zip(turns, states, strict=True)
+    ]
+    return _Shapes(poses, quadratics, fitted)
+
+
+def per_placement(
+    states: Sequence[JointRegistration], lines: CloudLinearisation
+) -> list[tuple[Array, Array]]:
+    """The predicted poses of the clouds, per placement (J, 3, 3) and (J, 3), target frame."""
+    out, start = [], 0
+    for state in states:
+        out.append(stack(lines.predicted[start : start + state.clouds.count]))
+        start += state.clouds.count
+    return out
+
+
+def _hand_weights(state: SolveState, states: Sequence[JointRegistration]) -> None:
+    """Gives every placement the robust weights of its clouds."""
+    start = 0
+    for shape in states:
+        shape.weights = state.weights.values[start : start + shape.clouds.count]
+        start += shape.clouds.count
+
+
+@dataclass
+class _Shapes:
+    """The clouds' quadratic over all placements at one set of poses."""
+
+    poses: list[tuple[Array, Array]]
+    quadratics: list[ShapeQuadratic]
+    turns: list[Symmetry | None]
+
+    def joint(self, scale: float) -> tuple[Array, Array]:
+        """(6 J, 6 J) and (6 J,) of all placements."""
+        H = block_diag(*[H for H, _ in self.joints])
+        return H / scale**2, np.concatenate([gradient for _, gradient in self.joints]) / scale**2
+
+    @cached_property
+    def joints(self) -> list[tuple[Array, Array]]:
+        """The same of each placement, before the scale of the registration."""
+        out = []
+        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
+            H, gradient = quadratic.joint(), quadratic.gradient.ravel()
+            out.append((H, gradient) if turn is None else forget_turns(H, gradient, turn))
+        return out
+
+    @cached_property
+    def single(self) -> tuple[Array, Array]:
+        """(J, 6, 6) and (J, 6): each cloud by itself, given the shape."""
+        blocks, gradients = [], []
+        for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
+            for H, gradient in zip(quadratic.blocks, quadratic.gradient, strict=True):
+                if turn is not None:
+                    H, gradient = forget_turns(H, gradient, turn)
+                blocks.append(H)
+                gradients.append(gradient)
+        return np.array(blocks), np.array(gradients)
+
+
+@dataclass
+class _ShapeMeasurements:
+    """What each cloud by itself, given the shape at its best, would have its pose be.
+
+    Attributes:
+        pull: (J, 6) left perturbations that lead there from the predicted poses.
+        information: (J, 6, 6) without robust weights.
+    """
+
+    pull: Array
+    information: Array
+
+
+def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurements:
+    """The pose factors that the quadratic stands for, one per cloud."""
+    weights = state.weights.values
+    blocks, gradient = shapes.single
+    information = blocks / weights[:, None, None] / state.scale**2
+    # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
+    ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
+    information = information + ridge[:, None, None] * np.eye(6)
+    force = gradient / weights[:, None] / state.scale**2
+    pull = -np.linalg.solve(information, force[..., None])[..., 0]
+    return _ShapeMeasurements(pull, information)
+
+
+def _refined_solution(
+    state: SolveState,
+    states: Sequence[JointRegistration],
+    steady: gtsam.NonlinearFactorGraph,
+    prior: Array,
+    undetermined: int | None,
+    iterations: int,
+    converged: bool,
+    last_step: tuple[float, float],
+) -> Solution:
+    """Reads covariance, residuals and registrations off the last estimate."""
+    problem = state.problem
+    lines = linearise_clouds(problem, state.values)
+    shapes = _expect(states, lines, state.turns)
+    clouds = shapes.joint(state.scale)
+    begun = time.perf_counter()
+    reduced = reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
+    if state.config.solve.mode == "auto":
+        split = spectrum(reduced.D, prior, undetermined)
+        cov = respectful_covariance(prior, split)
+    else:
+        cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
+    pulls = _shape_measurements(state, shapes)
+    # The robust weights of the clouds are kept apart from what they say.
+    weighted = shapes.single[0]
+    registrations, measured, start = [], [], 0
+    for shape, (R, t), (H, _) in zip(states, shapes.poses, shapes.joints, strict=True):
+        part = slice(start, start + shape.clouds.count)
+        start = part.stop
+        R, t = left_step(R, t, pulls.pull[part])
+        blocks = pulls.information[part] * state.scale**2
+        joint = H + block_diag(*(blocks - weighted[part]))
+        result = shape.result(R, t, blocks, joint, iterations, converged, last_step)
+        registrations.append(result)
+        measured += list(result.T_target_lidar)
+    state.graph_seconds += time.perf_counter() - begun
+    return packed_solution(
+        state,
+        registrations,
+        steady,
+        measured,
+        pulls.information,
+        reduced.D,
+        cov,
+        held=(),
+        iterations=iterations,
+        converged=converged,
+        time_offsets=reduced.time_offsets(problem, cov),
+        gradient_data=reduced.c,
+    )

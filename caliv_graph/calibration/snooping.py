@@ -1,0 +1,120 @@
+"""Clouds that were registered to the wrong place, found by what all clouds say together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from scipy.special import chdtri
+
+from caliv_graph.calibration.graph import (
+    dense_system,
+    left_over,
+    linearise_clouds,
+    merged,
+    prior_graph,
+    with_given_poses,
+)
+from caliv_graph.calibration.noise import fit_pose_noise
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.robust import DOF, FAR_OFF, MIN_WEIGHT, deletion_squares
+from caliv_graph.calibration.solve import (
+    SolveState,
+    cloud_residuals,
+    explained_parts,
+    joint_information,
+    measured_poses,
+    steady_graph,
+)
+from caliv_graph.products import Array, BoolArray, Registration
+
+AGREEING = 0.75
+"""Part of the clouds, those that agree best, by whose noise all are judged first."""
+
+MOST_LOST = 0.25
+"""Part of a LiDAR's clouds that can be lost for reasons of their own."""
+
+MEDIAN = float(chdtri(DOF, 0.5))
+"""Of the squares of clouds that nothing but noise is in."""
+
+SNOOPINGS = 6
+"""Rounds of dropping clouds and measuring the noise without them, at most."""
+
+
+def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> None:
+    """Weighs the clouds anew by their joint information, and measures the noise without the lost.
+
+    The graph of single pose factors judges a cloud by what its own pose does not explain, and does
+    not know what it shares with the others: of the clouds that were registered to the wrong place
+    it lets some through that the joint information, with its longer lever, cannot bear. And these
+    have made the fitted noise larger, that of the registration or that of the poses, and would hide
+    behind it: clouds are judged by the noise of those that agree best.
+
+    If a LiDAR would lose more than MOST_LOST, nothing is changed: then it is not its clouds that
+    are wrong but its clock, its mount or the target, and that is to be told (`contrasts`).
+
+    Args:
+        state: of `solve_registered`; gets new weights, and where clouds are lost new noise levels.
+        registrations: what it was given.
+
+    Raises:
+        SolveError: the graph is singular.
+    """
+    problem, fitted = state.problem, (state.noise, state.scale)
+    sound, weights = state.sound, state.weights.values
+    measured, information = measured_poses(registrations, state.turns)
+    single = information / problem.cloud_shares()[:, None, None]
+    given = with_given_poses(problem, state.values)
+    explained = explained_parts(registrations)
+    judged = _left_over(state, registrations, measured, explained)
+    squares, freedom = deletion_squares(*judged)
+    # Where less is controlled there is less to be off by.
+    squares = (squares * DOF / np.maximum(freedom, 1))[sound]
+    if squares.max() * MEDIAN <= FAR_OFF * min(float(np.median(squares)), MEDIAN):
+        # Not even by the noise of the median cloud is any far off.
+        state.weights.snoop(*judged, explained)
+        return
+    by = np.zeros(problem.clouds, dtype=bool)
+    by[np.flatnonzero(sound)[squares <= np.quantile(squares, AGREEING)]] = True
+    for _ in range(SNOOPINGS):
+        if (by == sound).all():
+            state.noise, state.scale = fitted
+        else:
+            state.noise, state.scale = fit_pose_noise(
+                problem, measured, single, by, given, state.config.noise
+            )
+        judged = _left_over(state, registrations, measured, explained)
+        kept = state.weights.snoop(*judged, explained)
+        if _too_many(problem, sound & ~kept):
+            (state.noise, state.scale), state.weights.values = fitted, weights
+            return
+        if (by == (sound & kept)).all():
+            break
+        by = sound & kept
+    state.sound = by
+
+
+def _too_many(problem: Problem, lost: BoolArray) -> bool:
+    """Whether more than MOST_LOST of a LiDAR's clouds are."""
+    clouds = np.bincount(problem.cloud_lidar, minlength=len(problem.lidars))
+    gone = np.bincount(problem.cloud_lidar, lost, minlength=len(problem.lidars))
+    return bool((gone > MOST_LOST * clouds).any())
+
+
+def _left_over(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    measured: Sequence[gtsam.Pose3],
+    explained: Array,
+) -> tuple[Array, Array, Array]:
+    """W and v of `left_over`, and (J, 6, 6) what each cloud says with the others held."""
+    problem = state.problem
+    state.weights.values = np.maximum(explained, MIN_WEIGHT)
+    H = joint_information(state, registrations)
+    lines = linearise_clouds(problem, state.values)
+    graph = merged(steady_graph(state), prior_graph(problem, problem.lidars))
+    system = dense_system(problem, graph, state.values)
+    W, v = left_over(system, lines, H, cloud_residuals(lines, measured))
+    each = np.arange(problem.clouds)
+    return W, v, H.reshape(problem.clouds, 6, problem.clouds, 6)[each, :, each, :]

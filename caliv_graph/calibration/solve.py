@@ -1,0 +1,467 @@
+"""The graph solve that every mode starts from, and what all modes share of it.
+
+The paper's minimisation: one pose factor per registered cloud, robust weights, noise levels from
+the data. Then the problem reduced to the extrinsics, which the stages step on and read covariances
+off, and the result as it is passed on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from caliv_graph.calibration.graph import (
+    CloudLinearisation,
+    DenseSystem,
+    add_shape,
+    cloud_graph,
+    dense_system,
+    initial_values,
+    linearise_clouds,
+    merged,
+    motion_graph,
+    offset_graph,
+    optimise,
+    pose_graph,
+    prior_graph,
+    retract,
+    with_given_poses,
+)
+from caliv_graph.calibration.ground import (
+    GroundWeights,
+    ground_graph,
+    ground_values,
+    ground_weights,
+)
+from caliv_graph.calibration.noise import (
+    TYPICAL_SCALE,
+    first_pose_noise,
+    fit_pose_noise,
+    sound_clouds,
+    squares_without_own_pose,
+)
+from caliv_graph.calibration.problem import Problem, moved_map
+from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
+from caliv_graph.config import Config, RobustConfig
+from caliv_graph.conventions import key_offset, key_target, key_vehicle
+from caliv_graph.errors import SolveError
+from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.products import (
+    Array,
+    BoolArray,
+    GroundObservation,
+    PoseNoise,
+    Registration,
+    Solution,
+)
+from caliv_graph.registration.symmetry import Symmetry, forget_turns
+
+REWEIGHTINGS = 12
+"""Rounds of reweighting at most; graduated non-convexity needs more and may take twice this."""
+
+WEIGHT_TOLERANCE = 0.02
+"""Largest change of a weight at which reweighting stops."""
+
+OFFSET_TOLD_S = 0.005
+"""A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
+
+
+@dataclass
+class SolveState:
+    """What the solve carries along."""
+
+    problem: Problem
+    config: Config
+    values: gtsam.Values
+    noise: PoseNoise
+    scale: float
+    weights: RobustWeights
+    motion: gtsam.NonlinearFactorGraph
+    sound: BoolArray
+    """(J,) the clouds that the noise was measured by."""
+    grounds: tuple[GroundObservation, ...] = ()
+    turns: tuple[Symmetry | None, ...] = ()
+    ground_weights: GroundWeights | None = None
+    graph_seconds: float = 0.0
+
+
+@dataclass
+class Reduced:
+    """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
+
+    `D` and `c`: the quadratic `e^T D e / 2 - c^T e` of the data in a step e of the extrinsics.
+    """
+
+    D: Array
+    c: Array
+    _to_axes: Array
+    _keys: tuple[int, ...]
+    _G: Array
+    _g: Array
+    _values: gtsam.Values
+    _system: DenseSystem
+
+    def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
+        """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
+
+        Args:
+            problem: which they are.
+            cov: (6n, 6n) of the extrinsics, vehicle axes.
+        """
+        inverse = np.linalg.inv(self._to_axes)
+        tangent = inverse @ cov @ inverse.T
+        out = {}
+        for i, name in enumerate(problem.lidars):
+            if name in problem.offsets:
+                variance = self._system.covariance_of(key_offset(i), tangent)[0, 0]
+                value = float(self._values.atVector(key_offset(i))[0])
+                out[name] = (value, float(np.sqrt(variance)))
+        return out
+
+    def step_with(self, prior: Array, offset: Array) -> Array:
+        """The step (6n,) that data and guesses together call for.
+
+        Args:
+            prior: (6n, 6n) information of the guesses.
+            offset: (6n,) where the estimate is from them.
+        """
+        return np.asarray(np.linalg.solve(self.D + prior, self.c - prior @ offset), np.float64)
+
+    def move(self, step: Array) -> gtsam.Values:
+        """All values after a step (6n,) of the extrinsics, the rest following."""
+        tangent = np.linalg.solve(self._to_axes, step)
+        rest = self._g - self._G @ tangent
+        return retract(self._values, self._keys, np.concatenate([rest, tangent]))
+
+
+def solve_registered(
+    problem: Problem,
+    registrations: Sequence[Registration],
+    grounds: tuple[GroundObservation, ...],
+    config: Config,
+    turns: tuple[Symmetry | None, ...] = (),
+) -> SolveState:
+    """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
+
+    Args:
+        problem: what takes part.
+        registrations: of its placements, in order.
+        grounds: the ground as the LiDARs saw it.
+        config: kernels, noise, ground.
+        turns: per placement the turn that its target looks the same after; empty: none known.
+
+    Raises:
+        SolveError: the graph is singular.
+    """
+    begun = time.perf_counter()
+    measured, information = measured_poses(registrations, turns)
+    state = SolveState(
+        problem=problem,
+        config=config,
+        values=initial_values(problem, measured),
+        noise=first_pose_noise(config.noise),
+        scale=TYPICAL_SCALE,
+        weights=RobustWeights(config.robust, problem.clouds),
+        motion=motion_graph(problem),
+        sound=np.ones(problem.clouds, dtype=bool),
+        grounds=grounds,
+        turns=turns,
+    )
+    state.values.insert(ground_values(problem, grounds, state.values, config.ground))
+    # Before the noise is known, weights would take the slow error of the poses for outliers, and
+    # the variances would then find none of it: solve plainly, and leave out what is far off.
+    plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
+    state.weights, kernel = plain, state.weights
+    explained = explained_parts(registrations)
+    _reweight(state, measured, information, explained, 1)
+    given = with_given_poses(problem, state.values)
+    # How far a cloud by itself may be off: what it shares with others from its place included.
+    single = information / problem.cloud_shares()[:, None, None]
+    state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
+    state.noise, state.scale = fit_pose_noise(
+        problem, measured, single, state.sound, given, config.noise
+    )
+    state.weights = kernel
+    rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
+    _reweight(state, measured, information, explained, rounds)
+    state.graph_seconds += time.perf_counter() - begun
+    return state
+
+
+def _reweight(
+    state: SolveState,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    explained: Array,
+    rounds: int,
+) -> None:
+    """Alternates graph solves and robust weights until the weights stay."""
+    problem = state.problem
+    scaled = information / state.scale**2
+    single = scaled / problem.cloud_shares()[:, None, None]
+    for _ in range(rounds):
+        steady = merged(
+            pose_graph(problem, state.noise, state.motion),
+            offset_graph(problem),
+            _ground_graph(state),
+            prior_graph(problem, problem.lidars),
+        )
+        clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
+        state.values = optimise(merged(steady, clouds), state.values, 10)
+        if state.grounds:
+            # Not before: by a guess that is degrees off, the vehicle would stand on no plane.
+            state.ground_weights = ground_weights(problem, state.grounds, state.values)
+        lines = linearise_clouds(problem, state.values)
+        r = cloud_residuals(lines, measured)
+        change = state.weights.update(
+            squares_without_own_pose(problem, lines, r, single, state.values, state.noise),
+            explained,
+        )
+        if change < WEIGHT_TOLERANCE and state.weights.settled:
+            break
+
+
+def with_determined_offsets(
+    state: SolveState, registrations: Sequence[Registration]
+) -> tuple[Problem, dict[str, float]]:
+    """The problem without the time offsets that the drive does not determine.
+
+    At constant speed on an arc an offset of a LiDAR is the same as its own x and yaw: to free it
+    would lose what the drive does tell of them (SPEC 4).
+
+    Args:
+        state: of `solve_registered`, offsets free.
+        registrations: what it was given.
+
+    Returns:
+        The problem; and LiDAR -> 1 sigma in seconds of each offset that was free.
+    """
+    problem = state.problem
+    if not problem.offsets:
+        return problem, {}
+    reduced = reduced_registered(state, registrations)
+    cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
+    sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
+    kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_TOLD_S)
+    return replace(problem, offsets=kept, twists=problem.twists if kept else None), sigmas
+
+
+def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
+    """What registered clouds, motion and ground say of the extrinsics where the solve is.
+
+    Args:
+        state: of `solve_registered`.
+        registrations: what it was given.
+    """
+    problem = state.problem
+    H = joint_information(state, registrations)
+    lines = linearise_clouds(problem, state.values)
+    r = cloud_residuals(lines, measured_poses(registrations)[0]).ravel()
+    return reduce_to_extrinsics(problem, state.values, steady_graph(state), (H, H @ r), lines)
+
+
+def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
+    """(6 J, 6 J) information of all registered poses, with what they share and their weights.
+
+    Args:
+        state: weights, scale of the registration's sigmas, turns that are forgotten.
+        registrations: of the placements, in order.
+    """
+    turns = state.turns or [None] * len(registrations)
+    out, start = [], 0
+    for r, turn in zip(registrations, turns, strict=True):
+        part = slice(start, start + len(r.information))
+        start = part.stop
+        H = r.information_joint
+        if turn is not None:
+            H = forget_turns(H, np.zeros(len(H)), turn)[0]
+        out.append(weighted_joint(H, state.weights.values[part]))
+    return np.asarray(block_diag(*out) / state.scale**2)
+
+
+def measured_poses(
+    registrations: Sequence[Registration], turns: Sequence[Symmetry | None] = ()
+) -> tuple[list[gtsam.Pose3], Array]:
+    """Registered poses (J,) and informations (J, 6, 6) of all placements, in order.
+
+    Args:
+        registrations: of the placements, in order.
+        turns: per placement the turn that its target looks the same after, and that the
+            information is to forget; empty: none.
+    """
+    poses = [T for r in registrations for T in r.T_target_lidar]
+    information = []
+    for r, turn in zip(registrations, turns or [None] * len(registrations), strict=True):
+        blocks = r.information
+        if turn is not None:
+            blocks = np.array([forget_turns(b, np.zeros(6), turn)[0] for b in blocks])
+            # Pose factors want an information that can be inverted.
+            ridge = 1e-9 * np.trace(blocks, axis1=1, axis2=2)
+            blocks = blocks + ridge[:, None, None] * np.eye(6)
+        information.append(blocks)
+    return poses, np.concatenate(information)
+
+
+def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:
+    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`, rad and m.
+
+    Args:
+        lines: with the predicted poses T_target_lidar.
+        measured: those that the registration found.
+    """
+    return np.array(
+        [
+            gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
+            for j, Z in enumerate(lines.predicted)
+        ]
+    )
+
+
+def _whitened(residuals: Array, information: Array) -> Array:
+    """Residuals (J, 6), whitened by the root of their (J, 6, 6) information."""
+    return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
+
+
+def explained_parts(registrations: Sequence[Registration]) -> Array:
+    """Factors (J,) on the weights of all clouds by how much of each is target at all."""
+    return np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
+
+
+def steady_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+    """What stays the same while clouds are weighed anew: poses, ground and trusted mountings."""
+    problem = state.problem
+    return merged(
+        pose_graph(problem, state.noise, state.motion),
+        offset_graph(problem),
+        _ground_graph(state),
+        prior_graph(problem, sorted(problem.fixed)),
+    )
+
+
+def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+    """What the ground says, as far as it is believed."""
+    return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
+
+
+def reduce_to_extrinsics(
+    problem: Problem,
+    values: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph,
+    clouds: tuple[Array, Array],
+    lines: CloudLinearisation,
+) -> Reduced:
+    """Linearises a graph and the clouds' quadratic, and eliminates all but the extrinsics.
+
+    Args:
+        problem: what takes part.
+        values: where to linearise.
+        graph: everything but the clouds and the guesses.
+        clouds: (6 J, 6 J) and (6 J,) their quadratic in left perturbations of their poses.
+        lines: how these move with the variables.
+
+    Raises:
+        SolveError: a pose or a target is tied to nothing.
+    """
+    system = add_shape(dense_system(problem, graph, values), lines, *clouds)
+    D, c, G, g = system.schur()
+    Q = problem.to_vehicle_axes(values)
+    inverse = np.linalg.inv(Q)
+    D = inverse.T @ D @ inverse
+    return Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
+
+
+def offset_from_guesses(state: SolveState) -> Array:
+    """(6 n,) where the extrinsics are from their guesses, vehicle axes, rad and m."""
+    problem = state.problem
+    return np.concatenate(
+        [
+            vehicle_axes_difference(problem.mounting(state.values, n), problem.guesses[n])
+            for n in problem.lidars
+        ]
+    )
+
+
+def packed_solution(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    steady: gtsam.NonlinearFactorGraph,
+    measured: Sequence[gtsam.Pose3],
+    information: Array,
+    information_data: Array,
+    cov: Array,
+    held: tuple[str, ...],
+    iterations: int,
+    converged: bool,
+    time_offsets: Mapping[str, tuple[float, float]],
+    gradient_data: Array,
+) -> Solution:
+    """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds.
+
+    Args:
+        state: after its last step.
+        registrations: the clouds where they have come to lie.
+        steady: `steady_graph` of the last step.
+        measured: T_target_lidar of each cloud for the graph's pose factors.
+        information: (J, 6, 6) of these, without robust weights.
+        information_data: (6 n, 6 n) what the data say of the extrinsics, vehicle axes.
+        cov: (6 n, 6 n) of the result, vehicle axes.
+        held: axes of the reference LiDAR that were held at the guess.
+        iterations: of the loop.
+        converged: whether it came to rest.
+        time_offsets: LiDAR -> offset and sigma, seconds.
+        gradient_data: (6 n,) of the data at the result.
+
+    Raises:
+        SolveError: the covariance is not finite.
+    """
+    problem = state.problem
+    graph = merged(
+        steady,
+        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
+        cloud_graph(problem, measured, information * state.weights.values[:, None, None]),
+    )
+    if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
+        raise SolveError("the covariance of the extrinsics is not finite")
+    left = cloud_residuals(linearise_clouds(problem, state.values), measured)
+    white = _whitened(left, information)
+    cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
+    return Solution(
+        mode=state.config.solve.mode,
+        lidars=problem.lidars,
+        reference=problem.reference,
+        T_vehicle_lidar={n: problem.mounting(state.values, n) for n in problem.lidars},
+        T_map_vehicle={
+            pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
+            for i, pose in enumerate(problem.poses)
+        },
+        T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
+        registrations=tuple(registrations),
+        cloud_weights=tuple(np.split(state.weights.values, cuts)),
+        residuals=tuple(np.split(white, cuts)),
+        pose_noise=state.noise if problem.given().any() else None,
+        registration_scale=state.scale,
+        information_data=information_data,
+        information_prior=problem.guess_information(),
+        cov=cov,
+        held=held,
+        iterations=iterations,
+        converged=converged,
+        time_offsets=time_offsets,
+        graph=graph,
+        values=state.values,
+        gradient_data=gradient_data,
+    )
+
+
+def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:
+    """T_target_map of a placement in the map of its drive."""
+    problem = state.problem
+    cloud = int(np.flatnonzero(problem.cloud_placement == placement)[0])
+    drive = problem.poses[problem.cloud_pose[cloud]][0]
+    T_target_map = state.values.atPose3(key_target(placement))
+    return T_target_map.compose(gtsam.Pose3(gtsam.Rot3(), -problem.origins_map[drive]))

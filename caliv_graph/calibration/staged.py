@@ -1,0 +1,165 @@
+"""The paper's two stages on the registered clouds: sensor to sensor, then the rotation alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import (
+    linearise_clouds,
+)
+from caliv_graph.calibration.snooping import snoop_clouds
+from caliv_graph.calibration.solve import (
+    Reduced,
+    SolveState,
+    cloud_residuals,
+    joint_information,
+    measured_poses,
+    offset_from_guesses,
+    packed_solution,
+    reduce_to_extrinsics,
+    steady_graph,
+)
+from caliv_graph.conventions import key_mounting
+from caliv_graph.products import Array, Registration, Solution
+
+COUPLED_STEPS = 20
+"""Gauss-Newton steps with the joint information at most: the problem is nearly linear there, and
+three or four are usual."""
+
+COUPLED_SIGMAS = 0.01
+"""Step in joint standard deviations of the extrinsics at which they have converged."""
+
+
+def staged_solution(state: SolveState, registrations: Sequence[Registration]) -> Solution:
+    """The paper's two stages on the registered clouds.
+
+    Stage 1 estimates all S_a with E free under its prior. Stage 2 fixes S_a, holds the reference
+    LiDAR's translation at its guess and solves its rotation.
+
+    The translation is reported as the guess has it, but the guess may be wrong by its sigma, and a
+    fit that denies this bends the rotation to make up for it: on an arc 50 mm of y become 10 mrad
+    of roll. So its error is *considered* (Schmidt 1966): it takes part with the guess's sigma
+    while the rotation is solved for, and is not reported.
+
+    Both stages take the registration's joint information. Its blocks, one pose factor per cloud,
+    say twice what the clouds share, since the shape was estimated from them: where two LiDARs saw
+    different skins of the target, blocks tie them together and the joint information does not.
+
+    Args:
+        state: of `solve_registered`; weights and noise are measured anew.
+        registrations: what it was given.
+
+    Raises:
+        SolveError: the graph is singular.
+    """
+    begun = time.perf_counter()
+    problem = state.problem
+    measured, information = measured_poses(registrations, state.turns)
+    snoop_clouds(state, registrations)
+    H = joint_information(state, registrations)
+    steady = steady_graph(state)
+    prior = problem.guess_information()
+
+    def reduce() -> Reduced:
+        lines = linearise_clouds(problem, state.values)
+        r = cloud_residuals(lines, measured).ravel()
+        return reduce_to_extrinsics(problem, state.values, steady, (H, H @ r), lines)
+
+    def settled(step: Callable[[Reduced], Array]) -> tuple[Reduced, Array, bool]:
+        """Repeats a step until it is small; the last linearisation, the step, and whether it is."""
+        for _ in range(COUPLED_STEPS):
+            reduced = reduce()
+            d = step(reduced)
+            state.values = reduced.move(d)
+            if d @ (reduced.D + prior) @ d < COUPLED_SIGMAS**2:
+                return reduced, d, True
+        return reduced, d, False
+
+    reduced, last, converged = settled(lambda r: r.step_with(prior, offset_from_guesses(state)))
+    first, information_data = state.values, reduced.D
+
+    guess = problem.guesses[problem.reference]
+    certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
+
+    def turn(reduced: Reduced) -> Array:
+        E = state.values.atPose3(key_mounting())
+        R = E.rotation().matrix()
+        Q = problem.to_vehicle_axes(state.values)[:, :6]
+        A, b = Q.T @ reduced.D @ Q, Q.T @ reduced.c
+        # The guess has a say in the translation alone: the paper's second stage minimises the
+        # data's error over the rotation.
+        A[3:, 3:] += R.T @ np.diag(certainty) @ R
+        b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
+        return np.asarray(Q @ np.linalg.solve(A, b))
+
+    reduced, second, turned = settled(turn)
+    if not (converged and turned):
+        moved = np.abs((second if converged else last).reshape(-1, 6))
+        step = float(moved[:, :3].max()), float(moved[:, 3:].max())
+        registrations = [
+            replace(r, converged=False, last_step=step, iterations=COUPLED_STEPS)
+            for r in registrations
+        ]
+    solved = state.values.atPose3(key_mounting())
+    state.values = gtsam.Values(state.values)
+    state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
+    cov = _staged_covariance(state, information_data, prior, first)
+    offsets = reduced.time_offsets(problem, cov)
+    gradient_data = reduce().c
+    state.graph_seconds += time.perf_counter() - begun
+    return packed_solution(
+        state,
+        registrations,
+        steady,
+        measured,
+        information / state.scale**2,
+        information_data,
+        cov,
+        held=("x", "y", "z"),
+        iterations=1,
+        converged=converged and turned,
+        time_offsets=offsets,
+        gradient_data=gradient_data,
+    )
+
+
+def _staged_covariance(
+    state: SolveState, information_data: Array, prior: Array, first: gtsam.Values
+) -> Array:
+    """Covariance of the staged result, vehicle axes.
+
+    S_a has the covariance of stage 1, the held translation that of the guess. The rotation is
+    solved with the translation considered: its error is the data's, and what a translation that
+    is off by its sigma pulls along (0.1 m turn the yaw by 0.1 m over the turning radius, SPEC 4).
+    """
+    problem = state.problem
+    n = len(problem.lidars)
+    Q = problem.to_vehicle_axes(first)
+    D = Q.T @ information_data @ Q  # tangents of E (rotation, translation), S_a
+    stage_one = np.linalg.inv(D + Q.T @ prior @ Q)
+    R = first.atPose3(key_mounting()).rotation().matrix()
+    sigma = problem.prior_sigmas[problem.reference][3:]
+    held = R.T @ np.diag(sigma**2) @ R  # of the translation, in E's tangent
+    considered = D[:6, :6].copy()
+    considered[3:, 3:] += np.linalg.inv(held)
+    solved = np.linalg.inv(considered)
+    # The rotation's error follows that of S_a, which stage 2 takes for known, and that of the
+    # translation: the solve estimated (d_t - guess error), so the error of the guess remains.
+    pull = -solved @ D[:6, 6:]
+    cov = np.zeros((6 * n, 6 * n))
+    cov[6:, 6:] = stage_one[6:, 6:]
+    cov[:3, :3] = solved[:3, :3] + pull[:3] @ stage_one[6:, 6:] @ pull[:3].T
+    cov[:3, 6:] = pull[:3] @ stage_one[6:, 6:]
+    cov[6:, :3] = cov[:3, 6:].T
+    cov[3:6, 3:6] = held
+    # Rotation error against the guess's own error d0: the solve weighs the guess by its sigma.
+    cov[:3, 3:6] = solved[:3, 3:]
+    cov[3:6, :3] = cov[:3, 3:6].T
+    Q = problem.to_vehicle_axes(state.values)
+    cov = Q @ cov @ Q.T
+    return np.asarray(0.5 * (cov + cov.T))

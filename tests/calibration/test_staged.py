@@ -1,0 +1,154 @@
+"""The two stages on registered poses with a known truth, some of them in a wrong place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.snooping import snoop_clouds
+from caliv_graph.calibration.solve import solve_registered
+from caliv_graph.calibration.staged import staged_solution
+from caliv_graph.config import Config, LidarConfig, Mounting, RobustConfig, SolveConfig
+from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
+from caliv_graph.products import Array, Registration, Solution
+from tests.calibration.problems import SIGMAS, Case, make_case, noisy
+from tests.samples import MOUNTINGS, make_solution
+
+LIDARS = ("front", "rear")
+
+SLID = [8, 9, 10, 11]
+"""Clouds of the front from places that follow each other."""
+
+SLIDES = (np.array([0.0, 0.0, 0.01, 0.1, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
+"""How far they are off: 10 cm and 10 mrad, and 3 cm."""
+
+
+def config_of(kernel: str) -> Config:
+    return Config(
+        lidars={
+            name: LidarConfig(
+                topic=name, initial=Mounting(xyz=MOUNTINGS[name][0], rpy_deg=MOUNTINGS[name][1])
+            )
+            for name in LIDARS
+        },
+        reference="rear",
+        solve=SolveConfig(mode="staged"),
+        robust=RobustConfig.model_validate({"kernel": kernel}),
+    )
+
+
+def guessed(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The same with guesses that are off by their sigmas."""
+    return replace(
+        problem,
+        guesses={
+            name: retract_vehicle_axes(T, SIGMAS * rng.normal(size=6))
+            for name, T in problem.guesses.items()
+        },
+    )
+
+
+def registered(case: Case, measured: tuple[gtsam.Pose3, ...]) -> Registration:
+    """Registered poses about a shape whose place is free."""
+    blocks = case.information
+    pull = np.vstack(list(blocks))
+    return replace(
+        make_solution().registrations[0],
+        T_target_lidar=measured,
+        information=blocks,
+        information_joint=block_diag(*blocks) - pull @ np.linalg.solve(blocks.sum(axis=0), pull.T),
+        inlier_ratio=np.ones(len(measured)),
+    )
+
+
+def solved(seed: int, slid: Array, kernel: str = "huber") -> tuple[Case, Solution]:
+    """A drive of 20 places by two LiDARs; four clouds of the front are off by `slid`."""
+    case = make_case(*LIDARS, count=20, seed=seed)
+    measured = list(noisy(case, seed))
+    for j in SLID:
+        measured[j] = gtsam.Pose3.Expmap(slid).compose(measured[j])
+    problem = guessed(case.problem, np.random.default_rng(seed))
+    registrations = [registered(case, tuple(measured))]
+    state = solve_registered(problem, registrations, (), config_of(kernel))
+    return case, staged_solution(state, registrations)
+
+
+def s2s_nees(case: Case, solution: Solution) -> float:
+    """Squared error of front to rear in its own covariance, six degrees of freedom."""
+    true, found = case.problem.guesses, solution.T_vehicle_lidar
+    S = found["rear"].between(found["front"])
+    error = gtsam.Pose3.Logmap(S.between(true["rear"].between(true["front"])))
+    # By right perturbations of both mountings; the covariance is about vehicle axes.
+    J = np.zeros((6, 12))
+    for name, part in (("front", np.eye(6)), ("rear", -S.inverse().AdjointMap())):
+        R = found[name].rotation().matrix().T
+        at = 6 * solution.lidars.index(name)
+        J[:, at : at + 6] = part @ block_diag(R, R)
+    return float(error @ np.linalg.solve(J @ solution.cov @ J.T, error))
+
+
+def lost(solution: Solution) -> list[int]:
+    return np.flatnonzero(solution.cloud_weights[0] < 1e-3).tolist()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_clouds_in_a_wrong_place_are_lost_and_nothing_else_changes(seed: int) -> None:
+    case, whole = solved(seed, np.zeros(6))
+    assert lost(whole) == []
+    assert s2s_nees(case, whole) < 18.5  # chi squared of six, one in two hundred
+    for slid in SLIDES:
+        case, solution = solved(seed, slid)
+        assert lost(solution) == SLID
+        assert s2s_nees(case, solution) < 18.5
+        assert solution.registration_scale == pytest.approx(whole.registration_scale, rel=0.1)
+        sigma = np.sqrt(np.diag(solution.cov))
+        for i, name in enumerate(solution.lidars):
+            off = vehicle_axes_difference(
+                solution.T_vehicle_lidar[name], whole.T_vehicle_lidar[name]
+            )
+            assert (np.abs(off) < 2.0 * sigma[6 * i : 6 * i + 6]).all()
+
+
+@pytest.mark.parametrize("kernel", ["tls", "trimmed"])
+def test_other_kernels_lose_them_too(kernel: str) -> None:
+    case, solution = solved(1, SLIDES[0], kernel)
+    assert set(lost(solution)) >= set(SLID)
+    assert s2s_nees(case, solution) < 18.5
+
+
+def test_without_a_kernel_nothing_is_lost() -> None:
+    _, solution = solved(1, SLIDES[0], "none")
+    assert lost(solution) == []
+
+
+def test_errors_between_sensors_are_as_large_as_is_said_of_them() -> None:
+    found = [s2s_nees(*solved(seed, np.zeros(6))) for seed in range(10, 40)]
+    # 30 draws: the standard error of their mean is 0.63.
+    assert np.mean(found) == pytest.approx(6.0, abs=2.0)
+
+
+def test_a_lidar_that_would_lose_many_clouds_keeps_them_all() -> None:
+    # Its clock or its mount is wrong then, and whoever looks at the weights shall see it.
+    case = make_case(*LIDARS, count=20, seed=1)
+    measured = list(noisy(case, 1))
+    for j in range(7, 13):
+        measured[j] = gtsam.Pose3.Expmap(SLIDES[0]).compose(measured[j])
+    registrations = [registered(case, tuple(measured))]
+    state = solve_registered(case.problem, registrations, (), config_of("huber"))
+    before = state.weights.values.copy(), state.noise, state.scale, state.sound.copy()
+    snoop_clouds(state, registrations)
+    np.testing.assert_array_equal(state.weights.values, before[0])
+    assert (state.noise, state.scale) == before[1:3]
+    np.testing.assert_array_equal(state.sound, before[3])
+    # A fifth of the front's twenty are lost.
+    measured[12] = noisy(case, 1)[12]
+    measured[11] = noisy(case, 1)[11]
+    registrations = [registered(case, tuple(measured))]
+    state = solve_registered(case.problem, registrations, (), config_of("huber"))
+    snoop_clouds(state, registrations)
+    assert np.flatnonzero(state.weights.values < 1e-3).tolist() == [7, 8, 9, 10]

@@ -25,8 +25,6 @@ from caliv_graph.cores import share_out
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture, Registration
 
-BoolArray = BoolArray
-
 MOST_VIEWS = 24
 """Clouds that the shape is compared in, from sides that are as different as they can be."""
 

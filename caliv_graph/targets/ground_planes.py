@@ -33,8 +33,6 @@ from caliv_graph.targets.ground import fit_ground, height_above
 from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.select import VehicleTrajectory
 
-BoolArray = BoolArray
-
 NORMAL_FLOOR_RAD = 0.5e-3
 DISTANCE_FLOOR_M = 2e-3
 """Added to what the noise of the points leaves (SPEC 8). With thousands of points that is 0.02 mrad

@@ -99,8 +99,6 @@ EDGE_RAD = math.radians(0.6)
 REGION_MARGIN_M = 0.3
 """The region is larger than the object by this on each side."""
 
-BoolArray = BoolArray
-
 
 @dataclass(frozen=True)
 class FoundTarget:

@@ -55,8 +55,6 @@ TURN_M = 5.0
 CREEP_M_S = 0.02
 """Standing still counts as this speed, so that a drive without any motion has scans too."""
 
-BoolArray = BoolArray
-
 
 @dataclass(frozen=True)
 class Mountings:

@@ -65,8 +65,6 @@ MIN_SCANS = 5
 POLE_STEPS = 15
 """Of Gauss-Newton for a pole."""
 
-BoolArray = BoolArray
-
 
 @dataclass(frozen=True)
 class Wall:

@@ -332,19 +332,21 @@ def _about(shape: _Shape, axis: Array, identity: _Comparison) -> Symmetry | None
         least = FEWEST_COMPARED * identity.compared
         return None if turn is None or turn.comparison.compared <= least else turn
 
-    def looked_at(angle_rad: float, most: float = math.inf) -> _Turn | None:
+    def looked_at(angle_rad: float, enough: float = math.inf) -> _Turn | None:
         """A turn and its opposite, the worse of the two.
 
-        None if either was hardly seen, or is contradicted by more than `most`: then the other need
-        not be looked at.
+        None if either was hardly seen. If the first is contradicted by more than `enough`, the
+        other is not looked at.
         """
         worst: _Turn | None = None
         for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
             turn = seen(signed)
-            if turn is None or turn.comparison.contradicted > most:
+            if turn is None:
                 return None
             if worst is None or turn.comparison.contradicted > worst.comparison.contradicted:
                 worst = turn
+            if turn.comparison.contradicted > enough:
+                break
         return worst
 
     turns: list[_Turn] = []
@@ -360,11 +362,18 @@ def _about(shape: _Shape, axis: Array, identity: _Comparison) -> Symmetry | None
         # What a fit is off by counts for the centre by 1 / (2 sin(angle / 2)).
         wide = max(turns, key=lambda t: abs(t.angle_rad))
         return _symmetry(replace(worst, axis=wide.axis, centre=wide.centre), 0.0, wide.angle_rad)
-    for order in sorted(ORDERS, reverse=True):
+    smallest, refuted = None, set[int]()
+    for order in sorted(ORDERS):
+        # What is the same after a part of a full turn is so after twice the part: a quarter turn
+        # need not be looked at where half a turn is another shape.
+        if any(order % part == 0 for part in refuted):
+            continue
         turn = looked_at(2.0 * math.pi / order, limit)
-        if turn is not None:
-            return _symmetry(turn, 2.0 * math.pi / order, turn.angle_rad)
-    return None
+        if turn is not None and turn.comparison.contradicted > limit:
+            refuted.add(order)
+        elif turn is not None:
+            smallest = _symmetry(turn, 2.0 * math.pi / order, turn.angle_rad)
+    return smallest
 
 
 def _symmetry(turn: _Turn, smallest_rad: float, fitted_rad: float) -> Symmetry:

@@ -1,10 +1,9 @@
-"""The estimator: registration, graph solve, and the loop around both.
+"""The estimator: registration, graph solve, and what `solve.mode` asks for after them.
 
-`estimate` is the one place that goes round. The paper's pipeline is its first half: register all
-clouds to the latent target, then solve the graph with one pose factor per cloud, robustly. `staged`
-stops there, in the paper's two stages. `joint` and `auto` go on: expectation-maximisation whose
-M-step is the graph solve, the clouds' quadratic (places and orientations of the components
-eliminated, all clouds coupled) in the place of the pose factors.
+The paper's pipeline is its first half: register all clouds to the latent target, then solve the
+graph with one pose factor per cloud, robustly (`solve`). `staged` stops there, in the paper's two
+stages. `joint` and `auto` go on (`refine`): expectation-maximisation whose M-step is the graph
+solve.
 
 Gauge: the target frames stay where they are, for the shapes are free; the map is held by the given
 poses, the extrinsics by the data or the guesses (SPEC 3, `auto`).

@@ -24,10 +24,10 @@ MIN_WEIGHT = 1e-6
 """A dropped cloud keeps this weight, so that its information stays invertible."""
 
 FAR_OFF = 54.0
-"""Squared whitened residual beyond which a cloud is lost, whatever the kernel: three sigma on each
-of six axes, which chance gives once in a thousand million. Such a cloud was registered to the wrong
-place (cut off by the field of view, it slid along the shape), and half a say, as Huber's kernel
-leaves it, would still bend all."""
+"""Squared whitened residual beyond which a cloud is lost by any kernel but `none`: three sigma on
+each of six axes, which chance gives once in a thousand million. Such a cloud was registered to the
+wrong place (cut off by the field of view, it slid along the shape), and half a say, as Huber's
+kernel leaves it, would still bend all. Where a kernel weighs nothing down, this tells."""
 
 CONTROLLED = 1e-4
 """Least part of what a cloud says that the rest of the data must control for its error to be
@@ -89,7 +89,7 @@ class RobustWeights:
 
         Args:
             W: (6 J, 6 J) and
-            v: (6 J,) of `graph.left_over`, with full weights.
+            v: (6 J,) of `graph.left_over`, no cloud weighed down by its residual.
             own: (J, 6, 6) what each cloud says, the others held.
             explained: (J,) factors for what the residuals do not show (`explained_part`).
 
@@ -104,10 +104,12 @@ class RobustWeights:
             lost = squared[worst] > FAR_OFF and self._config.kernel != "none"
             if not lost or 2 * kept.sum() <= len(kept):
                 self.update(squared, explained)
+                # `trimmed` drops its percentage, which may be fewer.
+                self.values[~kept] = MIN_WEIGHT
                 return kept
             kept[worst] = False
             squared[worst] = np.inf
-            W, v = _without(W, v, worst)
+            W, v = _without(W, v, own, worst)
 
     def _weights(self, squared: Array) -> Array:
         kernel = self._config.kernel
@@ -159,23 +161,33 @@ def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
         degrees of freedom: six, or fewer where the rest of the data does not control all of a
         cloud.
     """
+    inverses, freedom = _deletion_covariances(W, own)
+    parts = v.reshape(-1, 6)
+    return np.einsum("ja,jab,jb->j", parts, inverses, parts), freedom
+
+
+def _deletion_covariances(W: Array, own: Array) -> tuple[Array, IntArray]:
+    """(J, 6, 6) inverses of W's blocks along what is controlled, else zero; (J,) its dimension.
+
+    Rotations and translations have units of their own: a block is compared with what the cloud
+    itself says.
+    """
     each = np.arange(len(own))
     blocks = W.reshape(len(own), 6, len(own), 6)[each, :, each, :]
     values, axes = np.linalg.eigh(own)
-    some = values > 1e-12 * values[:, -1:]
-    roots = np.where(some, 1.0 / np.sqrt(np.where(some, values, 1.0)), 0.0)
-    white = axes * roots[:, None, :]
-    part, axes = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, blocks, white))
-    along = np.einsum("jxk,jax,ja->jk", axes, white, v.reshape(-1, 6))
+    # What a cloud of a drum says of turns about it is eliminated to rounding.
+    some = values > 1e-9 * values[:, -1:]
+    white = axes * np.where(some, 1.0 / np.sqrt(np.where(some, values, 1.0)), 0.0)[:, None, :]
+    part, along = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, blocks, white))
     controlled = part > CONTROLLED
-    squares = np.where(controlled, along**2 / np.where(controlled, part, 1.0), 0.0).sum(axis=1)
-    return squares, controlled.sum(axis=1)
+    roots = white @ along * np.where(controlled, part, np.inf)[:, None, :] ** -0.5
+    return roots @ np.swapaxes(roots, 1, 2), controlled.sum(axis=1)
 
 
-def _without(W: Array, v: Array, cloud: int) -> tuple[Array, Array]:
+def _without(W: Array, v: Array, own: Array, cloud: int) -> tuple[Array, Array]:
     """W and v of `graph.left_over` with the pose of one cloud left free."""
-    mine = np.arange(6 * cloud, 6 * cloud + 6)
-    inverse = np.linalg.pinv(W[np.ix_(mine, mine)], rcond=1e-9, hermitian=True)
+    mine = slice(6 * cloud, 6 * cloud + 6)
+    inverse = _deletion_covariances(W[mine, mine], own[cloud : cloud + 1])[0][0]
     pull = W[:, mine] @ inverse
     return W - pull @ W[mine], v - pull @ v[mine]
 

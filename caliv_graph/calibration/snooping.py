@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
 from caliv_graph.calibration.graph import (
     dense_system,
@@ -18,14 +17,16 @@ from caliv_graph.calibration.graph import (
 )
 from caliv_graph.calibration.noise import fit_pose_noise
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.robust import DOF, FAR_OFF, MIN_WEIGHT, deletion_squares
+from caliv_graph.calibration.robust import DOF, MIN_WEIGHT, deletion_squares
 from caliv_graph.calibration.solve import (
     SolveState,
     cloud_residuals,
     explained_parts,
     joint_information,
     measured_poses,
+    settle,
     steady_graph,
+    step_of_all,
 )
 from caliv_graph.products import Array, BoolArray, Registration
 
@@ -33,10 +34,12 @@ AGREEING = 0.75
 """Part of the clouds, those that agree best, by whose noise all are judged first."""
 
 MOST_LOST = 0.25
-"""Part of a LiDAR's clouds that can be lost for reasons of their own."""
+"""Part of a LiDAR's clouds that can be lost for reasons of their own; from a tenth on they are told
+as a contradiction (`uncertainty.consistency.OUTLIERS`)."""
 
-MEDIAN = float(chdtri(DOF, 0.5))
-"""Of the squares of clouds that nothing but noise is in."""
+LEAST_SAY = 0.5
+"""Weight below which a cloud says nothing where it is not clear which are wrong: the joint
+information has the longer lever, and less than half a say would still bend all."""
 
 SNOOPINGS = 6
 """Rounds of dropping clouds and measuring the noise without them, at most."""
@@ -51,48 +54,54 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     have made the fitted noise larger, that of the registration or that of the poses, and would hide
     behind it: clouds are judged by the noise of those that agree best.
 
-    If a LiDAR would lose more than MOST_LOST, nothing is changed: then it is not its clouds that
-    are wrong but its clock, its mount or the target, and that is to be told (`contrasts`).
+    If a LiDAR would lose more than MOST_LOST, it is not its clouds that are wrong but its clock,
+    its mount or the target, and that is to be told (`contrasts`): noise and values stay as they
+    are, and of the weights those below LEAST_SAY become none. Kernel `none` changes nothing.
 
     Args:
-        state: of `solve_registered`; gets new weights, and where clouds are lost new noise levels.
+        state: of `solve_registered`; gets new weights and values, and where clouds are lost new
+            noise levels.
         registrations: what it was given.
 
     Raises:
         SolveError: the graph is singular.
     """
+    if state.config.robust.kernel == "none" or not state.sound.any():
+        return
     problem, fitted = state.problem, (state.noise, state.scale)
-    sound, weights = state.sound, state.weights.values
+    sound, weights, values = state.sound, state.weights.values, state.values
     measured, information = measured_poses(registrations, state.turns)
     single = information / problem.cloud_shares()[:, None, None]
-    given = with_given_poses(problem, state.values)
     explained = explained_parts(registrations)
-    judged = _left_over(state, registrations, measured, explained)
-    squares, freedom = deletion_squares(*judged)
+    whole = np.maximum(explained, MIN_WEIGHT)
+    state.weights.values = whole
+    squares, freedom = deletion_squares(*_left_over(state, registrations, measured))
     # Where less is controlled there is less to be off by.
     squares = (squares * DOF / np.maximum(freedom, 1))[sound]
-    if squares.max() * MEDIAN <= FAR_OFF * min(float(np.median(squares)), MEDIAN):
-        # Not even by the noise of the median cloud is any far off.
-        state.weights.snoop(*judged, explained)
-        return
     by = np.zeros(problem.clouds, dtype=bool)
     by[np.flatnonzero(sound)[squares <= np.quantile(squares, AGREEING)]] = True
     for _ in range(SNOOPINGS):
+        state.sound = by
         if (by == sound).all():
             state.noise, state.scale = fitted
         else:
+            given = with_given_poses(problem, state.values)
             state.noise, state.scale = fit_pose_noise(
                 problem, measured, single, by, given, state.config.noise
             )
-        judged = _left_over(state, registrations, measured, explained)
-        kept = state.weights.snoop(*judged, explained)
-        if _too_many(problem, sound & ~kept):
-            (state.noise, state.scale), state.weights.values = fitted, weights
+        # Clouds that are a metre off have bent the values so much that all others seem to be off.
+        state.weights.values = np.where(by, whole, MIN_WEIGHT)
+        settle(state, registrations, step_of_all(state))
+        state.weights.values = whole
+        kept = state.weights.snoop(*_left_over(state, registrations, measured), explained)
+        if _too_many(problem, ~kept & (explained > 0.5)):
+            state.noise, state.scale = fitted
+            state.sound, state.values = sound, values
+            state.weights.values = np.where(weights < LEAST_SAY, MIN_WEIGHT, weights)
             return
         if (by == (sound & kept)).all():
-            break
+            return
         by = sound & kept
-    state.sound = by
 
 
 def _too_many(problem: Problem, lost: BoolArray) -> bool:
@@ -103,17 +112,14 @@ def _too_many(problem: Problem, lost: BoolArray) -> bool:
 
 
 def _left_over(
-    state: SolveState,
-    registrations: Sequence[Registration],
-    measured: Sequence[gtsam.Pose3],
-    explained: Array,
+    state: SolveState, registrations: Sequence[Registration], measured: Sequence[gtsam.Pose3]
 ) -> tuple[Array, Array, Array]:
     """W and v of `left_over`, and (J, 6, 6) what each cloud says with the others held."""
     problem = state.problem
-    state.weights.values = np.maximum(explained, MIN_WEIGHT)
+    guesses = prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
     H = joint_information(state, registrations)
     lines = linearise_clouds(problem, state.values)
-    graph = merged(steady_graph(state), prior_graph(problem, problem.lidars))
+    graph = merged(steady_graph(state), guesses)
     system = dense_system(problem, graph, state.values)
     W, v = left_over(system, lines, H, cloud_residuals(lines, measured))
     each = np.arange(problem.clouds)

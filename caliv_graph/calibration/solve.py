@@ -8,7 +8,7 @@ off, and the result as it is passed on.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -62,7 +62,15 @@ from caliv_graph.products import (
 from caliv_graph.registration.symmetry import Symmetry, forget_turns
 
 REWEIGHTINGS = 12
-"""Rounds of reweighting at most; graduated non-convexity needs more and may take twice this."""
+"""Rounds of reweighting at most; graduated non-convexity needs more and may take four times
+this."""
+
+COUPLED_STEPS = 20
+"""Gauss-Newton steps with the joint information at most: the problem is nearly linear there, and
+three or four are usual."""
+
+COUPLED_SIGMAS = 0.01
+"""Step in joint standard deviations of the extrinsics at which they have converged."""
 
 WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
@@ -263,6 +271,40 @@ def reduced_registered(state: SolveState, registrations: Sequence[Registration])
     lines = linearise_clouds(problem, state.values)
     r = cloud_residuals(lines, measured_poses(registrations)[0]).ravel()
     return reduce_to_extrinsics(problem, state.values, steady_graph(state), (H, H @ r), lines)
+
+
+def settle(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    step: Callable[[Reduced], Array],
+) -> tuple[Reduced, Array, bool]:
+    """Repeats a Gauss-Newton step on the joint information until it is small.
+
+    Args:
+        state: of `solve_registered`; its values are moved.
+        registrations: what it was given.
+        step: (6 n,) of the extrinsics, vehicle axes, from what is said of them where they are.
+
+    Returns:
+        The last linearisation, the last step, and whether that was small.
+
+    Raises:
+        SolveError: a pose or a target is tied to nothing.
+    """
+    prior = state.problem.guess_information()
+    for _ in range(COUPLED_STEPS):
+        reduced = reduced_registered(state, registrations)
+        d = step(reduced)
+        state.values = reduced.move(d)
+        if d @ (reduced.D + prior) @ d < COUPLED_SIGMAS**2:
+            return reduced, d, True
+    return reduced, d, False
+
+
+def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
+    """For `settle`: the step that data and guesses of all LiDARs together call for."""
+    prior = state.problem.guess_information()
+    return lambda reduced: reduced.step_with(prior, offset_from_guesses(state))
 
 
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:

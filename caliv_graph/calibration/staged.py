@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    linearise_clouds,
-)
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import (
+    COUPLED_STEPS,
     Reduced,
     SolveState,
-    cloud_residuals,
-    joint_information,
     measured_poses,
-    offset_from_guesses,
     packed_solution,
-    reduce_to_extrinsics,
+    reduced_registered,
+    settle,
     steady_graph,
+    step_of_all,
 )
 from caliv_graph.conventions import key_mounting
 from caliv_graph.products import Array, Registration, Solution
-
-COUPLED_STEPS = 20
-"""Gauss-Newton steps with the joint information at most: the problem is nearly linear there, and
-three or four are usual."""
-
-COUPLED_SIGMAS = 0.01
-"""Step in joint standard deviations of the extrinsics at which they have converged."""
 
 
 def staged_solution(state: SolveState, registrations: Sequence[Registration]) -> Solution:
@@ -61,26 +51,9 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     problem = state.problem
     measured, information = measured_poses(registrations, state.turns)
     snoop_clouds(state, registrations)
-    H = joint_information(state, registrations)
     steady = steady_graph(state)
     prior = problem.guess_information()
-
-    def reduce() -> Reduced:
-        lines = linearise_clouds(problem, state.values)
-        r = cloud_residuals(lines, measured).ravel()
-        return reduce_to_extrinsics(problem, state.values, steady, (H, H @ r), lines)
-
-    def settled(step: Callable[[Reduced], Array]) -> tuple[Reduced, Array, bool]:
-        """Repeats a step until it is small; the last linearisation, the step, and whether it is."""
-        for _ in range(COUPLED_STEPS):
-            reduced = reduce()
-            d = step(reduced)
-            state.values = reduced.move(d)
-            if d @ (reduced.D + prior) @ d < COUPLED_SIGMAS**2:
-                return reduced, d, True
-        return reduced, d, False
-
-    reduced, last, converged = settled(lambda r: r.step_with(prior, offset_from_guesses(state)))
+    reduced, last, converged = settle(state, registrations, step_of_all(state))
     first, information_data = state.values, reduced.D
 
     guess = problem.guesses[problem.reference]
@@ -97,7 +70,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
         b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
         return np.asarray(Q @ np.linalg.solve(A, b))
 
-    reduced, second, turned = settled(turn)
+    reduced, second, turned = settle(state, registrations, turn)
     if not (converged and turned):
         moved = np.abs((second if converged else last).reshape(-1, 6))
         step = float(moved[:, :3].max()), float(moved[:, 3:].max())
@@ -110,7 +83,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
     offsets = reduced.time_offsets(problem, cov)
-    gradient_data = reduce().c
+    gradient_data = reduced_registered(state, registrations).c
     state.graph_seconds += time.perf_counter() - begun
     return packed_solution(
         state,

@@ -293,6 +293,23 @@ def test_of_a_cloud_that_nothing_controls_nothing_is_said() -> None:
     assert found[0] == pytest.approx(whole - least_squares(A, H, y, (0,))[0], rel=1e-6)
 
 
+def test_along_what_a_cloud_does_not_say_it_is_not_judged() -> None:
+    # A drum: turns about its axis are taken out of what each cloud says, all but rounding.
+    rng = np.random.default_rng(6)
+    H, A = correlated(rng, 4), rng.normal(size=(24, 3))
+    turns = np.kron(np.eye(4), np.array([0.1, -0.2, 1.0, 0.5, 0.0, 0.3])[:, None])
+    H = H - H @ turns @ np.linalg.solve(turns.T @ H @ turns, turns.T @ H)
+    A, y = np.hstack([A, turns]), rng.normal(size=24)
+    r = y - A @ np.linalg.pinv(A.T @ H @ A, rcond=1e-9) @ A.T @ H @ y
+    W = H - H @ A @ np.linalg.pinv(A.T @ H @ A, rcond=1e-9) @ A.T @ H
+    found, freedom = deletion_squares(W, H @ r, own_blocks(H))
+    assert freedom.tolist() == [5] * 4
+    for j in range(4):
+        B = np.hstack([A, np.eye(24)[:, 6 * j : 6 * j + 6]])
+        left = y - B @ np.linalg.pinv(B.T @ H @ B, rcond=1e-9) @ B.T @ H @ y
+        assert found[j] == pytest.approx(r @ H @ r - left @ H @ left, rel=1e-5)
+
+
 def off_together(seed: int) -> tuple[Array, Array, Array]:
     """Twenty clouds of which three lie in the same wrong place, and pull others along."""
     rng = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.robust import MIN_WEIGHT
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
@@ -24,11 +25,15 @@ LIDARS = ("front", "rear")
 SLID = [8, 9, 10, 11]
 """Clouds of the front from places that follow each other."""
 
-SLIDES = (np.array([0.0, 0.0, 0.01, 0.1, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
-"""How far they are off: 10 cm and 10 mrad, and 3 cm."""
+SLIDES = (
+    np.array([0.0, 0.0, 0.01, 0.1, 0.0, 0.0]),
+    np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]),
+    np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+)
+"""How far they are off: 10 cm and 10 mrad, 3 cm, and a metre."""
 
 
-def config_of(kernel: str) -> Config:
+def config_of(kernel: str, trim_percent: float = 10.0) -> Config:
     return Config(
         lidars={
             name: LidarConfig(
@@ -38,7 +43,7 @@ def config_of(kernel: str) -> Config:
         },
         reference="rear",
         solve=SolveConfig(mode="staged"),
-        robust=RobustConfig.model_validate({"kernel": kernel}),
+        robust=RobustConfig.model_validate({"kernel": kernel, "trim_percent": trim_percent}),
     )
 
 
@@ -66,7 +71,9 @@ def registered(case: Case, measured: tuple[gtsam.Pose3, ...]) -> Registration:
     )
 
 
-def solved(seed: int, slid: Array, kernel: str = "huber") -> tuple[Case, Solution]:
+def solved(
+    seed: int, slid: Array, kernel: str = "huber", trim_percent: float = 10.0
+) -> tuple[Case, Solution]:
     """A drive of 20 places by two LiDARs; four clouds of the front are off by `slid`."""
     case = make_case(*LIDARS, count=20, seed=seed)
     measured = list(noisy(case, seed))
@@ -74,7 +81,7 @@ def solved(seed: int, slid: Array, kernel: str = "huber") -> tuple[Case, Solutio
         measured[j] = gtsam.Pose3.Expmap(slid).compose(measured[j])
     problem = guessed(case.problem, np.random.default_rng(seed))
     registrations = [registered(case, tuple(measured))]
-    state = solve_registered(problem, registrations, (), config_of(kernel))
+    state = solve_registered(problem, registrations, (), config_of(kernel, trim_percent))
     return case, staged_solution(state, registrations)
 
 
@@ -114,9 +121,12 @@ def test_clouds_in_a_wrong_place_are_lost_and_nothing_else_changes(seed: int) ->
             assert (np.abs(off) < 2.0 * sigma[6 * i : 6 * i + 6]).all()
 
 
-@pytest.mark.parametrize("kernel", ["tls", "trimmed"])
-def test_other_kernels_lose_them_too(kernel: str) -> None:
-    case, solution = solved(1, SLIDES[0], kernel)
+@pytest.mark.parametrize(
+    ("kernel", "trim_percent"),
+    [("tls", 10.0), ("trimmed", 10.0), ("trimmed", 5.0), ("trimmed", 0.0)],
+)
+def test_other_kernels_lose_them_too(kernel: str, trim_percent: float) -> None:
+    case, solution = solved(1, SLIDES[0], kernel, trim_percent)
     assert set(lost(solution)) >= set(SLID)
     assert s2s_nees(case, solution) < 18.5
 
@@ -140,9 +150,12 @@ def test_a_lidar_that_would_lose_many_clouds_keeps_them_all() -> None:
         measured[j] = gtsam.Pose3.Expmap(SLIDES[0]).compose(measured[j])
     registrations = [registered(case, tuple(measured))]
     state = solve_registered(case.problem, registrations, (), config_of("huber"))
+    state.weights.values[25] = 0.4  # of little say already
     before = state.weights.values.copy(), state.noise, state.scale, state.sound.copy()
     snoop_clouds(state, registrations)
-    np.testing.assert_array_equal(state.weights.values, before[0])
+    expected = before[0].copy()
+    expected[25] = MIN_WEIGHT
+    np.testing.assert_array_equal(state.weights.values, expected)
     assert (state.noise, state.scale) == before[1:3]
     np.testing.assert_array_equal(state.sound, before[3])
     # A fifth of the front's twenty are lost.
@@ -152,3 +165,38 @@ def test_a_lidar_that_would_lose_many_clouds_keeps_them_all() -> None:
     state = solve_registered(case.problem, registrations, (), config_of("huber"))
     snoop_clouds(state, registrations)
     assert np.flatnonzero(state.weights.values < 1e-3).tolist() == [7, 8, 9, 10]
+
+
+def test_clouds_none_of_which_is_the_target_are_solved_as_they_are() -> None:
+    case = make_case(*LIDARS, count=6, seed=1)
+    registration = registered(case, case.measured)
+    registration = replace(registration, inlier_ratio=np.zeros(len(case.measured)))
+    state = solve_registered(case.problem, [registration], (), config_of("huber"))
+    state.sound[:] = False
+    before = state.weights.values.copy(), state.scale
+    snoop_clouds(state, [registration])
+    np.testing.assert_array_equal(state.weights.values, before[0])
+    assert state.scale == before[1]
+
+
+def test_clouds_of_several_targets_are_judged_together() -> None:
+    case = make_case(*LIDARS, count=12, drives=2, seed=3)
+    measured = list(noisy(case, 3))
+    # Clouds are numbered by LiDAR, then drive: two of the front's in the second drive.
+    for j in (14, 20):
+        measured[j] = gtsam.Pose3.Expmap(SLIDES[0]).compose(measured[j])
+    registrations = []
+    for m in range(2):
+        mine = np.flatnonzero(case.problem.cloud_placement == m)
+        part = replace(case, information=case.information[mine])
+        registrations.append(registered(part, tuple(measured[j] for j in mine)))
+    order = np.argsort(case.problem.cloud_placement, kind="stable")
+    problem = replace(
+        case.problem,
+        cloud_lidar=case.problem.cloud_lidar[order],
+        cloud_pose=case.problem.cloud_pose[order],
+        cloud_placement=case.problem.cloud_placement[order],
+    )
+    state = solve_registered(problem, registrations, (), config_of("huber"))
+    snoop_clouds(state, registrations)
+    assert order[state.weights.values < 1e-3].tolist() == [14, 20]

@@ -363,14 +363,20 @@ def add_shape(
         H_clouds: (6 J, 6 J).
         gradient: (6 J,).
     """
-    J = cloud_rows(system, lines)
-    half = J.T @ H_clouds
-    H = system.H + (J.T @ half.T)
+    J = _cloud_rows(system, lines)
+    return _with_rows(system, J, J.T @ H_clouds, gradient)
+
+
+def _with_rows(
+    system: DenseSystem, J: scipy.sparse.csr_array, seen: Array, gradient: Array
+) -> DenseSystem:
+    """Adds what clouds of rows J say, `seen` being `J^T H`."""
+    H = system.H + (J.T @ seen.T)
     hold_targets(H, _starts(system))
     return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
-def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.csr_array:
+def _cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.csr_array:
     """(6 J, M) how the poses of all clouds move with the variables of a system."""
     starts = _starts(system)
     rows, columns, entries = [], [], []
@@ -409,10 +415,10 @@ def left_over(
     Raises:
         SolveError: some variable is not determined.
     """
-    r = residuals.ravel()
-    J = cloud_rows(system, lines)
-    full = add_shape(system, lines, H_clouds, H_clouds @ r)
+    gradient = H_clouds @ residuals.ravel()
+    J = _cloud_rows(system, lines)
     seen = J.T @ H_clouds
+    full = _with_rows(system, J, seen, gradient)
     try:
         factor = scipy.linalg.cho_factor(full.H, lower=True)
     except scipy.linalg.LinAlgError:
@@ -420,7 +426,7 @@ def left_over(
             "the graph of the registered clouds is singular: a pose or a target is tied to nothing"
         ) from None
     W = H_clouds - seen.T @ scipy.linalg.cho_solve(factor, seen)
-    return W, H_clouds @ r + seen.T @ scipy.linalg.cho_solve(factor, full.b)
+    return W, gradient + seen.T @ scipy.linalg.cho_solve(factor, full.b)
 
 
 def _starts(system: DenseSystem) -> dict[int, int]:

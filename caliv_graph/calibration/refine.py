@@ -276,22 +276,19 @@ def _refined_solution(
     pulls = _shape_measurements(state, shapes)
     # The robust weights of the clouds are kept apart from what they say.
     weighted = shapes.single[0]
-    registrations, measured, start = [], [], 0
+    registrations, start = [], 0
     for shape, (R, t), (H, _) in zip(states, shapes.poses, shapes.joints, strict=True):
         part = slice(start, start + shape.clouds.count)
         start = part.stop
         R, t = left_step(R, t, pulls.pull[part])
         blocks = pulls.information[part] * state.scale**2
         joint = H + block_diag(*(blocks - weighted[part]))
-        result = shape.result(R, t, blocks, joint, iterations, converged, last_step)
-        registrations.append(result)
-        measured += list(result.T_target_lidar)
+        registrations.append(shape.result(R, t, blocks, joint, iterations, converged, last_step))
     state.graph_seconds += time.perf_counter() - begun
     return packed_solution(
         state,
         registrations,
         steady,
-        measured,
         pulls.information,
         reduced.D,
         cov,

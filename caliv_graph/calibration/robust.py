@@ -145,6 +145,12 @@ class RobustWeights:
         return np.clip(middle, 0.0, 1.0)
 
 
+def own_blocks(H: Array) -> Array:
+    """(J, 6, 6) what each cloud of a (6 J, 6 J) information says, the others held."""
+    each = np.arange(len(H) // 6)
+    return np.asarray(H.reshape(len(each), 6, len(each), 6)[each, :, each, :])
+
+
 def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
     """Squares of what each cloud is off from all others together, in its own sigmas.
 
@@ -172,13 +178,11 @@ def _deletion_covariances(W: Array, own: Array) -> tuple[Array, IntArray]:
     Rotations and translations have units of their own: a block is compared with what the cloud
     itself says.
     """
-    each = np.arange(len(own))
-    blocks = W.reshape(len(own), 6, len(own), 6)[each, :, each, :]
     values, axes = np.linalg.eigh(own)
     # What a cloud of a drum says of turns about it is eliminated to rounding.
     some = values > 1e-9 * values[:, -1:]
     white = axes * np.where(some, 1.0 / np.sqrt(np.where(some, values, 1.0)), 0.0)[:, None, :]
-    part, along = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, blocks, white))
+    part, along = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, own_blocks(W), white))
     controlled = part > CONTROLLED
     roots = white @ along * np.where(controlled, part, np.inf)[:, None, :] ** -0.5
     return roots @ np.swapaxes(roots, 1, 2), controlled.sum(axis=1)
@@ -211,8 +215,7 @@ def weighted_joint(H: Array, weights: Array) -> Array:
     # At least, so that a cloud that nothing else ties down has an inverse.
     w = np.clip(weights[less], MIN_WEIGHT, 1.0 - 1e-12)
     rows = (6 * less[:, None] + np.arange(6)).ravel()
-    own = H.reshape(len(weights), 6, len(weights), 6)[less, :, less, :]
-    more = block_diag(*(own * (w / (1.0 - w))[:, None, None]))
+    more = block_diag(*(own_blocks(H)[less] * (w / (1.0 - w))[:, None, None]))
     ridge = (1e-12 * float(np.trace(H)) / len(H) + 1e-300) * np.eye(len(rows))
     out = H - H[:, rows] @ np.linalg.solve(H[np.ix_(rows, rows)] + more + ridge, H[rows])
     return np.asarray(0.5 * (out + out.T))

@@ -11,21 +11,19 @@ from caliv_graph.calibration.graph import (
     dense_system,
     left_over,
     linearise_clouds,
-    merged,
-    prior_graph,
     with_given_poses,
 )
 from caliv_graph.calibration.noise import fit_pose_noise
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.robust import DOF, MIN_WEIGHT, deletion_squares
+from caliv_graph.calibration.robust import DOF, MIN_WEIGHT, deletion_squares, own_blocks
 from caliv_graph.calibration.solve import (
     SolveState,
     cloud_residuals,
     explained_parts,
+    guessed_graph,
     joint_information,
     measured_poses,
     settle,
-    steady_graph,
     step_of_all,
 )
 from caliv_graph.products import Array, BoolArray, Registration
@@ -116,11 +114,8 @@ def _left_over(
 ) -> tuple[Array, Array, Array]:
     """W and v of `left_over`, and (J, 6, 6) what each cloud says with the others held."""
     problem = state.problem
-    guesses = prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
     H = joint_information(state, registrations)
     lines = linearise_clouds(problem, state.values)
-    graph = merged(steady_graph(state), guesses)
-    system = dense_system(problem, graph, state.values)
+    system = dense_system(problem, guessed_graph(state), state.values)
     W, v = left_over(system, lines, H, cloud_residuals(lines, measured))
-    each = np.arange(problem.clouds)
-    return W, v, H.reshape(problem.clouds, 6, problem.clouds, 6)[each, :, each, :]
+    return W, v, own_blocks(H)

@@ -213,14 +213,8 @@ def _reweight(
     scaled = information / state.scale**2
     single = scaled / problem.cloud_shares()[:, None, None]
     for _ in range(rounds):
-        steady = merged(
-            pose_graph(problem, state.noise, state.motion),
-            offset_graph(problem),
-            _ground_graph(state),
-            prior_graph(problem, problem.lidars),
-        )
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
-        state.values = optimise(merged(steady, clouds), state.values, 10)
+        state.values = optimise(merged(guessed_graph(state), clouds), state.values, 10)
         if state.grounds:
             # Not before: by a guess that is degrees off, the vehicle would stand on no plane.
             state.ground_weights = ground_weights(problem, state.grounds, state.values)
@@ -266,11 +260,20 @@ def reduced_registered(state: SolveState, registrations: Sequence[Registration])
         state: of `solve_registered`.
         registrations: what it was given.
     """
-    problem = state.problem
-    H = joint_information(state, registrations)
-    lines = linearise_clouds(problem, state.values)
-    r = cloud_residuals(lines, measured_poses(registrations)[0]).ravel()
-    return reduce_to_extrinsics(problem, state.values, steady_graph(state), (H, H @ r), lines)
+    return _reduction(state, registrations)()
+
+
+def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Callable[[], Reduced]:
+    """`reduced_registered` to be asked again as the values move, weights and noise as they are."""
+    problem, steady = state.problem, steady_graph(state)
+    H, measured = joint_information(state, registrations), measured_poses(registrations)[0]
+
+    def reduced() -> Reduced:
+        lines = linearise_clouds(problem, state.values)
+        r = cloud_residuals(lines, measured).ravel()
+        return reduce_to_extrinsics(problem, state.values, steady, (H, H @ r), lines)
+
+    return reduced
 
 
 def settle(
@@ -292,8 +295,9 @@ def settle(
         SolveError: a pose or a target is tied to nothing.
     """
     prior = state.problem.guess_information()
+    reduction = _reduction(state, registrations)
     for _ in range(COUPLED_STEPS):
-        reduced = reduced_registered(state, registrations)
+        reduced = reduction()
         d = step(reduced)
         state.values = reduced.move(d)
         if d @ (reduced.D + prior) @ d < COUPLED_SIGMAS**2:
@@ -385,6 +389,16 @@ def steady_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     )
 
 
+def guessed_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+    """What stays the same, and the guesses of the mountings that are not trusted."""
+    return merged(steady_graph(state), _guess_graph(state.problem))
+
+
+def _guess_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """The guesses of the mountings that are not trusted."""
+    return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
+
+
 def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     """What the ground says, as far as it is believed."""
     return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
@@ -432,7 +446,6 @@ def packed_solution(
     state: SolveState,
     registrations: Sequence[Registration],
     steady: gtsam.NonlinearFactorGraph,
-    measured: Sequence[gtsam.Pose3],
     information: Array,
     information_data: Array,
     cov: Array,
@@ -448,8 +461,7 @@ def packed_solution(
         state: after its last step.
         registrations: the clouds where they have come to lie.
         steady: `steady_graph` of the last step.
-        measured: T_target_lidar of each cloud for the graph's pose factors.
-        information: (J, 6, 6) of these, without robust weights.
+        information: (J, 6, 6) of the graph's pose factors, without robust weights.
         information_data: (6 n, 6 n) what the data say of the extrinsics, vehicle axes.
         cov: (6 n, 6 n) of the result, vehicle axes.
         held: axes of the reference LiDAR that were held at the guess.
@@ -461,10 +473,10 @@ def packed_solution(
     Raises:
         SolveError: the covariance is not finite.
     """
-    problem = state.problem
+    problem, measured = state.problem, measured_poses(registrations)[0]
     graph = merged(
         steady,
-        prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed]),
+        _guess_graph(problem),
         cloud_graph(problem, measured, information * state.weights.values[:, None, None]),
     )
     if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):

@@ -49,9 +49,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     """
     begun = time.perf_counter()
     problem = state.problem
-    measured, information = measured_poses(registrations, state.turns)
     snoop_clouds(state, registrations)
-    steady = steady_graph(state)
     prior = problem.guess_information()
     reduced, last, converged = settle(state, registrations, step_of_all(state))
     first, information_data = state.values, reduced.D
@@ -88,9 +86,8 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     return packed_solution(
         state,
         registrations,
-        steady,
-        measured,
-        information / state.scale**2,
+        steady_graph(state),
+        measured_poses(registrations, state.turns)[1] / state.scale**2,
         information_data,
         cov,
         held=("x", "y", "z"),

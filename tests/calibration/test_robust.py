@@ -15,6 +15,7 @@ from caliv_graph.calibration.robust import (
     MIN_WEIGHT,
     RobustWeights,
     deletion_squares,
+    own_blocks,
     weighted_joint,
 )
 from caliv_graph.config import RobustConfig
@@ -242,12 +243,6 @@ def least_squares(
     r = y - A @ np.linalg.lstsq(np.linalg.cholesky(H).T @ A, np.linalg.cholesky(H).T @ y)[0]
     W = H - H @ A @ np.linalg.pinv(A.T @ H @ A) @ A.T @ H
     return float(r @ H @ r), W, H @ r
-
-
-def own_blocks(H: Array) -> Array:
-    """(J, 6, 6) on the diagonal."""
-    each = np.arange(len(H) // 6)
-    return np.asarray(H.reshape(len(each), 6, len(each), 6)[each, :, each, :])
 
 
 def correlated(rng: np.random.Generator, count: int) -> Array:

@@ -39,7 +39,7 @@ def key_vehicle(index: int) -> int:
     return int(gtsam.symbol("x", index))
 
 
-def key_drift(index: int) -> int:
+def key_pose_error(index: int) -> int:
     """Key of the slow error of the given pose at the i-th stamp used."""
     return int(gtsam.symbol("d", index))
 
@@ -64,7 +64,7 @@ def key_yaw_bias() -> int:
     return int(gtsam.symbol("y", 0))
 
 
-def key_mounting() -> int:
+def key_extrinsic() -> int:
     """Key of E = T_vehicle_ref, the mounting of the reference LiDAR."""
     return int(gtsam.symbol("e", 0))
 

@@ -279,8 +279,8 @@ class GroundObservation:
         points: how many there are.
         R_vehicle_lidar: (3, 3) of the mounting that the motion was compensated with, a guess; None:
             nothing was to be compensated.
-        by_mounting: (3, 3) what (a, b, distance) become more by if that is `R_vehicle_lidar Exp(w)`
-            instead, per radian of w; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
+        by_extrinsic: (3, 3) derivative of (a, b, distance) by the extrinsic's rotation w,
+            `R_vehicle_lidar Exp(w)`; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
             the ground rise by a centimetre during a sweep.
         apart_ns: how long after `stamp_ns` the scan was really taken. The trajectory brings it
             there, but for what it does not know: the body's heave on its springs.
@@ -296,7 +296,7 @@ class GroundObservation:
     centre_lidar: Array
     points: int
     R_vehicle_lidar: Array | None = None
-    by_mounting: Array | None = None
+    by_extrinsic: Array | None = None
     apart_ns: int = 0
 
 
@@ -484,9 +484,9 @@ class Guess:
 
 @dataclass(frozen=True)
 class DataTerm:
-    """What the data of some drives, and nothing else, say about mountings.
+    """What the data of some drives, and nothing else, say about extrinsics.
 
-    Minus the log-likelihood of a perturbation e of the mountings is
+    Minus the log-likelihood of a perturbation e of the extrinsics is
     `e^T information e / 2 - gradient^T e`, in vehicle axes, LiDARs in the order of
     `T_vehicle_lidar`, six coordinates each.
 
@@ -542,11 +542,11 @@ class Calibration:
         weak: directions, vehicle axes.
         unmet: what `require` or `limits` asked for and did not get, a sentence each.
         provenance: versions, configuration digest, inputs; plain values only.
-        gradient_data: (6n,) of the data's log-likelihood at the mountings, same coordinates: by
+        gradient_data: (6n,) of the data's log-likelihood at the extrinsics, same coordinates: by
             themselves the data would have them move by `solve(information_data, gradient_data)`.
             None: not known (another program's file).
         earlier: what earlier drives said, where they were taken for a prior. Not part of
-            `information_data`, but of the mountings and `cov_joint`.
+            `information_data`, but of the extrinsics and `cov_joint`.
         contradictions: what contradicts what, a sentence each; the status is inconsistent if there
             is any.
     """

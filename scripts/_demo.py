@@ -16,13 +16,13 @@ from typing import Any
 import gtsam
 from scipy.stats import chi2
 
-from caliv_graph.config import Config, load_config
+from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, Calibration, Direction
-from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
-from caliv_graph.results import read_calibration, read_truth
+from caliv_graph.results.files import read_calibration, read_truth
 from caliv_graph.simulation.writer import write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined
@@ -99,7 +99,7 @@ def _simulated_drive(out: Path) -> Drive:
     _say(
         "A drive to calibrate: LiDARs that never see the same thing at the same time pass a chair, "
         "and IMU, GNSS and wheel speed are recorded with their clouds in a ROS bag. It is "
-        "simulated, so the true mountings are known:"
+        "simulated, so the true extrinsics are known:"
     )
     _run("simulate", SCENARIO, "--out", folder, "--seed", str(SEED), "--force")
     _say(
@@ -120,7 +120,7 @@ def _released_drive(out: Path) -> Drive:
     _say(
         "The drive that the CaLiV authors published: two LiDARs, one looking ahead and one back, "
         "pass a chair on an arc. Their own config lies beside the clouds, and 'init' takes over "
-        f"what it says of the mountings. Here that is the truth; {_shown(RELEASED)} has guesses "
+        f"what it says of the extrinsics. Here that is the truth; {_shown(RELEASED)} has guesses "
         "such as a tape measure gives."
     )
     out.mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ def _released_drive(out: Path) -> Drive:
     lidars = load_config(out / "authors.yaml").lidars
     write_truth(
         out / "truth.yaml",
-        {name: pose_from_mounting(lidar.initial) for name, lidar in lidars.items()},
+        {name: lidar.initial.pose() for name, lidar in lidars.items()},
         dict.fromkeys(lidars, 0.0),
     )
     return Drive(data, RELEASED, out / "truth.yaml")
@@ -137,7 +137,7 @@ def _released_drive(out: Path) -> Drive:
 def _calibrate_and_explain(drive: Drive, result: Path, released: bool) -> int:
     _say("What was recorded, and which LiDAR sees the target when:")
     _run("inspect", drive.data, "--config", drive.config)
-    _say("The main job, from what was recorded and the guesses to mountings:")
+    _say("The main job, from what was recorded and the guesses to extrinsics:")
     code = _run("calibrate", drive.config, "--out", result, "--force", may_fall_short=True)
     _say("Since the truth is known here, the errors:")
     _run("evaluate", result / "calibration.yaml", drive.truth)
@@ -210,7 +210,7 @@ def _explain(calibration: Calibration, config: Config, truth: Mapping[str, gtsam
 def _guessed(calibration: Calibration, config: Config) -> Calibration:
     """The initial guesses in the place of the estimates, to be evaluated likewise."""
     lidars = {
-        name: replace(lidar, T_vehicle_lidar=pose_from_mounting(config.lidars[name].initial))
+        name: replace(lidar, T_vehicle_lidar=config.lidars[name].initial.pose())
         for name, lidar in calibration.lidars.items()
     }
     return replace(calibration, lidars=lidars)

@@ -19,18 +19,12 @@ from rosbags.typesys.store import Typestore
 
 from caliv_graph.batch.manifest import load_manifest
 from caliv_graph.cli import streams
-from caliv_graph.config import (
-    LidarConfig,
-    Mounting,
-    TopicsConfig,
-    dump_config,
-    load_config,
-    parse_config,
-)
+from caliv_graph.config.load import dump_config, load_config, parse_config
+from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.export.consumers import export
 from caliv_graph.export.edit import read_base
-from caliv_graph.export.request import ImuMounting, Request
+from caliv_graph.export.request import ImuExtrinsic, Request
 from caliv_graph.products import LidarScan, MotionData, Recording
 from caliv_graph.readers.bag import Bag, DamagedMessageError
 from caliv_graph.readers.caliv_folder import CalivFolder
@@ -52,8 +46,8 @@ from caliv_graph.readers.pointcloud2 import (
     decode_pointcloud2,
 )
 from caliv_graph.readers.rosbag import RosbagRecording
-from caliv_graph.results import calibration_document, read_calibration_file, read_truth
-from caliv_graph.simulation.scenario import dump_scenario, load_scenario, parse_scenario
+from caliv_graph.results.files import calibration_document, read_calibration_file, read_truth
+from caliv_graph.scenario.model import dump_scenario, load_scenario, parse_scenario
 from scripts import _fuzz_seeds as seeds
 
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
@@ -271,7 +265,7 @@ def _urdf(folder: Path) -> Callable[[bytes], None]:
 def _base(folder: Path) -> Callable[[bytes], None]:
     consumers = list(seeds.BASES)
     calibration = replace(seeds.small_calibration("front", "rear"), undetermined=())
-    imu = ImuMounting(calibration.lidars["rear"].T_vehicle_lidar, "config.yaml")
+    imu = ImuExtrinsic(calibration.lidars["rear"].T_vehicle_lidar, "config.yaml")
 
     def attempt(data: bytes) -> None:
         consumer = consumers[data[0] % len(consumers) if data else 0]
@@ -387,7 +381,7 @@ def _metadata_seeds(folder: Path) -> list[bytes]:
 def _lidar(topic: str) -> LidarConfig:
     return LidarConfig(
         topic=topic,
-        initial=Mounting(xyz=(0.0, 0.0, 0.0)),
+        initial=PoseConfig(xyz=(0.0, 0.0, 0.0)),
         min_range=MIN_RANGE_M,
         max_range=MAX_RANGE_M,
     )

@@ -1,6 +1,6 @@
 """A sliding-window localiser: IMU, GNSS and LiDAR scans registered to a map, on GTSAM.
 
-It takes the mountings of the LiDARs as constants or as variables, and is otherwise the same; scans
+It takes the extrinsics of the LiDARs as constants or as variables, and is otherwise the same; scans
 that fit badly have Huber's weight in all cases, or wrong constants would throw it off the map. Made
 to show what a calibration is worth to one; its parts are those of a localiser that drives.
 
@@ -26,11 +26,11 @@ import pymap3d
 
 from caliv_graph._open3d import import_open3d
 from caliv_graph.fusion.factors import lidar_pose_factor, random_walk
-from caliv_graph.fusion.monitor import MountAlarm, MountMonitor, mounting_innovation
+from caliv_graph.fusion.monitor import MountAlarm, MountMonitor, extrinsic_innovation
 from caliv_graph.fusion.priors import prior_factors
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
-from caliv_graph.simulation.scenario import Scenario
-from caliv_graph.simulation.worlds import GROUND, World
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.shapes import GROUND, World
 from caliv_graph.trajectory.imu import clean_inertial, preintegrate
 from caliv_graph.trajectory.noise import ImuNoise
 
@@ -228,7 +228,7 @@ def _covariance(result: Any, scan: LidarScan, walls: WallMap, range_sigma_m: flo
 # ------------------------------------------------------------------ the localiser
 
 
-Mountings = Mapping[str, gtsam.Pose3] | Calibration
+Extrinsics = Mapping[str, gtsam.Pose3] | Calibration
 """Constants, or variables with a prior."""
 
 
@@ -264,7 +264,7 @@ class Localiser:
         scenario: Scenario,
         datum: tuple[float, float, float],
         walls: WallMap,
-        mountings: Mountings,
+        extrinsics: Extrinsics,
         first_ns: int,
         keyframes_per_s: float,
     ) -> None:
@@ -275,13 +275,13 @@ class Localiser:
             scenario: noise of the sensors, as their data sheets state it.
             datum: latitude, longitude (degrees) and altitude (m) of the map's origin.
             walls: the map.
-            mountings: poses: constants; a calibration: variables with its joint prior, watched.
+            extrinsics: poses: constants; a calibration: variables with its joint prior, watched.
             first_ns: stamp of the first keyframe; up to there the vehicle stands.
             keyframes_per_s: scans per second that will be handed in.
         """
         assert motion.imu is not None
         assert motion.gnss is not None
-        self._scenario, self._walls, self._mountings = scenario, walls, mountings
+        self._scenario, self._walls, self._extrinsics = scenario, walls, extrinsics
         self.track = Track()
         self._inertial = clean_inertial(motion.imu, motion.name)[0]
         self._noise = _imu_noise(scenario)
@@ -300,8 +300,8 @@ class Localiser:
         self._mounted: dict[str, tuple[int, int]] = {}
         self._monitor: MountMonitor | None = None
         self._start(motion)
-        if isinstance(mountings, Calibration):
-            poses = {n: result.T_vehicle_lidar for n, result in mountings.lidars.items()}
+        if isinstance(extrinsics, Calibration):
+            poses = {n: result.T_vehicle_lidar for n, result in extrinsics.lidars.items()}
             self._monitor = MountMonitor(poses, keyframes_per_s, FALSE_ALARMS_PER_HOUR)
 
     # -------------------------------------------------------------- start
@@ -341,12 +341,12 @@ class Localiser:
         values.insert(_v(0), np.zeros(3))
         values.insert(_b(0), bias)
         keys = [_x(0), _v(0), _b(0)]
-        if isinstance(self._mountings, Calibration):
-            names = list(self._mountings.lidars)
+        if isinstance(self._extrinsics, Calibration):
+            names = list(self._extrinsics.lidars)
             self._mounted = {name: (_m(i, 0), self._first_ns) for i, name in enumerate(names)}
-            graph.push_back(prior_factors(self._mountings, lambda name: self._mounted[name][0]))
+            graph.push_back(prior_factors(self._extrinsics, lambda name: self._mounted[name][0]))
             for name, (key, _) in self._mounted.items():
-                values.insert(key, self._mountings.lidars[name].T_vehicle_lidar)
+                values.insert(key, self._extrinsics.lidars[name].T_vehicle_lidar)
                 keys.append(key)
         self._update(graph, values, keys)
         self._pose, self._velocity, self._bias = pose, np.zeros(3), bias
@@ -414,8 +414,8 @@ class Localiser:
     def _mounting(self, lidar: str) -> gtsam.Pose3:
         if self._mounted:
             return self._smoother.calculateEstimatePose3(self._mounted[lidar][0])
-        assert not isinstance(self._mountings, Calibration)
-        return self._mountings[lidar]
+        assert not isinstance(self._extrinsics, Calibration)
+        return self._extrinsics[lidar]
 
     def _take_in(
         self,
@@ -428,7 +428,7 @@ class Localiser:
         up_lidar = found.T_map_lidar.rotation().matrix()[2]
         heave = self._scenario.suspension.heave_sigma_m * np.concatenate([np.zeros(3), up_lidar])
         cov = found.cov + np.outer(heave, heave)
-        innovation = mounting_innovation(
+        innovation = extrinsic_innovation(
             T_map_vehicle, T_vehicle_lidar, self._cov_predicted(scan.lidar), found.T_map_lidar, cov
         )
         self.track.innovations.append(innovation.chi2)

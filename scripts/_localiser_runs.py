@@ -12,22 +12,21 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Mounting
+from caliv_graph.common.files import atomic_write
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.files import atomic_write
 from caliv_graph.geometry.se3 import (
-    pose_from_mounting,
     retract_vehicle_axes,
     rpy,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
-from caliv_graph.results import read_calibration
+from caliv_graph.results.files import read_calibration
+from caliv_graph.scenario.model import Scenario, StandstillDrive, dump_scenario
+from caliv_graph.scenario.shapes import World
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive
-from caliv_graph.simulation.scenario import Scenario, StandstillDrive, dump_scenario
-from caliv_graph.simulation.worlds import World
 from scripts import _localiser
-from scripts._localiser import Localiser, Mountings, Track, make_map
+from scripts._localiser import Extrinsics, Localiser, Track, make_map
 
 KEYFRAME_S = 0.5
 """Between keyframes. The LiDARs take turns: scans taken together would share the heave."""
@@ -67,7 +66,7 @@ class KnockedRecording:
         x, y, z = (float(v) for v in moved.translation())
         roll, pitch, yaw = (float(v) for v in np.degrees(rpy(moved.rotation().matrix())))
         model = scenario.lidars[lidar].model_copy(
-            update={"mounting": Mounting(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))}
+            update={"mounting": PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))}
         )
         knocked = scenario.model_copy(update={"lidars": {**scenario.lidars, lidar: model}})
         self._after = simulate_drive(knocked, seed)
@@ -142,12 +141,12 @@ def runs(task: Task, seed: int) -> dict[str, Run]:
     calibration = read_calibration(task.calibration)
     if task.draw:
         calibration = drawn(calibration, recording.truth.T_vehicle_lidar, seed)
-    mountings: dict[str, Mountings] = {
-        "initial": {n: pose_from_mounting(guess) for n, guess in recording.guesses.items()},
+    extrinsics: dict[str, Extrinsics] = {
+        "initial": {n: guess.pose() for n, guess in recording.guesses.items()},
         "calibrated": {n: r.T_vehicle_lidar for n, r in calibration.lidars.items()},
         "priors": calibration,
     }
-    out = {name: one_run(recording, task.scenario, m) for name, m in mountings.items()}
+    out = {name: one_run(recording, task.scenario, m) for name, m in extrinsics.items()}
     if task.knock_deg > 0.0:
         out["knocked"] = knocked_run(task, seed, calibration)
     return out
@@ -181,7 +180,7 @@ def drawn(calibration: Calibration, truth: Mapping[str, gtsam.Pose3], seed: int)
 
 
 def one_run(
-    recording: SimulatedRecording | KnockedRecording, scenario: Scenario, mountings: Mountings
+    recording: SimulatedRecording | KnockedRecording, scenario: Scenario, extrinsics: Extrinsics
 ) -> Run:
     """A localiser on a drive."""
     truth = recording.truth
@@ -193,7 +192,7 @@ def one_run(
         scenario,
         truth.datum,
         make_map(recording.world),
-        mountings,
+        extrinsics,
         first_ns,
         1.0 / KEYFRAME_S,
     )

@@ -20,9 +20,10 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import pdist
 
 from caliv_graph._open3d import import_open3d
-from caliv_graph.config import Config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError, TargetError, TrajectoryError
-from caliv_graph.geometry.se3 import pose_from_mounting, stack, unstack
+from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import (
     Array,
     IntArray,
@@ -32,7 +33,6 @@ from caliv_graph.products import (
     TargetObservation,
     Trajectory,
 )
-from caliv_graph.progress import SilentProgress
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.select import GivenTrajectory, takes_given_poses, wanted_stamps
@@ -111,7 +111,7 @@ def paper_from_recording(
     result = paper_estimator(
         clouds,
         poses,
-        {name: pose_from_mounting(lidar.initial) for name, lidar in config.lidars.items()},
+        {name: lidar.initial.pose() for name, lidar in config.lidars.items()},
         config.reference,
         components=components,
         iterations=iterations,
@@ -254,7 +254,7 @@ def within_percentiles(errors: Array, percentile: float) -> Array:
 
 @dataclass(frozen=True)
 class Minimisation:
-    """The paper's equation 5: which mountings let all clouds agree where the target is.
+    """The paper's equation 5: which extrinsics let all clouds agree where the target is.
 
     Unknowns are in metres and degrees, as in the authors' program: Powell's method looks along one
     at a time, and begins with steps of one.
@@ -306,7 +306,7 @@ class Minimisation:
         return self.lidars[-1]
 
     def errors(self, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Array:
-        """`pairwise_errors` with these mountings."""
+        """`pairwise_errors` with these extrinsics."""
         R, t = stack([T_vehicle_lidar[name] for name in self.lidars])
         # C_R T inverted and applied to the corners: R_V T, V_L T, then the inverse of C_L T.
         R_map_lidar = self.R_map_vehicle @ R[self.lidar_of]
@@ -338,7 +338,9 @@ class Minimisation:
             }
 
         def cost(x: Array) -> float:
-            return self.cost(self._mountings(perturbed(self._reference_guess, x[-6:]), pairs_of(x)))
+            return self.cost(
+                self._extrinsics(perturbed(self._reference_guess, x[-6:]), pairs_of(x))
+            )
 
         found = _powell(cost, 6 * len(self.lidars))
         return pairs_of(np.asarray(found.x)), int(found.nfev)
@@ -357,14 +359,14 @@ class Minimisation:
         def reference_of(x: Array) -> gtsam.Pose3:
             return perturbed(self._reference_guess, np.concatenate([held, x]))
 
-        found = _powell(lambda x: self.cost(self._mountings(reference_of(x), pairs)), 3)
+        found = _powell(lambda x: self.cost(self._extrinsics(reference_of(x), pairs)), 3)
         return reference_of(np.asarray(found.x)), int(found.nfev)
 
     @property
     def _reference_guess(self) -> gtsam.Pose3:
         return self.guesses[self.reference]
 
-    def _mountings(
+    def _extrinsics(
         self, T_vehicle_reference: gtsam.Pose3, pairs: Mapping[str, gtsam.Pose3]
     ) -> dict[str, gtsam.Pose3]:
         out = {name: T_vehicle_reference.compose(T) for name, T in pairs.items()}

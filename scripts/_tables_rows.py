@@ -12,10 +12,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config, parse_config
+from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import pose_from_mounting
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import (
     Array,
     Calibration,
@@ -26,13 +28,12 @@ from caliv_graph.products import (
     MotionData,
     Recording,
 )
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.forwarding import ForwardingRecording
-from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
+from caliv_graph.results.run import CalibrationRun
 from caliv_graph.simulation import SimulatedRecording, SimulatedTruth
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.targets.ground_planes import GroundMeter
+from caliv_graph.targets.ground.planes import GroundMeter
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
@@ -313,7 +314,7 @@ def _ground_alone(recording: SimulatedRecording, seed: int) -> Outcome:
             for scan in recording.scans(name)
             if begin <= scan.stamp_ns <= end and (plane := meter.measure(scan)) is not None
         ]
-        guess = pose_from_mounting(config.lidars[name].initial)
+        guess = config.lidars[name].initial.pose()
         poses[name], own[name] = stood_on(planes, guess, config.ground.vehicle_height or 0.0)
     lidars = {
         name: LidarResult(T, np.full((6, 6), math.nan), dict.fromkeys(AXES, False), 0, False)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config
-from caliv_graph.geometry.se3 import pose_from_mounting, skew
+from caliv_graph.config.model import Config
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.gnss import normal_gravity, positions_in_map
 from caliv_graph.trajectory.imu import interpolate
@@ -125,7 +125,7 @@ def filter_trajectory(
 
     Args:
         motion: with IMU, orientations, GNSS and velocities.
-        config: mountings, noise.
+        config: extrinsics, noise.
         stamps_ns: (m,) increasing, at which poses are wanted.
 
     Returns:
@@ -142,7 +142,7 @@ def filter_trajectory(
     g = config.imu.gravity_m_s2 or normal_gravity(
         positions.origin_deg_m[0], positions.origin_deg_m[2]
     )
-    T_vehicle_imu = pose_from_mounting(config.imu.T_vehicle_imu)
+    T_vehicle_imu = config.imu.T_vehicle_imu.pose()
     T_imu_vehicle = T_vehicle_imu.inverse()
     R_iv, t_iv = T_imu_vehicle.rotation().matrix(), T_imu_vehicle.translation()
     antenna = T_vehicle_imu.transformTo(np.array(config.gnss.lever_arm))

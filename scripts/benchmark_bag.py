@@ -35,16 +35,16 @@ import numpy as np
 from rosbags.interfaces import Connection
 from scipy.special import jn_zeros
 
+from caliv_graph.calibration.requirements import sigmas_s2s
+from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, Calibration
-from caliv_graph.progress import PlainProgress, Progress, SilentProgress
-from caliv_graph.requirements import sigmas_s2s
-from caliv_graph.results import read_calibration, read_truth
+from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.scenario.drives import CurvatureProfile
+from caliv_graph.scenario.model import Scenario, parse_scenario
 from caliv_graph.simulation.bag import BagWriter
-from caliv_graph.simulation.drives import CurvatureProfile
 from caliv_graph.simulation.recording import SimulatedRecording
-from caliv_graph.simulation.scenario import Scenario, parse_scenario
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from scripts._command import COMMAND, Usage, between, calibrate_measured, exit_code_of

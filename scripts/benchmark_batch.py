@@ -36,9 +36,9 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # for the module beside this one, run from anywhere
 
-from caliv_graph.config import load_config
+from caliv_graph.common.files import output_folder
+from caliv_graph.config.load import load_config
 from caliv_graph.errors import CalivError
-from caliv_graph.files import output_folder
 from caliv_graph.simulation import load_scenario, simulate_caliv
 from scripts._command import between
 

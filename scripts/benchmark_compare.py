@@ -27,20 +27,21 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per c
 import numpy as np
 from scipy.stats import binomtest, kstest
 
-from caliv_graph.config import parse_config
+from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare
-from caliv_graph.fusion.terms import DRIVES, guess_of, own_term
+from caliv_graph.fusion.terms import guess_of, own_term
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, Calibration
-from caliv_graph.progress import SilentProgress
-from caliv_graph.results import read_calibration, write_calibration
-from caliv_graph.simulation.scenario import load_scenario
-from caliv_graph.simulation.thinned import GroundWaves, ThinnedRecording, cached_selection
+from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.observability import scaling, spectrum
+from scripts._thinned import GroundWaves, ThinnedRecording, cached_selection
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SCENARIOS = REPOSITORY / "configs" / "scenarios"

@@ -32,19 +32,19 @@ import numpy as np
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
+from caliv_graph.common.progress import SilentProgress
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan, Recording
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.forwarding import ForwardingRecording
-from caliv_graph.simulation.scenario import load_scenario
-from caliv_graph.simulation.thinned import (
+from caliv_graph.scenario.model import load_scenario
+from scripts._command import add_beams
+from scripts._tables_rows import config_for
+from scripts._thinned import (
     GroundWaves,
     ThinnedRecording,
     cached_selection,
 )
-from scripts._command import add_beams
-from scripts._tables_rows import config_for
 from scripts.benchmark_tables import code_digest
 
 OUT = REPOSITORY / "out" / "consistency"

@@ -26,16 +26,16 @@ import pymap3d
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
-from caliv_graph.config import Config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation.scenario import load_scenario
-from caliv_graph.simulation.thinned import GroundWaves, ThinnedRecording, cached_selection
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from scripts._command import add_beams, exit_code_of, positive
 from scripts._tables_rows import config_for
+from scripts._thinned import GroundWaves, ThinnedRecording, cached_selection
 
 SCENARIO = REPOSITORY / "configs" / "scenarios" / "noisy.yaml"
 

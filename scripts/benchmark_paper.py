@@ -3,7 +3,7 @@
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_paper.py
 
 Simulates each scenario with seeds 1 to N (`--runs`), keeps its clouds in memory, and calibrates
-them from the guess that a simulated drive comes with (`--starts truth`: from the true mountings,
+them from the guess that a simulated drive comes with (`--starts truth`: from the true extrinsics,
 which only shows how good the paper's estimator is at best). `--released` does the same on the drive
 that the CaLiV authors published, from drawn guesses. Errors are in vehicle axes, mean absolute over
 the runs, as the paper defines them. Each run is a line of `out/paper/NAME.jsonl`; lines that are
@@ -31,16 +31,17 @@ import numpy as np
 
 from caliv_graph import __version__
 from caliv_graph._open3d import import_open3d
-from caliv_graph.config import Config, Mounting, load_config, parse_config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import load_config, parse_config
+from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.geometry.se3 import pose_from_mounting, rpy
+from caliv_graph.geometry.se3 import rpy
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan, MotionData, Recording
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers import open_recording
+from caliv_graph.scenario.model import CropModel, load_scenario
 from caliv_graph.simulation.recording import simulate_drive
-from caliv_graph.simulation.scenario import CropModel, load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
 from scripts import benchmark_released as released
@@ -121,12 +122,12 @@ class Job:
     Attributes:
         drive: scenario, or RELEASED.
         run: seed of the drive, or number of the guess.
-        open: gives the recording, the config with the guesses, and the true mountings.
+        open: gives the recording, the config with the guesses, and the true extrinsics.
     """
 
     drive: str
     run: int
-    open: Callable[[], tuple[Recording, Config, Mapping[str, Mounting]]]
+    open: Callable[[], tuple[Recording, Config, Mapping[str, PoseConfig]]]
 
 
 def main() -> int:
@@ -193,8 +194,10 @@ def benchmark(arguments: argparse.Namespace) -> list[Outcome]:
     return outcomes
 
 
-def simulated(name: str, seed: int) -> Callable[[], tuple[Recording, Config, dict[str, Mounting]]]:
-    def opened() -> tuple[Recording, Config, dict[str, Mounting]]:
+def simulated(
+    name: str, seed: int
+) -> Callable[[], tuple[Recording, Config, dict[str, PoseConfig]]]:
+    def opened() -> tuple[Recording, Config, dict[str, PoseConfig]]:
         scenario = load_scenario(REPOSITORY / f"configs/scenarios/{name}.yaml")
         if scenario.crop is None:
             scenario = scenario.model_copy(update={"crop": CROP})
@@ -208,8 +211,8 @@ def simulated(name: str, seed: int) -> Callable[[], tuple[Recording, Config, dic
 
 def published(
     data: Path, guess: int
-) -> Callable[[], tuple[Recording, Config, dict[str, Mounting]]]:
-    def opened() -> tuple[Recording, Config, dict[str, Mounting]]:
+) -> Callable[[], tuple[Recording, Config, dict[str, PoseConfig]]]:
+    def opened() -> tuple[Recording, Config, dict[str, PoseConfig]]:
         true_config = released.authors_config(data)
         config = released.guessed(load_config(released.CONFIG), true_config, data, 1, guess)
         truth = {lidar: of.initial for lidar, of in true_config.lidars.items()}
@@ -237,7 +240,7 @@ def run_job(
     return [done[key] for key in wanted]
 
 
-def with_guesses(config: Config, guesses: Mapping[str, Mounting]) -> Config:
+def with_guesses(config: Config, guesses: Mapping[str, PoseConfig]) -> Config:
     lidars = {
         name: lidar.model_copy(update={"initial": guesses[name]})
         for name, lidar in config.lidars.items()
@@ -251,9 +254,9 @@ def run_once(
     estimator: str,
     recording: Recording,
     config: Config,
-    truth: Mapping[str, Mounting],
+    truth: Mapping[str, PoseConfig],
 ) -> Outcome:
-    true_poses = {name: pose_from_mounting(mounting) for name, mounting in truth.items()}
+    true_poses = {name: mounting.pose() for name, mounting in truth.items()}
     run = run_paper if estimator == PAPER else run_ours
     begun, cpu = time.perf_counter(), time.process_time()
     try:

@@ -31,23 +31,16 @@ import gtsam
 import numpy as np
 import yaml
 
-from caliv_graph.config import (
-    Config,
-    RobustKernel,
-    SolveMode,
-    dump_config,
-    load_config,
-    parse_config,
-)
-from caliv_graph.config_draft import draft_config
+from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
+from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
+from caliv_graph.config.load import dump_config, load_config, parse_config
+from caliv_graph.config.model import Config, RobustKernel, SolveMode
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError, ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, Calibration
-from caliv_graph.progress import PlainProgress, Progress, SilentProgress
-from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
-from caliv_graph.simulation.noise import perturbed_mounting
-from caliv_graph.simulation.scenario import InitialGuessModel
+from caliv_graph.scenario.model import InitialGuessModel
+from caliv_graph.simulation.noise import perturbed_extrinsic
+from caliv_graph.workflows.draft import draft_config
 from scripts._command import COMMAND, calibrate_measured, exit_code_of, positive
 
 CONFIG = REPOSITORY / "configs/caliv_released.yaml"
@@ -288,7 +281,7 @@ def guessed(config: Config, true_config: Config, data: Path, seed: int, guess: i
     rng = np.random.default_rng((seed, guess))
     lidars = {}
     for name, lidar in config.lidars.items():
-        initial = perturbed_mounting(true_config.lidars[name].initial, InitialGuessModel(), rng)
+        initial = perturbed_extrinsic(true_config.lidars[name].initial, InitialGuessModel(), rng)
         lidars[name] = lidar.model_copy(update={"initial": initial})
     where = config.data.model_copy(update={"path": data.resolve()})
     return config.model_copy(update={"data": where, "lidars": lidars})
@@ -341,7 +334,7 @@ def calibrate_once(config: Config, true_config: Config, guess: int) -> Outcome:
         run = calibrate([open_recording(config)], config, SilentProgress())
     except Exception as e:  # one that fails is a result too
         return replace(outcome, failure=f"{type(e).__name__}: {e}")
-    truth = {n: pose_from_mounting(lidar.initial) for n, lidar in true_config.lidars.items()}
+    truth = {n: lidar.initial.pose() for n, lidar in true_config.lidars.items()}
     return measured(outcome, run.calibration, truth)
 
 

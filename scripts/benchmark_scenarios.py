@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config import parse_config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
-from caliv_graph.progress import SilentProgress
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.recording import simulate_drive
-from caliv_graph.simulation.scenario import load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined

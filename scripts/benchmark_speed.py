@@ -35,9 +35,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
 
 from caliv_graph._open3d import import_open3d
-from caliv_graph.config import Config, dump_config, load_config
+from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
+from caliv_graph.config.load import dump_config, load_config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, ConfigError
-from caliv_graph.progress import PlainProgress, Progress, SilentProgress
 from scripts import _child, benchmark_bag, benchmark_paper
 from scripts import benchmark_released as released
 from scripts._command import positive

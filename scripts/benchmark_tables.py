@@ -8,7 +8,7 @@ Needs the environment that scripts/demo makes:
 
 Every run draws all that a stated sigma covers: vehicle height, heave, waves of the ground, the
 noise of every sensor, and initial guesses that are off by up to 0.1 m and 3 degrees. Of a cloud
-only the beams that matter are cast (`caliv_graph.simulation.thinned`). A run is a line in
+only the beams that matter are cast (`scripts._thinned`). A run is a line in
 out/tables/<scenario>-<row>.jsonl, written as it is done: a second start does what is missing. Runs
 of another version of the program, another scenario or another config do not count. Errors are in
 vehicle axes, as `evaluate` has them; of an axis that a run did not determine the error is left out,
@@ -35,29 +35,29 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
 import caliv_graph
-from caliv_graph.config import dump_config
+from caliv_graph.common.progress import PlainProgress
+from caliv_graph.config.load import dump_config
 from caliv_graph.errors import CalivError
-from caliv_graph.progress import PlainProgress
-from caliv_graph.simulation.recording import simulate_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     InitialGuessModel,
     Scenario,
     dump_scenario,
     load_scenario,
 )
-from caliv_graph.simulation.thinned import (
-    BeamSelection,
-    GroundWaves,
-    ThinnedRecording,
-    cached_selection,
-    scenario_digest,
-)
+from caliv_graph.simulation.recording import simulate_drive
 from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row
 from scripts._tables_statistics import (
     Line,
     comparison,
     other_systems,
     row_table,
+)
+from scripts._thinned import (
+    BeamSelection,
+    GroundWaves,
+    ThinnedRecording,
+    cached_selection,
+    scenario_digest,
 )
 
 SCENARIOS = REPOSITORY / "configs" / "scenarios"

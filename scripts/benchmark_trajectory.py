@@ -28,12 +28,13 @@ import pymap3d
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from caliv_graph.config import Config, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, MotionData
+from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import SimulatedTruth
-from caliv_graph.simulation.scenario import Scenario, load_scenario
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.smoothing import smooth_trajectory
 from scripts._ukf import filter_trajectory
@@ -70,7 +71,7 @@ class Run:
 
 
 def config_of(scenario: Scenario) -> Config:
-    """What a user would know: mountings; the noise is in the messages or the paper's."""
+    """What a user would know: extrinsics; the noise is in the messages or the paper's."""
     imu = scenario.imu.mounting
     raw = {
         "lidars": {

@@ -27,8 +27,8 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
 
+from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.errors import CalivError
-from caliv_graph.progress import PlainProgress, Progress, SilentProgress
 from scripts import _child, benchmark_bag
 
 LAPS = (1, 4, 16)

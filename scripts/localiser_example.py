@@ -1,4 +1,4 @@
-"""What is a calibration worth to a localiser? The same drives with three kinds of mountings.
+"""What is a calibration worth to a localiser? The same drives with three kinds of extrinsics.
 
     .venv/bin/python scripts/localiser_example.py
     .venv/bin/python scripts/localiser_example.py --seeds 20 --knock 0.5
@@ -7,9 +7,10 @@
 
 A sliding-window localiser (scripts/_localiser.py: `gtsam.IncrementalFixedLagSmoother`, IMU
 preintegration, GNSS with an outage of 20 s, scans registered to a map by Open3D) drives the
-scenario `localiser` with the mountings (a) as guessed, constants; (b) as calibrated, constants; (c)
-as calibrated, variables with the calibration's joint covariance for a prior. The LiDARs of (c) are
-watched by `caliv_graph.fusion.monitor`; it drives once more, with a mount knocked in mid-drive.
+scenario `localiser` with the extrinsics (a) as guessed, constants; (b) as calibrated, constants;
+(c) as calibrated, variables with the calibration's joint covariance for a prior. The LiDARs of (c)
+are watched by `caliv_graph.fusion.monitor`; it drives once more, with a mount knocked in
+mid-drive.
 
 NEES is the squared error in units of the stated covariance, per degree of freedom: 1 if the
 localiser knows how good it is. Every seed draws the drive's noise, the initial guess and the error
@@ -18,7 +19,7 @@ drive of figure_eight of that seed from raw sensors. Seeds that have been run ar
 out/localiser and not run again; one takes about 20 s.
 
 Measured with `--seeds 20` (seeds 1 to 20): position RMSE (a) 246, (b) 6.0, (c) 4.7 mm; heading RMSE
-25, 0.18, 0.12 mrad; NEES 45000, 16.4, 0.84: (c) lets the mountings drift by more than they do. A
+25, 0.18, 0.12 mrad; NEES 45000, 16.4, 0.84: (c) lets the extrinsics drift by more than they do. A
 knock of 0.5 degrees is found within 1.8 s in all drives, without an alarm in any clean one.
 """
 
@@ -42,8 +43,8 @@ import numpy as np
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.fusion.monitor import DOF, alarm_threshold
 from caliv_graph.products import Array
-from caliv_graph.results import read_calibration
-from caliv_graph.simulation.scenario import Scenario, load_scenario
+from caliv_graph.results.files import read_calibration
+from caliv_graph.scenario.model import Scenario, load_scenario
 from scripts._localiser import FALSE_ALARMS_PER_HOUR
 from scripts._localiser_runs import KEYFRAME_S, VARIANTS, Run, Task, cached_runs
 from scripts.benchmark_compare import SCENARIOS, calibrated
@@ -154,7 +155,7 @@ def accuracy_table(found: Seeds, scenario: Scenario) -> str:
     lines = [
         f"\n{len(found)} drives of '{scenario.name}': the newest pose of each keyframe against the "
         "truth. NEES per degree of freedom, mean of the drives +- its standard error",
-        f"  {'mountings':36}{'position':>10}{'in outage':>11}{'heading':>12}"
+        f"  {'extrinsics':36}{'position':>10}{'in outage':>11}{'heading':>12}"
         f"{'NEES pose':>20}{'position':>20}{'heading':>20}",
     ]
     for name, text in VARIANTS.items():

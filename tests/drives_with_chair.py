@@ -11,14 +11,13 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config, GroundConfig, LidarConfig, Mounting, load_config
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config, GroundConfig, LidarConfig, PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
 from caliv_graph.readers import open_recording
-from caliv_graph.simulation import simulate_caliv
-from caliv_graph.simulation.drives import Drive, make_drive, smoothstep, smoothstep_rate
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import Drive, make_drive, smoothstep, smoothstep_rate
+from caliv_graph.scenario.model import (
     ArcDrive,
     ChairModel,
     CropModel,
@@ -32,6 +31,7 @@ from caliv_graph.simulation.scenario import (
     StraightDrive,
     WorldModel,
 )
+from caliv_graph.simulation import simulate_caliv
 
 RADIUS_M = 9.16
 """Turning radius of the paper's vehicle."""
@@ -171,7 +171,7 @@ def paper_lidar(
 ) -> LidarModel:
     """A LiDAR of the paper's section IV: 2 m up, 10 degrees nose down, 120 x 25 degrees, 10 mm."""
     return LidarModel(
-        mounting=Mounting(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)), rate_hz=rate_hz
+        mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)), rate_hz=rate_hz
     )
 
 
@@ -231,5 +231,5 @@ def simulated(scenario: Scenario, seed: int, folder: Path) -> ChairDrive:
     return ChairDrive(
         recording=Memory(clouds, given),
         config=config,
-        truth={name: pose_from_mounting(m.mounting) for name, m in scenario.lidars.items()},
+        truth={name: m.mounting.pose() for name, m in scenario.lidars.items()},
     )

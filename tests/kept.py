@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 
+from caliv_graph.scenario.model import Scenario
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedScan
-from caliv_graph.simulation.scenario import Scenario
 
 
 class KeptDrive(SimulatedRecording):

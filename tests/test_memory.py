@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from caliv_graph.progress import SilentProgress
+from caliv_graph.common.progress import SilentProgress
 from scripts import benchmark_bag
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,12 +24,12 @@ It is 20 MB on a quiet machine, 33 on a busy one, where arenas of threads come a
 _STAGES = """
 import json, sys
 from pathlib import Path
-from caliv_graph.config import load_config
-from caliv_graph.progress import SilentProgress
+from caliv_graph.config.model import load_config
+from caliv_graph.common.progress import SilentProgress
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground_planes import measure_grounds
+from caliv_graph.targets.ground.planes import measure_grounds
 from caliv_graph.trajectory.select import smooth_trajectories
 
 config = load_config(Path(sys.argv[1]))

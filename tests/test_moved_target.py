@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caliv_graph.config import Config, Mounting, parse_config
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array
-from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.results.run import CalibrationRun
+from caliv_graph.scenario.model import (
     ChairModel,
     CropModel,
     LidarModel,
@@ -24,6 +25,7 @@ from caliv_graph.simulation.scenario import (
     WorldModel,
     load_scenario,
 )
+from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
@@ -51,7 +53,7 @@ class Standing:
 
 def lidar(x_m: float, y_m: float, yaw_deg: float, phase_s: float) -> LidarModel:
     return LidarModel(
-        mounting=Mounting(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
+        mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
         rate_hz=3.0,
         phase_s=phase_s,
         channels=110,

@@ -13,22 +13,23 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.config import (
-    Mounting,
-    MountingSigma,
+from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import (
+    PoseConfig,
+    PoseSigmaConfig,
     RobustConfig,
     RobustKernel,
     SolveConfig,
-    load_config,
 )
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers import open_recording
-from caliv_graph.requirements import sigmas_s2s, sigmas_s2v
-from caliv_graph.simulation.scenario import ChairModel, CylinderModel
+from caliv_graph.results.run import CalibrationRun
+from caliv_graph.scenario.model import ChairModel, CylinderModel
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_covariance
 from tests.drives_with_chair import (
@@ -135,7 +136,7 @@ def test_a_trusted_mounting_is_determined_and_so_is_the_other_by_it(tmp_path: Pa
     scenario = paper_scenario(rate_hz=2.5)
     drive = simulated(scenario, 1, tmp_path / "drive")
     truth = drive.truth["rear"]
-    initial = Mounting(
+    initial = PoseConfig(
         xyz=tuple(truth.translation().tolist()),
         rpy_deg=tuple(np.degrees(truth.rotation().rpy()).tolist()),
     )
@@ -172,11 +173,11 @@ def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(tmp_path:
     for name, lidar in drive.config.lidars.items():
         truth = drive.truth[name]
         way = rng.choice([-1.0, 1.0], 6)
-        initial = Mounting(
+        initial = PoseConfig(
             xyz=tuple((truth.translation() + 0.5 * way[:3]).tolist()),
             rpy_deg=tuple((np.degrees(truth.rotation().rpy()) + 10.0 * way[3:]).tolist()),
         )
-        sigma = MountingSigma(xyz=0.29, rpy_deg=5.8)
+        sigma = PoseSigmaConfig(xyz=0.29, rpy_deg=5.8)
         lidars[name] = lidar.model_copy(update={"initial": initial, "sigma": sigma})
     far = replace(drive, config=drive.config.model_copy(update={"lidars": lidars}))
     near, tried = try_out(drive).s2s(), try_out(far)
@@ -379,7 +380,7 @@ def test_a_lidar_that_never_sees_the_target_stays_where_it_was_guessed(four: Tri
 
 
 def apart(one: Tried, other: Tried, names: Mapping[str, str] | None = None) -> float:
-    """The largest difference of two results, of mountings and between LiDARs, in sigmas of `one`.
+    """The largest difference of two results, of extrinsics and between LiDARs, in sigmas of `one`.
 
     Args:
         one: a result of two LiDARs, front and rear.

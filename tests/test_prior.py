@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from caliv_graph.config import NoiseConfig
+from caliv_graph.calibration.requirements import sigmas_s2v
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, Calibration
-from caliv_graph.progress import SilentProgress
-from caliv_graph.requirements import sigmas_s2v
+from caliv_graph.results.run import CalibrationRun
 from tests.drives_with_chair import (
     ARC,
     ARC_LEFT,
@@ -113,7 +114,7 @@ def test_merging_is_solving_together(arcs: TwoArcs) -> None:
 
 
 def test_a_prior_is_merging(arcs: TwoArcs) -> None:
-    """The second drive starts from the first one's mountings, and ends where merging does."""
+    """The second drive starts from the first one's extrinsics, and ends where merging does."""
     result = calibrated(arcs.left, prior=arcs.of_right)
     merged = merge({"left": arcs.of_left, "right": arcs.of_right}).calibration
 

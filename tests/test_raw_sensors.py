@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, pose_problem
-from caliv_graph.config import Config, parse_config
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array
-from caliv_graph.progress import SilentProgress
+from caliv_graph.results.run import CalibrationRun
+from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording
-from caliv_graph.simulation.scenario import Scenario, load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
@@ -116,7 +118,7 @@ def test_no_pose_noise_is_reported_where_no_poses_were_given() -> None:
 
 
 def centres_map(which: Drive) -> Array:
-    """Middle of every extracted cloud in the map, through the true poses and mountings."""
+    """Middle of every extracted cloud in the map, through the true poses and extrinsics."""
     recording, config = which.recording, which.config
     trajectories = smooth_trajectories([recording], config, [[]])
     (observation,) = extract_targets([recording], trajectories, config, SilentProgress())
@@ -179,7 +181,7 @@ def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
     expected[z, z] += HEAVE_SIGMA_M**2
     np.testing.assert_allclose(cov, expected, rtol=1e-5, atol=1e-12)
     assert not problem.given().any()
-    assert problem.drift_keys() == ()
+    assert problem.pose_error_keys() == ()
     shift = problem.origins_map[0]
     for T, smoothed in zip(problem.T_map_vehicle, poses, strict=True):
         assert T.equals(gtsam.Pose3(smoothed.rotation(), smoothed.translation() - shift), 1e-9)

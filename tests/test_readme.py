@@ -12,10 +12,11 @@ import pytest
 import typer
 import yaml
 
-from caliv_graph import exits
 from caliv_graph.cli.main import app
-from caliv_graph.config import Config, GroundConfig, LidarConfig, load_config
-from caliv_graph.results import read_calibration, read_truth
+from caliv_graph.common import exits
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config, GroundConfig, LidarConfig
+from caliv_graph.results.files import read_calibration, read_truth
 from caliv_graph.simulation import load_scenario, simulate_caliv
 
 ROOT = Path(__file__).resolve().parents[1]

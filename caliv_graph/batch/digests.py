@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import caliv_graph
-from caliv_graph.config import Config, dump_config
+from caliv_graph.config.load import dump_config
+from caliv_graph.config.model import Config
 
 JOB_SCHEMA = "caliv-graph/batch-job/1"
 

@@ -11,17 +11,9 @@ from typing import Any
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from caliv_graph.config import (
-    Config,
-    Positive,
-    Requirement,
-    SolveMode,
-    _one_line,
-    _Section,
-    check_limit_keys,
-    parse_config,
-    read_yaml,
-)
+from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.config.model import Config, Requirement, SolveMode, check_limit_keys
+from caliv_graph.config.sections import Positive, _one_line, _Section
 from caliv_graph.errors import ConfigError
 
 MOST_CHARACTERS = 80

@@ -26,11 +26,11 @@ from caliv_graph.batch.worker import (
     run_task,
     stage_file,
 )
-from caliv_graph.config import Config
+from caliv_graph.common.exits import DEFECT, USAGE
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
 from caliv_graph.errors import BatchError, CalivError
-from caliv_graph.exits import DEFECT, USAGE
-from caliv_graph.progress import Progress
-from caliv_graph.results import CALIBRATION_FILE, read_calibration
+from caliv_graph.results.files import CALIBRATION_FILE, read_calibration
 
 _POLL_S = 0.2
 

@@ -17,15 +17,15 @@ import numpy as np
 
 import caliv_graph
 from caliv_graph.batch.folder import SUMMARY_SCHEMA
+from caliv_graph.common.exits import DONE, INCONSISTENT, UNMET
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.exits import DONE, INCONSISTENT, UNMET
 from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.report.layout import SHOWN_AXES
-from caliv_graph.results import REPORT_FILE
+from caliv_graph.results.files import REPORT_FILE
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What makes a spreadsheet take text for a formula."""
@@ -91,7 +91,7 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Spread:
-    """The mountings of one vehicle, from drive to drive.
+    """The extrinsics of one vehicle, from drive to drive.
 
     Attributes:
         vehicle: which.

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import caliv_graph
-from caliv_graph.config import Config
+from caliv_graph.common.exits import DEFECT, USAGE
+from caliv_graph.common.progress import SilentProgress, StageRecord, count_text
+from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError
-from caliv_graph.exits import DEFECT, USAGE
-from caliv_graph.progress import SilentProgress, StageRecord, count_text
 
 MOST_ATTEMPTS = 2
 """How often a job may take a worker down with it: once may have been somebody else's fault."""
@@ -204,11 +204,11 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     from threadpoolctl import threadpool_limits
 
     from caliv_graph.batch.digests import DigestCache, job_digest, job_inputs
-    from caliv_graph.cores import on_one_core
+    from caliv_graph.batch.job import check_guesses, open_recordings, run_job
+    from caliv_graph.common.cores import on_one_core
+    from caliv_graph.common.exits import exit_code
     from caliv_graph.errors import RecordingError
-    from caliv_graph.exits import exit_code
-    from caliv_graph.jobs import check_guesses, open_recordings, run_job
-    from caliv_graph.results import read_calibration
+    from caliv_graph.results.files import read_calibration
 
     if task.version != caliv_graph.__version__:
         raise CalivError(

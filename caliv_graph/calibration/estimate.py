@@ -22,12 +22,16 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.graph import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
-from caliv_graph.calibration.solve import OFFSET_TOLD_S, solve_registered, with_determined_offsets
+from caliv_graph.calibration.solve import (
+    OFFSET_DETERMINED_S,
+    solve_registered,
+    with_determined_offsets,
+)
 from caliv_graph.calibration.staged import staged_solution
-from caliv_graph.config import Config
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import GroundObservation, Registration, Solution, TargetObservation
-from caliv_graph.progress import Progress
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.registration.symmetry import (
     Symmetry,
@@ -38,7 +42,7 @@ from caliv_graph.registration.symmetry import (
 )
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.uncertainty.outlook import untold_offsets
+from caliv_graph.uncertainty.predicted import undetermined_offsets
 
 
 def estimate(
@@ -83,7 +87,7 @@ def _estimate(
     limit = config.registration.max_iterations
     begun = time.perf_counter()
     states = [
-        JointRegistration(o, config, rough=True, shares=problem.cloud_shares(m))
+        JointRegistration(o, config, rough=True, shares=problem.view_weights(m))
         for m, o in enumerate(observations)
     ]
     registrations = []
@@ -96,7 +100,7 @@ def _estimate(
         solve = solve_registered(problem, registrations, grounds, config)
         times["graph"] = solve.graph_seconds
         problem, offsets_s = with_determined_offsets(solve, registrations)
-        warnings = tuple(untold_offsets(offsets_s, OFFSET_TOLD_S))
+        warnings = tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
         if warnings:
             solve = solve_registered(problem, registrations, grounds, config)
             times["graph"] += solve.graph_seconds
@@ -106,10 +110,10 @@ def _estimate(
     # single ones do not.
     begun = time.perf_counter()
     lines = linearise_clouds(problem, solve.values)
-    mountings = {name: problem.mounting(solve.values, name) for name in problem.lidars}
-    observations = [_deskewed(o, mountings, trajectories) for o in observations]
+    extrinsics = {name: problem.extrinsic(solve.values, name) for name in problem.lidars}
+    observations = [_deskewed(o, extrinsics, trajectories) for o in observations]
     states = [
-        JointRegistration(o, config, normals=False, shares=problem.cloud_shares(m))
+        JointRegistration(o, config, normals=False, shares=problem.view_weights(m))
         for m, o in enumerate(observations)
     ]
     again = []
@@ -118,7 +122,7 @@ def _estimate(
             state.refine_normals(R, t)
             again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()
-    turns, alike = turns_of_targets(again, config)
+    turns, alike = symmetries_of_targets(again, config)
     warnings += alike
     times["registration"] += time.perf_counter() - begun
     begun = time.perf_counter()
@@ -132,15 +136,17 @@ def _estimate(
             solution = refined(solve, states, most, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
-    return replace(solution, stage_times_s=times, warnings=warnings)
+    return replace(
+        solution, stage_times_s=times, warnings=(*warnings, *_unconverged(solution.registrations))
+    )
 
 
 def _deskewed(
     observation: TargetObservation,
-    mountings: Mapping[str, gtsam.Pose3],
+    extrinsics: Mapping[str, gtsam.Pose3],
     trajectories: Sequence[VehicleTrajectory],
 ) -> TargetObservation:
-    """The clouds again, their sweeps put together with the mountings that have been found.
+    """The clouds again, their sweeps put together with the extrinsics that have been found.
 
     A guess that is off by 3 degrees puts what the vehicle moves by during a sweep, 0.1 to 0.2 m,
     off by some millimetres, in all clouds alike.
@@ -148,7 +154,7 @@ def _deskewed(
     clouds = []
     for cloud in observation.clouds:
         if cloud.swept is not None:
-            scan = deskew(cloud.swept, mountings[cloud.lidar], trajectories[cloud.drive])
+            scan = deskew(cloud.swept, extrinsics[cloud.lidar], trajectories[cloud.drive])
             cloud = replace(cloud, points_lidar=scan.points_lidar)
         clouds.append(cloud)
     return replace(observation, clouds=tuple(clouds))
@@ -163,7 +169,7 @@ def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
     return out
 
 
-def turns_of_targets(
+def symmetries_of_targets(
     registrations: Sequence[Registration], config: Config
 ) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
     """Per placement the turn that its target looks the same after, any turn; and what to tell.
@@ -183,3 +189,17 @@ def turns_of_targets(
             if alarming(s, sigma)
         ]
     return tuple(turns), tuple(told)
+
+
+def _unconverged(registrations: Sequence[Registration]) -> list[str]:
+    """A warning for each registration that stopped before its tolerance."""
+    out = []
+    for registration in registrations:
+        if not registration.converged:
+            turn, shift = registration.last_step
+            out.append(
+                f"{registration.observation.name}: shape and poses still moved by "
+                f"{1e3 * turn:.2f} mrad and {1e3 * shift:.2f} mm in the last of "
+                f"{registration.iterations} iterations: trust the result no further than its sigmas"
+            )
+    return out

@@ -94,7 +94,7 @@ def target_pose_factor(
 
 def given_pose_factor(
     key_pose: int,
-    key_drift: int,
+    key_pose_error: int,
     T_map_vehicle: gtsam.Pose3,
     sigma_rotation_rad: float,
     sigma_position_m: float,
@@ -117,14 +117,14 @@ def given_pose_factor(
             J[3:, 3:] = T.rotation().matrix()
             jacobians[0] = J
             jacobians[1] = -np.eye(6)
-        return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_drift)
+        return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
 
     return gtsam.CustomFactor(
-        gtsam.noiseModel.Diagonal.Sigmas(sigmas), [key_pose, key_drift], error
+        gtsam.noiseModel.Diagonal.Sigmas(sigmas), [key_pose, key_pose_error], error
     )
 
 
-def drift_factor(
+def gauss_markov_factor(
     key_before: int, key_after: int, decay: float, sigmas: Array
 ) -> gtsam.LinearContainerFactor:
     """A step of the slow error, `b_after = decay * b_before + noise` (first-order Gauss-Markov).
@@ -149,7 +149,7 @@ def drift_factor(
     return gtsam.LinearContainerFactor(linear, zero)
 
 
-def mounting_prior(
+def extrinsic_prior(
     keys: Sequence[int], T_vehicle_lidar: gtsam.Pose3, sigmas: Array
 ) -> gtsam.CustomFactor:
     """The initial guess of one LiDAR's mounting, on `T_vehicle_a = E S_a`, in vehicle axes.

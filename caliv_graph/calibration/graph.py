@@ -11,14 +11,14 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.calibration.factors import (
-    drift_factor,
+    extrinsic_prior,
+    gauss_markov_factor,
     given_pose_factor,
-    mounting_prior,
     predict_cloud,
     target_pose_factor,
 )
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import key_drift, key_mounting, key_target, key_vehicle
+from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise
 from caliv_graph.trajectory.factors import marginal_factor
@@ -30,12 +30,12 @@ GAUGE = 1e-9
 """Relative ridge under which a dense system is solved: directions that nothing says anything
 about (the clouds' poses when all weights vanish) stay where they are."""
 
-ANCHOR = 1.0
+GAUGE_PRIOR = 1.0
 """Information per radian^2 and metre^2 that holds the frame of a target where it is. The shape's
 own place and orientation are eliminated: what moves all clouds of a target alike is no quantity."""
 
 
-def drift_sigmas(noise: PoseNoise) -> Array:
+def pose_error_sigmas(noise: PoseNoise) -> Array:
     """(6,) stationary sigmas of the slow error."""
     return np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
 
@@ -73,13 +73,13 @@ def pose_graph(
     """
     graph = merged(motion_graph(problem) if motion is None else motion)
     times, drives, given = problem.times_s(), problem.drives(), problem.given()
-    stationary = drift_sigmas(noise)
+    stationary = pose_error_sigmas(noise)
     for i in np.flatnonzero(given).tolist():
         T = problem.T_map_vehicle[i]
         graph.add(
             given_pose_factor(
                 key_vehicle(i),
-                key_drift(i),
+                key_pose_error(i),
                 T,
                 noise.white_rotation_rad,
                 noise.white_position_m,
@@ -88,13 +88,13 @@ def pose_graph(
         if i == 0 or drives[i] != drives[i - 1]:
             graph.add(
                 gtsam.PriorFactorVector(
-                    key_drift(i), np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(stationary)
+                    key_pose_error(i), np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(stationary)
                 )
             )
         else:
             decay = float(np.exp(-(times[i] - times[i - 1]) / noise.drift_time_s))
             step = stationary * np.sqrt(1.0 - decay**2)
-            graph.add(drift_factor(key_drift(i - 1), key_drift(i), decay, step))
+            graph.add(gauss_markov_factor(key_pose_error(i - 1), key_pose_error(i), decay, step))
     return graph
 
 
@@ -103,8 +103,8 @@ def prior_graph(problem: Problem, lidars: Sequence[str]) -> gtsam.NonlinearFacto
     graph = gtsam.NonlinearFactorGraph()
     for name in lidars:
         graph.add(
-            mounting_prior(
-                problem.mounting_keys(name), problem.guesses[name], problem.prior_sigmas[name]
+            extrinsic_prior(
+                problem.extrinsic_keys_of(name), problem.guesses[name], problem.prior_sigmas[name]
             )
         )
     return graph
@@ -136,14 +136,14 @@ def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.V
     values = gtsam.Values()
     for i, T in enumerate(problem.T_map_vehicle):
         values.insert(key_vehicle(i), T)
-    for key in problem.drift_keys():
+    for key in problem.pose_error_keys():
         values.insert(key, np.zeros(6))
     for key in problem.offset_keys():
         values.insert(key, np.zeros(1))
     E = problem.guesses[problem.reference]
-    values.insert(key_mounting(), E)
+    values.insert(key_extrinsic(), E)
     for name in problem.lidars:
-        for key in problem.mounting_keys(name)[1:]:
+        for key in problem.extrinsic_keys_of(name)[1:]:
             values.insert(key, E.between(problem.guesses[name]))
     for m in range(problem.placements):
         candidates = []
@@ -160,7 +160,7 @@ def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
     out = gtsam.Values(values)
     for i, T in enumerate(problem.T_map_vehicle):
         out.update(key_vehicle(i), T)
-    for key in problem.drift_keys():
+    for key in problem.pose_error_keys():
         out.update(key, np.zeros(6))
     return out
 
@@ -314,7 +314,7 @@ def dense_system(
     are taken along.
     """
     extrinsics = problem.extrinsic_keys()
-    drifts = set(problem.drift_keys())
+    drifts = set(problem.pose_error_keys())
     linear = graph.linearize(values)
     touched = set(graph.keyVector())
     known = (*problem.pose_keys(), *problem.target_keys())
@@ -322,7 +322,7 @@ def dense_system(
     keys = (*known, *others, *extrinsics)
     zero = values.zeroVectors()
     sizes = tuple(6 if key in known or key in extrinsics else zero.at(key).size for key in keys)
-    chains = [key for key in problem.drift_keys() if key in touched]
+    chains = [key for key in problem.pose_error_keys() if key in touched]
     if chains:
         try:
             _, linear = linear.eliminatePartialMultifrontal(chains)
@@ -355,7 +355,7 @@ def add_shape(
 ) -> DenseSystem:
     """Adds a quadratic on the poses of all clouds, `d^T H d / 2 + g^T d` (left perturbations).
 
-    It says nothing of a common motion of a target's clouds: their target frame is held (ANCHOR).
+    A common motion of a target's clouds is free in it: GAUGE_PRIOR holds their target frame.
 
     Args:
         system: the rest of the graph.
@@ -372,7 +372,7 @@ def _with_rows(
 ) -> DenseSystem:
     """Adds what clouds of rows J say, `seen` being `J^T H`."""
     H = system.H + (J.T @ seen.T)
-    hold_targets(H, _starts(system))
+    add_gauge_prior(H, _starts(system))
     return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
@@ -393,7 +393,7 @@ def _cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.
     )
 
 
-def left_over(
+def adjusted_residuals(
     system: DenseSystem, lines: CloudLinearisation, H_clouds: Array, residuals: Array
 ) -> tuple[Array, Array]:
     """What measured poses of clouds are off, once all variables have made up for what they can.
@@ -434,8 +434,8 @@ def _starts(system: DenseSystem) -> dict[int, int]:
     return dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
 
 
-def hold_targets(H: Array, starts: Mapping[int, int]) -> None:
-    """Adds ANCHOR to the frames of the targets.
+def add_gauge_prior(H: Array, starts: Mapping[int, int]) -> None:
+    """Adds GAUGE_PRIOR to the frames of the targets.
 
     Args:
         H: (M, M) information, changed in place.
@@ -445,7 +445,7 @@ def hold_targets(H: Array, starts: Mapping[int, int]) -> None:
     for key, start in starts.items():
         if gtsam.symbolChr(key) == letter:
             frame = start + np.arange(6)
-            H[frame, frame] += ANCHOR
+            H[frame, frame] += GAUGE_PRIOR
 
 
 def retract(values: gtsam.Values, keys: Sequence[int], d: Array) -> gtsam.Values:

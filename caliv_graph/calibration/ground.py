@@ -16,15 +16,15 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
-from caliv_graph.config import GroundConfig
+from caliv_graph.config.model import GroundConfig
 from caliv_graph.conventions import key_ground, key_height, key_parallel, key_vehicle
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, GroundObservation, IntArray
-from caliv_graph.targets.views import view_shares
+from caliv_graph.targets.cloud.views import view_weights
 
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Of a plane before anything is seen: 45 degrees, and 100 m about the drive's poses. Next to the
-guesses of the mountings that is nothing; without it a plane that nothing sees were singular."""
+guesses of the extrinsics that is nothing; without it a plane that nothing sees were singular."""
 
 SWAY_SIGMA_RAD = 1e-3
 """How far the body on its springs is off its own mean tilt at each stamp, about either axis: it
@@ -134,12 +134,12 @@ def _measured(observation: GroundObservation, R_vehicle_lidar: Array) -> tuple[A
         (3,) tilts along its axes and distance; (3, 3) by a right perturbation of the rotation.
     """
     said = np.array([0.0, 0.0, observation.distance_m])
-    if observation.R_vehicle_lidar is None or observation.by_mounting is None:
+    if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
         return said, np.zeros((3, 3))
     turn = gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar)
     w = gtsam.Rot3.Logmap(turn)
-    by_turn = observation.by_mounting @ gtsam.Rot3.LogmapDerivative(w)
-    return said + observation.by_mounting @ w, np.asarray(by_turn)
+    by_turn = observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(w)
+    return said + observation.by_extrinsic @ w, np.asarray(by_turn)
 
 
 def ground_plane_factor(
@@ -346,7 +346,7 @@ def ground_graph(
     )
     for o, i, weight, heave_m in believed:
         if i >= 0 and weight > 0.0:
-            keys = (key_vehicle(i), *problem.mounting_keys(o.lidar))
+            keys = (key_vehicle(i), *problem.extrinsic_keys_of(o.lidar))
             plane, anchor = key_ground(o.drive), anchors[o.drive]
             graph.add(ground_plane_factor(keys, plane, anchor, o, weight, heave_m))
     for i, ((drive, _), weight) in enumerate(
@@ -377,7 +377,7 @@ def _place_shares(
             alike.setdefault((o.drive, o.lidar), []).append(n)
     for own in alike.values():
         places = [problem.T_map_vehicle[taken[n]].translation() for n in own]
-        out[own] = view_shares(np.array(places))
+        out[own] = view_weights(np.array(places))
     return out
 
 
@@ -409,7 +409,7 @@ def ground_values(
     Args:
         problem: LiDARs and poses.
         observations: the planes.
-        values: of poses and mountings, guesses will do.
+        values: of poses and extrinsics, guesses will do.
         config: as for `ground_graph`.
     """
     out = gtsam.Values()
@@ -421,7 +421,7 @@ def ground_values(
         slopes, feet = [], []
         for o, i in zip(observations, taken.tolist(), strict=True):
             if i >= 0 and o.drive == drive:
-                T = values.atPose3(key_vehicle(i)).compose(problem.mounting(values, o.lidar))
+                T = values.atPose3(key_vehicle(i)).compose(problem.extrinsic(values, o.lidar))
                 n = T.rotation().matrix() @ o.normal_lidar
                 slopes.append(-n[:2] / n[2])
                 feet.append(T.translation() - o.distance_m * n)
@@ -449,13 +449,13 @@ def _residuals(
     """(n, 3) residuals of role a with the vehicle at `poses`; NaN where not taken."""
     out = np.full((len(observations), 3), np.nan)
     anchors = {drive: ground_anchor(problem, drive) for drive in _drives(observations, taken)}
-    mountings = {name: problem.mounting(values, name) for name in problem.lidars}
+    extrinsics = {name: problem.extrinsic(values, name) for name in problem.lidars}
     for row, (o, i) in enumerate(zip(observations, taken.tolist(), strict=True)):
         if i >= 0:
-            T = poses[i].compose(mountings[o.lidar])
+            T = poses[i].compose(extrinsics[o.lidar])
             g = values.atVector(key_ground(o.drive))
             d, _, n = _height_over(g, anchors[o.drive], T.translation())
-            said, _ = _measured(o, mountings[o.lidar].rotation().matrix())
+            said, _ = _measured(o, extrinsics[o.lidar].rotation().matrix())
             out[row] = np.append(o.axes_lidar @ T.rotation().matrix().T @ n, d) - said
     return out
 
@@ -551,7 +551,7 @@ def _heave_between(
             continue
         apart = np.array([height[n] - height[m] for n, m in pairs])
         own = np.array([observations[n].cov[2, 2] + observations[m].cov[2, 2] for n, m in pairs])
-        # What the mountings are still off by is the same for two LiDARs at all times.
+        # What the extrinsics are still off by is the same for two LiDARs at all times.
         who = [(observations[n].lidar, observations[m].lidar) for n, m in pairs]
         for both in sorted(set(who)):
             of_both = np.array([w == both for w in who])

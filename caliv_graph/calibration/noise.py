@@ -19,8 +19,8 @@ from scipy.optimize import minimize
 
 from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.config import NoiseConfig
-from caliv_graph.conventions import key_drift, key_vehicle
+from caliv_graph.config.model import NoiseConfig
+from caliv_graph.conventions import key_pose_error, key_vehicle
 from caliv_graph.products import Array, BoolArray, IntArray, PoseNoise
 
 TYPICAL = PoseNoise(
@@ -247,7 +247,7 @@ def squares_without_own_pose(
         X = values.atPose3(key_vehicle(i))
         turn = gtsam.Rot3.Logmap(given.rotation().between(X.rotation()))
         error = np.concatenate([turn, X.translation() - given.translation()])
-        found[i] = error - values.atVector(key_drift(i))
+        found[i] = error - values.atVector(key_pose_error(i))
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
     B = B * problem.given()[problem.cloud_pose][:, None, None]
     V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B)

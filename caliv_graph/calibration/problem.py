@@ -8,32 +8,23 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config
+from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS, TRUSTED_SIGMAS
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
-    key_drift,
-    key_mounting,
+    key_extrinsic,
     key_offset,
+    key_pose_error,
     key_sensor,
     key_target,
     key_vehicle,
 )
 from caliv_graph.errors import SolveError
-from caliv_graph.geometry.se3 import (
-    USUAL_SIGMAS,
-    pose_from_mounting,
-    right_to_vehicle_axes,
-    sigmas_from_mounting,
-    unstack,
-)
+from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
-from caliv_graph.targets.views import view_shares
+from caliv_graph.targets.cloud.views import view_weights
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-
-TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
-"""Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
-0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
 
 HEAVE_SIGMA_M = 0.005
 """How far the body on its springs, and the LiDARs with it, is off its height at each stamp. The
@@ -90,29 +81,29 @@ class Problem:
         """Number of clouds."""
         return len(self.cloud_lidar)
 
-    def cloud_shares(self, placement: int | None = None) -> Array:
+    def view_weights(self, placement: int | None = None) -> Array:
         """What each cloud counts, of all (J,) or of those of one placement."""
         shares = np.ones(self.clouds) if self.shares is None else self.shares
         return shares if placement is None else shares[self.cloud_placement == placement]
 
-    def mounting_keys(self, lidar: str) -> tuple[int, ...]:
+    def extrinsic_keys_of(self, lidar: str) -> tuple[int, ...]:
         """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""
         if lidar == self.reference:
-            return (key_mounting(),)
-        return (key_mounting(), key_sensor(self.lidars.index(lidar)))
+            return (key_extrinsic(),)
+        return (key_extrinsic(), key_sensor(self.lidars.index(lidar)))
 
     def extrinsic_keys(self) -> tuple[int, ...]:
         """E, then S_a of every other LiDAR in order."""
-        others = [self.mounting_keys(n)[1] for n in self.lidars if n != self.reference]
-        return (key_mounting(), *others)
+        others = [self.extrinsic_keys_of(n)[1] for n in self.lidars if n != self.reference]
+        return (key_extrinsic(), *others)
 
     def pose_keys(self) -> tuple[int, ...]:
         """X_i of every pose used."""
         return tuple(key_vehicle(i) for i in range(len(self.poses)))
 
-    def drift_keys(self) -> tuple[int, ...]:
+    def pose_error_keys(self) -> tuple[int, ...]:
         """b_i of every given pose used."""
-        return tuple(key_drift(int(i)) for i in np.flatnonzero(self.given()))
+        return tuple(key_pose_error(int(i)) for i in np.flatnonzero(self.given()))
 
     def target_keys(self) -> tuple[int, ...]:
         """C of every placement."""
@@ -126,7 +117,7 @@ class Problem:
             key_target(int(self.cloud_placement[j])),
             key_vehicle(int(self.cloud_pose[j])),
             *offset,
-            *self.mounting_keys(lidar),
+            *self.extrinsic_keys_of(lidar),
         )
 
     def cloud_twist(self, j: int) -> Array | None:
@@ -149,7 +140,7 @@ class Problem:
 
     def guess_sigmas(self, lidar: str) -> Array:
         """(6,) what the guess of a LiDAR is worth, vehicle axes; a trusted one as any other."""
-        return USUAL_SIGMAS if lidar in self.fixed else self.prior_sigmas[lidar]
+        return DEFAULT_GUESS_SIGMAS if lidar in self.fixed else self.prior_sigmas[lidar]
 
     def times_s(self) -> Array:
         """(n,) times of the poses in seconds; between drives they mean nothing."""
@@ -164,10 +155,10 @@ class Problem:
         """(n,) drive of each pose."""
         return np.array([drive for drive, _ in self.poses], dtype=np.int64)
 
-    def mounting(self, values: gtsam.Values, lidar: str) -> gtsam.Pose3:
+    def extrinsic(self, values: gtsam.Values, lidar: str) -> gtsam.Pose3:
         """T_vehicle_lidar at given values."""
-        pose = values.atPose3(key_mounting())
-        for key in self.mounting_keys(lidar)[1:]:
+        pose = values.atPose3(key_extrinsic())
+        for key in self.extrinsic_keys_of(lidar)[1:]:
             pose = pose.compose(values.atPose3(key))
         return pose
 
@@ -179,11 +170,11 @@ class Problem:
         keys = self.extrinsic_keys()
         out = np.zeros((6 * len(self.lidars), 6 * len(keys)))
         for i, name in enumerate(self.lidars):
-            axes = right_to_vehicle_axes(self.mounting(values, name))
-            for key in self.mounting_keys(name):
+            axes = right_to_vehicle_axes(self.extrinsic(values, name))
+            for key in self.extrinsic_keys_of(name):
                 block = axes
-                if key == key_mounting() and name != self.reference:
-                    S = values.atPose3(self.mounting_keys(name)[1])
+                if key == key_extrinsic() and name != self.reference:
+                    S = values.atPose3(self.extrinsic_keys_of(name)[1])
                     block = axes @ S.inverse().AdjointMap()
                 column = 6 * keys.index(key)
                 out[6 * i : 6 * i + 6, column : column + 6] = block
@@ -236,10 +227,9 @@ def pose_problem(
     return Problem(
         lidars=lidars,
         reference=reference,
-        guesses={n: pose_from_mounting(config.lidars[n].initial) for n in lidars},
+        guesses={n: config.lidars[n].initial.pose() for n in lidars},
         prior_sigmas={
-            n: TRUSTED_SIGMAS if n in fixed else sigmas_from_mounting(config.lidars[n].sigma)
-            for n in lidars
+            n: TRUSTED_SIGMAS if n in fixed else config.lidars[n].sigma.sigmas() for n in lidars
         },
         fixed=fixed,
         poses=poses,
@@ -274,13 +264,13 @@ def _shares(
     names = np.array([c.lidar for c in observation.clouds])
     for name in dict.fromkeys(names.tolist()):
         own = np.flatnonzero(names == name)
-        guess = pose_from_mounting(config.lidars[name].initial)
+        guess = config.lidars[name].initial.pose()
         places = []
         for i in own.tolist():
             cloud = observation.clouds[i]
             T = T_map_vehicle[cloud.drive, cloud.stamp_ns].compose(guess)
             places.append(T.transformTo(observation.centre_map))
-        out[own] = view_shares(np.array(places))
+        out[own] = view_weights(np.array(places))
     return out
 
 

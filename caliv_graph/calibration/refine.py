@@ -21,10 +21,10 @@ from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
     WEIGHT_TOLERANCE,
     SolveState,
+    base_graph,
     offset_from_guesses,
     packed_solution,
     reduce_to_extrinsics,
-    steady_graph,
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, Iteration, Solution
@@ -35,8 +35,12 @@ from caliv_graph.registration.register import (
     annealing_steps,
     left_step,
 )
-from caliv_graph.registration.symmetry import Symmetry, forget_turns, refit
-from caliv_graph.uncertainty.observability import respectful_covariance, respectful_step, spectrum
+from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry, refit
+from caliv_graph.uncertainty.observability import (
+    covariance_with_prior_in_null_space,
+    spectrum,
+    step_with_prior_in_null_space,
+)
 
 SHAPES_BEGUN_AGAIN = 8
 """Iteration of the joint loop after which normals and mixture begin anew, now that annealing has
@@ -84,7 +88,7 @@ def refined(
     """
     problem, config = state.problem, state.config
     prior = problem.guess_information()
-    steady = steady_graph(state)
+    steady = base_graph(state)
     _begin_shapes(state, states, normals=False)
     undetermined: int | None = None
     course: list[Iteration] = []
@@ -102,11 +106,13 @@ def refined(
             lost = int(split.undetermined.sum())
             if iteration >= DECIDED_AFTER:
                 undetermined = int(split.undetermined.sum())
-            step = respectful_step(reduced.D, reduced.c, prior, offset_from_guesses(state), split)
+            step = step_with_prior_in_null_space(
+                reduced.D, reduced.c, prior, offset_from_guesses(state), split
+            )
         else:
             step = reduced.step_with(prior, offset_from_guesses(state))
         wanted = _shape_measurements(state, shapes)
-        single = wanted.information / problem.cloud_shares()[:, None, None]
+        single = wanted.information / problem.view_weights()[:, None, None]
         squared = squares_without_own_pose(
             problem, lines, -wanted.pull, single, state.values, state.noise
         )
@@ -209,7 +215,7 @@ class _Shapes:
         out = []
         for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
             H, gradient = quadratic.joint(), quadratic.gradient.ravel()
-            out.append((H, gradient) if turn is None else forget_turns(H, gradient, turn))
+            out.append((H, gradient) if turn is None else marginalise_symmetry(H, gradient, turn))
         return out
 
     @cached_property
@@ -219,7 +225,7 @@ class _Shapes:
         for quadratic, turn in zip(self.quadratics, self.turns, strict=True):
             for H, gradient in zip(quadratic.blocks, quadratic.gradient, strict=True):
                 if turn is not None:
-                    H, gradient = forget_turns(H, gradient, turn)
+                    H, gradient = marginalise_symmetry(H, gradient, turn)
                 blocks.append(H)
                 gradients.append(gradient)
         return np.array(blocks), np.array(gradients)
@@ -270,7 +276,7 @@ def _refined_solution(
     reduced = reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
     if state.config.solve.mode == "auto":
         split = spectrum(reduced.D, prior, undetermined)
-        cov = respectful_covariance(prior, split)
+        cov = covariance_with_prior_in_null_space(prior, split)
     else:
         cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
     pulls = _shape_measurements(state, shapes)

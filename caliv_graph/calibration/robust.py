@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtri
 
-from caliv_graph.config import RobustConfig
+from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array, BoolArray, IntArray
 
 DOF = 6
@@ -89,7 +89,7 @@ class RobustWeights:
 
         Args:
             W: (6 J, 6 J) and
-            v: (6 J,) of `graph.left_over`, no cloud weighed down by its residual.
+            v: (6 J,) of `graph.adjusted_residuals`, no cloud weighed down by its residual.
             own: (J, 6, 6) what each cloud says, the others held.
             explained: (J,) factors for what the residuals do not show (`explained_part`).
 
@@ -159,7 +159,7 @@ def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
 
     Args:
         W: (6 J, 6 J) and
-        v: (6 J,) of `graph.left_over`.
+        v: (6 J,) of `graph.adjusted_residuals`.
         own: (J, 6, 6) what each cloud says, the others held.
 
     Returns:
@@ -189,7 +189,7 @@ def _deletion_covariances(W: Array, own: Array) -> tuple[Array, IntArray]:
 
 
 def _without(W: Array, v: Array, own: Array, cloud: int) -> tuple[Array, Array]:
-    """W and v of `graph.left_over` with the pose of one cloud left free."""
+    """W and v of `graph.adjusted_residuals` with the pose of one cloud left free."""
     mine = slice(6 * cloud, 6 * cloud + 6)
     inverse = _deletion_covariances(W[mine, mine], own[cloud : cloud + 1])[0][0]
     pull = W[:, mine] @ inverse

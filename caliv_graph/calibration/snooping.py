@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.graph import (
+    adjusted_residuals,
     dense_system,
-    left_over,
     linearise_clouds,
     with_given_poses,
 )
@@ -35,7 +35,7 @@ MOST_LOST = 0.25
 """Part of a LiDAR's clouds that can be lost for reasons of their own; from a tenth on they are told
 as a contradiction (`uncertainty.consistency.OUTLIERS`)."""
 
-LEAST_SAY = 0.5
+MIN_REDUNDANCY = 0.5
 """Weight below which a cloud says nothing where it is not clear which are wrong: the joint
 information has the longer lever, and less than half a say would still bend all."""
 
@@ -53,8 +53,8 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     behind it: clouds are judged by the noise of those that agree best.
 
     If a LiDAR would lose more than MOST_LOST, it is not its clouds that are wrong but its clock,
-    its mount or the target, and that is to be told (`contrasts`): noise and values stay as they
-    are, and of the weights those below LEAST_SAY become none. Kernel `none` changes nothing.
+    its mount or the target, and that is to be told (`score_tests`): noise and values stay as they
+    are, and of the weights those below MIN_REDUNDANCY become none. Kernel `none` changes nothing.
 
     Args:
         state: of `solve_registered`; gets new weights and values, and where clouds are lost new
@@ -69,7 +69,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     problem, fitted = state.problem, (state.noise, state.scale)
     sound, weights, values = state.sound, state.weights.values, state.values
     measured, information = measured_poses(registrations, state.turns)
-    single = information / problem.cloud_shares()[:, None, None]
+    single = information / problem.view_weights()[:, None, None]
     explained = explained_parts(registrations)
     whole = np.maximum(explained, MIN_WEIGHT)
     state.weights.values = whole
@@ -95,7 +95,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
         if _too_many(problem, ~kept & (explained > 0.5)):
             state.noise, state.scale = fitted
             state.sound, state.values = sound, values
-            state.weights.values = np.where(weights < LEAST_SAY, MIN_WEIGHT, weights)
+            state.weights.values = np.where(weights < MIN_REDUNDANCY, MIN_WEIGHT, weights)
             return
         if (by == (sound & kept)).all():
             return
@@ -112,10 +112,10 @@ def _too_many(problem: Problem, lost: BoolArray) -> bool:
 def _left_over(
     state: SolveState, registrations: Sequence[Registration], measured: Sequence[gtsam.Pose3]
 ) -> tuple[Array, Array, Array]:
-    """W and v of `left_over`, and (J, 6, 6) what each cloud says with the others held."""
+    """W and v of `adjusted_residuals`, and (J, 6, 6) what each cloud says with the others held."""
     problem = state.problem
     H = joint_information(state, registrations)
     lines = linearise_clouds(problem, state.values)
     system = dense_system(problem, guessed_graph(state), state.values)
-    W, v = left_over(system, lines, H, cloud_residuals(lines, measured))
+    W, v = adjusted_residuals(system, lines, H, cloud_residuals(lines, measured))
     return W, v, own_blocks(H)

@@ -47,7 +47,7 @@ from caliv_graph.calibration.noise import (
 )
 from caliv_graph.calibration.problem import Problem, moved_map
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
-from caliv_graph.config import Config, RobustConfig
+from caliv_graph.config.model import Config, RobustConfig
 from caliv_graph.conventions import key_offset, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
@@ -59,7 +59,7 @@ from caliv_graph.products import (
     Registration,
     Solution,
 )
-from caliv_graph.registration.symmetry import Symmetry, forget_turns
+from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry
 
 REWEIGHTINGS = 12
 """Rounds of reweighting at most; graduated non-convexity needs more and may take four times
@@ -75,7 +75,7 @@ COUPLED_SIGMAS = 0.01
 WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
 
-OFFSET_TOLD_S = 0.005
+OFFSET_DETERMINED_S = 0.005
 """A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
 
 
@@ -189,7 +189,7 @@ def solve_registered(
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
     # How far a cloud by itself may be off: what it shares with others from its place included.
-    single = information / problem.cloud_shares()[:, None, None]
+    single = information / problem.view_weights()[:, None, None]
     state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
     state.noise, state.scale = fit_pose_noise(
         problem, measured, single, state.sound, given, config.noise
@@ -211,7 +211,7 @@ def _reweight(
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
     scaled = information / state.scale**2
-    single = scaled / problem.cloud_shares()[:, None, None]
+    single = scaled / problem.view_weights()[:, None, None]
     for _ in range(rounds):
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
         state.values = optimise(merged(guessed_graph(state), clouds), state.values, 10)
@@ -249,7 +249,7 @@ def with_determined_offsets(
     reduced = reduced_registered(state, registrations)
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
     sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
-    kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_TOLD_S)
+    kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_DETERMINED_S)
     return replace(problem, offsets=kept, twists=problem.twists if kept else None), sigmas
 
 
@@ -265,7 +265,7 @@ def reduced_registered(state: SolveState, registrations: Sequence[Registration])
 
 def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Callable[[], Reduced]:
     """`reduced_registered` to be asked again as the values move, weights and noise as they are."""
-    problem, steady = state.problem, steady_graph(state)
+    problem, steady = state.problem, base_graph(state)
     H, measured = joint_information(state, registrations), measured_poses(registrations)[0]
 
     def reduced() -> Reduced:
@@ -325,7 +325,7 @@ def joint_information(state: SolveState, registrations: Sequence[Registration]) 
         start = part.stop
         H = r.information_joint
         if turn is not None:
-            H = forget_turns(H, np.zeros(len(H)), turn)[0]
+            H = marginalise_symmetry(H, np.zeros(len(H)), turn)[0]
         out.append(weighted_joint(H, state.weights.values[part]))
     return np.asarray(block_diag(*out) / state.scale**2)
 
@@ -345,7 +345,7 @@ def measured_poses(
     for r, turn in zip(registrations, turns or [None] * len(registrations), strict=True):
         blocks = r.information
         if turn is not None:
-            blocks = np.array([forget_turns(b, np.zeros(6), turn)[0] for b in blocks])
+            blocks = np.array([marginalise_symmetry(b, np.zeros(6), turn)[0] for b in blocks])
             # Pose factors want an information that can be inverted.
             ridge = 1e-9 * np.trace(blocks, axis1=1, axis2=2)
             blocks = blocks + ridge[:, None, None] * np.eye(6)
@@ -378,8 +378,8 @@ def explained_parts(registrations: Sequence[Registration]) -> Array:
     return np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
 
 
-def steady_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
-    """What stays the same while clouds are weighed anew: poses, ground and trusted mountings."""
+def base_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+    """What stays the same while clouds are weighed anew: poses, ground and trusted extrinsics."""
     problem = state.problem
     return merged(
         pose_graph(problem, state.noise, state.motion),
@@ -390,12 +390,12 @@ def steady_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
 
 
 def guessed_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
-    """What stays the same, and the guesses of the mountings that are not trusted."""
-    return merged(steady_graph(state), _guess_graph(state.problem))
+    """What stays the same, and the guesses of the extrinsics that are not trusted."""
+    return merged(base_graph(state), _guess_graph(state.problem))
 
 
 def _guess_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """The guesses of the mountings that are not trusted."""
+    """The guesses of the extrinsics that are not trusted."""
     return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
 
 
@@ -436,7 +436,7 @@ def offset_from_guesses(state: SolveState) -> Array:
     problem = state.problem
     return np.concatenate(
         [
-            vehicle_axes_difference(problem.mounting(state.values, n), problem.guesses[n])
+            vehicle_axes_difference(problem.extrinsic(state.values, n), problem.guesses[n])
             for n in problem.lidars
         ]
     )
@@ -460,7 +460,7 @@ def packed_solution(
     Args:
         state: after its last step.
         registrations: the clouds where they have come to lie.
-        steady: `steady_graph` of the last step.
+        steady: `base_graph` of the last step.
         information: (J, 6, 6) of the graph's pose factors, without robust weights.
         information_data: (6 n, 6 n) what the data say of the extrinsics, vehicle axes.
         cov: (6 n, 6 n) of the result, vehicle axes.
@@ -488,7 +488,7 @@ def packed_solution(
         mode=state.config.solve.mode,
         lidars=problem.lidars,
         reference=problem.reference,
-        T_vehicle_lidar={n: problem.mounting(state.values, n) for n in problem.lidars},
+        T_vehicle_lidar={n: problem.extrinsic(state.values, n) for n in problem.lidars},
         T_map_vehicle={
             pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
             for i, pose in enumerate(problem.poses)

@@ -14,14 +14,14 @@ from caliv_graph.calibration.solve import (
     COUPLED_STEPS,
     Reduced,
     SolveState,
+    base_graph,
     measured_poses,
     packed_solution,
     reduced_registered,
     settle,
-    steady_graph,
     step_of_all,
 )
-from caliv_graph.conventions import key_mounting
+from caliv_graph.conventions import key_extrinsic
 from caliv_graph.products import Array, Registration, Solution
 
 
@@ -58,7 +58,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
 
     def turn(reduced: Reduced) -> Array:
-        E = state.values.atPose3(key_mounting())
+        E = state.values.atPose3(key_extrinsic())
         R = E.rotation().matrix()
         Q = problem.to_vehicle_axes(state.values)[:, :6]
         A, b = Q.T @ reduced.D @ Q, Q.T @ reduced.c
@@ -76,9 +76,9 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
             replace(r, converged=False, last_step=step, iterations=COUPLED_STEPS)
             for r in registrations
         ]
-    solved = state.values.atPose3(key_mounting())
+    solved = state.values.atPose3(key_extrinsic())
     state.values = gtsam.Values(state.values)
-    state.values.update(key_mounting(), gtsam.Pose3(solved.rotation(), guess.translation()))
+    state.values.update(key_extrinsic(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
     offsets = reduced.time_offsets(problem, cov)
     gradient_data = reduced_registered(state, registrations).c
@@ -86,7 +86,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     return packed_solution(
         state,
         registrations,
-        steady_graph(state),
+        base_graph(state),
         measured_poses(registrations, state.turns)[1] / state.scale**2,
         information_data,
         cov,
@@ -112,7 +112,7 @@ def _staged_covariance(
     Q = problem.to_vehicle_axes(first)
     D = Q.T @ information_data @ Q  # tangents of E (rotation, translation), S_a
     stage_one = np.linalg.inv(D + Q.T @ prior @ Q)
-    R = first.atPose3(key_mounting()).rotation().matrix()
+    R = first.atPose3(key_extrinsic()).rotation().matrix()
     sigma = problem.prior_sigmas[problem.reference][3:]
     held = R.T @ np.diag(sigma**2) @ R  # of the translation, in E's tangent
     considered = D[:6, :6].copy()

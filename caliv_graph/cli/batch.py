@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.exits import DONE
+from caliv_graph.common.exits import DONE
 
 
 def batch(
@@ -54,9 +54,9 @@ def batch(
 ) -> None:
     r"""Calibrate many drives and vehicles, on all processors or on a Dask cluster.
 
-    DIR gets a folder per job with what 'calibrate' writes, and index.html (every job, its mountings
-    and, per vehicle, how much its drives differ), summary.csv and summary.json, which are rewritten
-    as jobs finish.
+    DIR gets a folder per job with what 'calibrate' writes, and index.html (every job, its
+    extrinsics and, per vehicle, how much its drives differ), summary.csv and summary.json, which
+    are rewritten as jobs finish.
 
     The same command again resumes: a result that was made from the same bytes of data and prior,
     the same config and version is left as it is, also after a kill; all else is done again. One

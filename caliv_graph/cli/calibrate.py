@@ -1,4 +1,4 @@
-"""`caliv-graph calibrate`: from drives to mountings."""
+"""`caliv-graph calibrate`: from drives to extrinsics."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def calibrate(
 ) -> None:
     """Calibrate the LiDARs of a vehicle from one or more drives past a target.
 
-    DIR gets calibration.yaml (mountings, covariance, what was not determined), config.yaml (the
+    DIR gets calibration.yaml (extrinsics, covariance, what was not determined), config.yaml (the
     effective one), target.ply (the reconstructed target), graph.gtsam and graph.values.gtsam (the
-    mountings as priors that a GTSAM localiser loads), report.html (what the result is worth, in
+    extrinsics as priors that a GTSAM localiser loads), report.html (what the result is worth, in
     one page without any network) and log.jsonl (every stage, for programs).
 
     Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
@@ -40,13 +40,13 @@ def calibrate(
 
     Example: caliv-graph calibrate config.yaml --out result/
     """
-    from caliv_graph.config import load_config
-    from caliv_graph.exits import DONE, exit_code
-    from caliv_graph.files import check_output_folder, output_folder
-    from caliv_graph.jobs import check_guesses, open_recordings, run_job
+    from caliv_graph.batch.job import check_guesses, open_recordings, run_job
+    from caliv_graph.common.exits import DONE, exit_code
+    from caliv_graph.common.files import check_output_folder, output_folder
+    from caliv_graph.config.load import load_config
     from caliv_graph.report.log import stage_documents
     from caliv_graph.report.tables import calibration_table
-    from caliv_graph.results import (
+    from caliv_graph.results.files import (
         RESULT_FILES,
         calibration_document,
         read_calibration,

@@ -16,7 +16,7 @@ def evaluate(
     truth: Annotated[
         Path,
         typer.Argument(
-            metavar="TRUTH.yaml", help="True mountings; another calibration.yaml serves as well."
+            metavar="TRUTH.yaml", help="True extrinsics; another calibration.yaml serves as well."
         ),
     ],
     as_json: AsJson = False,
@@ -30,7 +30,7 @@ def evaluate(
     """
     from caliv_graph.errors import ConfigError
     from caliv_graph.report.tables import evaluation_table
-    from caliv_graph.results import read_calibration_file, read_truth
+    from caliv_graph.results.files import read_calibration_file, read_truth
     from caliv_graph.uncertainty.evaluation import evaluate as evaluate_calibration
 
     estimate = read_calibration_file(calibration)

@@ -128,10 +128,10 @@ def export(
 
     Example: caliv-graph export result/calibration.yaml --to urdf --base old.urdf --out new.urdf
     """
+    from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.export.consumers import export as export_to
     from caliv_graph.export.prepare import Wishes, prepare
     from caliv_graph.export.wording import caveats
-    from caliv_graph.files import atomic_write, check_output_file
 
     check_output_file(out, force)
     wishes = Wishes(

@@ -33,8 +33,8 @@ def init(
 
     Example: caliv-graph init drive/ --urdf vehicle.urdf --out config.yaml
     """
-    from caliv_graph.config_draft import draft_config
-    from caliv_graph.files import atomic_write, check_output_file
+    from caliv_graph.common.files import atomic_write, check_output_file
+    from caliv_graph.workflows.draft import draft_config
 
     check_output_file(out, force)
     draft = draft_config(data, out, urdf)

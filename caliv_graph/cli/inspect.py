@@ -29,7 +29,7 @@ def inspect(
 
     Example: caliv-graph inspect drive/ --config config.yaml
     """
-    from caliv_graph.config import load_config
+    from caliv_graph.config.load import load_config
     from caliv_graph.readers import open_recording
     from caliv_graph.readers.discover import open_all
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any

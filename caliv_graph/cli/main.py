@@ -31,8 +31,8 @@ from caliv_graph.cli.observability import observability
 from caliv_graph.cli.plan import plan
 from caliv_graph.cli.simulate import simulate
 from caliv_graph.cli.validate import validate
+from caliv_graph.common.exits import DEFECT, DONE, INTERRUPTED, USAGE
 from caliv_graph.errors import CalivError
-from caliv_graph.exits import DEFECT, DONE, INTERRUPTED, USAGE
 
 _PROGRAM = "caliv-graph"
 

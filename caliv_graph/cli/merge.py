@@ -9,7 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.options import P_VALUE, Force, PValue, ResultAsJson
-from caliv_graph.exits import INCONSISTENT
+from caliv_graph.common.exits import INCONSISTENT
 
 
 def merge(
@@ -32,11 +32,11 @@ def merge(
 
     Example: caliv-graph merge monday/calibration.yaml friday/calibration.yaml --out vehicle.yaml
     """
+    from caliv_graph.common.files import check_output_file, each_once
     from caliv_graph.errors import ConfigError
-    from caliv_graph.files import check_output_file, each_once
     from caliv_graph.fusion.merge import merge as merge_calibrations
     from caliv_graph.report.comparison import agreement_document, merger_table
-    from caliv_graph.results import (
+    from caliv_graph.results.files import (
         calibration_document,
         read_calibration,
         without_infinities,

@@ -6,7 +6,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.options import AsJson, ConfigArgument, Drives
-from caliv_graph.exits import UNMET
+from caliv_graph.common.exits import UNMET
 
 
 def observability(
@@ -25,10 +25,10 @@ def observability(
 
     Example: caliv-graph observability config.yaml --data drive/
     """
-    from caliv_graph.config import load_config
-    from caliv_graph.jobs import open_recordings
-    from caliv_graph.report.outlook import survey_document, survey_table
-    from caliv_graph.survey import survey
+    from caliv_graph.batch.job import open_recordings
+    from caliv_graph.config.load import load_config
+    from caliv_graph.report.predicted import survey_document, survey_table
+    from caliv_graph.workflows.survey import survey
 
     settings = load_config(config)
     recordings = open_recordings(settings, data or ())

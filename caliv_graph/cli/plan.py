@@ -9,7 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.options import AsJson, Force
-from caliv_graph.exits import UNMET
+from caliv_graph.common.exits import UNMET
 
 
 def plan(
@@ -63,12 +63,12 @@ def plan(
 
     Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
     """
+    from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.errors import OutputError
-    from caliv_graph.files import atomic_write, check_output_file
     from caliv_graph.planning.predict import Assumptions, predict
     from caliv_graph.planning.suggest import is_met, parse_goals, shortfall, suggest
-    from caliv_graph.report.outlook import plan_document, plan_table
-    from caliv_graph.simulation.scenario import dump_scenario, load_scenario
+    from caliv_graph.report.predicted import plan_document, plan_table
+    from caliv_graph.scenario.model import dump_scenario, load_scenario
 
     goals = parse_goals(sigma or ())
     if out is not None:

@@ -41,13 +41,13 @@ def simulate(
 ) -> None:
     """Simulate a drive past a target, with known truth.
 
-    DIR gets drive/ (the bag), caliv/ (the CaLiV folder), truth.yaml (true mountings),
+    DIR gets drive/ (the bag), caliv/ (the CaLiV folder), truth.yaml (true extrinsics),
     trajectory.tum (true poses), scenario.yaml (the effective one) and config.yaml: ready to run,
     with initial guesses that are off by as much as the scenario says.
 
     Example: caliv-graph simulate configs/scenarios/figure_eight.yaml --out drive/ --seed 1
     """
-    from caliv_graph.files import check_output_folder
+    from caliv_graph.common.files import check_output_folder
     from caliv_graph.simulation import load_scenario, write_drive
     from caliv_graph.simulation.simulate import CONTENT
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from caliv_graph.common.progress import BarProgress, PlainProgress, SilentProgress
 from caliv_graph.errors import OutputError
-from caliv_graph.progress import BarProgress, PlainProgress, SilentProgress
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

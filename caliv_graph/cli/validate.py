@@ -9,7 +9,7 @@ import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.options import P_VALUE, AsJson, CalibrationArgument, Force, PValue
-from caliv_graph.exits import INCONSISTENT, UNMET
+from caliv_graph.common.exits import INCONSISTENT, UNMET
 
 
 def validate(
@@ -60,13 +60,13 @@ def validate(
     """
     import json
 
-    from caliv_graph.config import load_config
-    from caliv_graph.files import check_output_folder, output_folder
+    from caliv_graph.common.files import check_output_folder, output_folder
+    from caliv_graph.config.load import load_config
     from caliv_graph.readers import open_recording
-    from caliv_graph.repeatability import split_halves
     from caliv_graph.report.validation import validation_document, validation_table
-    from caliv_graph.results import read_calibration, without_infinities
+    from caliv_graph.results.files import read_calibration, without_infinities
     from caliv_graph.validation import validate as validate_calibration
+    from caliv_graph.workflows.repeatability import split_halves
 
     content = ("validation.json", "validation.html")
     settings = load_config(config)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import yaml
 
+from caliv_graph.common.inputs import read_input
 from caliv_graph.errors import ExportError
 from caliv_graph.export.request import Base
 from caliv_graph.export.wording import number
-from caliv_graph.inputs import read_input
 
 _BOM = "\ufeff"
 

@@ -1,4 +1,4 @@
-"""GTSAM: a joint prior on the mountings as an archive, and as a YAML that needs no version.
+"""GTSAM: a joint prior on the extrinsics as an archive, and as a YAML that needs no version.
 
 Three files (`fusion.archive`): the factors, their values beside them, and the YAML, which has the
 comment: an archive has no place for one.
@@ -25,7 +25,7 @@ from caliv_graph.fusion.priors import lettered_keys
 
 
 def export(request: Request) -> Export:
-    """A graph of one factor over the mountings, and values, as GTSAM serialises them.
+    """A graph of one factor over the extrinsics, and values, as GTSAM serialises them.
 
     Raises:
         ExportError: the letter is none, the covariance has no inverse, or the YAML would have the

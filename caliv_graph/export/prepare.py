@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from caliv_graph.config import Config, ImuConfig, load_config
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config, ImuConfig
 from caliv_graph.errors import ExportError
 from caliv_graph.export.consumers import CONSUMERS, check_options
 from caliv_graph.export.edit import read_base
 from caliv_graph.export.frames import parse_named, parse_pose
 from caliv_graph.export.recording import RecordedFrames, read_frames
-from caliv_graph.export.request import ImuMounting, Request
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.export.request import ImuExtrinsic, Request
 from caliv_graph.products import Calibration
 from caliv_graph.readers.frames import FrameTree
-from caliv_graph.results import read_calibration
+from caliv_graph.results.files import read_calibration
 
 CONFIG_FILE = "config.yaml"
 """Name of the effective config beside a calibration."""
@@ -155,12 +155,12 @@ def _config(path: Path, wishes: Wishes) -> tuple[Config | None, Path]:
     return None, beside
 
 
-def _imu(wishes: Wishes, config: Config | None, path: Path) -> ImuMounting | None:
+def _imu(wishes: Wishes, config: Config | None, path: Path) -> ImuExtrinsic | None:
     if wishes.imu:
-        return ImuMounting(parse_pose(wishes.imu, "--imu"), "--imu")
+        return ImuExtrinsic(parse_pose(wishes.imu, "--imu"), "--imu")
     if config is None:
         return None
     mounting = config.imu.T_vehicle_imu
     # The effective config states every key: a default is a statement only where there was an IMU.
     stated = config.topics.imu is not None or mounting != ImuConfig().T_vehicle_imu
-    return ImuMounting(pose_from_mounting(mounting), path.name, stated)
+    return ImuExtrinsic(mounting.pose(), path.name, stated)

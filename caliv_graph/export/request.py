@@ -17,7 +17,7 @@ DEFAULT_VEHICLE_FRAME = "base_link"
 
 
 @dataclass(frozen=True)
-class ImuMounting:
+class ImuExtrinsic:
     """Where the IMU is.
 
     Attributes:
@@ -77,7 +77,7 @@ class Request:
     parents: Mapping[str, gtsam.Pose3] = field(default_factory=dict)
     tree: FrameTree | None = None
     vehicle_frame: str = ""
-    imu: ImuMounting | None = None
+    imu: ImuExtrinsic | None = None
     topics: Mapping[str, str] = field(default_factory=dict)
     base: Base | None = None
     letter: str = "m"
@@ -94,7 +94,7 @@ class Request:
         return told or (recorded if recorded in known else None)
 
     def T_vehicle_lidar(self, lidar: str) -> gtsam.Pose3:
-        """Mounting of a LiDAR."""
+        """PoseConfig of a LiDAR."""
         return self.calibration.lidars[lidar].T_vehicle_lidar
 
     def T_vehicle_child(self, lidar: str) -> gtsam.Pose3:

@@ -18,7 +18,7 @@ _TOPIC = "/tf_static"
 
 
 def export(request: Request) -> Export:
-    """The mountings as static transforms from the vehicle frame to the frames of the clouds.
+    """The extrinsics as static transforms from the vehicle frame to the frames of the clouds.
 
     Raises:
         ExportError: the form follows neither from `form` nor from the name of the output.

@@ -35,7 +35,7 @@ def export(request: Request) -> Export:
     if request.base is None:
         return _new(request)
     base = replace(request.base, text=without_notice(request.base.text))
-    return _Robot(base).with_mountings(request)
+    return _Robot(base).with_extrinsics(request)
 
 
 def _new(request: Request) -> Export:
@@ -183,8 +183,8 @@ class _Robot:
     def _end(self, _: str) -> None:
         self._stack.pop()
 
-    def with_mountings(self, request: Request) -> Export:
-        """The file with the mountings of all LiDARs in their joints."""
+    def with_extrinsics(self, request: Request) -> Export:
+        """The file with the extrinsics of all LiDARs in their joints."""
         vehicle, warnings = self._vehicle_frame(request)
         joints = {name: self._joint_of(name, request) for name in request.lidars}
         shared = [name for name in joints if list(joints.values()).count(joints[name]) > 1]

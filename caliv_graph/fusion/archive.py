@@ -16,13 +16,13 @@ import gtsam
 import numpy as np
 import yaml
 
+from caliv_graph.common.files import atomic_write, check_output_file
 from caliv_graph.errors import ExportError
-from caliv_graph.files import atomic_write, check_output_file
 from caliv_graph.fusion.priors import (
     DEFAULT_LETTER,
-    MountingKey,
+    ExtrinsicKey,
+    extrinsic_values,
     lettered_keys,
-    mounting_values,
     prior_factors,
 )
 from caliv_graph.products import Calibration
@@ -30,7 +30,7 @@ from caliv_graph.products import Calibration
 SCHEMA = "caliv-graph/gtsam/1"
 
 _HEADER = """\
-# Priors on the mountings of LiDARs, written by caliv-graph for GTSAM. Metres, radians.
+# Priors on the extrinsics of LiDARs, written by caliv-graph for GTSAM. Metres, radians.
 # T_vehicle_lidar maps points of the LiDAR into the vehicle: p_vehicle = T_vehicle_lidar p_lidar.
 # Variables are Pose3, tangent order rotation (3) then translation (3), right perturbation T Exp(d).
 # information is joint over the variables in their order: the error is d^T information d / 2.
@@ -106,7 +106,7 @@ def calibration_graph(
         ExportError: see `prior_factors`.
     """
     key = lettered_keys(calibration, letter)
-    return prior_factors(calibration, key, joint), mounting_values(calibration, key)
+    return prior_factors(calibration, key, joint), extrinsic_values(calibration, key)
 
 
 def write_calibration_archive(
@@ -144,7 +144,7 @@ def write_calibration_archive(
 
 def archive_document(
     calibration: Calibration,
-    key: MountingKey,
+    key: ExtrinsicKey,
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
 ) -> dict[str, Any]:

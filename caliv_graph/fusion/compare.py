@@ -1,4 +1,4 @@
-"""Has a mount moved? What two drives say about the mountings, tested against each other.
+"""Has a mount moved? What two drives say about the extrinsics, tested against each other.
 
 Only what the data themselves say takes part: a guess that two calibrations share would make them
 agree. Along a direction that either drive did not determine (SPEC 4) nothing can be said.
@@ -14,11 +14,11 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc, ndtr
 
+from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.terms import arranged, guess_of, own_term
 from caliv_graph.geometry.covariance import relative_jacobian
 from caliv_graph.geometry.se3 import (
-    USUAL_SIGMAS,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     vehicle_axes_difference,
@@ -260,7 +260,7 @@ def _told(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) ->
     D, c = arranged(term, names)
     unit = scaling(len(names))
     # A trusted guess would leave nothing determined; here the question is what the data say.
-    sigmas = [USUAL_SIGMAS if guesses[n].fixed else guesses[n].sigmas for n in names]
+    sigmas = [DEFAULT_GUESS_SIGMAS if guesses[n].fixed else guesses[n].sigmas for n in names]
     prior = np.diag(np.concatenate([*sigmas, np.zeros(0)]) ** -2.0)
     if not names:
         return _Told({}, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), ())
@@ -351,7 +351,7 @@ def _test(difference: Array, parts: Sequence[tuple[Array, _Told]]) -> tuple[floa
 
     Args:
         difference: (k,), vehicle axes.
-        parts: per drive, the (k, 6n) derivative of the difference by its mountings.
+        parts: per drive, the (k, 6n) derivative of the difference by its extrinsics.
 
     Returns:
         Chi-square, degrees of freedom, p-value.

@@ -1,4 +1,4 @@
-"""Factors for localisers in which mountings are variables beside the vehicle's poses.
+"""Factors for localisers in which extrinsics are variables beside the vehicle's poses.
 
 Variables: X = T_map_vehicle at a stamp, M = T_vehicle_lidar of a LiDAR.
 """
@@ -47,13 +47,13 @@ def lidar_pose_error(
         r (6,) in lidar axes; and (6, 6) by right perturbations of X and of M.
     """
     r = gtsam.Pose3.Logmap(T_map_lidar.between(T_map_vehicle.compose(T_vehicle_lidar)))
-    by_mounting = np.asarray(gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(r)))
-    by_vehicle = by_mounting @ T_vehicle_lidar.inverse().AdjointMap()
-    return np.asarray(r), by_vehicle, by_mounting
+    by_extrinsic = np.asarray(gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(r)))
+    by_vehicle = by_extrinsic @ T_vehicle_lidar.inverse().AdjointMap()
+    return np.asarray(r), by_vehicle, by_extrinsic
 
 
 def lidar_pose_factor(
-    key_vehicle: int, key_mounting: int, T_map_lidar: gtsam.Pose3, noise: NoiseModel
+    key_vehicle: int, key_extrinsic: int, T_map_lidar: gtsam.Pose3, noise: NoiseModel
 ) -> gtsam.CustomFactor:
     """A scan that was registered to a map, with the mounting as a variable.
 
@@ -62,25 +62,25 @@ def lidar_pose_factor(
 
     Args:
         key_vehicle: of X.
-        key_mounting: of M.
+        key_extrinsic: of M.
         T_map_lidar: measured.
         noise: of r, 6 dimensions, lidar axes, rotation before translation.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        r, by_vehicle, by_mounting = lidar_pose_error(
-            values.atPose3(key_vehicle), values.atPose3(key_mounting), T_map_lidar
+        r, by_vehicle, by_extrinsic = lidar_pose_error(
+            values.atPose3(key_vehicle), values.atPose3(key_extrinsic), T_map_lidar
         )
         if jacobians is not None:
-            jacobians[0], jacobians[1] = by_vehicle, by_mounting
+            jacobians[0], jacobians[1] = by_vehicle, by_extrinsic
         return r
 
-    return gtsam.CustomFactor(noise, [key_vehicle, key_mounting], error)
+    return gtsam.CustomFactor(noise, [key_vehicle, key_extrinsic], error)
 
 
 def linear_lidar_pose_factor(
     key_vehicle: int,
-    key_mounting: int,
+    key_extrinsic: int,
     T_map_lidar: gtsam.Pose3,
     noise: NoiseModel,
     values: gtsam.Values,
@@ -92,15 +92,15 @@ def linear_lidar_pose_factor(
 
     Args:
         key_vehicle: of X.
-        key_mounting: of M.
+        key_extrinsic: of M.
         T_map_lidar: measured.
         noise: of r, as in `lidar_pose_factor`. A robust kernel is applied at `values`, for good.
         values: of X and M; others are left alone.
     """
-    factor = lidar_pose_factor(key_vehicle, key_mounting, T_map_lidar, noise)
+    factor = lidar_pose_factor(key_vehicle, key_extrinsic, T_map_lidar, noise)
     point = gtsam.Values()
     point.insert(key_vehicle, values.atPose3(key_vehicle))
-    point.insert(key_mounting, values.atPose3(key_mounting))
+    point.insert(key_extrinsic, values.atPose3(key_extrinsic))
     return gtsam.LinearContainerFactor(factor.linearize(point), point)
 
 

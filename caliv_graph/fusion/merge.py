@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 import caliv_graph
-from caliv_graph.config import Config, Mounting
+from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
-from caliv_graph.fusion.terms import DRIVES, Fused, fuse, guess_of, moved_to, own_term
+from caliv_graph.fusion.terms import Fused, fuse, guess_of, moved_to, own_term
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
-from caliv_graph.products import Array, Calibration, DataTerm, Guess, LidarResult
+from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
 
 _SAME_GUESS = 1e-6
@@ -41,7 +41,7 @@ class Merger:
 def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Merger:
     """Several calibrations of one vehicle into one.
 
-    The informations of the data are summed at common mountings; the guesses, which the
+    The informations of the data are summed at common extrinsics; the guesses, which the
     calibrations share, count once: that of a LiDAR is the first file's that has it. Earlier
     calibrations that served as priors are taken along, each once.
 
@@ -105,7 +105,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
 
 
 def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) -> Config:
-    """The config with the mountings of an earlier calibration for initial guesses.
+    """The config with the extrinsics of an earlier calibration for initial guesses.
 
     How far off they may be stays as the config has it: a mount may have moved since.
 
@@ -141,7 +141,7 @@ def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) ->
             T = prior.lidars[name].T_vehicle_lidar
             x, y, z = (float(v) for v in T.translation())
             roll, pitch, yaw = (float(v) for v in np.degrees(T.rotation().rpy()))
-            initial = Mounting(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
+            initial = PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
             lidars[name] = lidars[name].model_copy(update={"initial": initial})
     return config.model_copy(update={"lidars": lidars})
 
@@ -156,7 +156,7 @@ def with_earlier(
 ) -> tuple[Calibration, tuple[str, ...]]:
     """A calibration together with what the data of an earlier one say.
 
-    Its own data's information stays its own; the mountings, their covariance and the verdicts
+    Its own data's information stays its own; the extrinsics, their covariance and the verdicts
     become those of all data together.
 
     Args:
@@ -191,12 +191,6 @@ def with_earlier(
     return _assembled(draft, results, fused, data, disagree), tuple(
         warnings if comparison.moved else ()
     )
-
-
-def guess_covariance(guess: Guess, T_vehicle_lidar: gtsam.Pose3) -> Array:
-    """(6, 6) covariance of a guess, right perturbation of `T_vehicle_lidar`."""
-    axes = right_to_vehicle_axes(T_vehicle_lidar)
-    return np.asarray(axes.T @ np.diag(guess.sigmas**2) @ axes)
 
 
 def _assembled(

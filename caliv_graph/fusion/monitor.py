@@ -78,7 +78,7 @@ class MountAlarm:
     alone: bool
 
 
-def mounting_innovation(
+def extrinsic_innovation(
     T_map_vehicle: gtsam.Pose3,
     T_vehicle_lidar: gtsam.Pose3,
     cov_predicted: Array,
@@ -95,8 +95,8 @@ def mounting_innovation(
         cov_registration: (6, 6) of it, right perturbation.
     """
     # A mounting that is off by d lets the scan register at Z = X M Exp(d): r = -d.
-    r, by_vehicle, by_mounting = lidar_pose_error(T_map_vehicle, T_vehicle_lidar, T_map_lidar)
-    J = np.hstack([by_vehicle, by_mounting])
+    r, by_vehicle, by_extrinsic = lidar_pose_error(T_map_vehicle, T_vehicle_lidar, T_map_lidar)
+    J = np.hstack([by_vehicle, by_extrinsic])
     cov = J @ cov_predicted @ J.T + cov_registration
     return Innovation(-r, 0.5 * (cov + cov.T))
 
@@ -123,9 +123,9 @@ def alarm_threshold(scans_per_hour: float, false_alarms_per_hour: float) -> floa
 class MountMonitor:
     """Watches the innovations of the scans of a localiser.
 
-    Feed it innovations of an estimator that is consistent, which one with calibrated mountings for
-    constants is not: carry the mountings as variables (`priors.prior_factors`). And leave scans out
-    of that estimator which `suspicious` says do not fit, or it will bend the pose until they do.
+    The innovations must come from a consistent estimator. One that holds the calibrated extrinsics
+    constant is not: carry them as variables (`priors.prior_factors`). Leave the scans that
+    `suspicious` rejects out of that estimator, or it bends the pose until they fit.
 
     Attributes:
         threshold: chi-square above which it alarms.
@@ -150,7 +150,7 @@ class MountMonitor:
         if not T_vehicle_lidar:
             raise ValueError("MountMonitor: needs at least one LiDAR")
         self.threshold = alarm_threshold(scans_per_s * SECONDS_PER_HOUR, false_alarms_per_hour)
-        self._mountings = dict(T_vehicle_lidar)
+        self._extrinsics = dict(T_vehicle_lidar)
         self._heard: dict[str, deque[tuple[Array, Array]]] = {
             name: deque(maxlen=WINDOWS[-1]) for name in T_vehicle_lidar
         }
@@ -184,7 +184,7 @@ class MountMonitor:
         if found is None:
             return None
         chi2, scans, mean, cov = found
-        axes = right_to_vehicle_axes(self._mountings[lidar])
+        axes = right_to_vehicle_axes(self._extrinsics[lidar])
         return MountAlarm(
             lidar=lidar,
             stamp_ns=stamp_ns,
@@ -205,16 +205,16 @@ class MountMonitor:
         Raises:
             ValueError: the LiDAR is unknown.
         """
-        if lidar not in self._mountings:
+        if lidar not in self._extrinsics:
             raise ValueError(self._unknown(lidar))
-        self._mountings[lidar] = T_vehicle_lidar
+        self._extrinsics[lidar] = T_vehicle_lidar
         self._heard[lidar].clear()
 
     def _unknown(self, lidar: str) -> str:
-        return f"lidar '{lidar}': is not watched; those are {', '.join(self._mountings)}"
+        return f"lidar '{lidar}': is not watched; those are {', '.join(self._extrinsics)}"
 
     def _check(self, lidar: str, stamp_ns: int, innovation: Innovation) -> None:
-        if lidar not in self._mountings:
+        if lidar not in self._extrinsics:
             raise ValueError(self._unknown(lidar))
         last_ns = self._last_ns.get(lidar)
         if last_ns is not None and stamp_ns <= last_ns:

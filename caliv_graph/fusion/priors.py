@@ -1,4 +1,4 @@
-"""A calibration as native GTSAM factors, for localisers that carry the mountings as variables."""
+"""A calibration as native GTSAM factors, for localisers that carry the extrinsics as variables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from caliv_graph.errors import ExportError
 from caliv_graph.products import Array, Calibration
 from caliv_graph.trajectory.factors import marginal_factor
 
-MountingKey = Callable[[str], int]
+ExtrinsicKey = Callable[[str], int]
 """Key of the variable `T_vehicle_lidar` of a LiDAR, by its name."""
 
 DEFAULT_LETTER = "m"
@@ -22,7 +22,7 @@ _LEAST_EIGENVALUE = 1e-10
 than this against the rest is told no better."""
 
 
-def lettered_keys(calibration: Calibration, letter: str = DEFAULT_LETTER) -> MountingKey:
+def lettered_keys(calibration: Calibration, letter: str = DEFAULT_LETTER) -> ExtrinsicKey:
     """Keys `letter` 0, 1, ... in the order of the calibration's LiDARs.
 
     Args:
@@ -40,11 +40,11 @@ def lettered_keys(calibration: Calibration, letter: str = DEFAULT_LETTER) -> Mou
 
 def prior_factors(
     calibration: Calibration,
-    key: MountingKey,
+    key: ExtrinsicKey,
     joint: bool = True,
     lidars: Sequence[str] | None = None,
 ) -> gtsam.NonlinearFactorGraph:
-    """The calibrated mountings as priors on variables of a localiser's graph.
+    """The calibrated extrinsics as priors on variables of a localiser's graph.
 
     All factors are native and can be serialised. Along what the drive did not determine they carry
     the initial guess with its sigma, as the calibration's covariance does.
@@ -54,7 +54,7 @@ def prior_factors(
         key: of the variable `T_vehicle_lidar` of each LiDAR.
         joint: one `LinearContainerFactor` over all of them, which keeps that the LiDARs are known
             better against each other than against the vehicle. It is a quadratic about the
-            calibrated mountings, good for movements of some degrees. Else a `PriorFactorPose3`
+            calibrated extrinsics, good for movements of some degrees. Else a `PriorFactorPose3`
             each, which forgets it: a localiser then thinks the LiDARs apart to be known worse.
         lidars: which ones; absent: all.
 
@@ -88,8 +88,8 @@ def prior_factors(
     return graph
 
 
-def mounting_values(calibration: Calibration, key: MountingKey) -> gtsam.Values:
-    """The calibrated mountings as values of the variables that `prior_factors` is about."""
+def extrinsic_values(calibration: Calibration, key: ExtrinsicKey) -> gtsam.Values:
+    """The calibrated extrinsics as values of the variables that `prior_factors` is about."""
     values = gtsam.Values()
     for name, lidar in calibration.lidars.items():
         values.insert(key(name), lidar.T_vehicle_lidar)

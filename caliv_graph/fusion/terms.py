@@ -1,6 +1,6 @@
-"""What the data of a drive say about the mountings, as a quadratic that can be moved and summed.
+"""What the data of a drive say about the extrinsics, as a quadratic that can be moved and summed.
 
-Everything is in vehicle axes (see `conventions`), LiDARs in the order of a term's mountings.
+Everything is in vehicle axes (see `conventions`), LiDARs in the order of a term's extrinsics.
 """
 
 from __future__ import annotations
@@ -13,23 +13,21 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
+from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
-    USUAL_SIGMAS,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, Calibration, DataTerm, Guess, MotionData
 from caliv_graph.uncertainty.observability import (
-    respectful_covariance,
-    respectful_step,
+    covariance_with_prior_in_null_space,
     scaling,
     spectrum,
+    step_with_prior_in_null_space,
 )
-
-DRIVES = "drive_sha256"
-"""Key of the provenance: digests of the drives a calibration was made from."""
 
 _STEPS = 20
 _STEP_TOLERANCE = 1e-12
@@ -142,10 +140,10 @@ def _sources(calibration: Calibration) -> tuple[str, ...]:
 
 
 def moved_to(term: DataTerm, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> DataTerm:
-    """The same quadratic about other mountings of its LiDARs, to first order in rotations.
+    """The same quadratic about other extrinsics of its LiDARs, to first order in rotations.
 
     From `Exp(w_old) R_old = Exp(w_new) R_new`: the old perturbation is the new one, turned by the
-    Jacobian of the logarithm, less the difference of the mountings.
+    Jacobian of the logarithm, less the difference of the extrinsics.
     """
     jacobian = np.eye(len(term.gradient))
     difference = np.zeros(len(term.gradient))
@@ -204,7 +202,7 @@ def _pseudo_inverse(information: Array) -> Array:
 
 @dataclass(frozen=True)
 class Fused:
-    """Where several terms and one set of guesses put the mountings.
+    """Where several terms and one set of guesses put the extrinsics.
 
     Attributes:
         T_vehicle_lidar: the estimate.
@@ -224,7 +222,7 @@ class Fused:
 
 
 def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "auto") -> Fused:
-    """Solves for the mountings from what the data of several drives say, and the guesses once.
+    """Solves for the extrinsics from what the data of several drives say, and the guesses once.
 
     Gauss-Newton on the sum of the quadratics, each moved to the current estimate: the joint solve
     of the drives, as far as each is quadratic about its own estimate.
@@ -240,7 +238,7 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
     fixed = np.repeat([guesses[name].fixed for name in names], 6)
     certainty = np.concatenate([guesses[name].sigmas for name in names]) ** -2.0
     trusted = np.diag(fixed * certainty)
-    prior = np.diag(np.where(fixed, np.tile(USUAL_SIGMAS, len(names)) ** -2.0, certainty))
+    prior = np.diag(np.where(fixed, np.tile(DEFAULT_GUESS_SIGMAS, len(names)) ** -2.0, certainty))
     poses = {name: _start(name, terms, guesses[name]) for name in names}
     undetermined: int | None = None
     for step_number in range(_STEPS):
@@ -255,7 +253,7 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
             split = spectrum(told, prior, undetermined)
             if step_number >= _STEPS_UNDECIDED:
                 undetermined = int(split.undetermined.sum())
-            step = respectful_step(told, pull, prior, offset, split)
+            step = step_with_prior_in_null_space(told, pull, prior, offset, split)
         poses = {
             n: retract_vehicle_axes(poses[n], step[6 * i : 6 * i + 6]) for i, n in enumerate(names)
         }
@@ -265,7 +263,7 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
     if mode == "joint":
         cov = np.asarray(np.linalg.inv(D + trusted + prior), np.float64)
     else:
-        cov = respectful_covariance(prior, spectrum(D + trusted, prior, undetermined))
+        cov = covariance_with_prior_in_null_space(prior, spectrum(D + trusted, prior, undetermined))
     return Fused(poses, D, c, trusted, prior, 0.5 * (cov + cov.T))
 
 
@@ -281,7 +279,7 @@ def _start(name: str, terms: Sequence[DataTerm], guess: Guess) -> gtsam.Pose3:
 
 
 def _total(terms: Sequence[DataTerm], poses: Mapping[str, gtsam.Pose3]) -> tuple[Array, Array]:
-    """Sum of all terms at common mountings."""
+    """Sum of all terms at common extrinsics."""
     names = list(poses)
     D, c = np.zeros((6 * len(names), 6 * len(names))), np.zeros(6 * len(names))
     for term in terms:
@@ -293,4 +291,4 @@ def _total(terms: Sequence[DataTerm], poses: Mapping[str, gtsam.Pose3]) -> tuple
 def guess_of(calibration: Calibration, name: str) -> Guess:
     """The guess of a LiDAR; where the file states none, the reported mounting, loosely."""
     lidar = calibration.lidars[name]
-    return lidar.guess or Guess(lidar.T_vehicle_lidar, USUAL_SIGMAS)
+    return lidar.guess or Guess(lidar.T_vehicle_lidar, DEFAULT_GUESS_SIGMAS)

@@ -1,4 +1,4 @@
-"""Covariance of the pose between two LiDARs, from the joint covariance of their mountings."""
+"""Covariance of the pose between two LiDARs, from the joint covariance of their extrinsics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from caliv_graph.products import Array
 
 
 def relative_jacobian(T_vehicle_a: gtsam.Pose3, T_vehicle_b: gtsam.Pose3) -> Array:
-    """How `T_b_a = T_vehicle_b^-1 T_vehicle_a` moves with the two mountings.
+    """How `T_b_a = T_vehicle_b^-1 T_vehicle_a` moves with the two extrinsics.
 
     From `(T_vehicle_b Exp(d_b))^-1 T_vehicle_a Exp(d_a) = T_b_a Exp(-Ad(T_b_a^-1) d_b) Exp(d_a)`.
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Mounting, MountingSigma
 from caliv_graph.products import Array
 
 
@@ -46,21 +45,6 @@ def skew(vectors: Array) -> Array:
     out[..., 2, 0] = -vectors[..., 1]
     out[..., 2, 1] = vectors[..., 0]
     return out
-
-
-def pose_from_mounting(mounting: Mounting) -> gtsam.Pose3:
-    """`T_parent_child` of a mounting as people write it (R = Rz(yaw) Ry(pitch) Rx(roll))."""
-    roll, pitch, yaw = (math.radians(a) for a in mounting.rpy_deg)
-    return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(mounting.xyz))
-
-
-def sigmas_from_mounting(sigma: MountingSigma) -> Array:
-    """(6,) rotation before translation, rad and m, vehicle axes."""
-    return np.array([*sigma.rpy_rad(), *sigma.xyz_m()])
-
-
-USUAL_SIGMAS = sigmas_from_mounting(MountingSigma())
-"""(6,) What a guess is worth where nothing is said: the config's defaults."""
 
 
 def rpy(R_a_b: Array) -> Array:

@@ -3,7 +3,7 @@
 The same chain of states as `trajectory` builds (pose and velocity of the IMU, its biases), with the
 same factors, but linearised along the drive as it is planned: no measurement is drawn and nothing
 is optimised, so that it takes milliseconds. Errors of poses that are near in time are alike, and
-the chain says how much: it is relative errors that matter for mountings.
+the chain says how much: it is relative errors that matter for extrinsics.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.config import NoiseConfig
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting, skew
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
-from caliv_graph.simulation.drives import Drive
-from caliv_graph.simulation.motion import sample_stamps
-from caliv_graph.simulation.scenario import Scenario
+from caliv_graph.scenario.drives import Drive, sample_stamps
+from caliv_graph.scenario.model import Scenario
 from caliv_graph.trajectory.chain import POSE, STATE
 from caliv_graph.trajectory.noise import DEFAULT_FORCE_WALK_M_S3, DEFAULT_GYRO_WALK_RAD_S2
 
@@ -101,7 +100,7 @@ def plan_motion(
     states = drive.states(nodes, scenario.world.ground.height_m)
     R = states.R_map_vehicle
     twist = np.hstack([states.angular_velocity, np.einsum("nji,nj->ni", R, states.velocity_map)])
-    T_vehicle_imu = pose_from_mounting(scenario.imu.mounting)
+    T_vehicle_imu = scenario.imu.mounting.pose()
     if source == "poses":
         diagonal, coupling = _given_poses(nodes, R, scenario)
         to_vehicle = np.eye(POSE)
@@ -215,7 +214,7 @@ def _inertial(
 def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenario) -> None:
     """GNSS, orientation and velocity, each at the node nearest to it."""
     states = drive.states(nodes)
-    T_vehicle_imu = pose_from_mounting(scenario.imu.mounting)
+    T_vehicle_imu = scenario.imu.mounting.pose()
     R_vi = T_vehicle_imu.rotation().matrix()
     R = states.R_map_vehicle @ R_vi
     R_back = np.swapaxes(R, 1, 2)

@@ -1,8 +1,8 @@
 """What a drive will determine, before it is driven (SPEC 4 and 8).
 
 No measurement is drawn: the graph that `calibrate` would solve is linearised along the planned
-drive, and all but the mountings is eliminated from its information. Poses, clouds and ground make a
-chain in time whose states all know a few common coordinates (mountings, targets, the ground's
+drive, and all but the extrinsics is eliminated from its information. Poses, clouds and ground
+make a chain in time whose states share a few coordinates (extrinsics, targets, the ground's
 plane), so this takes a tenth of a second.
 """
 
@@ -18,11 +18,11 @@ import numpy as np
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
-from caliv_graph.calibration.solve import OFFSET_TOLD_S
-from caliv_graph.config import ExtractionConfig, Mounting, MountingSigma
+from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
+from caliv_graph.config.model import ExtractionConfig, PoseConfig, PoseSigmaConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
-from caliv_graph.geometry.se3 import pose_from_mounting, skew
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.planning.motion import NODE_NS, PlannedMotion, Source, plan_motion
 from caliv_graph.planning.sightings import (
     INDEPENDENT_PART,
@@ -36,13 +36,17 @@ from caliv_graph.planning.sightings import (
     thinned,
 )
 from caliv_graph.products import Array, Direction, IntArray
-from caliv_graph.simulation.drives import Drive, make_drive
-from caliv_graph.simulation.scenario import Scenario
-from caliv_graph.simulation.terrain import make_terrain
-from caliv_graph.targets.ground_planes import DISTANCE_FLOOR_M, MAX_APART_NS, NORMAL_FLOOR_RAD
-from caliv_graph.targets.views import view_shares
+from caliv_graph.scenario.drives import Drive, make_drive
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.terrain import make_terrain
+from caliv_graph.targets.cloud.views import view_weights
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, MAX_APART_NS, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
-from caliv_graph.uncertainty.outlook import Outlook, look_ahead, untold_offsets
+from caliv_graph.uncertainty.predicted import (
+    PredictedCovariance,
+    predict_covariance,
+    undetermined_offsets,
+)
 
 Ground = Literal["none", "plane", "height"]
 """What is made of the ground: nothing; a plane of unknown height; one that the vehicle stands on at
@@ -111,7 +115,7 @@ class Prediction:
     """
 
     names: tuple[str, ...]
-    outlook: Outlook
+    outlook: PredictedCovariance
     sightings: tuple[tuple[Sighting, ...], ...]
     space_m: tuple[float, float]
     duration_s: float
@@ -193,11 +197,11 @@ def predict_drives(
             information += _information(scenario, drive, sightings, lidars, assumptions)
     sigmas = _guess_sigmas(first)
     D, offsets_s = _without_offsets(information, lidars, np.diag(np.tile(sigmas, n) ** -2.0))
-    outlook = look_ahead(
+    outlook = predict_covariance(
         D,
         lidars,
         first.reference if first.reference in lidars else lidars[0],
-        {name: pose_from_mounting(model.mounting) for name, model in first.lidars.items()},
+        {name: model.mounting.pose() for name, model in first.lidars.items()},
         dict.fromkeys(first.lidars, sigmas),
         {name: sum(len(s.used) for of in seen for s in of if s.lidar == name) for name in lidars},
         offsets_s,
@@ -210,7 +214,7 @@ def predict_drives(
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
             *_warnings(planned, seen, lidars, assumptions.time_offset),
-            *untold_offsets(offsets_s, OFFSET_TOLD_S),
+            *undetermined_offsets(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
 
@@ -231,7 +235,7 @@ def _sightings(scenario: Scenario, drive: Drive, assumptions: Assumptions) -> tu
         alike = [sight(drive, scenario, name, placement, extraction) for name in scenario.lidars]
         seeing = sum(len(s.stamps_ns) >= extraction.min_scans for s in alike)
         for s in alike:
-            used = thinned(view_shares(s.centres_lidar), seeing, extraction)
+            used = thinned(view_weights(s.centres_lidar), seeing, extraction)
             out.append(replace(s, used=used))
     return tuple(out)
 
@@ -367,10 +371,10 @@ def _information(
     lidars: Sequence[str],
     assumptions: Assumptions,
 ) -> Array:
-    """Information of one drive on mountings (and time offsets), vehicle axes, all else eliminated.
+    """Information of one drive on extrinsics (and time offsets), vehicle axes, all else eliminated.
 
     Returns:
-        (6n, 6n), or (7n, 7n) with a time offset per LiDAR after all mountings.
+        (6n, 6n), or (7n, 7n) with a time offset per LiDAR after all extrinsics.
     """
     stride = assumptions.stride
     used = [replace(s, used=s.used[stride // 2 :: stride]) for s in sightings]
@@ -450,7 +454,7 @@ def _add_clouds(
     model = scenario.lidars[sighting.lidar]
     independent = sighting.points[sighting.used] * INDEPENDENT_PART / SEEN_PART
     info = placement.information(independent, model.range_sigma_m)
-    info *= view_shares(sighting.centres_lidar[sighting.used])[:, None, None]
+    info *= view_weights(sighting.centres_lidar[sighting.used])[:, None, None]
     R = motion.R_map_vehicle[nodes]
     # Adjoint of C X: the target's frame has map axes, its origin at the target.
     by_pose = np.zeros((len(nodes), 6, 6))
@@ -471,12 +475,12 @@ def _behind(columns: slice) -> slice:
     return slice(POSE + columns.start, POSE + columns.stop)
 
 
-def _to_origin(mounting: Mounting) -> Array:
+def _to_origin(mounting: PoseConfig) -> Array:
     """(6, 6) a mounting's perturbation in vehicle axes at its own origin, as one at the vehicle's.
 
     Turning a LiDAR about itself by w moves what is at the vehicle's origin by -w x t.
     """
-    t = pose_from_mounting(mounting).translation()
+    t = mounting.pose().translation()
     out = np.eye(6)
     out[3:, :3] = skew(t)
     return out
@@ -515,9 +519,9 @@ def _add_ground(
         heave_variance = 2.0 * assumptions.heave_sigma_m**2
         later = nearest[near] > TOGETHER_NS
         info[later, 2] = 1.0 / (distance_sigma**2 + heave_variance)
-        info *= view_shares(motion.position_map[at])[:, None]
+        info *= view_weights(motion.position_map[at])[:, None]
         stood[at] = True
-        t = pose_from_mounting(model.mounting).translation()
+        t = model.mounting.pose().translation()
         R, place = motion.R_map_vehicle[at], motion.position_map[at]
         arm = place + R @ t - anchor
         J = np.zeros((len(at), 3, H.shape[1]))
@@ -569,7 +573,7 @@ def _with_heave(H: Array, sigma_m: float) -> Array:
 
 def _guess_sigmas(scenario: Scenario) -> Array:
     """(6,) of a guess, vehicle axes, as the config that `simulate` writes states them."""
-    guess, usual = scenario.initial_guess, MountingSigma(xyz=0.058, rpy_deg=1.73)
+    guess, usual = scenario.initial_guess, PoseSigmaConfig(xyz=0.058, rpy_deg=1.73)
     turn = math.radians(guess.rotation_deg) * UNIFORM_TO_SIGMA
     shift = guess.translation_m * UNIFORM_TO_SIGMA
     return np.array(
@@ -580,7 +584,7 @@ def _guess_sigmas(scenario: Scenario) -> Array:
 def _without_offsets(
     information: Array, lidars: Sequence[str], prior: Array
 ) -> tuple[Array, dict[str, float]]:
-    """Information on mountings alone, and the sigma of each time offset, if there are any.
+    """Information on extrinsics alone, and the sigma of each time offset, if there are any.
 
     As `calibrate` does, an offset that the drive does not tell is not freed.
     """
@@ -595,7 +599,7 @@ def _without_offsets(
     scale = 1.0 / np.sqrt(np.diagonal(known))
     cov = np.linalg.inv(known * np.outer(scale, scale)) * np.outer(scale, scale)
     sigma = np.sqrt(np.diagonal(cov))[offsets]
-    kept = np.append(np.arange(size), offsets[sigma < OFFSET_TOLD_S])
+    kept = np.append(np.arange(size), offsets[sigma < OFFSET_DETERMINED_S])
     D = _eliminated(both[np.ix_(kept, kept)], size)
     return D, dict(zip(lidars, sigma.tolist(), strict=True))
 

@@ -11,17 +11,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from caliv_graph.config import ExtractionConfig
+from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.simulation.drives import Drive
-from caliv_graph.simulation.motion import sample_stamps
-from caliv_graph.simulation.scenario import LidarModel, ObjectModel, Scenario, WorldModel
-from caliv_graph.simulation.terrain import Terrain, make_terrain
-from caliv_graph.simulation.worlds import make_world
-from caliv_graph.targets.extract import TOTAL_PER_LIDARS
-from caliv_graph.targets.views import evenly_spread
+from caliv_graph.scenario.drives import Drive, sample_stamps
+from caliv_graph.scenario.model import LidarModel, ObjectModel, Scenario, WorldModel
+from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.targets.cloud.extract import TOTAL_PER_LIDARS
+from caliv_graph.targets.cloud.views import evenly_spread
 
 SEEN_PART = 0.87
 """Part of the surface that faces a LiDAR that returns points: the rest hides behind itself. 480
@@ -238,7 +236,7 @@ def sight(
     ).reshape(-1, 3)
     # The corners of the box are farther out than the object is.
     grid = placement.centre_map + offsets * placement.half_size_m * [0.7, 0.7, 1.0]
-    T = pose_from_mounting(model.mounting)
+    T = model.mounting.pose()
     back = np.swapaxes(states.R_map_vehicle, 1, 2)
     in_vehicle = np.einsum("nij,nkj->nki", back, grid[None] - states.position_map[:, None])
     in_lidar = (in_vehicle - T.translation()) @ T.rotation().matrix()
@@ -281,7 +279,7 @@ def thinned(shares: Array, seeing: int, extraction: ExtractionConfig) -> IntArra
 
 def sees_ground(model: LidarModel) -> bool:
     """Whether a LiDAR that stands level has enough points on the ground about it."""
-    T = pose_from_mounting(model.mounting)
+    T = model.mounting.pose()
     elevation = np.radians(_elevations_deg(model))[:, None]
     low, high = np.radians(model.horizontal_fov_deg)
     azimuth = low + (high - low) * (np.arange(GROUND_COLUMNS) + 0.5) / GROUND_COLUMNS

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config import LIMIT_KEY
+from caliv_graph.config.model import LIMIT_KEY
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.planning.predict import Assumptions, Prediction, predict, sigma_of, space
-from caliv_graph.simulation.drives import Drive, make_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import Drive, make_drive
+from caliv_graph.scenario.model import (
     ArcDrive,
     DriveModel,
     FigureEightDrive,

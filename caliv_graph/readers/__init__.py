@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import CalivFolder

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from caliv_graph.cores import cores
+from caliv_graph.common.cores import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

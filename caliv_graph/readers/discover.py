@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caliv_graph.config import LidarConfig, Mounting, TopicsConfig, read_yaml
+from caliv_graph.config.load import read_yaml
+from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import POSES_FILE, CalivFolder
@@ -247,7 +248,7 @@ def _tells_poses(bag: Bag, topic: str) -> bool:
 def _any_lidar(topic: str) -> LidarConfig:
     return LidarConfig(
         topic=topic,
-        initial=Mounting(xyz=(0.0, 0.0, 0.0)),
+        initial=PoseConfig(xyz=(0.0, 0.0, 0.0)),
         min_range=0.0,
         max_range=_ANY_RANGE_M,
     )

@@ -1,4 +1,4 @@
-"""Mountings between named frames: from `/tf_static` or the fixed joints of a URDF."""
+"""Extrinsics between named frames: from `/tf_static` or the fixed joints of a URDF."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.common.inputs import read_input
 from caliv_graph.errors import ConfigError
-from caliv_graph.inputs import read_input
 
 VEHICLE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle")
 """Names of the vehicle frame, the usual one first (REP-105)."""

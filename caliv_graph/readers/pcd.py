@@ -19,8 +19,8 @@ import lzf  # type: ignore[import-not-found]
 import numpy as np
 import numpy.typing as npt
 
+from caliv_graph.common.inputs import read_input
 from caliv_graph.errors import RecordingError
-from caliv_graph.inputs import read_input
 from caliv_graph.products import Array
 
 _ENCODINGS = ("ascii", "binary", "binary_compressed")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config import LidarConfig, TopicsConfig
+from caliv_graph.config.model import LidarConfig, TopicsConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData

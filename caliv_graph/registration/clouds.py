@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from caliv_graph.cores import share_out
+from caliv_graph.common.cores import share_out
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray, TargetObservation
 

@@ -19,7 +19,7 @@ import scipy.sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.cores import parts, share_out
+from caliv_graph.common.cores import parts, share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, sampling_order, second_moments

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Mixture, Registration, TargetObservation

@@ -8,7 +8,7 @@ it is neither.
 
 The quadratic of `mixture` does not show a drum's freedom by itself: its components tile a smooth
 surface like the bumps of a golf ball, and each holds points across the surface as well as along the
-normal. `forget_turns` takes out what it claims of them.
+normal. `marginalise_symmetry` takes out what it claims of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.cores import share_out
+from caliv_graph.common.cores import share_out
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture, Registration
 
@@ -210,7 +210,7 @@ def symmetries(
 def refit(symmetry: Symmetry, mixture: Mixture) -> Symmetry:
     """The axis of a symmetry again, as the shape now is.
 
-    An axis that is off by millimetres would leave what `forget_turns` is to take out.
+    An axis that is off by millimetres would leave what `marginalise_symmetry` is to take out.
 
     Args:
         symmetry: its axis is right to some degrees.
@@ -232,7 +232,7 @@ def refit(symmetry: Symmetry, mixture: Mixture) -> Symmetry:
     )
 
 
-def forget_turns(H: Array, gradient: Array, symmetry: Symmetry) -> tuple[Array, Array]:
+def marginalise_symmetry(H: Array, gradient: Array, symmetry: Symmetry) -> tuple[Array, Array]:
     """A joint quadratic over cloud poses that knows nothing of turns about a shape's axis.
 
     Each cloud may have been turned about the axis by an angle of its own: these angles are

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from caliv_graph.common.progress import Progress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording, TargetObservation
-from caliv_graph.progress import Progress
 from caliv_graph.readers.clock import Clock
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.report.inspection import (

@@ -240,7 +240,7 @@ def spectrum_figure(solution: Solution) -> Figure:
     )
     return Figure(
         "spectrum",
-        "What the data alone say about all mountings together, direction by direction (the "
+        "What the data alone say about all extrinsics together, direction by direction (the "
         "eigenvectors of their information, 1 mrad counted as 10 mm). A triangle at the upper "
         f"edge: nothing, or next to nothing.{held}",
         figure,
@@ -248,7 +248,7 @@ def spectrum_figure(solution: Solution) -> Figure:
 
 
 def correlation_figure(calibration: Calibration) -> Figure:
-    """Correlations of all mountings, vehicle axes."""
+    """Correlations of all extrinsics, vehicle axes."""
     names = [n for n, lidar in calibration.lidars.items() if lidar.saw_target]
     rows = [i for i, n in enumerate(calibration.lidars) if n in names]
     pick = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in rows]) if rows else np.zeros(0, int)
@@ -425,9 +425,9 @@ def course_figure(solution: Solution) -> Figure | None:
     finish(figure, 340)
     return Figure(
         "course",
-        "Expectation-maximisation whose M-step is the graph solve: the step of the mountings per "
+        "Expectation-maximisation whose M-step is the graph solve: the step of the extrinsics per "
         "iteration. It ends when the step is small in rotation and position, or in joint standard "
-        "deviations of the mountings.",
+        "deviations of the extrinsics.",
         figure,
     )
 
@@ -640,7 +640,7 @@ def correction_figure(
 def target_figures(
     placement: int, solution: Solution, calibration: Calibration
 ) -> tuple[Figure, Figure]:
-    """A target with the initial mountings and with the solved ones: solid, and in two views."""
+    """A target with the initial extrinsics and with the solved ones: solid, and in two views."""
     registration = solution.registrations[placement]
     lidars = list(calibration.lidars)
     before = _target_points(placement, solution, calibration, guess=True)
@@ -648,7 +648,7 @@ def target_figures(
     name = registration.observation.name
     note = (
         f"'{name}' as each LiDAR saw it in all of its scans, put together with the initial "
-        "mountings (left) and the solved ones (right). Metres from the target's centre, map axes."
+        "extrinsics (left) and the solved ones (right). Metres from the target's centre, map axes."
     )
     solid = _pair_of_scenes(before, after, lidars, 2)
     flat = make_subplots(
@@ -704,7 +704,7 @@ def scene_figure(
     calibration: Calibration,
     name: str,
 ) -> Figure | None:
-    """The drive with the initial mountings and with the solved ones; None if nothing was kept."""
+    """The drive with the initial extrinsics and with the solved ones; None if nothing was kept."""
     share = max(MOST_POINTS // max(len(scans), 1), 20)
     before = _scene_points(trajectory, scans, calibration, share, guess=True)
     after = _scene_points(trajectory, scans, calibration, share, guess=False)
@@ -713,7 +713,7 @@ def scene_figure(
     _, t = trajectory.poses_at(_samples(trajectory, 200))
     return Figure(
         f"scene_{drive}",
-        f"Recording '{name}': some scans of every LiDAR in the map, with the initial mountings "
+        f"Recording '{name}': some scans of every LiDAR in the map, with the initial extrinsics "
         "(left) and the solved ones (right), on the same vehicle poses. What stands twice on the "
         "left and once on the right is what calibration put right. Metres from the first pose; "
         "black: the vehicle.",

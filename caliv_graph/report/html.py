@@ -18,13 +18,13 @@ import numpy as np
 from markupsafe import Markup
 
 import caliv_graph
-from caliv_graph.config import Config, dump_config
+from caliv_graph.common.progress import StageRecord, count_text
+from caliv_graph.config.load import dump_config
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, Direction, LidarResult, Solution
-from caliv_graph.progress import StageRecord, count_text
-from caliv_graph.report.evidence import Evidence
 from caliv_graph.report.layout import SHOWN_AXES, decimals_of, fixed
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import (
@@ -33,6 +33,7 @@ from caliv_graph.report.residuals import (
     down_weighted,
     figures_of,
 )
+from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
@@ -78,7 +79,7 @@ def render_report(
     config: Config,
     stages: Sequence[StageRecord],
     warnings: Sequence[str],
-    evidence: Evidence,
+    evidence: RunRecord,
 ) -> str:
     """The page.
 
@@ -113,7 +114,7 @@ def render_report(
         conflicts=_conflicts(calibration, warnings),
         directions=_direction_rows(calibration),
         axes=SHOWN_AXES,
-        mountings={n: mounting_row(r) for n, r in calibration.lidars.items()},
+        extrinsics={n: mounting_row(r) for n, r in calibration.lidars.items()},
         pairs=_pair_rows(calibration),
         moves=_move_rows(calibration),
         residuals=all_residuals(solution, evidence),
@@ -202,7 +203,7 @@ def _sigma_text(direction: Direction, sigma: float) -> str:
 
 
 def mounting_row(result: LidarResult) -> dict[str, Any]:
-    """One LiDAR's line in a table of mountings: per axis the value and its sigma."""
+    """One LiDAR's line in a table of extrinsics: per axis the value and its sigma."""
     estimated = not (result.guess is not None and result.guess.fixed)
     return {
         "cells": _cells(result.T_vehicle_lidar, result.cov, result.determined),
@@ -269,7 +270,7 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
     return rows
 
 
-def _cloud_row(cloud: CloudVerdict, evidence: Evidence) -> dict[str, str]:
+def _cloud_row(cloud: CloudVerdict, evidence: RunRecord) -> dict[str, str]:
     begin, _ = evidence.trajectories[cloud.drive].span_ns
     return {
         "lidar": cloud.lidar,
@@ -313,7 +314,7 @@ def _weight_rows(solution: Solution) -> list[dict[str, Any]]:
     return rows
 
 
-def _noise_rows(solution: Solution, evidence: Evidence) -> list[tuple[str, str]]:
+def _noise_rows(solution: Solution, evidence: RunRecord) -> list[tuple[str, str]]:
     """Noise levels, and where they are from."""
     rows = []
     noise = solution.pose_noise
@@ -360,7 +361,7 @@ def _versions() -> list[tuple[str, str]]:
 
 
 def _sections(
-    calibration: Calibration, solution: Solution, evidence: Evidence
+    calibration: Calibration, solution: Solution, evidence: RunRecord
 ) -> dict[str, list[Figure]]:
     """The figures of each section of the page."""
     from caliv_graph.report import figures as draw

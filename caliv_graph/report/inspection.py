@@ -11,10 +11,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.common.progress import Progress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GivenPoses, Recording, TargetObservation
-from caliv_graph.progress import Progress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 
 Run = tuple[int, int]

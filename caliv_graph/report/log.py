@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config import RobustConfig
+from caliv_graph.common.progress import StageRecord
+from caliv_graph.config.model import RobustConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Solution
-from caliv_graph.progress import StageRecord
-from caliv_graph.report.evidence import Evidence
 from caliv_graph.report.residuals import (
     Residuals,
     all_residuals,
     down_weighted,
 )
+from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 
@@ -48,7 +48,7 @@ def log_documents(
     robust: RobustConfig,
     stages: Sequence[StageRecord],
     warnings: Sequence[str],
-    evidence: Evidence | None,
+    evidence: RunRecord | None,
 ) -> Iterator[dict[str, Any]]:
     """The lines, plain values only. SI units; the names of the keys say which.
 
@@ -135,7 +135,7 @@ def log_documents(
         yield {"warning": warning}
 
 
-def _evidence(evidence: Evidence) -> Iterator[dict[str, Any]]:
+def _evidence(evidence: RunRecord) -> Iterator[dict[str, Any]]:
     for drive, (name, trajectory) in enumerate(
         zip(evidence.drives, evidence.trajectories, strict=True)
     ):

@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.robust import DOF, explained_part
-from caliv_graph.config import RobustConfig
+from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array, IntArray, Solution
-from caliv_graph.report.evidence import Evidence
+from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 NOTABLE_WEIGHT = 0.9
@@ -138,7 +138,7 @@ def trajectory_residuals(trajectory: SmoothedTrajectory) -> tuple[Residuals, ...
     )
 
 
-def all_residuals(solution: Solution, evidence: Evidence) -> tuple[Residuals, ...]:
+def all_residuals(solution: Solution, evidence: RunRecord) -> tuple[Residuals, ...]:
     """Of the calibration's graph and of every smoothed trajectory."""
     out = list(solution_residuals(solution))
     for name, trajectory in zip(evidence.drives, evidence.trajectories, strict=True):

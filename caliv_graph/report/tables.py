@@ -10,10 +10,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, Direction, LidarResult
-from caliv_graph.progress import StageRecord, count_text
 from caliv_graph.report.inspection import DriveSummary, Inspection, Run, Sighting, TargetSummary
 from caliv_graph.report.layout import (
     SHOWN_AXES,
@@ -51,7 +51,7 @@ def calibration_table(
     parts: list[RenderableType] = [_status_line(calibration)]
     parts += sentences("What contradicts what:", calibration.contradictions)
     parts += titled(
-        "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _mountings(calibration)
+        "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _extrinsics(calibration)
     )
     if len(calibration.lidars) > 1:
         parts += titled(
@@ -247,7 +247,7 @@ def _status_line(calibration: Calibration) -> Text:
     )
 
 
-def _mountings(calibration: Calibration) -> Table:
+def _extrinsics(calibration: Calibration) -> Table:
     table = new_table(
         "LiDAR",
         *axis_headings("m", "deg"),

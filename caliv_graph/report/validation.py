@@ -9,7 +9,6 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from caliv_graph.fusion.compare import Comparison
-from caliv_graph.repeatability import Repeatability
 from caliv_graph.report.comparison import comparison_document
 from caliv_graph.report.layout import new_table, sentences, titled
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
@@ -22,6 +21,7 @@ from caliv_graph.validation.validate import (
     ThingResult,
     Validation,
 )
+from caliv_graph.workflows.repeatability import Repeatability
 
 _UNTOLD = "-"
 

@@ -13,7 +13,6 @@ from markupsafe import Markup
 
 import caliv_graph
 from caliv_graph.products import Array, IntArray
-from caliv_graph.repeatability import Repeatability
 from caliv_graph.report.figures import (
     SYMBOLS,
     Figure,
@@ -26,6 +25,7 @@ from caliv_graph.report.figures import (
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.validation import repeatability_sentences, tables
 from caliv_graph.validation.validate import AFTER, BEFORE, Validation
+from caliv_graph.workflows.repeatability import Repeatability
 
 MOST_POINTS = 2500
 """Of one LiDAR in one picture."""

@@ -5,8 +5,8 @@ them, `drives` moves the vehicle, `lidar` takes the scans, `motion` says what IM
 measure, `noise` draws the rest. `recording` has it all in memory, `bag` and `writer` write it down.
 """
 
+from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive
-from caliv_graph.simulation.scenario import Scenario, load_scenario
 from caliv_graph.simulation.simulate import (
     SimulatedDrive,
     SimulatedScans,

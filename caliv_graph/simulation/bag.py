@@ -25,10 +25,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, LidarScan
+from caliv_graph.scenario.model import LidarModel, Scenario
 from caliv_graph.simulation.recording import SimulatedRecording
-from caliv_graph.simulation.scenario import LidarModel, Scenario
 from caliv_graph.simulation.writer import TOPIC_GNSS, TOPIC_IMU, TOPIC_TWIST, topic_of_lidar
 
 TOPIC_TF_STATIC = "/tf_static"
@@ -227,21 +226,20 @@ class BagWriter:
         return self._store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
 
     def _tf_static(self) -> Iterator[tuple[int, Connection, Any]]:
-        """The mountings as the vehicle believes them to be: LiDARs at their initial guesses."""
+        """The extrinsics as the vehicle believes them to be: LiDARs at their initial guesses."""
         connection = self._connection(TOPIC_TF_STATIC, "tf2_msgs/msg/TFMessage", latched=True)
         scenario, types = self._scenario, self._store.types
         stamp_ns = self._recording.truth.start_ns
-        mountings = {
-            frame_of_lidar(name): pose_from_mounting(guess)
-            for name, guess in self._recording.guesses.items()
+        extrinsics = {
+            frame_of_lidar(name): guess.pose() for name, guess in self._recording.guesses.items()
         }
         if scenario.imu.enabled:
-            mountings[FRAME_IMU] = pose_from_mounting(scenario.imu.mounting)
+            extrinsics[FRAME_IMU] = scenario.imu.mounting.pose()
         if scenario.gnss.enabled:
             antenna = np.array(scenario.gnss.lever_arm)
-            mountings[FRAME_GNSS] = gtsam.Pose3(gtsam.Rot3(), antenna)
+            extrinsics[FRAME_GNSS] = gtsam.Pose3(gtsam.Rot3(), antenna)
         transforms = []
-        for frame, pose in mountings.items():
+        for frame, pose in extrinsics.items():
             q: Any = pose.rotation().toQuaternion()
             transforms.append(
                 types["geometry_msgs/msg/TransformStamped"](

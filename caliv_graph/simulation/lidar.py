@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.simulation.scenario import CropModel, EdgeModel, LidarModel
-from caliv_graph.simulation.worlds import GROUND, NO_OBJECT, RayCaster, World
+from caliv_graph.scenario.model import CropModel, EdgeModel, LidarModel
+from caliv_graph.scenario.shapes import GROUND, World
+from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SingleArray = npt.NDArray[np.float32]
 
@@ -127,7 +127,7 @@ class SimulatedLidar:
             crop: which beams to keep; None: all.
             rng: source of its noise, and of nothing else.
         """
-        self.T_vehicle_lidar = pose_from_mounting(model.mounting)
+        self.T_vehicle_lidar = model.mounting.pose()
         self._model = model
         self._caster = caster
         self._rng = rng

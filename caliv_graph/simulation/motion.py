@@ -14,12 +14,10 @@ import pymap3d
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, TwistSamples
-from caliv_graph.simulation.drives import Drive, VehicleStates
+from caliv_graph.scenario.drives import Drive, VehicleStates, sample_stamps
+from caliv_graph.scenario.model import GnssModel, ImuModel, Scenario
 from caliv_graph.simulation.noise import Stream, random_stream
-from caliv_graph.simulation.scenario import GnssModel, ImuModel, Scenario
 
 ANGULAR_ACCELERATION_STEP_NS = 50_000
 """Half of the time over which angular acceleration is differenced: exact to 1e-7 rad/s^2."""
@@ -53,34 +51,6 @@ class SimulatedGnss:
     lost_ns: IntArray
 
 
-def sample_stamps(
-    what: str, rate_hz: float, phase_s: float, duration_s: float, last_s: float = 0.0
-) -> IntArray:
-    """Stamps of what is published at a rate, in nanoseconds since the start of the drive.
-
-    Args:
-        what: whose, for messages: its place in the scenario.
-        rate_hz: samples per second.
-        phase_s: first stamp.
-        duration_s: duration of the drive.
-        last_s: how long before its end the last stamp lies at least.
-
-    Returns:
-        (n,) strictly increasing, n at least 1.
-
-    Raises:
-        ConfigError: the drive ends before the first one.
-    """
-    count = math.floor((duration_s - last_s - phase_s) * rate_hz + 1e-6) + 1
-    if count < 1:
-        raise ConfigError(
-            f"{what}: the drive of {duration_s:.3g} s ends before the first sample, which starts "
-            f"at {phase_s:g} s and takes {last_s:g} s. Lower phase_s, or make the drive longer"
-        )
-    seconds = phase_s + np.arange(count, dtype=np.float64) / rate_hz
-    return np.rint(seconds * NANOSECONDS_PER_SECOND).astype(np.int64)
-
-
 def angular_acceleration(drive: Drive, stamps_ns: IntArray) -> Array:
     """(n, 3) rate of the vehicle's angular velocity in rad/s^2, vehicle axes."""
     step_ns = ANGULAR_ACCELERATION_STEP_NS
@@ -107,7 +77,7 @@ def true_imu(
         and n rotations R_map_imu.
     """
     states = drive.states(stamps_ns)
-    T_vehicle_imu = pose_from_mounting(model.mounting)
+    T_vehicle_imu = model.mounting.pose()
     R_vehicle_imu = T_vehicle_imu.rotation().matrix()
     lever = T_vehicle_imu.translation()
     rate = states.angular_velocity

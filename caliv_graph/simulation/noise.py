@@ -13,12 +13,11 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray
-from caliv_graph.simulation.scenario import InitialGuessModel, PoseNoiseModel, SuspensionModel
+from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
 
 
 class Stream(enum.IntEnum):
@@ -107,9 +106,9 @@ def noisy_poses(
     )
 
 
-def perturbed_mounting(
-    mounting: Mounting, model: InitialGuessModel, rng: np.random.Generator
-) -> Mounting:
+def perturbed_extrinsic(
+    mounting: PoseConfig, model: InitialGuessModel, rng: np.random.Generator
+) -> PoseConfig:
     """An initial guess: uniform errors of position per vehicle axis, and of rotation.
 
     The rotation is R_true Rxyz, with roll, pitch and yaw of Rxyz drawn uniformly (CaLiV, section
@@ -120,9 +119,9 @@ def perturbed_mounting(
     """
     shift_m = rng.uniform(-1.0, 1.0, 3) * model.translation_m
     turn_rad = rng.uniform(-1.0, 1.0, 3) * math.radians(model.rotation_deg)
-    T_vehicle_lidar = pose_from_mounting(mounting)
+    T_vehicle_lidar = mounting.pose()
     rotation = T_vehicle_lidar.rotation().compose(gtsam.Rot3.RzRyRx(*turn_rad))
-    return Mounting(
+    return PoseConfig(
         xyz=_rounded(T_vehicle_lidar.translation() + shift_m),
         rpy_deg=_rounded(np.degrees(rotation.rpy())),
     )

@@ -9,16 +9,17 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, IntArray, LidarScan, MotionData
-from caliv_graph.simulation.drives import Drive, VehicleStates, make_drive
+from caliv_graph.scenario.drives import Drive, VehicleStates, make_drive, sample_stamps
+from caliv_graph.scenario.model import LidarModel, Scenario
+from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
 from caliv_graph.simulation.motion import (
     SimulatedGnss,
     SimulatedImu,
-    sample_stamps,
     simulate_gnss,
     simulate_imu,
     simulate_velocity,
@@ -27,12 +28,10 @@ from caliv_graph.simulation.motion import (
 from caliv_graph.simulation.noise import (
     Stream,
     height_and_heave,
-    perturbed_mounting,
+    perturbed_extrinsic,
     random_stream,
 )
-from caliv_graph.simulation.scenario import LidarModel, Scenario
-from caliv_graph.simulation.terrain import make_terrain
-from caliv_graph.simulation.worlds import RayCaster, World, make_world
+from caliv_graph.simulation.rays import RayCaster
 
 HEAVE_PERIOD_NS = NANOSECONDS_PER_SECOND // 10
 """The heave of the vehicle is drawn anew as often: clouds taken together share it."""
@@ -129,7 +128,7 @@ class SimulatedRecording:
         gnss = scenario.gnss
         self.truth = SimulatedTruth(
             T_vehicle_lidar={
-                name: pose_from_mounting(model.mounting) for name, model in scenario.lidars.items()
+                name: model.mounting.pose() for name, model in scenario.lidars.items()
             },
             time_offset_s={name: model.time_offset_s for name, model in scenario.lidars.items()},
             datum=(gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m),
@@ -139,8 +138,8 @@ class SimulatedRecording:
             level_z_map=self.world.ground_z_map + height_m,
             heave_m=heave_m,
         )
-        self.guesses: dict[str, Mounting] = {
-            name: perturbed_mounting(
+        self.guesses: dict[str, PoseConfig] = {
+            name: perturbed_extrinsic(
                 model.mounting,
                 scenario.initial_guess,
                 random_stream(seed, Stream.INITIAL_GUESS, index),

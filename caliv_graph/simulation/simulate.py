@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Literal
 import gtsam
 import numpy as np
 
+from caliv_graph.common.files import check_output_folder, output_folder
+from caliv_graph.common.progress import Progress, SilentProgress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
-from caliv_graph.files import check_output_folder, output_folder
 from caliv_graph.products import IntArray
-from caliv_graph.progress import Progress, SilentProgress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS, POSES_FILE
+from caliv_graph.scenario.model import Scenario
 from caliv_graph.simulation.noise import Stream, noisy_poses, random_stream
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedScan, simulate_drive
-from caliv_graph.simulation.scenario import Scenario
 from caliv_graph.simulation.writer import (
     BAG_FOLDER,
     CALIV_FOLDER,

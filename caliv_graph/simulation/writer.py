@@ -15,13 +15,13 @@ import gtsam
 import numpy as np
 import yaml
 
-from caliv_graph.config import parse_config
+from caliv_graph.config.load import parse_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.model import Scenario, dump_scenario
 from caliv_graph.simulation.motion import antenna_positions
 from caliv_graph.simulation.recording import SimulatedRecording
-from caliv_graph.simulation.scenario import Scenario, dump_scenario
 
 BAG_FOLDER = "drive"
 """Name of the bag in the folder of a simulated drive."""
@@ -300,7 +300,7 @@ def write_config(path: Path, recording: SimulatedRecording, has_bag: bool) -> No
     parse_config(content, str(path), path.parent)
     text = (
         f"# A simulated drive: scenario '{recording.scenario.name}', seed {recording.seed}.\n"
-        "# The initial guesses are off on purpose: truth.yaml has the true mountings.\n"
+        "# The initial guesses are off on purpose: truth.yaml has the true extrinsics.\n"
     )
     path.write_text(text + _dump_yaml(content), encoding="utf-8")
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.targets.surface import GroundSurface, fit_surface
+from caliv_graph.targets.ground.surface import GroundSurface, fit_surface
 
 MAX_RANGE_M = 30.0
 """Objects farther away are not looked at: few points, and far from where the guess puts them."""

@@ -19,11 +19,10 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from caliv_graph.config import Config, TargetRegion
+from caliv_graph.common.progress import Advance, Progress
+from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import TargetError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, BoolArray, IntArray, Recording
-from caliv_graph.progress import Advance, Progress
 from caliv_graph.targets.objects import AZIMUTH_BIN_RAD, WIDE_M, SeenObject, SeenScan, see_objects
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -351,7 +350,7 @@ def _history(
     advance: Advance,
 ) -> _History:
     lidar = config.lidars[name]
-    guess = pose_from_mounting(lidar.initial)
+    guess = lidar.initial.pose()
     scans, stamps = [], []
     for scan in recording.scans(name, wanted=set(chosen.tolist())):
         range_m = np.linalg.norm(scan.points_lidar, axis=1)

@@ -45,7 +45,7 @@ def deskew(
 def deskewed(
     scan: LidarScan, T_vehicle_lidar: Iterable[gtsam.Pose3], trajectory: VehicleTrajectory
 ) -> Iterator[Array]:
-    """Points (N, 3) of a scan moved as `deskew` does, for each of several mountings.
+    """Points (N, 3) of a scan moved as `deskew` does, for each of several extrinsics.
 
     The vehicle's motion, which takes as long as all the rest, is asked for once.
 

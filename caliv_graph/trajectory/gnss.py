@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pymap3d
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GnssFixes, IntArray
 from caliv_graph.trajectory.noise import gnss_covariances

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, TwistSamples
 
 # Table I of the paper, 1 sigma per sample.

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack, unstack
@@ -111,7 +111,7 @@ def smooth_trajectories(
 
     Args:
         recordings: opened drives.
-        config: topics, mountings, noise.
+        config: topics, extrinsics, noise.
         wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
         motions: what the recordings hold, by their index, if it has been read already.
 

@@ -32,10 +32,10 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.geometry.se3 import pose_from_mounting, stack
+from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, ImuSamples, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain
 from caliv_graph.trajectory.factors import (
@@ -161,7 +161,7 @@ def smooth_trajectory(
 
     Args:
         motion: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
-        config: mountings, noise, robust kernel.
+        config: extrinsics, noise, robust kernel.
         stamps_ns: stamps at which poses are wanted (of LiDAR scans), in any order.
 
     Returns:
@@ -288,7 +288,7 @@ def _checked(motion: MotionData, config: Config) -> tuple[_Data, list[str]]:
         noise=imu_noise(motion.imu, config),
         positions=positions,
         orientation=_usable_orientation(motion.imu, inertial, name),
-        T_vehicle_imu=pose_from_mounting(config.imu.T_vehicle_imu),
+        T_vehicle_imu=config.imu.T_vehicle_imu.pose(),
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
     )
     return data, warnings

@@ -62,11 +62,11 @@ registrations taken for coarse make every contrast less sure than it is."""
 FAR_M = 3.0
 """Clouds that are farther off are off because the mounting is; the number means nothing."""
 
-ContrastKind = Literal["halves", "turns", "clock", "trust"]
+ScoreTestKind = Literal["halves", "turns", "clock", "trust"]
 
 
 @dataclass(frozen=True)
-class Contrast:
+class ScoreTest:
     """What would differ between two parts of the data, were it let differ.
 
     Minus the log-likelihood of a difference d is `d^T information d / 2 - gradient^T d`, all else
@@ -82,7 +82,7 @@ class Contrast:
     """
 
     lidar: str
-    kind: ContrastKind
+    kind: ScoreTestKind
     information: Array
     gradient: Array
 
@@ -152,12 +152,12 @@ class Heading:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CheckInputs:
     """What the tests look at.
 
     Attributes:
         lidars: the result.
-        contrasts: between parts of the data.
+        score_tests: between parts of the data.
         counts: of clouds that do not fit.
         registration_scale: sigmas of the registrations against what their points' scatter allows.
         registration_sigma: rad and m, of the median cloud, scaled.
@@ -167,7 +167,7 @@ class Evidence:
     """
 
     lidars: Mapping[str, LidarResult]
-    contrasts: Sequence[Contrast] = ()
+    score_tests: Sequence[ScoreTest] = ()
     counts: Sequence[CloudCount] = ()
     registration_scale: float = 1.0
     registration_sigma: tuple[float, float] = (0.0, 0.0)
@@ -176,13 +176,13 @@ class Evidence:
     speed_m_s: float = 0.0
 
 
-def contradictions(evidence: Evidence) -> tuple[str, ...]:
+def contradictions(evidence: CheckInputs) -> tuple[str, ...]:
     """What contradicts what, a sentence each; empty if all is as it should be."""
     return (
         *against_guesses(evidence.lidars, evidence.speed_m_s),
         *misfits(evidence.counts),
         *too_coarse(evidence),
-        *(text for contrast in evidence.contrasts if (text := contrasted(contrast))),
+        *(text for contrast in evidence.score_tests if (text := contrasted(contrast))),
         *(text for assumed in evidence.assumed if (text := denied(assumed))),
         *(text for heading in evidence.headings if (text := turned(heading))),
     )
@@ -308,7 +308,7 @@ def _where(count: CloudCount) -> str:
     return ""
 
 
-def too_coarse(evidence: Evidence) -> list[str]:
+def too_coarse(evidence: CheckInputs) -> list[str]:
     """Whether the clouds fit each other worse than registrations can be off."""
     scale = evidence.registration_scale
     if scale < SCALE_LIMIT:
@@ -316,7 +316,7 @@ def too_coarse(evidence: Evidence) -> list[str]:
     turn, shift = evidence.registration_sigma
     seen = [(1.0 - count.down / count.clouds, _down(count)) for count in evidence.counts]
     shown = [text for part, text in sorted(seen) if part < 1.0][:1]
-    likely = min(evidence.contrasts, key=chance, default=None)
+    likely = min(evidence.score_tests, key=chance, default=None)
     if not shown and likely is not None and chance(likely) < SUSPECT:
         shown = [_asked(likely)]
     hint = f" It shows most here: {shown[0]}." if shown else ""
@@ -329,7 +329,7 @@ def too_coarse(evidence: Evidence) -> list[str]:
     ]
 
 
-def chance(contrast: Contrast) -> float:
+def chance(contrast: ScoreTest) -> float:
     """Of a larger contrast if nothing is wrong; 1 if it is not known to `TOLD`.
 
     Chi-square of the difference along the directions that are told, with the allowance for what
@@ -347,7 +347,7 @@ def chance(contrast: Contrast) -> float:
     return float(chdtrc(len(along), squares))
 
 
-def contrasted(contrast: Contrast) -> str:
+def contrasted(contrast: ScoreTest) -> str:
     """What a contrast says, if it is beyond chance; else nothing."""
     if chance(contrast) >= CHANCE:
         return ""
@@ -360,7 +360,7 @@ def contrasted(contrast: Contrast) -> str:
     return f"{_asked(contrast)}. {remedy}"
 
 
-def _asked(contrast: Contrast) -> str:
+def _asked(contrast: ScoreTest) -> str:
     """What a contrast asks for, and how sure it is."""
     overall = float(-ndtri(0.5 * max(chance(contrast), 1e-300)))
     if contrast.kind == "clock":
@@ -380,16 +380,16 @@ def _asked(contrast: Contrast) -> str:
         if ratio[i] > max(0.5 * ratio.max(), 1.0)
     )
     what = {
-        "halves": "the first half of its clouds and the second ask for different mountings",
-        "turns": "left turns and right turns ask for different mountings",
+        "halves": "the first half of its clouds and the second ask for different extrinsics",
+        "turns": "left turns and right turns ask for different extrinsics",
         "trust": "its clouds contradict the mounting that the config says to trust (fixed)",
     }[contrast.kind]
     size = sizes or "along several axes together"
     return f"lidar '{contrast.lidar}': {what}: {size} ({overall:.0f} sigma in all)"
 
 
-def difference(contrast: Contrast) -> tuple[Array, Array, Array]:
-    """The difference that a contrast of mountings asks for.
+def difference(contrast: ScoreTest) -> tuple[Array, Array, Array]:
+    """The difference that a contrast of extrinsics asks for.
 
     Returns:
         (6,) difference along what is told, vehicle axes; (6, 6) covariance with the allowance,
@@ -404,7 +404,7 @@ def difference(contrast: Contrast) -> tuple[Array, Array, Array]:
     return d, cov, V
 
 
-def _lateness(contrast: Contrast) -> tuple[float, float]:
+def _lateness(contrast: ScoreTest) -> tuple[float, float]:
     """Seconds by which stamps seem late, and its sigma with the allowance; 0 if not told."""
     information = float(contrast.information[0, 0])
     if information <= TOLD_CLOCK_S**-2.0:

@@ -24,7 +24,7 @@ def evaluate(
     """Errors in vehicle axes and their consistency with the covariance (SPEC 5 'Errors').
 
     The error of a pair (from a, to b) is that of `T_vehicle_a` against
-    `T_vehicle_b T_b_a(true)`, with both mountings as estimated: they share the error of
+    `T_vehicle_b T_b_a(true)`, with both extrinsics as estimated: they share the error of
     `T_vehicle_b`, so that what is left is the pair's own (the paper's Evaluation section). NEES is
     `e^T C^-1 e` with `e = Log(T_est^-1 T_true)`, 6 degrees of freedom.
 

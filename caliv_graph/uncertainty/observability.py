@@ -100,7 +100,9 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
     return Spectrum(vectors, values, sigma_data, sigma_prior, lost, weak)
 
 
-def respectful_step(D: Array, c: Array, prior: Array, offset: Array, split: Spectrum) -> Array:
+def step_with_prior_in_null_space(
+    D: Array, c: Array, prior: Array, offset: Array, split: Spectrum
+) -> Array:
     """The step of `auto`: data alone where they can tell, the joint prior alone where not.
 
     Minimises `e^T D e / 2 - c^T e` over the determined directions; along the others the step is
@@ -125,8 +127,8 @@ def respectful_step(D: Array, c: Array, prior: Array, offset: Array, split: Spec
     return np.asarray(unit * step)
 
 
-def respectful_covariance(prior: Array, split: Spectrum) -> Array:
-    """Covariance of the estimate that `respectful_step` arrives at.
+def covariance_with_prior_in_null_space(prior: Array, split: Spectrum) -> Array:
+    """Covariance of the estimate that `step_with_prior_in_null_space` arrives at.
 
     The determined directions carry the data's covariance; along the others the joint prior's, and
     what of the data's errors its condition drags along.

@@ -14,13 +14,13 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.config import Config, TargetRegion
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import RecordingError, TargetError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
-from caliv_graph.progress import Progress
+from caliv_graph.targets.ground.surface import HALF_SIZE_M, fit_surface
 from caliv_graph.targets.search import find_target
-from caliv_graph.targets.surface import HALF_SIZE_M, fit_surface
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -57,8 +57,8 @@ CREEP_M_S = 0.02
 
 
 @dataclass(frozen=True)
-class Mountings:
-    """Mountings to be looked at.
+class Extrinsics:
+    """Extrinsics to be looked at.
 
     Attributes:
         T_vehicle_lidar: per LiDAR.
@@ -76,17 +76,17 @@ class Mountings:
 
 @dataclass(frozen=True)
 class Placed:
-    """The points as one set of mountings has them.
+    """The points as one set of extrinsics has them.
 
     Attributes:
-        mountings: these.
+        extrinsics: these.
         taken_ns: (S,) when each scan was taken.
         R_map_vehicle: (S, 3, 3) the vehicle's attitude then.
         t_map_vehicle: (S, 3) metres, where it was.
-        points_lidar: (N, 3) metres, motion compensated with these mountings.
+        points_lidar: (N, 3) metres, motion compensated with these extrinsics.
     """
 
-    mountings: Mountings
+    extrinsics: Extrinsics
     taken_ns: IntArray
     R_map_vehicle: Array
     t_map_vehicle: Array
@@ -101,7 +101,7 @@ class Clouds:
         lidars: names, in the config's order.
         lidar: (N,) index into them, of each point.
         scan: (N,) index of its scan, counted over all LiDARs.
-        placed: by the name of a set of mountings.
+        placed: by the name of a set of extrinsics.
         scans: per LiDAR, how many were read.
         target_points: how many points were left out, being in the region of a target.
         notes: what a person should know, a line each.
@@ -123,7 +123,7 @@ class Clouds:
             poses: T_vehicle_lidar in the order of `lidars`, instead of those of `placed`.
         """
         if poses is None:
-            poses = [placed.mountings.T_vehicle_lidar[name] for name in self.lidars]
+            poses = [placed.extrinsics.T_vehicle_lidar[name] for name in self.lidars]
         R, t = stack(poses)
         turned = np.einsum("nij,nj->ni", R[self.lidar], placed.points_lidar)
         return np.asarray(turned + t[self.lidar])
@@ -137,7 +137,7 @@ class Clouds:
     def beams_map(self, placed: Placed, poses: Sequence[gtsam.Pose3] | None = None) -> Array:
         """(N, 3) unit vectors from the LiDARs to the points, map; see `points_vehicle`."""
         if poses is None:
-            poses = [placed.mountings.T_vehicle_lidar[name] for name in self.lidars]
+            poses = [placed.extrinsics.T_vehicle_lidar[name] for name in self.lidars]
         R, _ = stack(poses)
         beams = np.einsum("nij,nj->ni", R[self.lidar], placed.points_lidar)
         beams = np.einsum("nij,nj->ni", placed.R_map_vehicle[self.scan], beams)
@@ -211,7 +211,7 @@ def read_clouds(
     recording: Recording,
     trajectory: VehicleTrajectory,
     chosen: Mapping[str, IntArray],
-    mountings: Mapping[str, Mountings],
+    extrinsics: Mapping[str, Extrinsics],
     regions: Sequence[TargetRegion],
     with_ground: bool,
     progress: Progress,
@@ -222,8 +222,8 @@ def read_clouds(
         recording: the drive.
         trajectory: of it; the chosen stamps are within its span.
         chosen: per LiDAR the stamps of the scans to read.
-        mountings: sets of mountings by name. By the first one it is decided what is ground and what
-            is target.
+        extrinsics: sets of extrinsics by name. The first set decides what is ground and what is
+            target.
         regions: of the targets, left out.
         with_ground: keep the ground as well: the solve did not use it.
         progress: told of every scan.
@@ -231,8 +231,8 @@ def read_clouds(
     Raises:
         RecordingError: a cloud could not be read, or none of them holds a point.
     """
-    first = next(iter(mountings))
-    reader = _Reader(trajectory, mountings, _Regions(regions, trajectory), with_ground)
+    first = next(iter(extrinsics))
+    reader = _Reader(trajectory, extrinsics, _Regions(regions, trajectory), with_ground)
     names = tuple(chosen)
     total = sum(map(len, chosen.values()))
     # Matrices are small: threads of a linear algebra library would mostly wait for each other.
@@ -253,7 +253,7 @@ def read_clouds(
     at = np.repeat(np.arange(len(counts)), [len(points[first]) for _, points in reader.scans])
     of = np.array(counts, dtype=np.int64)
     placed = {}
-    for key, m in mountings.items():
+    for key, m in extrinsics.items():
         taken: IntArray = np.array([t[key] for t in reader.taken_ns], dtype=np.int64)
         R, t = trajectory.poses_at(taken)
         points = np.concatenate([p[key] for _, p in reader.scans])
@@ -274,12 +274,12 @@ class _Reader:
     def __init__(
         self,
         trajectory: VehicleTrajectory,
-        mountings: Mapping[str, Mountings],
+        extrinsics: Mapping[str, Extrinsics],
         regions: _Regions,
         with_ground: bool,
     ) -> None:
         self._trajectory = trajectory
-        self._mountings = mountings
+        self._extrinsics = extrinsics
         self._regions = regions
         self._with_ground = with_ground
         self.scans: list[tuple[int, dict[str, Array]]] = []
@@ -291,18 +291,18 @@ class _Reader:
         stamp: IntArray = np.array([scan.stamp_ns], dtype=np.int64)
         taken = {
             key: min(max(int(m.true_ns(scan.lidar, stamp)[0]), begin), end)
-            for key, m in self._mountings.items()
+            for key, m in self._extrinsics.items()
         }
         thin = _thinned(scan)
         whole = {
             key: deskew(
                 replace(thin, stamp_ns=taken[key]), m.T_vehicle_lidar[scan.lidar], self._trajectory
             ).points_lidar
-            for key, m in self._mountings.items()
+            for key, m in self._extrinsics.items()
         }
-        key = next(iter(self._mountings))
+        key = next(iter(self._extrinsics))
         kept = self._standing(
-            whole[key], self._mountings[key].T_vehicle_lidar[scan.lidar], taken[key]
+            whole[key], self._extrinsics[key].T_vehicle_lidar[scan.lidar], taken[key]
         )
         if len(kept) > POINTS:
             # The same scan gives the same points.

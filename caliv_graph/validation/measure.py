@@ -1,9 +1,9 @@
 """How well the LiDARs agree about a wall or a pole, and how well they could be expected to.
 
-Everything measured is linear in small errors of the mountings, of the vehicle's poses and of the
+Everything measured is linear in small errors of the extrinsics, of the vehicle's poses and of the
 ranges, so that its variance follows from their joint covariances (propagation of errors). The
-errors of mountings and of poses are taken as independent. On the very drive that was calibrated
-they are not: the mountings were found such that they fit the poses, errors and all, and what is
+errors of extrinsics and of poses are taken as independent. On the very drive that was calibrated
+they are not: the extrinsics were found such that they fit the poses, errors and all, and what is
 expected is then rather too large than too small.
 """
 
@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.validation.clouds import Clouds, Placed
-from caliv_graph.validation.refine import linearised, mounting_jacobian, pose_jacobian
+from caliv_graph.validation.refine import extrinsic_jacobian, linearised, pose_jacobian
 from caliv_graph.validation.surfaces import (
     Pole,
     Wall,
@@ -54,13 +54,13 @@ class Errors:
     """What the alignment may be off by.
 
     Attributes:
-        cov_mountings: (6 L, 6 L) joint, vehicle axes, LiDARs in the order of the clouds.
+        cov_extrinsics: (6 L, 6 L) joint, vehicle axes, LiDARs in the order of the clouds.
         cov_poses: (6 S, 6 S) joint, of the vehicle's poses at the scans, right perturbations.
         sigma_range_m: along the beam.
         sigma_heave_m: of the body on its springs, per scan, which the trajectory does not know.
     """
 
-    cov_mountings: Array
+    cov_extrinsics: Array
     cov_poses: Array
     sigma_range_m: float
     sigma_heave_m: float = 0.0
@@ -103,7 +103,7 @@ class Expected:
         merged: thickness, root of the expected square, metres.
         alone: likewise, per LiDAR.
         distance_m: per pair, root of the expected square.
-        rows: per pair (k, 6 L + 6 S), how the offset moves with mountings and poses.
+        rows: per pair (k, 6 L + 6 S), how the offset moves with extrinsics and poses.
         noise: per pair (k, k) covariance of the offset from ranges and shape.
     """
 
@@ -116,7 +116,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class _Refitted:
-    """A surface as one set of mountings has its points."""
+    """A surface as one set of extrinsics has its points."""
 
     surface: Wall | Pole
     points: Array
@@ -124,7 +124,7 @@ class _Refitted:
 
 
 class SurfaceMeter:
-    """Measures one surface under any mountings; its points stay the same."""
+    """Measures one surface under any extrinsics; its points stay the same."""
 
     def __init__(self, clouds: Clouds, surface: Wall | Pole) -> None:
         """Binds the points.
@@ -150,7 +150,7 @@ class SurfaceMeter:
         """Thickness and distances between LiDARs.
 
         Args:
-            placed: the points under some mountings.
+            placed: the points under some extrinsics.
             poses: T_vehicle_lidar to take instead, in the order of the LiDARs.
         """
         points = self._clouds.points_map(placed, poses)[self._surface.members]
@@ -191,13 +191,13 @@ class SurfaceMeter:
         """What `measure` would give on average, if only the known errors were there."""
         clouds, members = self._clouds, self._surface.members
         names = clouds.lidars
-        poses = [placed.mountings.T_vehicle_lidar[name] for name in names]
+        poses = [placed.extrinsics.T_vehicle_lidar[name] for name in names]
         vehicle = clouds.points_vehicle(placed)[members]
         points = clouds.points_map(placed)[members]
         beam = clouds.beams_map(placed)[members]
         merged = _refitted(points, beam, self._surface)
         _, normal, basis = linearised(merged.surface, points)
-        by_mounting = mounting_jacobian(clouds, placed, poses, members, normal)
+        by_extrinsic = extrinsic_jacobian(clouds, placed, poses, members, normal)
         by_pose = pose_jacobian(clouds, placed, vehicle, members, normal)
         across = np.einsum("ni,ni->n", beam, normal)
         variance = (errors.sigma_range_m * across) ** 2 + (errors.sigma_heave_m * normal[:, 2]) ** 2
@@ -205,8 +205,8 @@ class SurfaceMeter:
         scan = clouds.scan[members]
 
         def thickness(which: Array) -> float:
-            J = _sparse(by_mounting[which], self._lidar[which], len(names))
-            square = _scatter(J, errors.cov_mountings, basis[which])
+            J = _sparse(by_extrinsic[which], self._lidar[which], len(names))
+            square = _scatter(J, errors.cov_extrinsics, basis[which])
             square += _scatter_of_scans(by_pose[which], scan[which], errors.cov_poses, basis[which])
             return float(np.sqrt(square + variance[which].mean() + of_shape**2))
 
@@ -219,12 +219,12 @@ class SurfaceMeter:
             G = basis[which][:, :columns]
             gain = np.linalg.solve(G.T @ G + 1e-9 * np.eye(columns), G.T)
             gains[names[i]] = gain
-            row = np.zeros((columns, len(errors.cov_mountings) + len(errors.cov_poses)))
-            row[:, 6 * i : 6 * i + 6] = gain @ by_mounting[which]
+            row = np.zeros((columns, len(errors.cov_extrinsics) + len(errors.cov_poses)))
+            row[:, 6 * i : 6 * i + 6] = gain @ by_extrinsic[which]
             into = np.zeros((columns, len(errors.cov_poses) // 6, 6))
             for k in range(columns):
                 np.add.at(into[k], scan[which], gain[k][:, None] * by_pose[which])
-            row[:, len(errors.cov_mountings) :] = into.reshape(columns, -1)
+            row[:, len(errors.cov_extrinsics) :] = into.reshape(columns, -1)
             rows_of[names[i]] = row
             noise_of[names[i]] = (gain * variance[which]) @ gain.T
         distance, rows, noise = {}, {}, {}
@@ -258,11 +258,11 @@ def _own_parameters(merged: _Refitted, which: Array, beams: Array) -> Array:
 
 
 def _propagated(rows: Array, errors: Errors) -> Array:
-    """Covariance (k, k) of what moves with mountings and poses by `rows`."""
-    split = len(errors.cov_mountings)
-    by_mountings, by_poses = rows[:, :split], rows[:, split:]
+    """Covariance (k, k) of what moves with extrinsics and poses by `rows`."""
+    split = len(errors.cov_extrinsics)
+    by_extrinsics, by_poses = rows[:, :split], rows[:, split:]
     return np.asarray(
-        by_mountings @ errors.cov_mountings @ by_mountings.T
+        by_extrinsics @ errors.cov_extrinsics @ by_extrinsics.T
         + by_poses @ errors.cov_poses @ by_poses.T
     )
 
@@ -297,7 +297,7 @@ def _refitted(points: Array, beams: Array, surface: Wall | Pole) -> _Refitted:
         )
         return _Refitted(fitted, points, (points - centre) @ normal)
     members = np.arange(len(points))
-    # Torn apart by mountings that are wrong it has no radius: that of the best ones is taken.
+    # Torn apart by extrinsics that are wrong it has no radius: that of the best ones is taken.
     pole = fit_pole(points, beams, members, surface.radius_m)
     assert pole is not None  # a known radius is never refused
     residual, _ = pole_residuals(points, pole.foot, pole.slope, pole.middle_z, pole.radius_m)

@@ -1,9 +1,9 @@
-"""Which points belong together: the mountings moved until walls and poles are thin.
+"""Which points belong together: the extrinsics moved until walls and poles are thin.
 
 A measure that looked only at points that are near each other already would find every calibration
-good. So the mountings are moved, from a gate of half a metre down, until the structure is as thin
-as it gets; which points lie on which surface is settled there, and kept for every set of mountings
-that is measured. What this gives for mountings is a bound for how well this structure can be
+good. So the extrinsics are moved, from a gate of half a metre down, until the structure is as thin
+as it gets; which points lie on which surface is settled there, and kept for every set of extrinsics
+that is measured. What this gives for extrinsics is a bound for how well this structure can be
 aligned, and no calibration: its errors follow those of the trajectory.
 """
 
@@ -36,7 +36,7 @@ COUNT_CELL_M = 0.25
 
 
 def sharper(clouds: Clouds, names: Sequence[str]) -> str:
-    """Which set of mountings has the points in fewer cells of the map, with the fewest first."""
+    """Which set of extrinsics has the points in fewer cells of the map, with the fewest first."""
 
     def cells(name: str) -> int:
         points = clouds.points_map(clouds.placed[name])
@@ -48,19 +48,19 @@ def sharper(clouds: Clouds, names: Sequence[str]) -> str:
 def align(
     clouds: Clouds, placed: Placed, sigmas: Array, with_ground: bool
 ) -> tuple[Structure, tuple[gtsam.Pose3, ...]]:
-    """Finds the structure, and mountings under which it is as thin as it gets.
+    """Finds the structure, and extrinsics under which it is as thin as it gets.
 
     Args:
         clouds: points of all LiDARs.
-        placed: under the mountings to begin with.
+        placed: under the extrinsics to begin with.
         sigmas: (L, 6) how far these may be off, vehicle axes, rad and m: what the structure does
             not tell stays.
         with_ground: level planes count too.
 
     Returns:
-        The structure, its geometry as those mountings have it, and T_vehicle_lidar per LiDAR.
+        The structure, its geometry as those extrinsics have it, and T_vehicle_lidar per LiDAR.
     """
-    start = [placed.mountings.T_vehicle_lidar[name] for name in clouds.lidars]
+    start = [placed.extrinsics.T_vehicle_lidar[name] for name in clouds.lidars]
     poses = list(start)
     prior = np.diag(sigmas.ravel() ** -2.0)
     for number, gate_m in enumerate(GATES_M):
@@ -95,14 +95,14 @@ def _between(T: gtsam.Pose3, start: gtsam.Pose3) -> Array:
     return np.concatenate([gtsam.Rot3.Logmap(R), T.translation() - start.translation()])
 
 
-def mounting_jacobian(
+def extrinsic_jacobian(
     clouds: Clouds, placed: Placed, poses: Sequence[gtsam.Pose3], members: IntArray, normal: Array
 ) -> Array:
     """How points move along a direction with the mounting of their LiDAR.
 
     Args:
         clouds: the points.
-        placed: under some mountings.
+        placed: under some extrinsics.
         poses: T_vehicle_lidar to take instead.
         members: (n,) the points, by index.
         normal: (n, 3) the direction, map.
@@ -125,7 +125,7 @@ def _normal_equations(
     structure: Structure,
     sigma_m: float,
 ) -> tuple[Array, Array]:
-    """Information and gradient on all mountings, vehicle axes, the surfaces eliminated."""
+    """Information and gradient on all extrinsics, vehicle axes, the surfaces eliminated."""
     size = 6 * len(poses)
     H, g = np.zeros((size, size)), np.zeros(size)
     points = clouds.points_map(placed, poses)
@@ -134,7 +134,7 @@ def _normal_equations(
         residual, normal, basis = linearised(surface, p)
         J = np.zeros((len(p), size))
         columns = 6 * clouds.lidar[surface.members][:, None] + np.arange(6)
-        own = mounting_jacobian(clouds, placed, poses, surface.members, normal)
+        own = extrinsic_jacobian(clouds, placed, poses, surface.members, normal)
         np.put_along_axis(J, columns, own, axis=1)
         weight = 1.0 / np.maximum(1.0, np.abs(residual) / sigma_m) / (sigma_m**2 * CORRELATED)
         weighted = basis * weight[:, None]
@@ -186,7 +186,7 @@ def pose_jacobian(
 
     Args:
         clouds: the points.
-        placed: under some mountings.
+        placed: under some extrinsics.
         points_vehicle: (n, 3) the points, vehicle frame.
         members: (n,) by index.
         normal: (n, 3) the direction, map.

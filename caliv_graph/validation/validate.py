@@ -12,16 +12,15 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.noise import first_pose_noise
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
-from caliv_graph.config import Config
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting, sigmas_from_mounting
 from caliv_graph.products import Array, Calibration, IntArray, MotionData, PoseNoise, Recording
-from caliv_graph.progress import Progress
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.trajectory.smoothed import MERGE_NS, SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
-    Mountings,
+    Extrinsics,
     Placed,
     choose_scans,
     read_clouds,
@@ -123,7 +122,7 @@ class Verdict:
         of_expected: what remains of it over what is expected.
         chi2: of all offsets between LiDARs against their joint covariance.
         dof: how many these are; 0: nothing to test.
-        p_value: chance of more, if mountings, trajectory and ranges are as good as they say.
+        p_value: chance of more, if extrinsics, trajectory and ranges are as good as they say.
         contradicts: whether that is beyond 5 sigma.
         sentences: as a person says it.
     """
@@ -155,7 +154,7 @@ class Validation:
         expected_alone_m: likewise per LiDAR.
         verdict: what it comes to.
         clouds: the points, for pictures.
-        best: mountings that align this structure best, in the order of `lidars`; no calibration.
+        best: extrinsics that align this structure best, in the order of `lidars`; no calibration.
         warnings: what a person should know, a line each.
     """
 
@@ -195,7 +194,7 @@ def validate(
 ) -> Validation:
     """Measures the alignment of all LiDARs' clouds of a drive, before and after calibration.
 
-    The clouds are brought into the map by the trajectory and the mountings. What a target's region
+    The clouds are brought into the map by the trajectory and the extrinsics. What a target's region
     holds is left out, and the ground, unless the solve did without it.
 
     Args:
@@ -223,18 +222,18 @@ def _validate(
     motion: MotionData | None,
 ) -> Validation:
     names, notes = _common_lidars(recording, calibration, config)
-    mountings = _mountings(names, calibration, config)
+    extrinsics = _extrinsics(names, calibration, config)
     motions = {0: recording.motion() if motion is None else motion}
     with progress.stage("smoothing the trajectory", None):
         (rough,) = smooth_trajectories([recording], config, [[]], motions)
     regions, no_target = target_regions(recording, rough, config, progress)
     chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
-    nodes = _nodes(chosen, mountings[AFTER], rough.span_ns)
+    nodes = _nodes(chosen, extrinsics[AFTER], rough.span_ns)
     with progress.stage("smoothing the trajectory at the scans", None):
         (trajectory,) = smooth_trajectories([recording], config, [nodes], motions)
     # First the calibration: by it one sees what is target and what is ground.
     clouds = read_clouds(
-        recording, trajectory, chosen, mountings, regions, not config.ground.use, progress
+        recording, trajectory, chosen, extrinsics, regions, not config.ground.use, progress
     )
     errors = Errors(
         _mounting_covariance(names, calibration),
@@ -242,7 +241,7 @@ def _validate(
         config.noise.lidar_range_m,
         HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
     )
-    sigmas = np.array([sigmas_from_mounting(config.lidars[n].sigma) for n in names])
+    sigmas = np.array([config.lidars[n].sigma.sigmas() for n in names])
     with progress.stage("measuring the alignment", None):
         start = sharper(clouds, (AFTER, BEFORE))
         structure, best = align(clouds, clouds.placed[start], sigmas, not config.ground.use)
@@ -279,27 +278,25 @@ def _common_lidars(
     return names, notes
 
 
-def _mountings(
+def _extrinsics(
     names: Sequence[str], calibration: Calibration, config: Config
-) -> dict[str, Mountings]:
+) -> dict[str, Extrinsics]:
     """The calibration first, then the guesses."""
     results = calibration.lidars
     return {
-        AFTER: Mountings(
+        AFTER: Extrinsics(
             {name: results[name].T_vehicle_lidar for name in names},
             {n: o[0] for n in names if (o := results[n].time_offset) is not None},
         ),
-        BEFORE: Mountings(
-            {name: pose_from_mounting(config.lidars[name].initial) for name in names}, {}
-        ),
+        BEFORE: Extrinsics({name: config.lidars[name].initial.pose() for name in names}, {}),
     }
 
 
 def _nodes(
-    chosen: Mapping[str, IntArray], mountings: Mountings, span_ns: tuple[int, int]
+    chosen: Mapping[str, IntArray], extrinsics: Extrinsics, span_ns: tuple[int, int]
 ) -> IntArray:
     """Times at which poses are wanted, ascending; those that share a node once."""
-    taken = [mountings.true_ns(name, stamps) for name, stamps in chosen.items()]
+    taken = [extrinsics.true_ns(name, stamps) for name, stamps in chosen.items()]
     stamps = np.unique(np.clip(np.concatenate([*taken, np.zeros(0, dtype=np.int64)]), *span_ns))
     out: list[int] = []
     for stamp in stamps.tolist():
@@ -367,7 +364,7 @@ def _measured(
     errors: Errors,
     warnings: tuple[str, ...],
 ) -> Validation:
-    """Measures under all mountings what was found under the best ones."""
+    """Measures under all extrinsics what was found under the best ones."""
     start, structure, best = aligned
     stages: dict[str, tuple[Placed, Sequence[gtsam.Pose3] | None]] = {
         BEFORE: (clouds.placed[BEFORE], None),
@@ -493,7 +490,7 @@ def _pairs(
 
 
 def _is_shared(surface: SurfaceResult, pair: Pair) -> bool:
-    """Whether a surface tells how two LiDARs are apart, under all mountings."""
+    """Whether a surface tells how two LiDARs are apart, under all extrinsics."""
     told = [surface.expected.distance_m, *surface.apart.values()]
     return all(pair in of_stage for of_stage in told)
 
@@ -589,7 +586,7 @@ def _sentences(
         if not contradicts and p_value < 0.01:
             word = "They explain it poorly"
         out.append(f"{remains}. {word} ({tested}).")
-    out.append(f"Mountings fitted to this structure alone would leave {best}.")
+    out.append(f"Extrinsics fitted to this structure alone would leave {best}.")
     return tuple(out)
 
 

@@ -8,7 +8,8 @@ import pytest
 import caliv_graph
 from caliv_graph.batch import digests
 from caliv_graph.batch.digests import DigestCache, job_digest, job_inputs
-from caliv_graph.config import Config, load_config
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config
 from tests.cli.commands import write_config, write_drive
 
 OLD_S = 1_000_000_000

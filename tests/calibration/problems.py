@@ -1,4 +1,4 @@
-"""Small calibrations with known truth, without any cloud: poses, mountings, registered poses."""
+"""Small calibrations with known truth, without any cloud: poses, extrinsics, registered poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import key_drift, key_mounting, key_target, key_vehicle
+from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.products import Array
 from tests.samples import MOUNTINGS, pose
 
@@ -27,7 +27,7 @@ class Case:
     """A problem, its truth, and what a registration without errors would give.
 
     Attributes:
-        problem: with the true poses and mountings as given poses and guesses.
+        problem: with the true poses and extrinsics as given poses and guesses.
         truth: values of all variables.
         measured: T_target_lidar of each cloud.
         information: (J, 6, 6) of them, correlated, never the same twice.
@@ -71,7 +71,7 @@ def make_case(
     names = lidars or ("front", "rear")
     reference = reference or names[-1]
     rng = np.random.default_rng(seed)
-    mountings = {name: pose(*MOUNTINGS[name]) for name in names}
+    extrinsics = {name: pose(*MOUNTINGS[name]) for name in names}
     poses = [
         T
         for drive in range(drives)
@@ -81,7 +81,7 @@ def make_case(
     problem = Problem(
         lidars=names,
         reference=reference,
-        guesses=mountings,
+        guesses=extrinsics,
         prior_sigmas=dict.fromkeys(names, SIGMAS),
         fixed=frozenset(),
         poses=tuple((i // count, (i % count) * PERIOD_NS) for i in range(len(poses))),
@@ -95,12 +95,12 @@ def make_case(
     truth = gtsam.Values()
     for i, T in enumerate(poses):
         truth.insert(key_vehicle(i), T)
-        truth.insert(key_drift(i), np.zeros(6))
-    E = mountings[reference]
-    truth.insert(key_mounting(), E)
+        truth.insert(key_pose_error(i), np.zeros(6))
+    E = extrinsics[reference]
+    truth.insert(key_extrinsic(), E)
     for name in names:
-        for key in problem.mounting_keys(name)[1:]:
-            truth.insert(key, E.between(mountings[name]))
+        for key in problem.extrinsic_keys_of(name)[1:]:
+            truth.insert(key, E.between(extrinsics[name]))
     for m in range(drives):
         # The target stands in the drive's map, turned by an angle of its own.
         place = np.add(origin, (9.0, 4.0, 0.6))
@@ -123,8 +123,8 @@ def predictions(problem: Problem, values: gtsam.Values) -> list[gtsam.Pose3]:
         T_target_vehicle = values.atPose3(key_target(int(m))).compose(
             values.atPose3(key_vehicle(int(i)))
         )
-        mounting = values.atPose3(key_mounting())
-        for key in problem.mounting_keys(problem.lidars[a])[1:]:
+        mounting = values.atPose3(key_extrinsic())
+        for key in problem.extrinsic_keys_of(problem.lidars[a])[1:]:
             mounting = mounting.compose(values.atPose3(key))
         out.append(T_target_vehicle.compose(mounting))
     return out

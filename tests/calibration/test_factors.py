@@ -11,18 +11,24 @@ import pytest
 
 from caliv_graph.calibration.factors import (
     chain_jacobians,
-    drift_factor,
+    extrinsic_prior,
+    gauss_markov_factor,
     given_pose_factor,
-    mounting_prior,
     target_pose_factor,
 )
-from caliv_graph.conventions import key_drift, key_mounting, key_sensor, key_target, key_vehicle
+from caliv_graph.conventions import (
+    key_extrinsic,
+    key_pose_error,
+    key_sensor,
+    key_target,
+    key_vehicle,
+)
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array
 from tests.calibration.problems import correlated_information, numerical_jacobian
 from tests.samples import MOUNTINGS, pose
 
-C, X, B, E, S = key_target(0), key_vehicle(0), key_drift(0), key_mounting(), key_sensor(1)
+C, X, B, E, S = key_target(0), key_vehicle(0), key_pose_error(0), key_extrinsic(), key_sensor(1)
 
 OFFSETS_M = (0.0, 30.0, 2000.0)
 """How far poses are from their origin: at it, on a drive, and in a map of a city."""
@@ -223,7 +229,7 @@ def test_slow_error_is_what_the_given_pose_is_off_by() -> None:
 
 
 def test_slow_error_decays_towards_zero() -> None:
-    factor = drift_factor(1, 2, 0.8, np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]))
+    factor = gauss_markov_factor(1, 2, 0.8, np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]))
     values = gtsam.Values()
     values.insert(1, np.array([1.0, 0.0, 0.0, 10.0, 0.0, 0.0]))
     values.insert(2, np.array([0.8, 0.0, 0.0, 8.0, 0.0, 0.0]))
@@ -241,7 +247,7 @@ def test_slow_error_keeps_its_variance() -> None:
     values.insert(0, np.zeros(6))
     decays = (0.9, 0.5, 0.99, 0.1)
     for i, decay in enumerate(decays):
-        graph.add(drift_factor(i, i + 1, decay, stationary * math.sqrt(1.0 - decay**2)))
+        graph.add(gauss_markov_factor(i, i + 1, decay, stationary * math.sqrt(1.0 - decay**2)))
         values.insert(i + 1, np.zeros(6))
     marginals = gtsam.Marginals(graph, values)
     for i in range(len(decays) + 1):
@@ -263,9 +269,9 @@ def test_jacobians_of_a_guess(off_by: float) -> None:
         sigmas = rng.uniform(0.01, 0.1, 6)
         mounting = values.atPose3(E).compose(values.atPose3(S))
         guess = retract_vehicle_axes(mounting, off_by * rng.uniform(-1, 1, 6))
-        check_jacobians(mounting_prior((E, S), guess, sigmas), values, (E, S))
+        check_jacobians(extrinsic_prior((E, S), guess, sigmas), values, (E, S))
         guess = retract_vehicle_axes(values.atPose3(E), off_by * rng.uniform(-1, 1, 6))
-        check_jacobians(mounting_prior((E,), guess, sigmas), values, (E,))
+        check_jacobians(extrinsic_prior((E,), guess, sigmas), values, (E,))
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -279,7 +285,7 @@ def test_sigmas_of_a_guess_are_those_of_the_vehicle_s_axes(name: str, axis: int)
     actual = retract_vehicle_axes(guess, off)
     reference = pose(*MOUNTINGS["rear"])
     values = values_of(E=reference, S=reference.between(actual))
-    factor = mounting_prior((E, S), guess, sigmas)
+    factor = extrinsic_prior((E, S), guess, sigmas)
     assert factor.unwhitenedError(values) == pytest.approx(off, abs=1e-12)
     assert factor.error(values) == pytest.approx(2.0)
 

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
-    ANCHOR,
+    GAUGE_PRIOR,
     CloudLinearisation,
     DenseSystem,
     add_shape,
+    adjusted_residuals,
     cloud_graph,
     dense_system,
-    drift_sigmas,
     initial_values,
-    left_over,
     linearise_clouds,
     merged,
     optimise,
+    pose_error_sigmas,
     pose_graph,
     prior_graph,
     retract,
     with_given_poses,
 )
-from caliv_graph.conventions import key_drift, key_mounting, key_target, key_vehicle
+from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, PoseNoise
@@ -75,10 +75,10 @@ def test_slow_errors_are_a_stationary_process_of_each_drive() -> None:
         poses=(*((0, s * PERIOD_NS) for s in (0, 1, 2, 7, 8)), *case.problem.poses[5:]),
     )
     marginals = gtsam.Marginals(pose_graph(problem, NOISE), case.truth)
-    stationary = drift_sigmas(NOISE)
+    stationary = pose_error_sigmas(NOISE)
     assert stationary == pytest.approx([1e-3] * 3 + [0.01] * 3)
     for i in range(10):
-        sigma = np.sqrt(np.diag(marginals.marginalCovariance(key_drift(i))))
+        sigma = np.sqrt(np.diag(marginals.marginalCovariance(key_pose_error(i))))
         assert sigma == pytest.approx(stationary)
     for i, j, correlation in (
         (0, 1, math.exp(-0.2 / 1.5)),
@@ -86,9 +86,13 @@ def test_slow_errors_are_a_stationary_process_of_each_drive() -> None:
         (0, 4, math.exp(-1.6 / 1.5)),
         (4, 5, 0.0),
     ):
-        joint = marginals.jointMarginalCovariance(gtsam.KeyVector([key_drift(i), key_drift(j)]))
+        joint = marginals.jointMarginalCovariance(
+            gtsam.KeyVector([key_pose_error(i), key_pose_error(j)])
+        )
         expected = correlation * stationary**2
-        assert np.diag(joint.at(key_drift(i), key_drift(j))) == pytest.approx(expected, abs=1e-12)
+        assert np.diag(joint.at(key_pose_error(i), key_pose_error(j))) == pytest.approx(
+            expected, abs=1e-12
+        )
 
 
 def test_a_given_pose_is_as_good_as_its_white_and_slow_error_together() -> None:
@@ -116,7 +120,7 @@ def test_guesses_are_of_the_named_lidars_only() -> None:
     assert graph.size() == 2
     # The mounting of `front` may be anything.
     values = gtsam.Values(case.truth)
-    front, left = (case.problem.mounting_keys(n)[1] for n in ("front", "left"))
+    front, left = (case.problem.extrinsic_keys_of(n)[1] for n in ("front", "left"))
     values.update(front, gtsam.Pose3())
     assert graph.error(values) == pytest.approx(0.0, abs=1e-15)
     values.update(left, gtsam.Pose3())
@@ -131,10 +135,10 @@ def test_first_values_are_guesses_and_given_poses() -> None:
     values = initial_values(case.problem, case.measured)
     assert set(values.keys()) == set(case.truth.keys())
     for name, guess in case.problem.guesses.items():
-        assert case.problem.mounting(values, name).equals(guess, 1e-12)
+        assert case.problem.extrinsic(values, name).equals(guess, 1e-12)
     for m in range(2):
         assert values.atPose3(key_target(m)).equals(case.truth.atPose3(key_target(m)), 1e-9)
-    np.testing.assert_array_equal(values.atVector(key_drift(3)), np.zeros(6))
+    np.testing.assert_array_equal(values.atVector(key_pose_error(3)), np.zeros(6))
 
 
 def test_first_target_frame_is_not_that_of_clouds_that_are_far_off() -> None:
@@ -150,15 +154,15 @@ def test_first_target_frame_is_not_that_of_clouds_that_are_far_off() -> None:
 def test_poses_go_back_to_what_was_given() -> None:
     case = make_case()
     elsewhere = moved(case.truth, 3, 0.1, 1.0)
-    elsewhere.update(key_drift(2), np.ones(6))
+    elsewhere.update(key_pose_error(2), np.ones(6))
     back = with_given_poses(case.problem, elsewhere)
     for i, T in enumerate(case.problem.T_map_vehicle):
         assert back.atPose3(key_vehicle(i)).equals(T, 0.0)
-        np.testing.assert_array_equal(back.atVector(key_drift(i)), np.zeros(6))
+        np.testing.assert_array_equal(back.atVector(key_pose_error(i)), np.zeros(6))
     for key in (*case.problem.extrinsic_keys(), key_target(0)):
         assert back.atPose3(key).equals(elsewhere.atPose3(key), 0.0)
     # And the values that were given are left as they were.
-    assert elsewhere.atVector(key_drift(2)).tolist() == [1.0] * 6
+    assert elsewhere.atVector(key_pose_error(2)).tolist() == [1.0] * 6
 
 
 # ------------------------------------------------------------------ solving
@@ -173,19 +177,19 @@ def test_a_known_truth_is_found_without_guesses() -> None:
     )
     result = optimise(graph, moved(case.truth, 4, math.radians(3.0), 0.1), 50)
     for name, true in case.problem.guesses.items():
-        found = case.problem.mounting(result, name)
+        found = case.problem.extrinsic(result, name)
         assert vehicle_axes_difference(found, true) == pytest.approx(np.zeros(6), abs=1e-4)
     assert result.atPose3(key_target(0)).equals(case.truth.atPose3(key_target(0)), 1e-3)
 
 
 def mountings_in_a_map_at(origin: tuple[float, float, float]) -> Array:
-    """(2, 6) how the mountings that are found differ from those in a map that begins here."""
+    """(2, 6) how the extrinsics that are found differ from those in a map that begins here."""
     here, there = make_case(count=10), make_case(count=10, origin=origin)
     (_, at_here), (_, at_there) = solved(here), solved(there)
     return np.array(
         [
             vehicle_axes_difference(
-                there.problem.mounting(at_there, name), here.problem.mounting(at_here, name)
+                there.problem.extrinsic(at_there, name), here.problem.extrinsic(at_here, name)
             )
             for name in here.problem.lidars
         ]
@@ -204,15 +208,15 @@ def test_another_reference_finds_the_same_mountings() -> None:
     by_left = make_case("front", "rear", "left", reference="left", count=10)
     (_, rear), (_, left) = solved(by_rear), solved(by_left)
     for name in by_rear.problem.lidars:
-        first = by_rear.problem.mounting(rear, name)
-        second = by_left.problem.mounting(left, name)
+        first = by_rear.problem.extrinsic(rear, name)
+        second = by_left.problem.extrinsic(left, name)
         assert vehicle_axes_difference(first, second) == pytest.approx(np.zeros(6), abs=1e-5)
 
 
 def drawn(case: Case, seed: int) -> Case:
     """The case with given poses and guesses that are off by what is said of them."""
     rng = np.random.default_rng(seed)
-    slow = drift_sigmas(NOISE)
+    slow = pose_error_sigmas(NOISE)
     decay = math.exp(-PERIOD_NS * 1e-9 / NOISE.drift_time_s)
     drift, poses = slow * rng.normal(size=6), []
     for T in case.problem.T_map_vehicle:
@@ -245,7 +249,7 @@ def test_errors_are_as_large_as_is_said_of_them() -> None:
         )
         nees.append(e @ D @ e)
     assert np.mean(squared) == pytest.approx(138.0, abs=17.0)
-    # Of the two mountings' 12 dimensions, 12 give or take 4.9 / sqrt(10).
+    # Of the two extrinsics' 12 dimensions, 12 give or take 4.9 / sqrt(10).
     assert np.mean(nees) == pytest.approx(12.0, abs=5.0)
 
 
@@ -282,7 +286,7 @@ def test_predictions_move_as_their_jacobians_say(reference: str) -> None:
 
 def test_each_variable_moves_by_its_own_tangent() -> None:
     case = make_case(count=3)
-    keys = (key_target(0), key_vehicle(2), key_mounting())
+    keys = (key_target(0), key_vehicle(2), key_extrinsic())
     d = np.arange(18.0) * 0.01
     after = retract(case.truth, keys, d)
     for i, key in enumerate(keys):
@@ -290,7 +294,7 @@ def test_each_variable_moves_by_its_own_tangent() -> None:
         assert after.atPose3(key).equals(expected, 1e-9)
     for key in (key_vehicle(0), key_vehicle(1), case.problem.extrinsic_keys()[1]):
         assert after.atPose3(key).equals(case.truth.atPose3(key), 0.0)
-    assert case.truth.atPose3(key_mounting()).equals(case.problem.guesses["rear"], 0.0)
+    assert case.truth.atPose3(key_extrinsic()).equals(case.problem.guesses["rear"], 0.0)
 
 
 # ------------------------------------------------------------------ the dense system
@@ -344,10 +348,10 @@ def test_eliminating_the_slow_errors_loses_nothing() -> None:
     problem = case.problem
     keys = (*problem.pose_keys(), *problem.target_keys(), *problem.extrinsic_keys())
     ordering = gtsam.Ordering()
-    for key in (*problem.drift_keys(), *keys):
+    for key in (*problem.pose_error_keys(), *keys):
         ordering.push_back(key)
     H, b = graph.linearize(values).hessian(ordering)
-    n = 6 * len(problem.drift_keys())
+    n = 6 * len(problem.pose_error_keys())
     gain = np.linalg.solve(H[:n, :n], H[:n, n:]).T
     system = dense_system(problem, graph, values)
     expected = H[n:, n:] - gain @ H[:n, n:]
@@ -361,7 +365,7 @@ def test_eliminating_the_slow_errors_loses_nothing() -> None:
 def test_what_the_graph_does_not_touch_has_zero_rows() -> None:
     case = make_case(count=3)
     system = dense_system(case.problem, prior_graph(case.problem, ("rear",)), case.truth)
-    E = system.offset(key_mounting())
+    E = system.offset(key_extrinsic())
     assert system.H.shape == (6 * (3 + 1 + 2),) * 2
     touched = np.zeros(len(system.b), dtype=bool)
     touched[E : E + 6] = True
@@ -373,7 +377,7 @@ def test_what_the_graph_does_not_touch_has_zero_rows() -> None:
 
 
 def test_lidars_that_share_nothing_know_nothing_of_each_other() -> None:
-    # Each LiDAR has a drive of its own and no target in common: without priors the mountings are
+    # Each LiDAR has a drive of its own and no target in common: without priors the extrinsics are
     # known, each by itself. With the target frames tied to nothing else, no covariance between.
     case = make_case(count=10, drives=2)
     keep = [j for j in range(40) if case.problem.cloud_lidar[j] == case.problem.cloud_placement[j]]
@@ -457,7 +461,7 @@ def test_cross_terms_between_clouds_are_kept() -> None:
     J = dense_jacobian(before, lines)
     expected = before.H + J.T @ H @ J
     frame = np.arange(6) + before.offset(key_target(0))
-    expected[frame, frame] += ANCHOR
+    expected[frame, frame] += GAUGE_PRIOR
     np.testing.assert_allclose(after.H, expected, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(after.b, before.b - J.T @ g, rtol=1e-9, atol=1e-6)
 
@@ -485,7 +489,7 @@ def test_a_shape_that_moves_with_its_clouds_says_nothing_of_the_target_frame() -
 
 
 def test_the_step_of_the_quadratic_leads_to_the_measurements() -> None:
-    # Poses known, targets and mountings wrong: Gauss-Newton on quadratics finds the truth.
+    # Poses known, targets and extrinsics wrong: Gauss-Newton on quadratics finds the truth.
     case = make_case("front", "rear", count=16)
     steady = pose_graph(case.problem, NOISE)
     values = with_given_poses(case.problem, moved(case.truth, 14, 0.02, 0.05))
@@ -503,7 +507,7 @@ def test_the_step_of_the_quadratic_leads_to_the_measurements() -> None:
         step = np.linalg.solve(D, c)
         values = retract(values, system.keys, np.concatenate([g - G @ step, step]))
     for name, true in case.problem.guesses.items():
-        found = case.problem.mounting(values, name)
+        found = case.problem.extrinsic(values, name)
         assert vehicle_axes_difference(found, true) == pytest.approx(np.zeros(6), abs=1e-6)
 
 
@@ -517,7 +521,7 @@ def test_what_is_left_over_moves_with_an_error_of_the_clouds_by_its_information(
     system = dense_system(case.problem, graph, case.truth)
     lines = linearise_clouds(case.problem, case.truth)
     r = 1e-3 * np.random.default_rng(16).normal(size=(count, 6))
-    W, v = left_over(system, lines, H, r)
+    W, v = adjusted_residuals(system, lines, H, r)
 
     # Gauss-Newton's step by itself, and the gradient there.
     full = add_shape(system, lines, H, H @ r.ravel())
@@ -526,20 +530,20 @@ def test_what_is_left_over_moves_with_an_error_of_the_clouds_by_its_information(
     scale = np.abs(v).max()
     np.testing.assert_allclose(v, expected, atol=1e-6 * scale)
     error = 1e-3 * np.random.default_rng(17).normal(size=6 * count)
-    _, after = left_over(system, lines, H, r + error.reshape(-1, 6))
+    _, after = adjusted_residuals(system, lines, H, r + error.reshape(-1, 6))
     np.testing.assert_allclose(after - v, W @ error, atol=1e-6 * scale)
     # A turn of the target's frame is taken up by it.
     common = np.tile(np.eye(6), (count, 1))
     assert np.abs(W @ common).max() < 1e-6 * np.abs(W).max()
     # Without any error nothing is left.
-    assert np.abs(left_over(system, lines, H, 0.0 * r)[1]).max() < 1e-9 * scale
+    assert np.abs(adjusted_residuals(system, lines, H, 0.0 * r)[1]).max() < 1e-9 * scale
 
 
 def test_what_is_left_over_of_poses_that_nothing_ties_is_a_solve_error() -> None:
     case = make_case(count=4)
     H = block_diagonal(case.information)
     with pytest.raises(SolveError, match="tied to nothing"):
-        left_over(
+        adjusted_residuals(
             empty_system(case, case.truth),
             linearise_clouds(case.problem, case.truth),
             H,
@@ -557,7 +561,7 @@ def test_poses_that_are_off_are_told_from_mountings_that_are() -> None:
     )
     values = optimise(graph, case.truth, 30)
     for name, true in problem.guesses.items():
-        difference = vehicle_axes_difference(problem.mounting(values, name), true)
+        difference = vehicle_axes_difference(problem.extrinsic(values, name), true)
         assert difference == pytest.approx(np.zeros(6), abs=1e-5)
     C = values.atPose3(key_target(0)).inverse().translation()
     true_C = case.truth.atPose3(key_target(0)).inverse().translation()

@@ -34,17 +34,18 @@ from caliv_graph.calibration.ground import (
     standing_factor,
 )
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, moved_map
-from caliv_graph.config import GroundConfig, parse_config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import GroundConfig
 from caliv_graph.conventions import (
+    key_extrinsic,
     key_ground,
     key_height,
-    key_mounting,
     key_parallel,
     key_sensor,
     key_vehicle,
 )
 from caliv_graph.geometry.se3 import (
-    pose_from_mounting,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     tangent_axes,
@@ -58,9 +59,8 @@ from caliv_graph.products import (
     TargetObservation,
     Trajectory,
 )
-from caliv_graph.progress import SilentProgress
 from caliv_graph.simulation import load_scenario, simulate_drive
-from caliv_graph.targets.ground_planes import (
+from caliv_graph.targets.ground.planes import (
     DISTANCE_FLOOR_M,
     NORMAL_FLOOR_RAD,
     measure_grounds,
@@ -72,7 +72,7 @@ from tests.samples import pose
 
 X, E, S, G, H, P = (
     key_vehicle(0),
-    key_mounting(),
+    key_extrinsic(),
     key_sensor(1),
     key_ground(0),
     key_height(0),
@@ -136,7 +136,7 @@ def observed(
     out: list[GroundObservation] = []
     for name in problem.lidars:
         for i, (drive, stamp_ns) in enumerate(problem.poses):
-            T = truth.atPose3(key_vehicle(i)).compose(problem.mounting(truth, name))
+            T = truth.atPose3(key_vehicle(i)).compose(problem.extrinsic(truth, name))
             out.append(
                 seen_from(
                     T,
@@ -237,7 +237,7 @@ def test_jacobians(offset_m: float) -> None:
         swept = replace(
             observation,
             R_vehicle_lidar=random_values(seed + 9, 1.0)[0].atPose3(E).rotation().matrix(),
-            by_mounting=0.1 * np.random.default_rng(seed).normal(size=(3, 3)),
+            by_extrinsic=0.1 * np.random.default_rng(seed).normal(size=(3, 3)),
         )
         check_jacobians(ground_plane_factor((X, E, S), G, anchor, swept), values)
         check_jacobians(ground_plane_factor((X, E), G, anchor, swept), values)
@@ -324,8 +324,8 @@ def test_plane_is_found_from_guesses_and_solved() -> None:
     assert solved.atVector(G) == pytest.approx(g, abs=1e-5)
     assert np.nanmax(ground_squares(case.problem, observations, solved)) < 1e-2
     for name in case.problem.lidars:
-        difference = case.problem.mounting(case.truth, name).between(
-            case.problem.mounting(solved, name)
+        difference = case.problem.extrinsic(case.truth, name).between(
+            case.problem.extrinsic(solved, name)
         )
         assert gtsam.Pose3.Logmap(difference) == pytest.approx(np.zeros(6), abs=1e-5)
 
@@ -431,7 +431,7 @@ known is known to one far better."""
 def vehicle_information(
     case: Case, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 ) -> Array:
-    """(12, 12) of both mountings, scaled, vehicle axes, all else eliminated."""
+    """(12, 12) of both extrinsics, scaled, vehicle axes, all else eliminated."""
     D, _, _, _ = dense_system(case.problem, graph, values).schur()
     back = np.linalg.inv(case.problem.to_vehicle_axes(values))
     unit = scaling(len(case.problem.lidars))
@@ -473,7 +473,7 @@ def test_what_the_height_leaves_on_an_arc_is_the_turn_about_its_centre() -> None
     centre, up = np.array([0.0, -9.16, 0.0]), np.array([0.0, 0.0, 1.0])
     expected = []
     for name in case.problem.lidars:
-        t = case.problem.mounting(case.truth, name).translation()
+        t = case.problem.extrinsic(case.truth, name).translation()
         expected += [*up, *np.cross(up, t - centre)]
     direction = np.array(expected) / scaling(2)
     direction /= np.linalg.norm(direction)
@@ -554,10 +554,10 @@ def test_solved_errors_are_what_the_graph_claims() -> None:
         solved = optimise(graph, start, 50)
         error = np.concatenate(
             [
-                right_to_vehicle_axes(case.problem.mounting(solved, name))
+                right_to_vehicle_axes(case.problem.extrinsic(solved, name))
                 @ gtsam.Pose3.Logmap(
-                    case.problem.mounting(case.truth, name).between(
-                        case.problem.mounting(solved, name)
+                    case.problem.extrinsic(case.truth, name).between(
+                        case.problem.extrinsic(solved, name)
                     )
                 )
                 for name in case.problem.lidars
@@ -568,7 +568,7 @@ def test_solved_errors_are_what_the_graph_claims() -> None:
         plane_squares.append(ground_squares(case.problem, observations, solved).sum())
     # 144 degrees of freedom: 110 to 181 in 95 of 100 cases. No heave is drawn, z claims too much.
     assert 95.0 < sum(squares) < 190.0
-    # 96 residuals, less what the plane and the mountings take.
+    # 96 residuals, less what the plane and the extrinsics take.
     assert 75.0 < np.mean(plane_squares) < 100.0
 
 
@@ -589,8 +589,8 @@ def test_wrong_planes_are_dropped_and_good_ones_kept() -> None:
     rng = np.random.default_rng(1)
     for name in case.problem.lidars:
         d = np.array([math.radians(3.0)] * 3 + [0.1] * 3) * rng.uniform(-1.0, 1.0, 6)
-        guess = retract_vehicle_axes(case.problem.mounting(case.truth, name), d)
-        keys = case.problem.mounting_keys(name)
+        guess = retract_vehicle_axes(case.problem.extrinsic(case.truth, name), d)
+        keys = case.problem.extrinsic_keys_of(name)
         base = start.atPose3(E) if len(keys) > 1 else gtsam.Pose3()
         start.update(keys[-1], base.between(guess))
     start.insert(ground_values(case.problem, observations, start, HEIGHT_KNOWN))
@@ -718,7 +718,7 @@ def test_heave_between_a_few_scans_is_that_of_two() -> None:
 def test_heave_is_in_the_sigma_of_the_distance_and_in_nothing_else() -> None:
     case, observations = one_later(40_000_000, 0.0, count=2)
     g = np.array([0.0, 0.0, GROUND_Z])
-    keys = (X, *case.problem.mounting_keys(observations[2].lidar))
+    keys = (X, *case.problem.extrinsic_keys_of(observations[2].lidar))
     anchor = ground_anchor(case.problem, 0)
     factor = ground_plane_factor(keys, G, anchor, observations[2], 0.5, 0.007)
     plain = ground_plane_factor(keys, G, anchor, observations[2])
@@ -765,7 +765,7 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
     none = np.zeros(0, dtype=np.int64)
     problem = replace(
         make_case(count=2).problem,
-        guesses={name: pose_from_mounting(guess) for name, guess in recording.guesses.items()},
+        guesses={name: guess.pose() for name, guess in recording.guesses.items()},
         poses=tuple((0, t) for t in stamps),
         T_map_vehicle=tuple(poses),
         cloud_lidar=none,
@@ -787,13 +787,13 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
     assert weights.planes.min() > 0.5
 
     front, rear = (
-        vehicle_axes_difference(problem.mounting(values, name), truth.T_vehicle_lidar[name])
+        vehicle_axes_difference(problem.extrinsic(values, name), truth.T_vehicle_lidar[name])
         for name in ("front", "rear")
     )
     # S2S to hundredths of a milliradian and of a millimetre, roll and pitch to the vehicle to the
     # poses' noise, and its height to the 5 mm that the scenario draws.
     assert np.abs(front[:2] - rear[:2]).max() < 3e-5
-    between = problem.mounting(values, "rear").between(problem.mounting(values, "front"))
+    between = problem.extrinsic(values, "rear").between(problem.extrinsic(values, "front"))
     true_between = truth.T_vehicle_lidar["rear"].between(truth.T_vehicle_lidar["front"])
     up = truth.T_vehicle_lidar["rear"].rotation().matrix()[2]
     # Yaw and place are the guesses': the height is compared where both agree on the ground.

@@ -19,7 +19,7 @@ from caliv_graph.calibration.noise import (
     first_pose_noise,
     fit_pose_noise,
 )
-from caliv_graph.config import NoiseConfig
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.products import PoseNoise
 from tests.calibration.problems import PERIOD_NS, Case, make_case, noisy, with_poses
 

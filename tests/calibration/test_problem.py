@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import retract
-from caliv_graph.calibration.problem import TRUSTED_SIGMAS, Problem, pose_problem
-from caliv_graph.config import Config, LidarConfig, Mounting, MountingSigma
-from caliv_graph.conventions import key_mounting, key_sensor, key_target, key_vehicle
+from caliv_graph.calibration.guesses import TRUSTED_SIGMAS
+from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.config.model import Config, LidarConfig, PoseConfig, PoseSigmaConfig
+from caliv_graph.conventions import key_extrinsic, key_sensor, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import TargetCloud, TargetObservation, Trajectory
@@ -26,8 +27,8 @@ def config_of(*names: str, reference: str = "", fixed: tuple[str, ...] = ()) -> 
         lidars={
             name: LidarConfig(
                 topic=f"sensor_{i}",
-                initial=Mounting(xyz=MOUNTINGS[name][0], rpy_deg=MOUNTINGS[name][1]),
-                sigma=MountingSigma(xyz=(0.1, 0.2, 0.3), rpy_deg=(1.0, 2.0, 3.0)),
+                initial=PoseConfig(xyz=MOUNTINGS[name][0], rpy_deg=MOUNTINGS[name][1]),
+                sigma=PoseSigmaConfig(xyz=(0.1, 0.2, 0.3), rpy_deg=(1.0, 2.0, 3.0)),
                 fixed=name in fixed,
             )
             for i, name in enumerate(names)
@@ -105,17 +106,17 @@ def test_sigmas_are_of_the_vehicle_s_axes_in_radians_and_metres() -> None:
 
 def test_keys_are_in_the_order_of_the_product() -> None:
     problem = small_problem()
-    E, front, left = key_mounting(), key_sensor(0), key_sensor(2)
-    assert problem.mounting_keys("rear") == (E,)
-    assert problem.mounting_keys("front") == (E, front)
-    assert problem.mounting_keys("left") == (E, left)
+    E, front, left = key_extrinsic(), key_sensor(0), key_sensor(2)
+    assert problem.extrinsic_keys_of("rear") == (E,)
+    assert problem.extrinsic_keys_of("front") == (E, front)
+    assert problem.extrinsic_keys_of("left") == (E, left)
     assert problem.extrinsic_keys() == (E, front, left)
     # The first cloud: target 0, the pose at stamp 30, the front LiDAR.
     assert problem.cloud_keys(0) == (key_target(0), key_vehicle(1), E, front)
     assert problem.cloud_keys(5) == (key_target(1), key_vehicle(3), E)
     every = (
         *problem.pose_keys(),
-        *problem.drift_keys(),
+        *problem.pose_error_keys(),
         *problem.target_keys(),
         *problem.extrinsic_keys(),
     )
@@ -128,8 +129,8 @@ def test_a_reference_that_saw_nothing_is_replaced_by_the_first_that_did() -> Non
     problem = pose_problem(observations, [drive(10, 20)], config)
     assert problem.lidars == ("rear", "left")
     assert problem.reference == "rear"
-    assert problem.mounting_keys("rear") == (key_mounting(),)
-    assert problem.mounting_keys("left") == (key_mounting(), key_sensor(1))
+    assert problem.extrinsic_keys_of("rear") == (key_extrinsic(),)
+    assert problem.extrinsic_keys_of("left") == (key_extrinsic(), key_sensor(1))
 
 
 def test_a_trusted_lidar_takes_part_even_if_it_saw_nothing() -> None:
@@ -157,14 +158,14 @@ def test_nothing_seen_is_a_solve_error() -> None:
 def test_mounting_is_the_product_of_its_keys(reference: str) -> None:
     case = make_case("front", "rear", "left", reference=reference)
     for name in case.problem.lidars:
-        assert case.problem.mounting(case.truth, name).equals(pose(*MOUNTINGS[name]), 1e-9)
+        assert case.problem.extrinsic(case.truth, name).equals(pose(*MOUNTINGS[name]), 1e-9)
     # E before S.
     values = moved(case.truth, 1, 0.5, 1.0)
     other = next(n for n in case.problem.lidars if n != reference)
-    E, S = (values.atPose3(key) for key in case.problem.mounting_keys(other))
+    E, S = (values.atPose3(key) for key in case.problem.extrinsic_keys_of(other))
     point = np.array([1.0, 2.0, 3.0])
     expected = E.transformFrom(S.transformFrom(point))
-    assert case.problem.mounting(values, other).transformFrom(point) == pytest.approx(expected)
+    assert case.problem.extrinsic(values, other).transformFrom(point) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("reference", ["front", "rear", "left"])
@@ -180,7 +181,7 @@ def test_tangents_turn_into_vehicle_axes_of_every_lidar(reference: str) -> None:
         before = retract(values, problem.extrinsic_keys(), -d)
         numerical = np.concatenate(
             [
-                vehicle_axes_difference(problem.mounting(after, n), problem.mounting(before, n))
+                vehicle_axes_difference(problem.extrinsic(after, n), problem.extrinsic(before, n))
                 for n in problem.lidars
             ]
         ) / (2.0 * step)

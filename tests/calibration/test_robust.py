@@ -18,7 +18,7 @@ from caliv_graph.calibration.robust import (
     own_blocks,
     weighted_joint,
 )
-from caliv_graph.config import RobustConfig
+from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array
 
 SQUARED = np.array([0.0, 1.0, 6.0, 12.0, 54.0, 600.0])

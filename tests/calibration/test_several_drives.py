@@ -10,14 +10,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Config, Mounting, parse_config
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.conventions import AXES
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan, Recording
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.forwarding import ForwardingRecording
-from caliv_graph.simulation.recording import SimulatedRecording
-from caliv_graph.simulation.scenario import (
+from caliv_graph.results.run import CalibrationRun
+from caliv_graph.scenario.model import (
     ArcDrive,
     ChairModel,
     CropModel,
@@ -28,6 +29,7 @@ from caliv_graph.simulation.scenario import (
     Scenario,
     WorldModel,
 )
+from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
 from tests.kept import KeptDrive
@@ -47,7 +49,7 @@ TWO_CHAIRS = {
 
 def lidar(x_m: float, yaw_deg: float, y_m: float = 0.0) -> LidarModel:
     return LidarModel(
-        mounting=Mounting(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
+        mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
         rate_hz=4.0,
         channels=90,
         horizontal_resolution_deg=0.3,

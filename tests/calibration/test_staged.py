@@ -14,7 +14,7 @@ from caliv_graph.calibration.robust import MIN_WEIGHT
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
-from caliv_graph.config import Config, LidarConfig, Mounting, RobustConfig, SolveConfig
+from caliv_graph.config.model import Config, LidarConfig, PoseConfig, RobustConfig, SolveConfig
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Registration, Solution
 from tests.calibration.problems import SIGMAS, Case, make_case, noisy
@@ -37,7 +37,7 @@ def config_of(kernel: str, trim_percent: float = 10.0) -> Config:
     return Config(
         lidars={
             name: LidarConfig(
-                topic=name, initial=Mounting(xyz=MOUNTINGS[name][0], rpy_deg=MOUNTINGS[name][1])
+                topic=name, initial=PoseConfig(xyz=MOUNTINGS[name][0], rpy_deg=MOUNTINGS[name][1])
             )
             for name in LIDARS
         },
@@ -90,7 +90,7 @@ def s2s_nees(case: Case, solution: Solution) -> float:
     true, found = case.problem.guesses, solution.T_vehicle_lidar
     S = found["rear"].between(found["front"])
     error = gtsam.Pose3.Logmap(S.between(true["rear"].between(true["front"])))
-    # By right perturbations of both mountings; the covariance is about vehicle axes.
+    # By right perturbations of both extrinsics; the covariance is about vehicle axes.
     J = np.zeros((6, 12))
     for name, part in (("front", np.eye(6)), ("rear", -S.inverse().AdjointMap())):
         R = found[name].rotation().matrix().T

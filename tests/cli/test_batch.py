@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import yaml
 
-from caliv_graph.results import read_calibration
+from caliv_graph.results.files import read_calibration
 from tests.batch.tiny import tiny_drive
 from tests.cli.commands import ROOT, run
 
@@ -402,7 +402,7 @@ def test_help_explains_it_without_importing_anything_heavy() -> None:
         "import sys\n"
         "from caliv_graph.cli.main import run\n"
         "run(['batch', '--help'])\n"
-        "heavy = {'gtsam', 'dask', 'numpy', 'caliv_graph.config'} & set(sys.modules)\n"
+        "heavy = {'gtsam', 'dask', 'numpy', 'caliv_graph.config.model'} & set(sys.modules)\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)\n"
     )
     result = subprocess.run(

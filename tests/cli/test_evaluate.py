@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
 from caliv_graph.errors import ConfigError
-from caliv_graph.results import write_calibration
+from caliv_graph.results.files import write_calibration
 from tests.samples import make_calibration
 
 
@@ -26,12 +26,12 @@ def truth(tmp_path: Path) -> Path:
     """The front LiDAR is 10 mm further left than it was found, the rear where it was found."""
     # Nose down by 10 degrees; the rear LiDAR turned by 180 besides.
     sin, cos = math.sin(math.radians(5.0)), math.cos(math.radians(5.0))
-    mountings = {
+    extrinsics = {
         "front": {"translation": [2.0, 0.01, 2.0], "quaternion_xyzw": [0.0, sin, 0.0, cos]},
         "rear": {"translation": [-0.4, 0.0, 2.0], "quaternion_xyzw": [-sin, 0.0, cos, 0.0]},
     }
     path = tmp_path / "truth.yaml"
-    lidars = {name: {"T_vehicle_lidar": pose} for name, pose in mountings.items()}
+    lidars = {name: {"T_vehicle_lidar": pose} for name, pose in extrinsics.items()}
     path.write_text(yaml.safe_dump({"lidars": lidars}))
     return path
 

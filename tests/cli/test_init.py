@@ -9,7 +9,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
-from caliv_graph.config import load_config
+from caliv_graph.config.load import load_config
 from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.readers import open_recording
 from tests.cli.commands import write_drive

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from caliv_graph.cli.main import app, run
 from caliv_graph.simulation.simulate import write_drive as write_simulated
 from tests.cli.commands import write_config, write_drive
-from tests.test_survey import scenario_of
+from tests.workflows.test_survey import scenario_of
 
 
 def observability(*arguments: object) -> Result:

@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app, run
-from caliv_graph.simulation.scenario import load_scenario
+from caliv_graph.scenario.model import load_scenario
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 ARC = SCENARIOS / "paper_arc.yaml"

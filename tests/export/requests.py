@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.export.request import Base, ImuMounting, Request
+from caliv_graph.export.request import Base, ImuExtrinsic, Request
 from caliv_graph.products import Array, Calibration
 from tests.samples import make_calibration, pose
 
@@ -27,7 +27,7 @@ T_VEHICLE_KIT = pose((0.9, 0.05, 2.0), (-0.7, 1.9, -2.6))
 def calibration_of(
     T_vehicle_lidar: Mapping[str, gtsam.Pose3] = T_VEHICLE_LIDAR, **changes: Any
 ) -> Calibration:
-    """Mountings as given; x and yaw were not determined.
+    """Extrinsics as given; x and yaw were not determined.
 
     Args:
         T_vehicle_lidar: per LiDAR.
@@ -49,7 +49,7 @@ def request(calibration: Calibration | None = None, **changes: Any) -> Request:
     settings: dict[str, Any] = {
         "lidars": tuple(chosen.lidars),
         "out": Path("out"),
-        "imu": ImuMounting(T_VEHICLE_IMU, "config.yaml"),
+        "imu": ImuExtrinsic(T_VEHICLE_IMU, "config.yaml"),
         **changes,
     }
     return Request(calibration=chosen, source="calibration.yaml", **settings)

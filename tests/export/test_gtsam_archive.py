@@ -22,7 +22,7 @@ graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 graph.deserialize(open(sys.argv[1]).read())
 values.deserialize(open(sys.argv[2]).read())
 keys = [gtsam.symbol("l", i) for i in range(2)]
-# From elsewhere, the prior alone leads back to the calibrated mountings.
+# From elsewhere, the prior alone leads back to the calibrated extrinsics.
 start = gtsam.Values()
 for key in keys:
     start.insert(key, values.atPose3(key).retract(np.full(6, 1e-3)))

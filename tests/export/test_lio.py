@@ -14,7 +14,7 @@ import yaml
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export import fast_lio, glim, lio_sam
-from caliv_graph.export.request import Export, ImuMounting
+from caliv_graph.export.request import Export, ImuExtrinsic
 from caliv_graph.products import Array
 from tests.export.requests import (
     T_VEHICLE_IMU,
@@ -123,7 +123,7 @@ def test_lio_sam_gives_the_published_values_for_kitti() -> None:
     T_vehicle_imu = gtsam.Pose3(gtsam.Rot3.Yaw(0.1), np.array([0.3, 0.0, 0.9]))
     velo = calibration_of({"velo": T_vehicle_imu.compose(T_velo_imu.inverse())})
 
-    made = lio_sam.export(request(velo, imu=ImuMounting(T_vehicle_imu, "--imu"), form="ros1"))
+    made = lio_sam.export(request(velo, imu=ImuExtrinsic(T_vehicle_imu, "--imu"), form="ros1"))
 
     told = parameters(made, "lio_sam")
     np.testing.assert_allclose(told["extrinsicTrans"], t, atol=1e-7)
@@ -264,7 +264,7 @@ def test_which_lidar_and_whose_imu(consumer: Any) -> None:
     assert [t.lidar for t in one.transforms] == ["front"]
     assert one.warnings == ()
 
-    unsaid = ImuMounting(gtsam.Pose3(), "config.yaml", stated=False)
+    unsaid = ImuExtrinsic(gtsam.Pose3(), "config.yaml", stated=False)
     assert "names no IMU" in consumer.export(replace(request(), imu=unsaid)).warnings[-1]
 
     with pytest.raises(ExportError, match="needs where the IMU is") as caught:

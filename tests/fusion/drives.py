@@ -10,9 +10,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.terms import fuse
-from caliv_graph.geometry.se3 import USUAL_SIGMAS, retract_vehicle_axes, right_to_vehicle_axes
+from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
 from tests.samples import MOUNTINGS, make_covariance, pose, turn_about_centre
@@ -50,7 +51,7 @@ def draw(D: Array, rng: np.random.Generator) -> Array:
 
 
 def moved(poses: Mapping[str, gtsam.Pose3], e: Array) -> dict[str, gtsam.Pose3]:
-    """Mountings after a perturbation in vehicle axes."""
+    """Extrinsics after a perturbation in vehicle axes."""
     return {
         name: retract_vehicle_axes(T, e[6 * i : 6 * i + 6])
         for i, (name, T) in enumerate(poses.items())
@@ -75,7 +76,7 @@ def drive(
         names: LiDARs.
         source: digest of the drive.
         error: (6n,) of what its data say.
-        truth: mountings.
+        truth: extrinsics.
         guess_error: (6n,) of the initial guess, by which the rest is decided.
         reference: LiDAR; absent: the last.
         changes: of the calibration.
@@ -84,7 +85,7 @@ def drive(
     zero = np.zeros(6 * len(names))
     centre = moved(true, zero if error is None else error)
     start = moved(true, zero if guess_error is None else guess_error)
-    guesses = {name: Guess(start[name], USUAL_SIGMAS) for name in names}
+    guesses = {name: Guess(start[name], DEFAULT_GUESS_SIGMAS) for name in names}
     fused = fuse([DataTerm((source,), centre, D, zero)], guesses)
     uncertainty = assess(D, fused.prior, fused.T_vehicle_lidar)
     to_right = np.zeros((len(D), len(D)))

@@ -31,7 +31,7 @@ def compared(first: Calibration, second: Calibration) -> Comparison:
 
 
 def after(e: Array) -> dict[str, gtsam.Pose3]:
-    """Mountings that have been moved."""
+    """Extrinsics that have been moved."""
     return moved({name: TRUTH[name] for name in NAMES}, e)
 
 

@@ -23,7 +23,7 @@ def random_pose(rng: np.random.Generator, size: float = 1.0) -> gtsam.Pose3:
 def test_jacobians_of_the_lidar_pose(seed: int) -> None:
     rng = np.random.default_rng(seed)
     X, M, Z = (random_pose(rng) for _ in range(3))
-    _, by_vehicle, by_mounting = lidar_pose_error(X, M, Z)
+    _, by_vehicle, by_extrinsic = lidar_pose_error(X, M, Z)
     step = 1e-6
 
     def slope(of: str, axis: int) -> Array:
@@ -36,7 +36,7 @@ def test_jacobians_of_the_lidar_pose(seed: int) -> None:
 
     for axis in range(6):
         assert by_vehicle[:, axis] == pytest.approx(slope("X", axis), abs=1e-7)
-        assert by_mounting[:, axis] == pytest.approx(slope("M", axis), abs=1e-7)
+        assert by_extrinsic[:, axis] == pytest.approx(slope("M", axis), abs=1e-7)
 
 
 def test_it_is_zero_where_the_chain_closes() -> None:

@@ -12,7 +12,7 @@ from caliv_graph.fusion.monitor import (
     MountAlarm,
     MountMonitor,
     alarm_threshold,
-    mounting_innovation,
+    extrinsic_innovation,
 )
 from caliv_graph.products import Array
 
@@ -175,7 +175,7 @@ def test_innovation_is_the_movement_of_the_mount() -> None:
     d = np.array([1e-3, -2e-3, 3e-3, 0.01, 0.02, -0.01])
     measured = X.compose(LOOKS_BACK.retract(d))
 
-    innovation = mounting_innovation(X, LOOKS_BACK, np.zeros((12, 12)), measured, COV)
+    innovation = extrinsic_innovation(X, LOOKS_BACK, np.zeros((12, 12)), measured, COV)
 
     assert innovation.movement == pytest.approx(d, abs=1e-12)
     assert innovation.cov == pytest.approx(COV)
@@ -190,7 +190,7 @@ def test_covariance_of_an_innovation_is_that_of_draws() -> None:
     draws = []
     for _ in range(4000):
         e, n = root @ rng.normal(size=12), SIGMA * rng.normal(size=6)
-        innovation = mounting_innovation(
+        innovation = extrinsic_innovation(
             X.retract(e[:6]),
             LOOKS_BACK.retract(e[6:]),
             cov_predicted,
@@ -199,7 +199,7 @@ def test_covariance_of_an_innovation_is_that_of_draws() -> None:
         )
         draws.append(innovation.movement)
 
-    stated = mounting_innovation(X, LOOKS_BACK, cov_predicted, T_map_lidar, COV).cov
+    stated = extrinsic_innovation(X, LOOKS_BACK, cov_predicted, T_map_lidar, COV).cov
     nees = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(stated), draws)
     # Six degrees of freedom; 4000 draws leave their mean uncertain by 0.055, their variance by 4%.
     assert np.mean(nees) == pytest.approx(6.0, abs=0.25)

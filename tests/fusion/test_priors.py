@@ -18,7 +18,7 @@ from caliv_graph.fusion.archive import (
     write_calibration_archive,
 )
 from caliv_graph.fusion.factors import lidar_pose_factor, serialisable
-from caliv_graph.fusion.priors import lettered_keys, mounting_values, prior_factors
+from caliv_graph.fusion.priors import extrinsic_values, lettered_keys, prior_factors
 from caliv_graph.products import Array
 from tests.samples import make_calibration
 
@@ -39,7 +39,7 @@ def test_the_joint_prior_has_the_joint_covariance() -> None:
     calibration = make_calibration("front", "rear", "left")
     graph = prior_factors(calibration, key)
 
-    found = covariance(graph, mounting_values(calibration, key), "front", "rear", "left")
+    found = covariance(graph, extrinsic_values(calibration, key), "front", "rear", "left")
 
     assert graph.size() == 1
     assert found == pytest.approx(calibration.cov_joint, rel=1e-6, abs=1e-15)
@@ -49,7 +49,7 @@ def test_single_priors_have_each_lidars_covariance_and_no_more() -> None:
     calibration = make_calibration()
     graph = prior_factors(calibration, key, joint=False)
 
-    found = covariance(graph, mounting_values(calibration, key), "front", "rear")
+    found = covariance(graph, extrinsic_values(calibration, key), "front", "rear")
 
     expected = calibration.cov_joint.copy()
     expected[:6, 6:] = expected[6:, :6] = 0.0
@@ -76,7 +76,7 @@ def test_some_lidars_keep_their_marginal() -> None:
     calibration = make_calibration("front", "rear", "left")
     graph = prior_factors(calibration, key, lidars=["left"])
 
-    found = covariance(graph, mounting_values(calibration, key), "left")
+    found = covariance(graph, extrinsic_values(calibration, key), "left")
 
     assert list(graph.keyVector()) == [key("left")]
     assert found == pytest.approx(calibration.cov_joint[12:, 12:], rel=1e-6)
@@ -105,7 +105,7 @@ def test_a_covariance_that_is_nearly_singular_claims_no_more() -> None:
     ordering = gtsam.Ordering()
     for name in calibration.lidars:
         ordering.push_back(key(name))
-    information = graph.linearize(mounting_values(calibration, key)).hessian(ordering)[0]
+    information = graph.linearize(extrinsic_values(calibration, key)).hessian(ordering)[0]
     sigma = np.sqrt(np.diag(cov))
     assert np.isfinite(information).all()
     assert np.linalg.eigvalsh(information * np.outer(sigma, sigma))[-1] < 1.01e10

@@ -33,7 +33,7 @@ def cost(term: DataTerm, poses: dict[str, gtsam.Pose3]) -> float:
 
 @pytest.mark.parametrize("degrees", [0.0, 1.0, 10.0])
 def test_a_moved_quadratic_has_the_same_slope_and_curvature(degrees: float) -> None:
-    """Against numerical derivatives of the cost at the new mountings."""
+    """Against numerical derivatives of the cost at the new extrinsics."""
     old = term(1)
     rng = np.random.default_rng(2)
     d = np.asarray(np.radians(degrees) * rng.uniform(-1.0, 1.0, 12), np.float64)

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from caliv_graph.config import Mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
-    pose_from_mounting,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     rpy,
@@ -92,7 +91,7 @@ def test_skew_is_the_cross_product_for_any_batch() -> None:
 
 
 def test_positive_pitch_is_nose_down() -> None:
-    T = pose_from_mounting(Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)))
+    T = PoseConfig(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)).pose()
     assert T.translation() == pytest.approx([2.0, 0.0, 2.0])
     # Columns: the LiDAR's axes in the vehicle. Its x dips, its z leans forward.
     expected = [[COS_10, 0.0, SIN_10], [0.0, 1.0, 0.0], [-SIN_10, 0.0, COS_10]]
@@ -104,7 +103,7 @@ def test_positive_pitch_is_nose_down() -> None:
 
 
 def test_lidar_that_looks_back() -> None:
-    T = pose_from_mounting(Mounting(xyz=(-0.4, 0.0, 2.0), rpy_deg=(0.0, 10.0, 180.0)))
+    T = PoseConfig(xyz=(-0.4, 0.0, 2.0), rpy_deg=(0.0, 10.0, 180.0)).pose()
     expected = [[-COS_10, 0.0, -SIN_10], [0.0, -1.0, 0.0], [-SIN_10, 0.0, COS_10]]
     assert T.rotation().matrix() == pytest.approx(np.array(expected), abs=1e-12)
     # 10 m in front of it is behind the vehicle, and below; its left is the vehicle's right.
@@ -115,11 +114,7 @@ def test_lidar_that_looks_back() -> None:
 
 def test_roll_comes_before_yaw() -> None:
     # Rz(90) Rx(90): y -> z -> z, x -> x -> y, z -> -y -> x. The other order would leave x at z.
-    R = (
-        pose_from_mounting(Mounting(xyz=(0.0, 0.0, 0.0), rpy_deg=(90.0, 0.0, 90.0)))
-        .rotation()
-        .matrix()
-    )
+    R = PoseConfig(xyz=(0.0, 0.0, 0.0), rpy_deg=(90.0, 0.0, 90.0)).pose().rotation().matrix()
     expected = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     np.testing.assert_allclose(R, expected, atol=1e-12)
 
@@ -127,7 +122,7 @@ def test_roll_comes_before_yaw() -> None:
 @given(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(-179.0, 179.0))
 @SEEDED
 def test_rpy_undoes_a_mounting(roll: float, pitch: float, yaw: float) -> None:
-    T = pose_from_mounting(Mounting(xyz=(0.0, 0.0, 0.0), rpy_deg=(roll, pitch, yaw)))
+    T = PoseConfig(xyz=(0.0, 0.0, 0.0), rpy_deg=(roll, pitch, yaw)).pose()
     assert np.degrees(rpy(T.rotation().matrix())) == pytest.approx([roll, pitch, yaw], abs=1e-7)
 
 

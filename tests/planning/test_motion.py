@@ -9,9 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Mounting, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import pose_from_mounting, retract_vehicle_axes
+from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.planning.motion import NODE_NS, PlannedMotion, nearest, plan_motion
 from caliv_graph.planning.predict import (
     Assumptions,
@@ -23,9 +24,8 @@ from caliv_graph.planning.predict import (
 )
 from caliv_graph.planning.sightings import Sighting, placements, sight
 from caliv_graph.products import Array, IntArray
-from caliv_graph.simulation.drives import Drive, make_drive
-from caliv_graph.simulation.recording import simulate_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import Drive, make_drive
+from caliv_graph.scenario.model import (
     ArcDrive,
     DriveModel,
     OutageModel,
@@ -33,8 +33,9 @@ from caliv_graph.simulation.scenario import (
     SCurveDrive,
     StraightDrive,
 )
+from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.targets.ground_planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.chain import Chain
 from caliv_graph.trajectory.smoothing import smooth_trajectory
 from tests.drives_with_chair import paper_scenario
@@ -62,7 +63,7 @@ def relative(poses: tuple[gtsam.Pose3, ...], cov: Array, a: int, b: int) -> Arra
 def scenario_of(drive: DriveModel) -> Scenario:
     scenario = paper_scenario(drive)
     imu = scenario.imu.model_copy(
-        update={"mounting": Mounting(xyz=(0.8, -0.3, 0.4), rpy_deg=(2.0, -3.0, 90.0))}
+        update={"mounting": PoseConfig(xyz=(0.8, -0.3, 0.4), rpy_deg=(2.0, -3.0, 90.0))}
     )
     gnss = scenario.gnss.model_copy(
         update={
@@ -96,7 +97,7 @@ def test_covariances_are_those_of_the_smoother(drive: DriveModel) -> None:
         block = slice(6 * i, 6 * i + 6)
         ratio = np.sqrt(np.diag(planned[block, block]) / np.diag(cov[block, block]))
         assert ratio == pytest.approx(np.ones(6), abs=0.1)
-    # What mountings depend on: errors of poses against each other, 1 s and 7 s apart.
+    # What extrinsics depend on: errors of poses against each other, 1 s and 7 s apart.
     for a, b in ((2, 3), (3, 4), (0, 7)):
         one, other = relative(poses, planned, a, b), relative(poses, cov, a, b)
         assert np.sqrt(np.diag(one) / np.diag(other)) == pytest.approx(np.ones(6), abs=0.1)
@@ -194,7 +195,7 @@ class OneScan:
         self.X = gtsam.Pose3(
             gtsam.Rot3(self.motion.R_map_vehicle[self.node]), self.motion.position_map[self.node]
         )
-        self.E = pose_from_mounting(self.scenario.lidars["front"].mounting)
+        self.E = self.scenario.lidars["front"].mounting.pose()
         self.C = gtsam.Pose3(gtsam.Rot3(), -self.placement.centre_map)
 
     @property

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caliv_graph.config import ExtractionConfig, Mounting
+from caliv_graph.config.model import ExtractionConfig, PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.predict import Ground, Prediction, predict_drives, sigma_of
-from caliv_graph.simulation.drives import CurvatureProfile, Drive, SpeedProfile
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile
+from caliv_graph.scenario.model import (
     ArcDrive,
     ChairModel,
     DriveModel,
@@ -349,7 +349,7 @@ def test_a_quick_look_is_nearly_as_good() -> None:
 def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:
     scenario = DRIVES["figure-eight"][0]
     imu = scenario.imu.model_copy(
-        update={"mounting": Mounting(xyz=(1.2, -0.3, 0.6), rpy_deg=(3.0, -4.0, 90.0))}
+        update={"mounting": PoseConfig(xyz=(1.2, -0.3, 0.6), rpy_deg=(3.0, -4.0, 90.0))}
     )
     gnss = scenario.gnss.model_copy(update={"lever_arm": (-0.6, 0.2, 1.6)})
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from caliv_graph.config import ExtractionConfig, Mounting
+from caliv_graph.config.model import ExtractionConfig, PoseConfig
 from caliv_graph.planning.sightings import (
     INDEPENDENT_PART,
     POSITION_FLOOR_M,
@@ -19,9 +19,8 @@ from caliv_graph.planning.sightings import (
     sight,
     thinned,
 )
-from caliv_graph.simulation.drives import make_drive
-from caliv_graph.simulation.recording import simulate_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import make_drive
+from caliv_graph.scenario.model import (
     BoxModel,
     ChairModel,
     GroundModel,
@@ -33,6 +32,7 @@ from caliv_graph.simulation.scenario import (
     StraightDrive,
     WorldModel,
 )
+from caliv_graph.simulation.recording import simulate_drive
 from tests.drives_with_chair import ARC, paper_lidar, paper_scenario
 
 EXTRACTION = ExtractionConfig()
@@ -88,7 +88,7 @@ def test_half_the_channels_are_half_the_points() -> None:
 
 
 def test_uneven_channels_count_where_they_are_dense() -> None:
-    lidar = paper_lidar(0.0, 0.0).model_copy(update={"mounting": Mounting(xyz=(0.0, 0.0, 0.6))})
+    lidar = paper_lidar(0.0, 0.0).model_copy(update={"mounting": PoseConfig(xyz=(0.0, 0.0, 0.6))})
     dense = lidar.model_copy(
         update={"elevations_deg": (-20.0, -10.0, *np.linspace(-3.0, 3.0, 61), 10.0, 20.0)}
     )
@@ -230,7 +230,7 @@ def test_who_sees_ground(
     pitch_deg: float, z_m: float, vertical_deg: tuple[float, float], seen: bool
 ) -> None:
     lidar = LidarModel(
-        mounting=Mounting(xyz=(0.0, 0.0, z_m), rpy_deg=(0.0, pitch_deg, 0.0)),
+        mounting=PoseConfig(xyz=(0.0, 0.0, z_m), rpy_deg=(0.0, pitch_deg, 0.0)),
         vertical_fov_deg=vertical_deg,
     )
 

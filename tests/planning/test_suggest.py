@@ -21,8 +21,8 @@ from caliv_graph.planning.suggest import (
     shortfall,
     suggest,
 )
-from caliv_graph.simulation.drives import make_drive
-from caliv_graph.simulation.scenario import Scenario, dump_scenario, load_scenario, parse_scenario
+from caliv_graph.scenario.drives import make_drive
+from caliv_graph.scenario.model import Scenario, dump_scenario, load_scenario, parse_scenario
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.config import Config, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import Array, GivenPoses, LidarScan, Recording
 from caliv_graph.readers import open_recording

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caliv_graph.config import LidarConfig, Mounting, TopicsConfig, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
 from caliv_graph.errors import RecordingError
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.pointcloud2 import DecodedCloud
@@ -36,7 +37,7 @@ Recorded = tuple[str, int, Message]
 
 def lidar(topic: str, low: float = 0.0, high: float = 100.0) -> LidarConfig:
     return LidarConfig(
-        topic=topic, initial=Mounting(xyz=(0.0, 0.0, 0.0)), min_range=low, max_range=high
+        topic=topic, initial=PoseConfig(xyz=(0.0, 0.0, 0.0)), min_range=low, max_range=high
     )
 
 

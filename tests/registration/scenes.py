@@ -10,17 +10,24 @@ from functools import cache
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config, LidarConfig, Mounting, NoiseConfig, RegistrationConfig
+from caliv_graph.config.model import (
+    Config,
+    LidarConfig,
+    NoiseConfig,
+    PoseConfig,
+    RegistrationConfig,
+)
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, TargetCloud, TargetObservation
+from caliv_graph.scenario.model import ChairModel, CropModel, LidarModel, WorldModel
+from caliv_graph.scenario.shapes import World, make_world
 from caliv_graph.simulation.lidar import SimulatedLidar
-from caliv_graph.simulation.scenario import ChairModel, CropModel, LidarModel, WorldModel
-from caliv_graph.simulation.worlds import RayCaster, World, make_world
+from caliv_graph.simulation.rays import RayCaster
 
 CENTRE_M = 0.62
 """Height of the chair's middle above the ground: the origin of the target frame."""
 
-STRAIGHT = Mounting(xyz=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
+STRAIGHT = PoseConfig(xyz=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)

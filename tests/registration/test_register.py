@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.config import Config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.products import Array, Registration
 from caliv_graph.registration.mixture import ShapeQuadratic

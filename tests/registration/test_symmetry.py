@@ -19,14 +19,13 @@ from caliv_graph.registration.symmetry import (
     View,
     _Seen,
     alarming,
-    forget_turns,
+    marginalise_symmetry,
     refit,
     symmetries,
     symmetry_sentence,
     views_of,
 )
-from caliv_graph.simulation.lidar import SimulatedLidar
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     BoxModel,
     ChairModel,
     CropModel,
@@ -36,7 +35,9 @@ from caliv_graph.simulation.scenario import (
     TableModel,
     WorldModel,
 )
-from caliv_graph.simulation.worlds import RayCaster, make_world
+from caliv_graph.scenario.shapes import make_world
+from caliv_graph.simulation.lidar import SimulatedLidar
+from caliv_graph.simulation.rays import RayCaster
 from tests.registration.scenes import STRAIGHT, config_of, looking_at_target, observe
 
 NAMED: dict[str, ObjectModel] = {
@@ -203,7 +204,7 @@ def test_turns_about_the_axis_are_forgotten_and_nothing_else() -> None:
     symmetry = upright("cylinder", A_QUARTER)
     assert symmetry is not None
     H, g = quadratic_of("cylinder")
-    forgot, gradient = forget_turns(H, g, symmetry)
+    forgot, gradient = marginalise_symmetry(H, g, symmetry)
     count = len(H) // 6
     turns = np.kron(np.eye(count), symmetry.generator()[:, None])
     scale = np.abs(H).max()
@@ -235,8 +236,8 @@ def test_the_generator_moves_points_about_the_axis() -> None:
 
 
 def test_a_drum_alone_claims_its_yaw_and_the_symmetry_takes_it_back() -> None:
-    # The reason for `forget_turns`: flat components on a round surface resist a turn a little,
-    # each as much as what it spans of the surface bends.
+    # The reason for `marginalise_symmetry`: flat components on a round surface resist a turn a
+    # little, each as much as its part of the surface bends.
     registration = seen("cylinder", A_QUARTER)
     symmetry = upright("cylinder", A_QUARTER)
     assert symmetry is not None
@@ -246,7 +247,7 @@ def test_a_drum_alone_claims_its_yaw_and_the_symmetry_takes_it_back() -> None:
     # Of a hundred such clouds that would be some milliradians.
     assert np.median(claimed) < 50e-3
     left = [
-        float(turn @ forget_turns(b, np.zeros(6), symmetry)[0] @ turn)
+        float(turn @ marginalise_symmetry(b, np.zeros(6), symmetry)[0] @ turn)
         for b in registration.information
     ]
     assert max(left) < 1.0

@@ -19,13 +19,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Config, RobustConfig, SolveConfig, load_config
+from caliv_graph.common.progress import SilentProgress, StageRecord
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import Config, RobustConfig, SolveConfig
 from caliv_graph.conventions import AXES
-from caliv_graph.pipeline import CalibrationRun, calibrate
+from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan
-from caliv_graph.progress import SilentProgress, StageRecord
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.sampled import POINTS, SCANS, SampledRecording, thinned
+from caliv_graph.report.folder import write_result
 from caliv_graph.report.html import render_report
 from caliv_graph.report.log import log_documents
 from caliv_graph.report.residuals import (
@@ -36,8 +38,8 @@ from caliv_graph.report.residuals import (
     solution_residuals,
     trajectory_residuals,
 )
-from caliv_graph.results import write_result
-from caliv_graph.simulation.scenario import load_scenario
+from caliv_graph.results.run import CalibrationRun
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.simulate import write_drive
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.drives_with_chair import paper_scenario, simulated
@@ -458,7 +460,7 @@ def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> No
 
 def test_plotly_waits_until_there_is_something_to_write() -> None:
     code = (
-        "import sys, caliv_graph.pipeline, caliv_graph.results, caliv_graph.report.tables\n"
+        "import sys, caliv_graph.pipeline, caliv_graph.results.files, caliv_graph.report.tables\n"
         "print([m for m in ('plotly', 'jinja2') if m in sys.modules])"
     )
     done = subprocess.run(

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.common.progress import SilentProgress
 from caliv_graph.products import GivenPoses, LidarScan, MotionData, TargetCloud, TargetObservation
-from caliv_graph.progress import SilentProgress
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 from caliv_graph.report.inspection import Points, add_targets, inspect_recording
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from caliv_graph.progress import SilentProgress
+from caliv_graph.common.progress import SilentProgress
 from caliv_graph.report.inspection import (
     DriveSummary,
     Inspection,

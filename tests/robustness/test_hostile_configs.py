@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from caliv_graph.config import Config, dump_config, load_config, name_problem, parse_config
+from caliv_graph.config.load import dump_config, load_config, parse_config
+from caliv_graph.config.model import Config, name_problem
 from caliv_graph.errors import ConfigError
 from tests.robustness.hostile_drives import command
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caliv_graph.config import Mounting, load_config
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import pose_from_mounting
 from scripts import benchmark_released as benchmark
 from scripts.benchmark_released import Outcome, Runs, Timing, Verdict
 
@@ -127,8 +127,8 @@ def test_guesses_are_drawn_as_in_the_paper() -> None:
     drawn = [benchmark.guessed(config, config, ROOT, 1, guess) for guess in range(50)]
 
     for name, lidar in config.lidars.items():
-        true = pose_from_mounting(lidar.initial)
-        guesses = [pose_from_mounting(c.lidars[name].initial) for c in drawn]
+        true = lidar.initial.pose()
+        guesses = [c.lidars[name].initial.pose() for c in drawn]
         shift = np.array([g.translation() - true.translation() for g in guesses])
         turn = np.array([true.rotation().between(g.rotation()).rpy() for g in guesses])
         assert 0.09 < np.abs(shift).max() < 0.1 + 1e-5
@@ -137,7 +137,7 @@ def test_guesses_are_drawn_as_in_the_paper() -> None:
     again = benchmark.guessed(config, config, ROOT, 1, 7)
     assert again.lidars == drawn[7].lidars
     assert len({c.lidars["sensor_1"].initial for c in drawn}) == 50
-    assert isinstance(again.lidars["sensor_1"].initial, Mounting)
+    assert isinstance(again.lidars["sensor_1"].initial, PoseConfig)
 
 
 @pytest.mark.parametrize("json", [[], ["--json"]])

@@ -16,9 +16,9 @@ import pytest
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import SolveError
 from caliv_graph.products import GroundObservation
+from caliv_graph.scenario.model import ArcDrive, SuspensionModel, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
-from caliv_graph.simulation.scenario import ArcDrive, SuspensionModel, load_scenario
 from scripts import _tables_rows as rows
 from scripts import _tables_statistics as tables
 from scripts import benchmark_tables as benchmark

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from caliv_graph.simulation.scenario import load_scenario
+from caliv_graph.scenario.model import load_scenario
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SCRIPT = REPOSITORY / "scripts/benchmark_trajectory.py"

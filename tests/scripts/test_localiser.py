@@ -11,11 +11,11 @@ import pytest
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, LidarResult, LidarScan
-from caliv_graph.results import write_calibration
+from caliv_graph.results.files import write_calibration
+from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
-from caliv_graph.simulation.scenario import Scenario, load_scenario
 from scripts import _localiser_runs, localiser_example
-from scripts._localiser import Localiser, Mountings, Track, WallMap, make_map, register
+from scripts._localiser import Extrinsics, Localiser, Track, WallMap, make_map, register
 from scripts._localiser_runs import KnockedRecording, Run, Task, cached_runs, drawn, keyframes
 from tests.samples import make_calibration
 
@@ -73,7 +73,7 @@ def track(
     recording: SimulatedRecording | KnockedRecording,
     scenario: Scenario,
     walls: WallMap,
-    mountings: Mountings,
+    extrinsics: Extrinsics,
     scans: list[LidarScan],
 ) -> Track:
     localiser = Localiser(
@@ -81,7 +81,7 @@ def track(
         scenario,
         recording.truth.datum,
         walls,
-        mountings,
+        extrinsics,
         first_ns(recording),
         2.0,
     )
@@ -193,9 +193,9 @@ def test_wrong_constants_are_worse_and_not_known_to_be_while_priors_are(
 
     constants, priors = (
         _localiser_runs.measured(
-            track(recording, scenario, walls, mountings, scans), recording.truth
+            track(recording, scenario, walls, extrinsics, scans), recording.truth
         )
-        for mountings in (wrong, replace(said, lidars=lidars))
+        for extrinsics in (wrong, replace(said, lidars=lidars))
     )
 
     # Both priors are off by two sigmas the same way: of independent ones, their mean by 2.8.

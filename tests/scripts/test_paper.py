@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.config import Config, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError, TargetError, TrajectoryError
 from caliv_graph.geometry.se3 import rpy
 from caliv_graph.products import Array, GivenPoses, MotionData, TargetCloud
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.recording import SimulatedTruth, simulate_drive
-from caliv_graph.simulation.scenario import load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.trajectory.select import wanted_stamps
 from caliv_graph.uncertainty.evaluation import evaluate

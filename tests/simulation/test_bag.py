@@ -11,12 +11,11 @@ import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from caliv_graph.config import Mounting, load_config
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array
-from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive, write_drive
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     ArcDrive,
     BagModel,
     ChairModel,
@@ -30,11 +29,12 @@ from caliv_graph.simulation.scenario import (
     VelocityModel,
     WorldModel,
 )
+from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive, write_drive
 
 BEGIN_NS = 1_750_000_000 * 10**9
 
 FRONT = LidarModel(
-    mounting=Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)),
+    mounting=PoseConfig(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)),
     channels=16,
     horizontal_resolution_deg=2.0,
 )
@@ -59,7 +59,7 @@ SCENARIO = Scenario(
     lidars=LIDARS,
     world=WorldModel(objects={"chair": ChairModel(xy_m=(9.0, -3.0))}, targets=("chair",)),
     gnss=GnssModel(lever_arm=(0.5, -0.2, 1.7), outages=(OutageModel(start_s=2.0, duration_s=0.5),)),
-    imu=ImuModel(mounting=Mounting(xyz=(0.3, 0.1, 0.5), rpy_deg=(0.0, 0.0, 90.0))),
+    imu=ImuModel(mounting=PoseConfig(xyz=(0.3, 0.1, 0.5), rpy_deg=(0.0, 0.0, 90.0))),
 )
 
 SEED = 3
@@ -255,12 +255,12 @@ def test_tree_of_frames_has_the_initial_guesses(
     config = load_config(folder / "config.yaml")
     expected = {f"lidar_{name}": lidar.initial for name, lidar in config.lidars.items()}
     expected["imu_link"] = SCENARIO.imu.mounting
-    expected["gnss_link"] = Mounting(xyz=SCENARIO.gnss.lever_arm)
+    expected["gnss_link"] = PoseConfig(xyz=SCENARIO.gnss.lever_arm)
     assert {t.child_frame_id for t in message.transforms} == set(expected)
     for sent in message.transforms:
         assert sent.header.frame_id == "base_link"
         t, q = sent.transform.translation, sent.transform.rotation
-        pose = pose_from_mounting(expected[sent.child_frame_id])
+        pose = expected[sent.child_frame_id].pose()
         np.testing.assert_allclose([t.x, t.y, t.z], pose.translation(), atol=1e-9)
         w: Any = pose.rotation().toQuaternion()
         np.testing.assert_allclose([q.x, q.y, q.z, q.w], [w.x(), w.y(), w.z(), w.w()], atol=1e-9)

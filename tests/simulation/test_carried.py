@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import ConfigError
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     BoxModel,
     CylinderModel,
     MoveModel,
@@ -18,7 +18,8 @@ from caliv_graph.simulation.scenario import (
     WorldModel,
     parse_scenario,
 )
-from caliv_graph.simulation.worlds import NO_OBJECT, RayCaster, World, make_world, table
+from caliv_graph.scenario.shapes import World, make_world, table
+from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 MOVES = (
     MoveModel(begin_s=10.0, end_s=14.0, xy_m=(5.0, 4.0), yaw_deg=90.0),

@@ -6,17 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Mounting
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.products import Array
-from caliv_graph.simulation.lidar import (
-    LidarReturns,
-    SimulatedLidar,
-    beam_directions,
-    beams_through_sphere,
-    column_times,
-)
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
@@ -26,9 +18,17 @@ from caliv_graph.simulation.scenario import (
     SweepModel,
     WorldModel,
 )
-from caliv_graph.simulation.worlds import NO_OBJECT, RayCaster, World, make_world
+from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.simulation.lidar import (
+    LidarReturns,
+    SimulatedLidar,
+    beam_directions,
+    beams_through_sphere,
+    column_times,
+)
+from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
-FRONT = LidarModel(mounting=Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)))
+FRONT = LidarModel(mounting=PoseConfig(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)))
 CHAIR_WORLD = make_world(
     WorldModel(objects={"chair": ChairModel(xy_m=(9.0, -1.0), yaw_deg=150.0)}, targets=("chair",))
 )
@@ -59,11 +59,11 @@ def angles_deg(points: Array) -> tuple[Array, Array]:
 
 def test_mounting_is_roll_pitch_yaw_of_urdf() -> None:
     # Nose down by 10 degrees: what lies ahead of the LiDAR lies below it.
-    T_vehicle_lidar = pose_from_mounting(Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)))
+    T_vehicle_lidar = PoseConfig(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)).pose()
     down, ahead = math.sin(math.radians(10.0)), math.cos(math.radians(10.0))
     ahead_vehicle = T_vehicle_lidar.transformFrom(np.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(ahead_vehicle, [2.0 + ahead, 0.0, 2.0 - down])
-    T_vehicle_rear = pose_from_mounting(Mounting(xyz=(-0.4, 0.0, 2.0), rpy_deg=(0.0, 10.0, 180.0)))
+    T_vehicle_rear = PoseConfig(xyz=(-0.4, 0.0, 2.0), rpy_deg=(0.0, 10.0, 180.0)).pose()
     behind_vehicle = T_vehicle_rear.transformFrom(np.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(behind_vehicle, [-0.4 - ahead, 0.0, 2.0 - down], atol=1e-12)
 
@@ -91,7 +91,7 @@ def test_full_turn_has_no_column_twice() -> None:
 def test_beam_straight_down_measures_the_height_of_the_mount() -> None:
     model = quiet(FRONT).model_copy(
         update={
-            "mounting": Mounting(xyz=(2.0, 0.0, 2.25)),
+            "mounting": PoseConfig(xyz=(2.0, 0.0, 2.25)),
             "vertical_fov_deg": (-90.0, -45.0),
             "channels": 2,
             "horizontal_fov_deg": (-1.0, 1.0),
@@ -106,9 +106,7 @@ def test_beam_straight_down_measures_the_height_of_the_mount() -> None:
 def test_quiet_returns_lie_on_the_mesh_that_they_name() -> None:
     returns = scan(quiet(FRONT))
     points_map = (
-        T_MAP_VEHICLE.compose(pose_from_mounting(FRONT.mounting))
-        .transformFrom(returns.points_lidar.T)
-        .T
+        T_MAP_VEHICLE.compose(FRONT.mounting.pose()).transformFrom(returns.points_lidar.T).T
     )
     on_chair = returns.objects == CHAIR_WORLD.names.index("chair")
     assert on_chair.sum() > 500
@@ -269,7 +267,7 @@ def sweeping(
 def test_each_column_of_a_sweep_is_taken_from_its_own_pose() -> None:
     lidar, returns = sweeping(quiet(swept()))
     R, t = moving_poses(658)
-    T_vehicle_lidar = pose_from_mounting(FRONT.mounting)
+    T_vehicle_lidar = FRONT.mounting.pose()
     points_vehicle = T_vehicle_lidar.transformFrom(returns.points_lidar.T).T
     column = lidar.columns_of(returns)
     points_map = np.einsum("nij,nj->ni", R[column], points_vehicle) + t[column]
@@ -337,7 +335,7 @@ def test_mixed_returns_lie_between_the_two_surfaces_and_at_edges_only() -> None:
     np.testing.assert_allclose(
         mixed.points_lidar[~between], clean.points_lidar[~between], atol=1e-9
     )
-    T_vehicle_lidar = pose_from_mounting(FRONT.mounting)
+    T_vehicle_lidar = FRONT.mounting.pose()
     points = T_vehicle_lidar.transformFrom(mixed.points_lidar[between].T).T
     # Beside the box, above the ground: between its front at 8.9 m and the wall's at 9.9 m.
     beside = (
@@ -380,6 +378,6 @@ def test_body_of_the_vehicle_is_seen_the_same_from_everywhere() -> None:
     roofs = [r.points_lidar[r.objects == world.names.index("vehicle")] for r in returns]
     assert len(roofs[0]) > 1000
     np.testing.assert_array_equal(roofs[0], roofs[1])
-    points_vehicle = pose_from_mounting(FRONT.mounting).transformFrom(roofs[0].T).T
+    points_vehicle = FRONT.mounting.pose().transformFrom(roofs[0].T).T
     np.testing.assert_allclose(points_vehicle[:, 2], 1.9, atol=1e-5)
     assert np.abs(points_vehicle[:, 1]).max() <= 0.9 + 1e-5

@@ -8,14 +8,11 @@ import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.config import Mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, GnssFixes, ImuSamples, TwistSamples
-from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
-from caliv_graph.simulation.drives import make_drive
-from caliv_graph.simulation.motion import angular_acceleration, sample_stamps, true_imu
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.drives import make_drive, sample_stamps
+from caliv_graph.scenario.model import (
     ArcDrive,
     BagModel,
     ChairModel,
@@ -35,7 +32,9 @@ from caliv_graph.simulation.scenario import (
     VelocityModel,
     WorldModel,
 )
-from caliv_graph.simulation.terrain import Terrain, make_terrain
+from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
+from caliv_graph.simulation.motion import angular_acceleration, true_imu
 
 RAMPS = (
     RampModel(xy_m=(9.0, -7.0), yaw_deg=250.0, height_m=0.5, flank_m=5.0, top_m=2.0, width_m=4.0),
@@ -52,7 +51,7 @@ DRIVES: dict[str, tuple[DriveModel, tuple[RampModel, ...]]] = {
     "ramp slowly": (FigureEightDrive(speed_m_s=1.4, turn="left"), RAMPS),
 }
 
-MOUNTED = Mounting(xyz=(1.2, -0.4, 0.9), rpy_deg=(3.0, -4.0, 100.0))
+MOUNTED = PoseConfig(xyz=(1.2, -0.4, 0.9), rpy_deg=(3.0, -4.0, 100.0))
 
 GRAVITY = 9.80665
 
@@ -62,7 +61,7 @@ def scenario_of(name: str = "arc", **sections: Any) -> Scenario:
     return Scenario(
         name=name.replace(" ", "_"),
         drive=drive,
-        lidars={"front": LidarModel(mounting=Mounting(xyz=(2.0, 0.0, 2.0)))},
+        lidars={"front": LidarModel(mounting=PoseConfig(xyz=(2.0, 0.0, 2.0)))},
         world=WorldModel(
             ground=GroundModel(height_m=0.4, ramps=ramps),
             objects={"chair": ChairModel(xy_m=(15.0, -9.0))},
@@ -129,14 +128,16 @@ def integrated(imu: ImuSamples, R: Array, t: Array, v: Array) -> tuple[list[Arra
 
 
 @pytest.mark.parametrize("name", DRIVES)
-@pytest.mark.parametrize("mounting", [Mounting(xyz=(0.0, 0.0, 0.0)), MOUNTED], ids=["base", "arm"])
+@pytest.mark.parametrize(
+    "mounting", [PoseConfig(xyz=(0.0, 0.0, 0.0)), MOUNTED], ids=["base", "arm"]
+)
 def test_perfect_imu_integrated_from_the_true_start_follows_the_whole_drive(
-    name: str, mounting: Mounting
+    name: str, mounting: PoseConfig
 ) -> None:
     recording = simulate_drive(scenario_of(name, imu=quiet_imu(mounting=mounting)), 0)
     imu, truth = imu_of(recording), recording.truth
     states = truth.states(imu.stamps_ns)
-    T_vehicle_imu = pose_from_mounting(mounting)
+    T_vehicle_imu = mounting.pose()
     R_true = states.R_map_vehicle @ T_vehicle_imu.rotation().matrix()
     t_true = states.position_map + states.R_map_vehicle @ T_vehicle_imu.translation()
 
@@ -228,7 +229,7 @@ def test_imu_at_rest_feels_gravity_upwards() -> None:
 def test_imu_on_an_arm_feels_the_centripetal_acceleration_there() -> None:
     # At 2 m/s on a right-hand circle of 9.16 m: 0.2183 rad/s. 1 m to the left the circle is
     # 10.16 m, and the pull to the right 0.2183^2 x 10.16 = 0.4844 m/s^2.
-    model = quiet_imu(mounting=Mounting(xyz=(0.0, 1.0, 0.5)))
+    model = quiet_imu(mounting=PoseConfig(xyz=(0.0, 1.0, 0.5)))
     drive = make_drive(ArcDrive(duration_s=17.0))
     rate, force, _ = true_imu(drive, model, GRAVITY, np.array([8_000_000_000]))
     np.testing.assert_allclose(rate, [[0.0, 0.0, -2.0 / 9.16]], atol=1e-12)

@@ -6,18 +6,17 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array
+from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
 from caliv_graph.simulation.noise import (
     Stream,
     noisy_poses,
-    perturbed_mounting,
+    perturbed_extrinsic,
     random_stream,
     vehicle_heights,
 )
-from caliv_graph.simulation.scenario import InitialGuessModel, PoseNoiseModel, SuspensionModel
 
 N = 4000
 STAMPS_NS = np.arange(N, dtype=np.int64) * 100_000_000
@@ -102,12 +101,12 @@ def test_heights_have_a_common_and_a_white_part() -> None:
 
 
 def test_initial_guesses_are_off_as_far_as_stated_and_no_farther() -> None:
-    true = Mounting(xyz=(-0.4, 0.1, 2.0), rpy_deg=(1.0, 10.0, 180.0))
+    true = PoseConfig(xyz=(-0.4, 0.1, 2.0), rpy_deg=(1.0, 10.0, 180.0))
     model = InitialGuessModel(translation_m=0.1, rotation_deg=3.0)
-    R_true = pose_from_mounting(true).rotation()
+    R_true = true.pose().rotation()
     shifts, turns = [], []
     for seed in range(2000):
-        guess = pose_from_mounting(perturbed_mounting(true, model, np.random.default_rng(seed)))
+        guess = perturbed_extrinsic(true, model, np.random.default_rng(seed)).pose()
         shifts.append(guess.translation() - np.array(true.xyz))
         turns.append(np.degrees(R_true.between(guess.rotation()).rpy()))
     for values, bound in ((np.array(shifts), 0.1), (np.array(turns), 3.0)):

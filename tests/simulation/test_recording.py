@@ -1,4 +1,4 @@
-"""A simulated drive in memory: true poses, mountings and times put its points on the world."""
+"""A simulated drive in memory: true poses, extrinsics and times put its points on the world."""
 
 from pathlib import Path
 from typing import Any
@@ -6,12 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caliv_graph.config import Mounting
-from caliv_graph.geometry.se3 import pose_from_mounting
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.products import Array, LidarScan, Recording
-from caliv_graph.simulation import Scenario, SimulatedRecording, load_scenario, simulate_drive
-from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     ArcDrive,
     BodyBoxModel,
     BoxModel,
@@ -28,7 +25,9 @@ from caliv_graph.simulation.scenario import (
     WalkerModel,
     WorldModel,
 )
-from caliv_graph.simulation.worlds import RayCaster
+from caliv_graph.simulation import Scenario, SimulatedRecording, load_scenario, simulate_drive
+from caliv_graph.simulation.rays import RayCaster
+from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -44,13 +43,13 @@ WORLD = WorldModel(
 )
 
 FRONT = LidarModel(
-    mounting=Mounting(xyz=(2.0, 0.2, 2.0), rpy_deg=(1.0, 10.0, -3.0)),
+    mounting=PoseConfig(xyz=(2.0, 0.2, 2.0), rpy_deg=(1.0, 10.0, -3.0)),
     channels=48,
     horizontal_resolution_deg=0.6,
     range_sigma_m=0.0,
 )
 SIDE = FRONT.model_copy(
-    update={"mounting": Mounting(xyz=(0.5, 0.8, 1.8), rpy_deg=(0.0, 12.0, 60.0)), "rate_hz": 5.0}
+    update={"mounting": PoseConfig(xyz=(0.5, 0.8, 1.8), rpy_deg=(0.0, 12.0, 60.0)), "rate_hz": 5.0}
 )
 
 
@@ -236,7 +235,7 @@ def test_heave_lifts_clouds_and_nothing_else() -> None:
     np.testing.assert_array_equal(a_imu.specific_force, b_imu.specific_force)
     # The ground comes nearer and goes: 2 m below the LiDAR, by as much as the heave.
     down = LidarModel(
-        mounting=Mounting(xyz=(0.0, 0.0, 2.0)),
+        mounting=PoseConfig(xyz=(0.0, 0.0, 2.0)),
         vertical_fov_deg=(-90.0, -80.0),
         channels=2,
         horizontal_fov_deg=(-1.0, 1.0),
@@ -289,7 +288,7 @@ def test_returns_from_the_vehicle_stay_where_they_are() -> None:
     assert len(own[0]) > 50
     assert all(np.array_equal(points, own[0]) for points in own[1:])
     # The IMU and the truth do not know of it.
-    points_vehicle = pose_from_mounting(FRONT.mounting).transformFrom(own[0].T).T
+    points_vehicle = FRONT.mounting.pose().transformFrom(own[0].T).T
     np.testing.assert_allclose(points_vehicle[:, 2], 1.8, atol=1e-5)
 
 

@@ -10,19 +10,13 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.config import Mounting, load_config
+from caliv_graph.common.progress import SilentProgress, StageRecord
+from caliv_graph.config.load import load_config
+from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError, OutputError
 from caliv_graph.products import Array
-from caliv_graph.progress import SilentProgress, StageRecord
 from caliv_graph.readers.caliv_folder import CalivFolder
-from caliv_graph.simulation import (
-    Scenario,
-    SimulatedDrive,
-    load_scenario,
-    simulate_caliv,
-    write_drive,
-)
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     ArcDrive,
     ChairModel,
     CropModel,
@@ -33,8 +27,16 @@ from caliv_graph.simulation.scenario import (
     SweepModel,
     WorldModel,
 )
+from caliv_graph.scenario.shapes import make_world
+from caliv_graph.simulation import (
+    Scenario,
+    SimulatedDrive,
+    load_scenario,
+    simulate_caliv,
+    write_drive,
+)
+from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.simulate import Format
-from caliv_graph.simulation.worlds import RayCaster, make_world
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -43,12 +45,12 @@ SMALL = Scenario(
     drive=ArcDrive(duration_s=5.0),
     lidars={
         "front": LidarModel(
-            mounting=Mounting(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)),
+            mounting=PoseConfig(xyz=(2.0, 0.0, 2.0), rpy_deg=(0.0, 10.0, 0.0)),
             channels=24,
             horizontal_resolution_deg=1.0,
         ),
         "side": LidarModel(
-            mounting=Mounting(xyz=(1.0, -0.8, 1.5), rpy_deg=(1.0, 12.0, -80.0)),
+            mounting=PoseConfig(xyz=(1.0, -0.8, 1.5), rpy_deg=(1.0, 12.0, -80.0)),
             rate_hz=5.0,
             channels=16,
             horizontal_fov_deg=(-180.0, 180.0),
@@ -191,12 +193,12 @@ def test_project_s_own_reader_takes_the_folder(small: SimulatedDrive) -> None:
 def test_quiet_points_lie_on_the_world_seen_from_the_written_truth(quiet: SimulatedDrive) -> None:
     world = make_world(QUIET.world)
     caster = RayCaster(world)
-    poses, mountings = true_poses(quiet.folder), true_mountings(quiet.folder)
+    poses, extrinsics = true_poses(quiet.folder), true_mountings(quiet.folder)
     for sensor, name in (("sensor_1", "front"), ("sensor_2", "side")):
         assert max(quiet.scans[name].target_points) > 5
         for frame in (0, 20, 34, 50):
             _, points_lidar = parse_pcd(quiet.folder / "caliv/input" / sensor / f"{frame}.pcd")
-            T_map_lidar = poses[frame].compose(mountings[name])
+            T_map_lidar = poses[frame].compose(extrinsics[name])
             points_map = T_map_lidar.transformFrom(points_lidar.T).T
             assert caster.distance(points_map).max() < 1e-4
 
@@ -261,12 +263,12 @@ def test_config_is_ready_to_run(small: SimulatedDrive) -> None:
     (region,) = config.target
     assert region.min == pytest.approx((9.0 - 0.40 - 5.0, -3.0 - 0.36 - 5.0, -5.0), abs=0.01)
     assert region.max == pytest.approx((9.0 + 0.37 + 5.0, -3.0 + 0.36 + 5.0, 6.25), abs=0.01)
-    mountings = true_mountings(small.folder)
+    extrinsics = true_mountings(small.folder)
     for name, lidar in config.lidars.items():
-        shift = np.array(lidar.initial.xyz) - mountings[name].translation()
+        shift = np.array(lidar.initial.xyz) - extrinsics[name].translation()
         assert 0.001 < np.abs(shift).max() <= 0.1
         guess = gtsam.Rot3.RzRyRx(np.radians(lidar.initial.rpy_deg))
-        turn = np.degrees(mountings[name].rotation().between(guess).rpy())
+        turn = np.degrees(extrinsics[name].rotation().between(guess).rpy())
         assert 0.05 < np.abs(turn).max() <= 3.0 + 1e-5
         assert lidar.sigma.xyz == pytest.approx(0.1 / 3.0**0.5)
         assert lidar.sigma.rpy_deg == pytest.approx(3.0 / 3.0**0.5)

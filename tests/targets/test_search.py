@@ -12,15 +12,18 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import Config, ExtractionConfig, LidarConfig, Mounting, MountingSigma
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import (
+    Config,
+    ExtractionConfig,
+    LidarConfig,
+    PoseConfig,
+    PoseSigmaConfig,
+)
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
-from caliv_graph.geometry.se3 import pose_from_mounting
 from caliv_graph.products import Array, GivenPoses, IntArray, Trajectory
-from caliv_graph.progress import SilentProgress
-from caliv_graph.simulation import SimulatedRecording, simulate_drive
-from caliv_graph.simulation.noise import perturbed_mounting
-from caliv_graph.simulation.scenario import (
+from caliv_graph.scenario.model import (
     ArcDrive,
     BodyBoxModel,
     BoxModel,
@@ -38,8 +41,10 @@ from caliv_graph.simulation.scenario import (
     WalkerModel,
     WorldModel,
 )
+from caliv_graph.simulation import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.noise import perturbed_extrinsic
 from caliv_graph.targets import search
-from caliv_graph.targets.extract import RegionExtractor
+from caliv_graph.targets.cloud.extract import RegionExtractor
 from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.drives_with_chair import Memory
@@ -67,7 +72,7 @@ WALKER = WalkerModel(from_xy_m=(11.5, -14.0), to_xy_m=(12.5, -3.0), speed_m_s=1.
 def lidar(x_m: float, yaw_deg: float, **options: object) -> LidarModel:
     """The paper's LiDAR, with a sixth of its beams and 2.5 clouds a second."""
     return LidarModel(
-        mounting=Mounting(xyz=(x_m, 0.0, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
+        mounting=PoseConfig(xyz=(x_m, 0.0, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
         channels=64,
         horizontal_resolution_deg=0.45,
         rate_hz=2.5,
@@ -118,20 +123,20 @@ class Drive:
 
 
 def guesses(
-    mountings: Mapping[str, LidarModel], seed: int, *, rotation_deg: float, translation_m: float
+    extrinsics: Mapping[str, LidarModel], seed: int, *, rotation_deg: float, translation_m: float
 ) -> dict[str, LidarConfig]:
     """Configs of the LiDARs with uniform errors of the guesses, as large as given."""
     rng = np.random.default_rng(seed)
     model = InitialGuessModel(rotation_deg=rotation_deg, translation_m=translation_m)
-    sigma = MountingSigma(xyz=translation_m / math.sqrt(3), rpy_deg=rotation_deg / math.sqrt(3))
+    sigma = PoseSigmaConfig(xyz=translation_m / math.sqrt(3), rpy_deg=rotation_deg / math.sqrt(3))
     return {
         name: LidarConfig(
             topic=name,
-            initial=perturbed_mounting(m.mounting, model, rng),
+            initial=perturbed_extrinsic(m.mounting, model, rng),
             sigma=sigma,
             min_range=m.min_range_m,
         )
-        for name, m in mountings.items()
+        for name, m in extrinsics.items()
     }
 
 
@@ -212,7 +217,7 @@ SCENARIOS: Mapping[str, Scenario] = {
             "roof": lidar(
                 0.8,
                 0.0,
-                mounting=Mounting(xyz=(0.8, 0.0, 2.15)),
+                mounting=PoseConfig(xyz=(0.8, 0.0, 2.15)),
                 horizontal_fov_deg=(-180.0, 180.0),
                 vertical_fov_deg=(-20.0, 10.0),
                 sweep=SweepModel(),
@@ -365,9 +370,7 @@ class TestInvariance:
                 float(gtsam.Rot3.Logmap(T.rotation() * drive.truth[name].rotation().inverse())[2])
             )
 
-        before = [
-            yaw_error(pose_from_mounting(c.initial), n) for n, c in drive.config.lidars.items()
-        ]
+        before = [yaw_error(c.initial.pose(), n) for n, c in drive.config.lidars.items()]
         after = [yaw_error(found.aligned[n], n) for n in drive.config.lidars]
         assert sum(after) < 0.5 * sum(before)
 

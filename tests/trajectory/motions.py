@@ -11,7 +11,8 @@ import numpy as np
 import pymap3d
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.config import Config, parse_config
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.products import (
     Array,
     GnssFixes,
@@ -20,7 +21,7 @@ from caliv_graph.products import (
     MotionData,
     TwistSamples,
 )
-from caliv_graph.simulation.drives import CurvatureProfile, Drive, SpeedProfile, smoothstep
+from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile, smoothstep
 from caliv_graph.trajectory.gnss import normal_gravity
 
 ORIGIN = (48.2627, 11.6673, 480.0)
@@ -115,7 +116,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Mountings, rates and noise; the noise is the paper's, `noise` scales all of it."""
+    """Extrinsics, rates and noise; the noise is the paper's, `noise` scales all of it."""
 
     T_vehicle_imu: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -189,7 +190,7 @@ def first_fix_map(motion: MotionData) -> Array:
 
 
 def config_for(sensors: Sensors, **sections: dict[str, object]) -> Config:
-    """A config that knows the mountings."""
+    """A config that knows the extrinsics."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},

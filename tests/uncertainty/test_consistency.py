@@ -19,11 +19,11 @@ from caliv_graph.uncertainty.consistency import (
     OUTLIERS,
     SCALE_LIMIT,
     Assumed,
+    CheckInputs,
     CloudCount,
-    Contrast,
-    ContrastKind,
-    Evidence,
     Heading,
+    ScoreTest,
+    ScoreTestKind,
     against_guesses,
     chance,
     contradictions,
@@ -60,10 +60,12 @@ def along(axis: str, size: float) -> Array:
     return np.asarray(size * np.eye(6)[AXES.index(axis)])
 
 
-def split(d: Array, sigma: Array, kind: ContrastKind = "halves", lidar: str = "front") -> Contrast:
+def split(
+    d: Array, sigma: Array, kind: ScoreTestKind = "halves", lidar: str = "front"
+) -> ScoreTest:
     """A contrast that comes out at d with these sigmas."""
     information = np.diag(np.atleast_1d(sigma) ** -2.0)
-    return Contrast(lidar, kind, information, information @ np.atleast_1d(d))
+    return ScoreTest(lidar, kind, information, information @ np.atleast_1d(d))
 
 
 def counted(down: int, clouds: int = 80, **changes: object) -> CloudCount:
@@ -150,12 +152,12 @@ def test_where_they_are_is_told_if_most_are_in_one_part_of_the_drive() -> None:
 
 
 def test_registrations_that_would_have_to_be_coarse_are_a_contradiction() -> None:
-    fine = Evidence({}, counts=[counted(0)], registration_scale=0.99 * SCALE_LIMIT)
+    fine = CheckInputs({}, counts=[counted(0)], registration_scale=0.99 * SCALE_LIMIT)
     assert not contradictions(fine)
     late = split(np.array([0.017]), np.array([0.0028]), "clock")
-    coarse = Evidence(
+    coarse = CheckInputs(
         {},
-        contrasts=[late],
+        score_tests=[late],
         counts=[counted(0)],
         registration_scale=10.0,
         registration_sigma=(0.032, 0.015),
@@ -166,7 +168,7 @@ def test_registrations_that_would_have_to_be_coarse_are_a_contradiction() -> Non
     assert "17 +- 3 ms late" in text
 
 
-# ------------------------------------------------------------------ contrasts
+# ------------------------------------------------------------------ score_tests
 
 
 def test_p_values_of_contrasts_are_uniform_if_nothing_is_wrong() -> None:
@@ -177,7 +179,7 @@ def test_p_values_of_contrasts_are_uniform_if_nothing_is_wrong() -> None:
     p = []
     for _ in range(400):
         d = rng.multivariate_normal(np.zeros(6), cov) + BIAS * rng.normal(size=6)
-        p.append(chance(Contrast("front", "turns", information, information @ d)))
+        p.append(chance(ScoreTest("front", "turns", information, information @ d)))
     assert kstest(p, "uniform").pvalue > 0.01
 
 
@@ -196,13 +198,13 @@ def test_what_is_not_told_contradicts_nothing() -> None:
     vague = np.array([2e-4, 2e-4, math.inf, 2.0, 2e-3, 2e-3])
     d = np.array([0.0, 0.0, 5.0, 100.0, 0.0, 0.0])
     information = np.diag(vague**-2.0)
-    contrast = Contrast("front", "halves", information, information @ d)
+    contrast = ScoreTest("front", "halves", information, information @ d)
     assert not contrasted(contrast)
     found, _, directions = difference(contrast)
     assert directions.shape == (6, 4)
     assert not found.any()
-    assert chance(Contrast("front", "halves", np.zeros((6, 6)), np.zeros(6))) == 1.0
-    assert not contrasted(Contrast("front", "clock", np.zeros((1, 1)), np.zeros(1)))
+    assert chance(ScoreTest("front", "halves", np.zeros((6, 6)), np.zeros(6))) == 1.0
+    assert not contrasted(ScoreTest("front", "clock", np.zeros((1, 1)), np.zeros(1)))
 
 
 def test_a_clock_is_told_beyond_five_sigma() -> None:
@@ -241,7 +243,7 @@ def test_a_heading_a_degree_off_is_told_and_side_slip_is_not() -> None:
 
 
 def test_together_the_tests_seldom_err() -> None:
-    """Eight LiDARs of good data: six axes, three contrasts and a count each."""
+    """Eight LiDARs of good data: six axes, three score_tests and a count each."""
     rng = np.random.default_rng(2)
     guess = pose(*MOUNTINGS["front"])
     total = np.hypot(GUESS_SIGMAS, DATA_SIGMAS)
@@ -249,10 +251,10 @@ def test_together_the_tests_seldom_err() -> None:
     for _ in range(50):
         lidars = {str(i): result(guess, total * rng.normal(size=6)) for i in range(8)}
         spread = np.hypot(sigma, BIAS)
-        contrasts = [
+        score_tests = [
             split(spread * rng.normal(size=6), sigma, kind, name)
             for name in lidars
             for kind in ("halves", "turns")
         ]
         counts = [counted(int(rng.binomial(80, OUTLIERS))) for _ in lidars]
-        assert not contradictions(Evidence(lidars, contrasts, counts, registration_scale=1.5))
+        assert not contradictions(CheckInputs(lidars, score_tests, counts, registration_scale=1.5))

@@ -25,18 +25,18 @@ from caliv_graph.calibration.graph import (
     prior_graph,
 )
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import AXES, key_drift, key_mounting, key_target, key_vehicle
+from caliv_graph.conventions import AXES, key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, PoseNoise, Uncertainty
 from caliv_graph.uncertainty.observability import (
     UNIT,
     assess,
+    covariance_with_prior_in_null_space,
     describe,
-    respectful_covariance,
-    respectful_step,
     scaling,
     simplified,
     spectrum,
+    step_with_prior_in_null_space,
 )
 from tests.calibration.problems import predictions
 from tests.drives_with_chair import (
@@ -125,8 +125,8 @@ class Case:
         sigmas = [self.problem.prior_sigmas[name] for name in self.problem.lidars]
         return np.diag(np.concatenate(sigmas) ** -2.0)
 
-    def mountings(self, values: gtsam.Values) -> dict[str, gtsam.Pose3]:
-        return {name: self.problem.mounting(values, name) for name in self.problem.lidars}
+    def extrinsics(self, values: gtsam.Values) -> dict[str, gtsam.Pose3]:
+        return {name: self.problem.extrinsic(values, name) for name in self.problem.lidars}
 
 
 def make_case(drives: Sequence[Sequence[gtsam.Pose3]], *lidars: str) -> Case:
@@ -134,11 +134,11 @@ def make_case(drives: Sequence[Sequence[gtsam.Pose3]], *lidars: str) -> Case:
     names = lidars or ("front", "rear")
     poses = [T for drive in drives for T in drive]
     drive_of = [d for d, drive in enumerate(drives) for _ in drive]
-    mountings = {name: pose(*MOUNTINGS[name]) for name in names}
+    extrinsics = {name: pose(*MOUNTINGS[name]) for name in names}
     problem = Problem(
         lidars=names,
         reference=names[-1],
-        guesses=mountings,
+        guesses=extrinsics,
         prior_sigmas=dict.fromkeys(names, GUESS_SIGMAS),
         fixed=frozenset(),
         poses=tuple((d, 500_000_000 * i) for i, d in enumerate(drive_of)),
@@ -152,11 +152,11 @@ def make_case(drives: Sequence[Sequence[gtsam.Pose3]], *lidars: str) -> Case:
     truth = gtsam.Values()
     for i, T in enumerate(poses):
         truth.insert(key_vehicle(i), T)
-        truth.insert(key_drift(i), np.zeros(6))
-    truth.insert(key_mounting(), mountings[problem.reference])
+        truth.insert(key_pose_error(i), np.zeros(6))
+    truth.insert(key_extrinsic(), extrinsics[problem.reference])
     for name in names:
-        for key in problem.mounting_keys(name)[1:]:
-            truth.insert(key, mountings[problem.reference].between(mountings[name]))
+        for key in problem.extrinsic_keys_of(name)[1:]:
+            truth.insert(key, extrinsics[problem.reference].between(extrinsics[name]))
     T_map_target = gtsam.Pose3(gtsam.Rot3(), np.array(CHAIR_XYZ_M))
     for m in range(problem.placements):
         truth.insert(key_target(m), T_map_target.inverse())
@@ -239,7 +239,7 @@ def solved(case: Case, noise: PoseNoise) -> gtsam.Values:
 
 def verdict_of(case: Case, noise: PoseNoise, *, disjoint: bool = False) -> Uncertainty:
     D = data_information(case, case.truth, noise, disjoint=disjoint)
-    return assess(D, case.prior, case.mountings(case.truth))
+    return assess(D, case.prior, case.extrinsics(case.truth))
 
 
 def verdict_on_noise(case: Case, seed: int, noise: PoseNoise = WHITE) -> tuple[Uncertainty, Array]:
@@ -249,7 +249,7 @@ def verdict_on_noise(case: Case, seed: int, noise: PoseNoise = WHITE) -> tuple[U
     D = data_information(noisy, values, noise)
     split = spectrum(D, case.prior)
     ratio = np.sort(split.sigma_data / split.sigma_prior)[::-1]
-    return assess(D, case.prior, case.mountings(values)), ratio
+    return assess(D, case.prior, case.extrinsics(values)), ratio
 
 
 def texts(uncertainty: Uncertainty) -> list[str]:
@@ -378,7 +378,7 @@ def test_a_turn_of_the_lidars_about_the_centre_is_a_turn_of_the_targets_frame() 
     problem, values = case.problem, gtsam.Values(case.truth)
     angle = 0.02
     turn = gtsam.Pose3.Expmap(angle * np.array(turn_about((0.0, -RADIUS_M))))
-    values.update(key_mounting(), turn.compose(values.atPose3(key_mounting())))
+    values.update(key_extrinsic(), turn.compose(values.atPose3(key_extrinsic())))
     moved = predictions(problem, values)
     change = [a.compose(b.inverse()) for a, b in zip(moved, case.measured, strict=True)]
 
@@ -475,7 +475,7 @@ def test_along_what_is_lost_the_guess_decides_and_has_no_say_elsewhere() -> None
     c = np.array([3e3, -8e3, 0.0, 50.0, -20.0, 0.0])
     offset = np.array([0.01, 0.02, -0.01, 0.03, -0.04, 0.05])
 
-    step = respectful_step(D, c, prior, offset, spectrum(D, prior))
+    step = step_with_prior_in_null_space(D, c, prior, offset, spectrum(D, prior))
 
     # z returns to the guess; everything else goes where the data say: c / D, whatever the guess.
     assert step == pytest.approx([3e-3, -2e-3, 0.0, 5e-3, -2e-3, -0.05])
@@ -487,7 +487,7 @@ def test_what_the_data_tell_of_a_lost_direction_is_not_listened_to() -> None:
     D = np.diag([1e6, 1e6, 1e6, 1e6, 1e6, 0.01 / 0.058**2])
     c = D @ np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0])
 
-    step = respectful_step(D, c, prior, np.zeros(6), spectrum(D, prior))
+    step = step_with_prior_in_null_space(D, c, prior, np.zeros(6), spectrum(D, prior))
 
     assert step == pytest.approx(np.zeros(6), abs=1e-12)
 
@@ -502,7 +502,7 @@ def test_one_lidar_shares_its_x_and_y_out_by_the_guess() -> None:
     c = np.array([0.0, 0.0, 0.0, 1e4 * d, -1e4 * d, 0.0])
     offset = np.array([0.0, 0.0, 0.0, ox, oy, 0.0])
 
-    step = respectful_step(D, c, prior, offset, spectrum(D, prior))
+    step = step_with_prior_in_null_space(D, c, prior, offset, spectrum(D, prior))
 
     # min (ox + y + d)^2 + (oy + y)^2 / 4  =>  y = -(0.05 + -0.0125) / 1.25 = -0.03
     assert step[3:5] == pytest.approx([-0.01, -0.03])
@@ -533,7 +533,7 @@ def test_the_guesses_of_two_lidars_vote(
     offset = np.zeros(12)
     offset[[5, 11]] = -0.06, 0.02
 
-    step = respectful_step(D, c, prior, offset, spectrum(D, prior))
+    step = step_with_prior_in_null_space(D, c, prior, offset, spectrum(D, prior))
 
     front, rear = step[5], step[11]
     assert front - rear == pytest.approx(0.01)
@@ -545,7 +545,7 @@ def test_the_guesses_of_two_lidars_vote(
 def test_covariance_of_two_votes_by_hand() -> None:
     D, prior = two_heights(0.04, 0.08)
 
-    cov = respectful_covariance(prior, spectrum(D, prior))
+    cov = covariance_with_prior_in_null_space(prior, spectrum(D, prior))
 
     # Data: front - rear with variance 1e-6 s, s of the pseudo-inverse of [[1, -1], [-1, 1]] seen
     # along (1, -1): 1. The common height: 1 / (1/0.04^2 + 1/0.08^2) = 0.00128, and what the
@@ -572,14 +572,14 @@ def test_covariance_against_monte_carlo() -> None:
     errors = np.array(
         [
             # From the truth: the data err by c ~ N(0, D), the guesses by their sigma.
-            respectful_step(
+            step_with_prior_in_null_space(
                 D, root @ rng.normal(size=12), prior, sigmas * rng.normal(size=12), split
             )
             for _ in range(draws)
         ]
     )
 
-    cov = respectful_covariance(prior, split)
+    cov = covariance_with_prior_in_null_space(prior, split)
 
     white = np.linalg.solve(np.linalg.cholesky(cov), errors.T)
     sample = white @ white.T / draws
@@ -784,7 +784,7 @@ def test_sigmas_are_those_along_the_vector_that_is_shown() -> None:
     values = solved(noisy, WHITE)
     D = data_information(noisy, values, WHITE)
 
-    uncertainty = assess(D, case.prior, case.mountings(values))
+    uncertainty = assess(D, case.prior, case.extrinsics(values))
 
     for direction in uncertainty.undetermined:
         vector = np.concatenate([direction.vector[name] for name in case.problem.lidars])
@@ -811,7 +811,7 @@ def test_the_verdict_does_not_depend_on_the_order_of_the_lidars() -> None:
     names = ("front", "left", "rear")
     case = make_case(DRIVES["arc"], *names)
     D = data_information(case, case.truth, WHITE)
-    one = assess(D, case.prior, case.mountings(case.truth))
+    one = assess(D, case.prior, case.extrinsics(case.truth))
     order = [2, 0, 1]
     rows = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in order])
     other = assess(

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.config import Config, GroundConfig, LidarConfig, Mounting, TargetRegion, Triple
+from caliv_graph.config.model import Config, GroundConfig, LidarConfig, PoseConfig, TargetRegion
+from caliv_graph.config.sections import Triple
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import (
     Array,
@@ -127,7 +128,7 @@ def make_config(
     nowhere = TargetRegion(min=(-1.0, -10.0, 0.0), max=(1.0, -8.0, 2.0))
     return Config(
         lidars={
-            name: LidarConfig(topic=f"sensor_{i}", initial=Mounting(xyz=xyz, rpy_deg=rpy))
+            name: LidarConfig(topic=f"sensor_{i}", initial=PoseConfig(xyz=xyz, rpy_deg=rpy))
             for i, (name, (xyz, rpy)) in enumerate(guesses.items(), start=1)
         },
         target=(region or nowhere,),

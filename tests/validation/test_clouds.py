@@ -7,16 +7,16 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config import TargetRegion
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import TargetRegion
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, Trajectory
-from caliv_graph.progress import SilentProgress
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.validation.clouds import (
     POINTS,
     SCANS,
     Clouds,
-    Mountings,
+    Extrinsics,
     choose_scans,
     read_clouds,
 )
@@ -45,7 +45,7 @@ def read(
         Memory({"top": tuple(scans)}, none),
         trajectory,
         {"top": stamps},
-        {"after": Mountings(level, {})},
+        {"after": Extrinsics(level, {})},
         regions,
         False,
         SilentProgress(),

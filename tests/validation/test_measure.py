@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from caliv_graph.common.progress import SilentProgress
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array
-from caliv_graph.progress import SilentProgress
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.validation import measure
-from caliv_graph.validation.clouds import Clouds, Mountings, Placed, read_clouds
+from caliv_graph.validation.clouds import Clouds, Extrinsics, Placed, read_clouds
 from caliv_graph.validation.measure import (
     Errors,
     SurfaceMeter,
@@ -22,7 +22,7 @@ from caliv_graph.validation.measure import (
     thing_distance,
 )
 from caliv_graph.validation.refine import (
-    mounting_jacobian,
+    extrinsic_jacobian,
     pose_jacobian,
     vehicle_axes_covariance,
 )
@@ -37,7 +37,7 @@ STEP = 1e-6
 def clouds() -> Clouds:
     recording = make_recording()
     (trajectory,) = smooth_trajectories([recording], make_config())
-    truth = Mountings({n: pose(*m) for n, m in MOUNTINGS.items()}, {})
+    truth = Extrinsics({n: pose(*m) for n, m in MOUNTINGS.items()}, {})
     chosen = {n: np.array(recording.scan_stamps_ns(n)[::4]) for n in MOUNTINGS}
     return read_clouds(recording, trajectory, chosen, {"after": truth}, (), False, SilentProgress())
 
@@ -50,7 +50,7 @@ def structure(clouds: Clouds) -> Structure:
 
 
 def poses_of(clouds: Clouds) -> list[gtsam.Pose3]:
-    return list(clouds.placed["after"].mountings.T_vehicle_lidar.values())
+    return list(clouds.placed["after"].extrinsics.T_vehicle_lidar.values())
 
 
 def moved(placed: Placed, errors: Array) -> Placed:
@@ -73,7 +73,7 @@ def test_points_move_with_mountings_and_poses_as_the_jacobians_say(clouds: Cloud
     rng = np.random.default_rng(2)
     normal = rng.normal(size=(len(members), 3))
     there = clouds.points_map(placed)[members]
-    by_mounting = mounting_jacobian(clouds, placed, poses, members, normal)
+    by_extrinsic = extrinsic_jacobian(clouds, placed, poses, members, normal)
     vehicle = clouds.points_vehicle(placed)[members]
     by_pose = pose_jacobian(clouds, placed, vehicle, members, normal)
 
@@ -81,7 +81,7 @@ def test_points_move_with_mountings_and_poses_as_the_jacobians_say(clouds: Cloud
         d = STEP * np.eye(6)[axis]
         shifted = clouds.points_map(placed, remounted(poses, np.concatenate([d, d])))[members]
         expected = np.einsum("ni,ni->n", shifted - there, normal) / STEP
-        assert by_mounting[:, axis] == pytest.approx(expected, abs=1e-4)
+        assert by_extrinsic[:, axis] == pytest.approx(expected, abs=1e-4)
         other = moved(placed, np.tile(d, (len(placed.taken_ns), 1)))
         expected = np.einsum("ni,ni->n", clouds.points_map(other)[members] - there, normal) / STEP
         assert by_pose[:, axis] == pytest.approx(expected, abs=1e-4)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caliv_graph.config import Config, TargetRegion
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, PoseNoise
-from caliv_graph.progress import SilentProgress
 from caliv_graph.validation.surfaces import Pole, Wall
 from caliv_graph.validation.validate import (
     AFTER,

@@ -1,0 +1,160 @@
+"""From the solved graph to the reported result: every LiDAR, joint covariance, provenance."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+import caliv_graph
+from caliv_graph.calibration.guesses import configured_guess, guess_covariance
+from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.config.load import dump_config
+from caliv_graph.config.model import Config
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import (
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    Guess,
+    LidarResult,
+    Recording,
+    Solution,
+)
+from caliv_graph.uncertainty.observability import assess
+
+DRIVES = "drive_sha256"
+"""Key of the provenance: digests of the drives a calibration was made from."""
+
+
+def assemble(
+    solution: Solution,
+    config: Config,
+    recordings: Sequence[Recording],
+    digests: Sequence[str] = (),
+) -> Calibration:
+    """The reported result: every LiDAR of the config, in its order, in right perturbations.
+
+    Args:
+        solution: the solved graph.
+        config: guesses, and what was asked.
+        recordings: the drives, for the provenance.
+        digests: of the drives (`drive_digest`).
+    """
+    uncertainty = assess(
+        solution.information_data,
+        solution.information_prior,
+        solution.T_vehicle_lidar,
+        solution.held,
+    )
+    names = config.lidar_order()
+    index = {name: i for i, name in enumerate(solution.lidars)}
+    used = _scans_used(solution)
+    size = 6 * len(names)
+    to_right = np.zeros((size, 6 * len(solution.lidars)))
+    cov_joint, information = np.zeros((size, size)), np.zeros((size, size))
+    guesses = {name: configured_guess(config, name) for name in names}
+    information_data, gradient_data = _without_trust(solution, guesses)
+    poses: dict[str, gtsam.Pose3] = {}
+    for row, name in enumerate(names):
+        block = slice(6 * row, 6 * row + 6)
+        if name in index:
+            poses[name] = solution.T_vehicle_lidar[name]
+            column = slice(6 * index[name], 6 * index[name] + 6)
+            to_right[block, column] = right_to_vehicle_axes(poses[name]).T
+        else:
+            poses[name] = guesses[name].T_vehicle_lidar
+            cov_joint[block, block] = guess_covariance(guesses[name], poses[name])
+    cov_joint += to_right @ solution.cov @ to_right.T
+    information += to_right @ information_data @ to_right.T
+    lidars = {}
+    for row, name in enumerate(names):
+        block = slice(6 * row, 6 * row + 6)
+        lidars[name] = LidarResult(
+            T_vehicle_lidar=poses[name],
+            cov=cov_joint[block, block],
+            determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
+            scans_used=used.get(name, 0),
+            saw_target=used.get(name, 0) > 0,
+            time_offset=solution.time_offsets.get(name),
+            guess=guesses[name],
+        )
+    complete = not uncertainty.undetermined and all(
+        all(lidar.determined.values()) for lidar in lidars.values()
+    )
+    draft = Calibration(
+        status="ok" if complete else "partial",
+        reference=solution.reference,
+        lidars=lidars,
+        cov_joint=0.5 * (cov_joint + cov_joint.T),
+        information_data=0.5 * (information + information.T),
+        undetermined=uncertainty.undetermined,
+        weak=uncertainty.weak,
+        unmet=(),
+        provenance=_provenance(config, recordings, solution, digests),
+        gradient_data=None if gradient_data is None else to_right @ gradient_data,
+    )
+    return unmet_requirements(draft, config)
+
+
+def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
+    """Information and gradient of the data (vehicle axes), less what `fixed: true` put in.
+
+    The solve takes a trusted mounting for one more measurement; it is still a guess, and two
+    calibrations that share it must not count it twice.
+    """
+    information = solution.information_data.copy()
+    gradient = None if solution.gradient_data is None else solution.gradient_data.copy()
+    seen = {c.lidar for r in solution.registrations for c in r.observation.clouds}
+    for i, name in enumerate(solution.lidars):
+        rows = slice(6 * i, 6 * i + 6)
+        guess = guesses[name]
+        if not guess.fixed:
+            continue
+        certainty = guess.sigmas**-2.0
+        information[rows, rows] -= np.diag(certainty)
+        if gradient is not None:
+            moved = vehicle_axes_difference(solution.T_vehicle_lidar[name], guess.T_vehicle_lidar)
+            gradient[rows] += certainty * moved
+        if name not in seen:
+            # Nothing is left but the rounding of large numbers.
+            information[rows], information[:, rows] = 0.0, 0.0
+            if gradient is not None:
+                gradient[rows] = 0.0
+    return information, gradient
+
+
+def _scans_used(solution: Solution) -> dict[str, int]:
+    """Per LiDAR, the scans whose clouds carry at least half their weight."""
+    out: dict[str, int] = {}
+    for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
+        for cloud, weight in zip(registration.observation.clouds, weights, strict=True):
+            out[cloud.lidar] = out.get(cloud.lidar, 0) + int(weight >= 0.5)
+    return out
+
+
+def _provenance(
+    config: Config, recordings: Sequence[Recording], solution: Solution, digests: Sequence[str]
+) -> dict[str, object]:
+    """Versions, what was asked, and what the solve found out about its input."""
+    # Where the drive lies on this machine is no part of what was asked.
+    asked = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
+    return {
+        "caliv_graph": caliv_graph.__version__,
+        "config_sha256": hashlib.sha256(dump_config(asked).encode()).hexdigest(),
+        "mode": solution.mode,
+        "robust_kernel": config.robust.kernel,
+        "recordings": [Path(r.name).absolute().name for r in recordings],
+        **({DRIVES: list(digests)} if digests else {}),
+        **({} if solution.pose_noise is None else {"pose_noise": asdict(solution.pose_noise)}),
+        "registration_scale": solution.registration_scale,
+        "iterations": solution.iterations,
+        "converged": solution.converged,
+    }

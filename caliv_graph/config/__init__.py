@@ -1,0 +1,1 @@
+"""The configuration: its model, and reading and writing it."""

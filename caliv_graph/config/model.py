@@ -1,0 +1,413 @@
+"""The configuration: frozen, validated on load, dumped beside every result.
+
+Units are in the `Field` descriptions. An unknown key is an error that names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import (
+    Field,
+    field_validator,
+    model_validator,
+)
+
+from caliv_graph.config.sections import (
+    Finite,
+    NonNegative,
+    Place,
+    Positive,
+    PositiveTriple,
+    Triple,
+    _Section,
+)
+
+_LEAST_SIGMA = 1e-6
+"""Of a guess, metres or degrees: GTSAM takes much less for a constraint."""
+
+
+if TYPE_CHECKING:
+    import gtsam
+
+    from caliv_graph.products import Array
+
+SolveMode = Literal["auto", "staged", "joint"]
+RobustKernel = Literal["huber", "tls", "trimmed", "none"]
+Requirement = Literal["s2s", "s2v_rotation", "s2v"]
+
+LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
+
+
+_MOST_CHARACTERS = 100
+"""Of a LiDAR's name, which stands in the columns of tables."""
+
+
+def name_problem(name: str) -> str:
+    """What is wrong with a name for a LiDAR; empty: nothing.
+
+    Names go to tables, terminals and other programs' files, where a line end or an escape would do
+    what nobody asked for.
+    """
+    if name.strip() == name != "" and name.isprintable() and len(name) <= _MOST_CHARACTERS:
+        return ""
+    return (
+        f"{name[:40]!r} cannot be the name of a LiDAR: give it 1 to {_MOST_CHARACTERS} printable "
+        "characters, without blanks around them"
+    )
+
+
+class PoseConfig(_Section):
+    """A pose as people measure it: `T_parent_child`."""
+
+    xyz: Place = Field(description="metres, in the parent frame")
+    rpy_deg: Triple = Field(
+        (0.0, 0.0, 0.0), description="roll, pitch, yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll)"
+    )
+
+    def pose(self) -> gtsam.Pose3:
+        """`T_parent_child`."""
+        import gtsam  # here: `--help` and `init` need no gtsam, which takes 0.4 s to import
+        import numpy as np
+
+        roll, pitch, yaw = (math.radians(a) for a in self.rpy_deg)
+        return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(self.xyz))
+
+
+class PoseSigmaConfig(_Section):
+    """How far off the initial guess may be, 1 sigma, per vehicle axis."""
+
+    xyz: Positive | PositiveTriple = Field(0.058, description="metres; 0.058 is a uniform +-0.1 m")
+    rpy_deg: Positive | PositiveTriple = Field(
+        1.73, description="degrees; 1.73 is a uniform +-3 degrees"
+    )
+
+    @field_validator("xyz", "rpy_deg")
+    @classmethod
+    def _not_a_certainty(cls, sigma: Any) -> Any:
+        if min(sigma if isinstance(sigma, tuple) else (sigma,)) < _LEAST_SIGMA:
+            raise ValueError(
+                f"must be at least {_LEAST_SIGMA:g}. To trust the guess, set 'fixed: true'"
+            )
+        return sigma
+
+    def xyz_m(self) -> tuple[float, float, float]:
+        """Sigma of x, y, z in metres."""
+        return self.xyz if isinstance(self.xyz, tuple) else (self.xyz,) * 3
+
+    def rpy_rad(self) -> tuple[float, float, float]:
+        """Sigma of the rotation about the vehicle's x, y, z axes in radians."""
+        deg = self.rpy_deg if isinstance(self.rpy_deg, tuple) else (self.rpy_deg,) * 3
+        return (math.radians(deg[0]), math.radians(deg[1]), math.radians(deg[2]))
+
+    def sigmas(self) -> Array:
+        """(6,) rotation before translation, rad and m, vehicle axes."""
+        import numpy as np
+
+        return np.array([*self.rpy_rad(), *self.xyz_m()])
+
+
+class LidarConfig(_Section):
+    """One LiDAR, by the user's name for it."""
+
+    topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
+    initial: PoseConfig = Field(description="initial guess of T_vehicle_lidar")
+    sigma: PoseSigmaConfig = PoseSigmaConfig()
+    fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
+    min_range: NonNegative = Field(
+        1.0, description="metres; nearer returns are dropped (the vehicle's own body)"
+    )
+    max_range: Positive = Field(200.0, description="metres; farther returns are dropped")
+
+    @model_validator(mode="after")
+    def _ranges_in_order(self) -> LidarConfig:
+        if self.min_range >= self.max_range:
+            raise ValueError(
+                f"min_range ({self.min_range} m) must be below max_range ({self.max_range} m)"
+            )
+        return self
+
+
+class DataConfig(_Section):
+    """Where the recording is."""
+
+    format: Literal["rosbag", "caliv"] = "rosbag"
+    path: Path | None = Field(None, description="folder or file, relative to the config")
+
+
+class TopicsConfig(_Section):
+    """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
+
+    imu: str | None = None
+    gnss: str | None = None
+    twist: str | None = None
+    pose: str | None = None
+
+
+class TargetRegion(_Section):
+    """An axis-aligned box in which the target, and nothing else above the ground, stands."""
+
+    min: Triple = Field(description="metres, lower corner")
+    max: Triple = Field(description="metres, upper corner")
+    frame: Literal["map", "start"] = Field(
+        "map", description="map, or start: the vehicle's first pose"
+    )
+
+    @model_validator(mode="after")
+    def _corners_in_order(self) -> TargetRegion:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low >= high:
+                raise ValueError(f"min {axis} ({low} m) must be below max {axis} ({high} m)")
+        return self
+
+
+class GroundConfig(_Section):
+    """The ground as a source of roll, pitch and height."""
+
+    use: bool = True
+    vehicle_height: Finite | None = Field(
+        None, description="metres, height of the vehicle frame above ground; absent: unknown"
+    )
+    sigma: Positive = Field(0.005, description="metres, sigma of vehicle_height over the drive")
+    parallel_sigma_deg: Positive | None = Field(
+        None, description="degrees; given: the vehicle stands parallel to the ground to this sigma"
+    )
+
+
+class ImuConfig(_Section):
+    """PoseConfig of the IMU."""
+
+    T_vehicle_imu: PoseConfig = PoseConfig(xyz=(0.0, 0.0, 0.0))
+    gravity_m_s2: Positive | None = Field(
+        None, description="m/s^2, local gravity; absent: by latitude and altitude"
+    )
+    yaw_bias: bool = Field(
+        False, description="estimate a constant yaw error of the IMU's orientation"
+    )
+    yaw_bias_sigma_deg: Positive = Field(
+        5.0, description="degrees, how large that yaw error may be, 1 sigma"
+    )
+
+
+class GnssConfig(_Section):
+    """PoseConfig of the GNSS antenna."""
+
+    lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
+
+
+class NoiseConfig(_Section):
+    """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
+
+    lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
+    pose_position_m: Positive | None = Field(
+        None, description="metres, white error of each given pose; absent: from the poses"
+    )
+    pose_rotation_deg: Positive | None = Field(
+        None, description="degrees, white error of each given pose; absent: from the poses"
+    )
+    pose_drift_position_m: Positive | None = Field(
+        None, description="metres, slowly varying error of the given poses over the drive"
+    )
+    pose_drift_rotation_deg: Positive | None = Field(
+        None, description="degrees, slowly varying error of the given poses over the drive"
+    )
+    pose_drift_time_s: Positive = Field(
+        4.0, description="seconds, correlation time of the slowly varying error of given poses"
+    )
+    accelerometer_density_m_s2_sqrthz: Positive | None = None
+    gyroscope_density_rad_s_sqrthz: Positive | None = None
+    accelerometer_bias_walk_m_s3_sqrthz: Positive | None = None
+    gyroscope_bias_walk_rad_s2_sqrthz: Positive | None = None
+    accelerometer_bias_m_s2: Positive = Field(
+        0.1, description="m/s^2, constant bias of the accelerometer, per axis"
+    )
+    gyroscope_bias_rad_s: Positive = Field(
+        0.01, description="rad/s, constant bias of the gyroscope, per axis"
+    )
+    gnss_horizontal_m: Positive | None = None
+    gnss_vertical_m: Positive | None = None
+    velocity_m_s: Positive | None = None
+    orientation_deg: Positive | None = None
+
+
+class SolveConfig(_Section):
+    """How the graph is solved."""
+
+    mode: SolveMode = Field(
+        "auto",
+        description="staged: the paper's two stages; joint: everything free under its prior; "
+        "auto: the prior decides only along what the drive does not determine",
+    )
+    time_offset: bool = Field(False, description="estimate a constant time offset per LiDAR")
+
+
+class RobustConfig(_Section):
+    """What stands in for the paper's percentile filter."""
+
+    kernel: RobustKernel = "huber"
+    huber_k: Positive = Field(1.5, description="whitened residual per sqrt(dof) where Huber bends")
+    tls_p_value: Annotated[float, Field(gt=0.0, lt=0.5)] = Field(
+        0.001, description="chi-square tail probability beyond which TLS drops a cloud"
+    )
+    trim_percent: Annotated[float, Field(ge=0.0, lt=50.0)] = Field(
+        10.0, description="percent of the clouds that `trimmed` drops: the worst"
+    )
+
+
+class ExtractionConfig(_Section):
+    """How target points are cut out of the clouds."""
+
+    ground_distance: Positive = Field(
+        0.05, description="metres; points nearer to the ground plane are ground"
+    )
+    voxel: NonNegative = Field(
+        0.0, description="metres; at most one point per voxel of this size is kept; 0: all points"
+    )
+    outlier_neighbours: Annotated[int, Field(ge=0)] = Field(
+        6, description="neighbours of the statistical outlier filter; 0: no filter"
+    )
+    outlier_ratio: Positive = Field(
+        3.0, description="a point this many standard deviations lonelier than the rest is dropped"
+    )
+    min_points: Annotated[int, Field(ge=10)] = Field(
+        50, description="a scan with fewer target points does not see the target"
+    )
+    min_scans: Annotated[int, Field(ge=2)] = Field(
+        8, description="a LiDAR with fewer scans of the target does not see it"
+    )
+    max_scans: Annotated[int, Field(ge=10)] = Field(
+        80,
+        description="scans of one LiDAR used at most, evenly spread; of three and more LiDARs "
+        "fewer of each",
+    )
+
+
+class RegistrationConfig(_Section):
+    """The mixture that all clouds of a target are registered to."""
+
+    components: Annotated[int, Field(ge=20)] = Field(
+        1000, description="Gaussian components of the target at most; one per 10 points if fewer"
+    )
+    outlier_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        0.05, description="assumed ratio of outliers to inliers (gamma)"
+    )
+    max_iterations: Annotated[int, Field(ge=5)] = Field(100, description="EM iterations at most")
+    max_points: Annotated[int, Field(ge=20)] = Field(
+        1500, description="points of one cloud used at most; a larger cloud is thinned"
+    )
+
+
+def check_limit_keys(keys: Iterable[str]) -> None:
+    """Checks the names of limits on sigmas.
+
+    Raises:
+        ValueError: one is no `LIMIT_KEY`; the message says what they look like.
+    """
+    for key in keys:
+        if not LIMIT_KEY.match(key):
+            raise ValueError(
+                f"unknown limit '{key}': write s2s_ or s2v_, then roll_deg, pitch_deg, "
+                "yaw_deg, x_m, y_m or z_m"
+            )
+
+
+class Config(_Section):
+    """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
+
+    data: DataConfig = DataConfig()
+    topics: TopicsConfig = TopicsConfig()
+    lidars: dict[str, LidarConfig] = Field(min_length=1)
+    reference: str = Field("", description="reference LiDAR; empty: the first")
+    target: tuple[TargetRegion, ...] | None = Field(
+        None,
+        min_length=1,
+        description="one region or a list of them; absent: the target is searched for",
+    )
+    ground: GroundConfig = GroundConfig()
+    imu: ImuConfig = ImuConfig()
+    gnss: GnssConfig = GnssConfig()
+    noise: NoiseConfig = NoiseConfig()
+    solve: SolveConfig = SolveConfig()
+    robust: RobustConfig = RobustConfig()
+    extraction: ExtractionConfig = ExtractionConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    require: tuple[Requirement, ...] = Field(
+        ("s2s",), description="what exit code 0 promises to have determined"
+    )
+    limits: dict[str, Positive] = Field(
+        {},
+        description="largest sigma that exit code 0 allows, vehicle axes: s2v_yaw_deg: 0.1, ...",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _empty_sections(cls, raw: Any) -> Any:
+        """`topics:` with nothing below it means its defaults, as a person would expect."""
+        if not isinstance(raw, Mapping):
+            return raw
+        return {key: value for key, value in raw.items() if value is not None or key == "lidars"}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_inside_require(cls, raw: Any) -> Any:
+        """`require` may carry the limits: `{limits: {...}}`, alone or as an item of the list."""
+        if not isinstance(raw, Mapping) or "require" not in raw:
+            return raw
+        items = raw["require"]
+        items = [items] if isinstance(items, str | Mapping) else items
+        if not isinstance(items, list | tuple):
+            return raw
+        names = [item for item in items if not isinstance(item, Mapping)]
+        found: list[Any] = [raw["limits"]] if "limits" in raw else []
+        # A bare {s2v_yaw_deg: 0.1} can only mean a limit as well.
+        found += [item.get("limits", item) for item in items if isinstance(item, Mapping)]
+        limits: Any = {}
+        for given in found:
+            if not isinstance(given, Mapping):
+                limits = given  # what is wrong with it, the field's own check says
+                break
+            limits = {**limits, **given}
+        return {**raw, "require": names, "limits": limits}
+
+    @field_validator("lidars")
+    @classmethod
+    def _names_can_be_shown(cls, lidars: dict[str, LidarConfig]) -> dict[str, LidarConfig]:
+        for name in lidars:
+            problem = name_problem(name)
+            if problem:
+                raise ValueError(problem)
+        return lidars
+
+    @field_validator("target", mode="before")
+    @classmethod
+    def _one_region_or_many(cls, raw: Any) -> Any:
+        return [raw] if isinstance(raw, Mapping) else raw
+
+    @field_validator("limits")
+    @classmethod
+    def _known_limits(cls, limits: dict[str, float]) -> dict[str, float]:
+        check_limit_keys(limits)
+        return limits
+
+    @model_validator(mode="after")
+    def _reference_is_a_lidar(self) -> Config:
+        if self.reference and self.reference not in self.lidars:
+            raise ValueError(
+                f"reference '{self.reference}' is not a LiDAR of this config: "
+                f"{', '.join(self.lidars)}"
+            )
+        if not self.reference:
+            object.__setattr__(self, "reference", next(iter(self.lidars)))
+        topics = [lidar.topic for lidar in self.lidars.values()]
+        for topic in topics:
+            if topics.count(topic) > 1:
+                raise ValueError(f"topic '{topic}' belongs to more than one LiDAR")
+        return self
+
+    def lidar_order(self) -> tuple[str, ...]:
+        """LiDAR names in the order of the file."""
+        return tuple(self.lidars)

@@ -1,0 +1,70 @@
+"""The folder of a result: calibration, graph, targets, effective config, log and report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from caliv_graph.common.progress import StageRecord
+from caliv_graph.config.load import dump_config
+from caliv_graph.config.model import Config
+from caliv_graph.fusion.archive import calibration_graph, write_archive
+from caliv_graph.products import (
+    Calibration,
+    Solution,
+)
+
+if TYPE_CHECKING:
+    from caliv_graph.results.run import RunRecord
+from caliv_graph.report.html import render_report
+from caliv_graph.report.log import log_documents
+from caliv_graph.results.files import (
+    CALIBRATION_FILE,
+    GRAPH_FILE,
+    REPORT_FILE,
+    without_infinities,
+    write_calibration,
+    write_target,
+)
+
+
+def write_result(
+    folder: Path,
+    calibration: Calibration,
+    solution: Solution,
+    config: Config,
+    stages: Sequence[StageRecord],
+    warnings: Sequence[str],
+    record: RunRecord | None = None,
+) -> None:
+    """Writes all files of a result into a folder (`common.files.output_folder`).
+
+    Args:
+        folder: an empty folder.
+        calibration: goes to calibration.yaml and, as priors that GTSAM reads, to graph.gtsam and
+            graph.values.gtsam.
+        solution: its reconstructed targets go to target.ply, target_2.ply and so on, its course to
+            log.jsonl.
+        config: the effective one, goes to config.yaml.
+        stages: what was done and how long it took, goes to log.jsonl.
+        warnings: go to log.jsonl.
+        record: for report.html, which is not written without it; its numbers go to log.jsonl.
+
+    Raises:
+        OSError: something cannot be written.
+        OutputError: likewise.
+    """
+    write_calibration(calibration, folder / CALIBRATION_FILE)
+    write_archive(*calibration_graph(calibration), folder / GRAPH_FILE)
+    (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
+    for number, registration in enumerate(solution.registrations, start=1):
+        file = "target.ply" if number == 1 else f"target_{number}.ply"
+        write_target(registration.mixture, folder / file, registration.observation.name)
+    documents = log_documents(calibration, solution, config.robust, stages, warnings, record)
+    lines = [json.dumps(without_infinities(line)) for line in documents]
+    (folder / "log.jsonl").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    if record is not None:
+        page = render_report(calibration, solution, config, stages, warnings, record)
+        (folder / REPORT_FILE).write_text(page, encoding="utf-8")

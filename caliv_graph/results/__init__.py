@@ -1,0 +1,1 @@
+"""The files that a calibration leaves, and reading them back."""

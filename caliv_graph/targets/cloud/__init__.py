@@ -1,0 +1,1 @@
+"""The target's points in each scan."""

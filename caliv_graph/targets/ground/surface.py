@@ -1,0 +1,188 @@
+"""The ground of a whole scan: a surface, because ramps and kerbs are no plane.
+
+Heights on a grid of nodes, bilinear in between, fitted to the lowest point of every cell by
+asymmetric least squares: what stands above the surface is not ground, what lies below it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.sparse import coo_array, csr_array, diags_array, vstack
+from scipy.spatial import cKDTree
+
+from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.targets.ground.fit import fit_ground, height_above
+
+HALF_SIZE_M = 35.0
+"""The surface reaches this far from the LiDAR along either axis."""
+
+CELL_M = 0.5
+"""One point, the lowest, of each cell of this size speaks for the ground."""
+
+NODE_M = 2.5
+"""Spacing of the nodes: wide enough that no target of 1.5 m carries one of its own."""
+
+PLANE_DISTANCE_M = 0.1
+"""Half thickness of the plane that the fit starts from."""
+
+MIN_LEVEL = math.cos(math.radians(25.0))
+"""Vertical part of the plane's normal: 10 degrees of guess and 15 of slope. The foot of a wall, a
+line, leaves the tilt of a plane open."""
+
+TOLERANCES_M = (0.5, 0.3, 0.2, 0.12, 0.12)
+"""Cells higher than this above the surface are not ground; shrinking, so that hills are taken in
+from where the vehicle stands outwards."""
+
+STIFFNESS = 1.0
+"""Weight of a second difference of the nodes against that of a cell: a cell is worth 10 cm, and so
+is a bend of 10 cm. A node with its share of 25 cells follows a ramp, one without follows the
+neighbours."""
+
+GAUGE_PRIOR = 1e-6
+"""Weight that keeps nodes without any data at the plane."""
+
+SUPPORT_M = 1.5
+"""Ground was seen at a place if a cell of it is within this distance."""
+
+_PER_AXIS = 2 * int(HALF_SIZE_M / NODE_M) + 1
+
+
+@dataclass(frozen=True)
+class GroundSurface:
+    """Height of the ground about a LiDAR.
+
+    Attributes:
+        nodes: (n, n) metres, height at the nodes, by x, then y; the LiDAR is in the middle.
+        cells: (m, 2) metres, x and y of the cells in which ground was seen.
+    """
+
+    nodes: Array
+    cells: Array
+
+    def height_at(self, xy: Array) -> Array:
+        """(k,) metres at places (k, 2); beyond the rim, the height of the rim."""
+        node, part = _node_and_part(xy)
+        nodes = self.nodes.ravel()
+        before = nodes[node] + part[:, 1] * (nodes[node + 1] - nodes[node])
+        node = node + _PER_AXIS
+        after = nodes[node] + part[:, 1] * (nodes[node + 1] - nodes[node])
+        return np.asarray(before + part[:, 0] * (after - before))
+
+    def is_seen_at(self, xy: Array) -> BoolArray:
+        """(k,) whether ground was seen within `SUPPORT_M` of places (k, 2)."""
+        distance, _ = cKDTree(self.cells).query(xy, distance_upper_bound=SUPPORT_M)
+        seen: BoolArray = np.isfinite(distance)
+        return seen
+
+
+def fit_surface(points: Array) -> GroundSurface | None:
+    """The ground in a scan.
+
+    Args:
+        points: (N, 3) metres about the LiDAR, z up but for what the mounting is off.
+
+    Returns:
+        The surface; None if there is no near-horizontal plane to begin with.
+    """
+    lowest = points[_lowest_of_cells(points)]
+    plane = fit_ground(lowest, PLANE_DISTANCE_M)
+    if plane is None or plane[2] < MIN_LEVEL:
+        return None
+    # The tilt goes first: the stiffness is about what remains.
+    above_plane = height_above(plane, lowest) / plane[2]
+    interpolate = _bilinear(lowest[:, :2])
+    stiffness = STIFFNESS * _BENDING + GAUGE_PRIOR * diags_array(np.ones(_PER_AXIS**2))
+    nodes = np.zeros(_PER_AXIS**2)
+    for tolerance in TOLERANCES_M:
+        residual = above_plane - interpolate @ nodes
+        weight = np.where(
+            residual > tolerance, 0.0, np.minimum(1.0, tolerance / np.abs(residual - 1e-12))
+        )
+        normal = interpolate.T @ diags_array(weight) @ interpolate + stiffness
+        nodes = _solve_banded(normal, interpolate.T @ (weight * above_plane))
+    ground = np.abs(above_plane - interpolate @ nodes) < TOLERANCES_M[-1]
+    at = np.linspace(-HALF_SIZE_M, HALF_SIZE_M, _PER_AXIS)
+    x, y = np.meshgrid(at, at, indexing="ij")
+    tilted = (
+        nodes.reshape(_PER_AXIS, _PER_AXIS) - (plane[0] * x + plane[1] * y + plane[3]) / plane[2]
+    )
+    return GroundSurface(tilted, lowest[ground, :2]) if ground.any() else None
+
+
+def _lowest_of_cells(points: Array) -> IntArray:
+    """Index of the lowest point of every cell within the surface's reach."""
+    inside = np.flatnonzero(
+        (np.abs(points[:, 0]) < HALF_SIZE_M) & (np.abs(points[:, 1]) < HALF_SIZE_M)
+    )
+    cell = np.floor((points[inside, :2] + HALF_SIZE_M) / CELL_M).astype(np.int64)
+    # Cell, height in millimetres and index in one number: sorting those is several times faster
+    # than sorting by two keys.
+    height_mm = np.clip(1e3 * points[inside, 2] + 2.0**17, 0.0, 2.0**18 - 1.0).astype(np.int64)
+    packed = np.sort(((cell[:, 0] * 256 + cell[:, 1]) << 46) | (height_mm << 28) | inside)
+    first = np.ones(len(packed), dtype=bool)
+    first[1:] = np.diff(packed >> 46) != 0
+    return np.asarray(packed[first] & (2**28 - 1))
+
+
+def _node_and_part(xy: Array) -> tuple[IntArray, Array]:
+    """Per place (k, 2) the node (k,) below it along x and y, and how far (k, 2) it is beyond."""
+    at = np.clip((xy + HALF_SIZE_M) / NODE_M, 0.0, _PER_AXIS - 1.0)
+    low = np.minimum(at.astype(np.int64), _PER_AXIS - 2)
+    return np.asarray(low[:, 0] * _PER_AXIS + low[:, 1]), np.asarray(at - low)
+
+
+def _bilinear(xy: Array) -> csr_array:
+    """(k, nodes) matrix that interpolates the nodes at places (k, 2)."""
+    node, part = _node_and_part(xy)
+    row = np.arange(len(xy))
+    rows, columns, values = [], [], []
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        rows.append(row)
+        columns.append(node + i * _PER_AXIS + j)
+        values.append(
+            (part[:, 0] if i else 1.0 - part[:, 0]) * (part[:, 1] if j else 1.0 - part[:, 1])
+        )
+    shape = (len(xy), _PER_AXIS**2)
+    return coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    ).tocsr()
+
+
+def _bending() -> csr_array:
+    """(nodes, nodes) sum of squares of the second differences along x, y, and of the twist."""
+    index = np.arange(_PER_AXIS**2).reshape(_PER_AXIS, _PER_AXIS)
+    stencils = [
+        ((index[:-2], index[1:-1], index[2:]), (1.0, -2.0, 1.0)),
+        ((index[:, :-2], index[:, 1:-1], index[:, 2:]), (1.0, -2.0, 1.0)),
+        (
+            (index[1:, 1:], index[:-1, 1:], index[1:, :-1], index[:-1, :-1]),
+            (1.0, -1.0, -1.0, 1.0),
+        ),
+    ]
+    blocks = []
+    for nodes, factors in stencils:
+        count = nodes[0].size
+        rows = np.tile(np.arange(count), len(nodes))
+        columns = np.concatenate([n.ravel() for n in nodes])
+        values = np.repeat(factors, count)
+        blocks.append(coo_array((values, (rows, columns)), shape=(count, _PER_AXIS**2)))
+    stacked = vstack(blocks).tocsr()
+    return csr_array(stacked.T @ stacked)
+
+
+_BENDING = _bending()
+
+
+def _solve_banded(matrix: csr_array, right: Array) -> Array:
+    """Solves a positive definite system whose nodes are coupled to two rows of the grid at most."""
+    band = 2 * _PER_AXIS
+    entries = coo_array(matrix)
+    upper = entries.col >= entries.row
+    row, column = entries.row[upper], entries.col[upper]
+    banded = np.zeros((band + 1, _PER_AXIS**2))
+    banded[band + row - column, column] = entries.data[upper]
+    return np.asarray(solveh_banded(banded, right, check_finite=False))

@@ -1,0 +1,460 @@
+"""The config that `init` writes: what can be known from a drive, and what a person must fill in."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import yaml
+
+from caliv_graph.common.fields import Field
+from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.errors import ConfigError
+from caliv_graph.geometry.se3 import rpy
+from caliv_graph.readers.bag import Bag, DamagedMessageError
+from caliv_graph.readers.discover import (
+    MotionTopics,
+    choose_lidar_topics,
+    choose_motion_topics,
+    drive_folder,
+    is_recorded_bag,
+    recorded_sensors,
+)
+from caliv_graph.readers.frames import (
+    TF_TYPES,
+    FrameTransform,
+    FrameTree,
+    clean_frame,
+    message_transforms,
+    read_urdf,
+)
+
+_NO_GUESS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+_STILL_MESSAGES = 200
+"""Messages of /tf in which old senders repeat what does not move: a few seconds of them."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A config to be completed.
+
+    Attributes:
+        text: YAML that `config.load_config` accepts.
+        lidars: names of its LiDARs.
+        unknown: keys that a person must fill in before calibrating.
+        origin: a sentence on where the guesses were taken from; empty: nowhere.
+    """
+
+    text: str
+    lidars: tuple[str, ...]
+    unknown: tuple[str, ...]
+    origin: str
+
+
+@dataclass(frozen=True)
+class _Original:
+    """What a config of the CaLiV authors' program says.
+
+    Attributes:
+        path: the file.
+        extrinsics: per sensor, metres and roll, pitch, yaw in degrees of T_vehicle_lidar.
+        target: lower and upper corner in the map, metres; None if it says nothing.
+    """
+
+    path: Path
+    extrinsics: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    target: tuple[Sequence[float], Sequence[float]] | None
+
+
+def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
+    """Drafts the config of a drive.
+
+    Of a bag: LiDARs and what tells the motion by the types of the topics, initial guesses from
+    `/tf_static` or a URDF. Of a CaLiV folder: initial guesses and the target's region from a config
+    of the CaLiV authors' program (`transform_sensor_N`, `min_bound`, `max_bound`) beside the data.
+
+    Args:
+        data: the drive.
+        config: where the config will be written: paths in it are relative to its folder.
+        urdf: of the vehicle; for a bag only, whose messages name the frames of the sensors.
+
+    Raises:
+        RecordingError: the drive is missing, no recording, or has no clouds.
+        ConfigError: the URDF, or the CaLiV config beside the data, is damaged.
+    """
+    if is_recorded_bag(data):
+        draft = _draft_of_bag(data, config, urdf)
+    elif urdf is not None:
+        raise ConfigError(
+            f"{data}: is no bag: its clouds name no frame that {urdf} could place. Leave out --urdf"
+        )
+    else:
+        draft = _draft_of_folder(data, config)
+    # A draft that does not load would be a defect of this module, not of the user's data.
+    parse_config(yaml.safe_load(draft.text), str(config), config.parent)
+    return draft
+
+
+def _draft_of_folder(data: Path, config: Path) -> Draft:
+    sensors = recorded_sensors(data)
+    original = _find_original(drive_folder(data))
+    extrinsics = original.extrinsics if original else {}
+    target = original.target if original else None
+    unknown = [f"lidars.{sensor}.initial" for sensor in sensors if sensor not in extrinsics]
+    if target is None:
+        unknown.append("target")
+    source = original.path.name if original else ""
+    lidars = "\n".join(
+        _lidar_text(
+            sensor,
+            sensor,
+            "its folder of clouds",
+            *extrinsics.get(sensor, _NO_GUESS),
+            _origin(source if sensor in extrinsics else ""),
+        )
+        for sensor in sensors
+    )
+    text = _align(
+        _TEMPLATE.format(
+            format="caliv\t# a folder with input/ego_poses.yaml and input/sensor_N/<frame>.pcd",
+            path=_scalar(_relative(data, config)),
+            motion="",
+            lidars=lidars,
+            reference=_scalar(sensors[0]),
+            target=_target_text(target, source),
+        )
+    )
+    taken = f"Initial guesses and target taken from {original.path}" if original else ""
+    return Draft(text, sensors, tuple(unknown), taken)
+
+
+def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
+    bag = Bag(data)
+    frames = _read_frames(bag, urdf)
+    clouds = choose_lidar_topics(bag)
+    motion = choose_motion_topics(bag)
+    unknown: list[str] = [] if motion.chosen else ["topics"]
+    lidars = []
+    for name, topic in clouds.chosen.items():
+        guess = frames.mounting(clouds.frame_ids[name])
+        if guess.T_vehicle_sensor is None:
+            unknown.append(f"lidars.{name}.initial")
+        kind = bag.topics[topic].type.rpartition("/")[2]
+        note = f"{kind} in frame {clouds.frame_ids[name] or '(none)'}"
+        lidars.append(_lidar_text(name, topic, note, *guess.numbers(), guess.origin))
+    lidars += [_comment(f"  # not taken: {topic}, {why}") for topic, why in clouds.others.items()]
+    sections = _topics_text(bag, motion)
+    for kind, key, template in (
+        ("imu", "imu.T_vehicle_imu", _IMU_TEMPLATE),
+        ("gnss", "gnss.lever_arm", _GNSS_TEMPLATE),
+    ):
+        if kind in motion.chosen:
+            guess = frames.mounting(_frame_of(bag, motion.chosen[kind]))
+            if guess.T_vehicle_sensor is None:
+                unknown.append(key)
+            xyz, rpy_deg = guess.numbers()
+            sections += template.format(origin=guess.origin, xyz=_list(xyz), rpy_deg=_list(rpy_deg))
+    text = _align(
+        _TEMPLATE.format(
+            format="rosbag\t# a ROS 2 bag (folder, .mcap) or a ROS 1 .bag",
+            path=_scalar(_relative(data, config)),
+            motion=sections,
+            lidars="\n".join(lidars),
+            reference=_scalar(next(iter(clouds.chosen))),
+            target=_SEARCHED_TARGET_TEMPLATE,
+        )
+    )
+    found = [name for name in clouds.chosen if f"lidars.{name}.initial" not in unknown]
+    taken = f"Initial guesses of {', '.join(found)} taken from {frames.source}" if found else ""
+    return Draft(text, tuple(clouds.chosen), tuple(unknown), taken)
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """The mounting of a sensor, if it is known.
+
+    Attributes:
+        T_vehicle_sensor: None if it is not.
+        origin: where it was taken from, or why it is not known.
+    """
+
+    T_vehicle_sensor: gtsam.Pose3 | None
+    origin: str
+
+    def numbers(self) -> tuple[Sequence[float], Sequence[float]]:
+        """Metres, and roll, pitch, yaw in degrees; zeros if it is not known."""
+        if self.T_vehicle_sensor is None:
+            return _NO_GUESS
+        angles = rpy(self.T_vehicle_sensor.rotation().matrix())
+        # To the micrometre and microdegree: quaternions leave 1e-15 where zeros were meant.
+        xyz = [round(float(v), 6) + 0.0 for v in self.T_vehicle_sensor.translation()]
+        return xyz, [round(math.degrees(v), 6) + 0.0 for v in angles]
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Where sensors are mounted.
+
+    Attributes:
+        tree: frames that are fixed to each other.
+        vehicle: the vehicle's; None if none of them is it.
+        source: what they were taken from.
+    """
+
+    tree: FrameTree
+    vehicle: str | None
+    source: str
+
+    def mounting(self, frame: str) -> _Guess:
+        """`T_vehicle_sensor` of the sensor with this frame."""
+        if self.vehicle is None:
+            why = f"{self.source} has no frame base_link"
+        elif not frame:
+            why = "its messages name no frame"
+        else:
+            T = gtsam.Pose3() if frame == self.vehicle else None
+            T = T or self.tree.transform(self.vehicle, frame)
+            if T is not None:
+                return _Guess(T, f"{self.vehicle} to {frame}, {_origin(self.source)}")
+            why = f"{self.source} does not lead from {self.vehicle} to {frame}"
+        return _Guess(None, f"{_origin('')} ({why})")
+
+
+def _read_frames(bag: Bag, urdf: Path | None) -> _Frames:
+    links: list[FrameTransform] = []
+    for topic in bag.topics.values():
+        if topic.type in TF_TYPES and topic.name.rpartition("/")[2] != "tf_static":
+            links += _still_links(bag, topic.name)
+    static = [name for name in bag.topics if name.rpartition("/")[2] == "tf_static"]
+    for _, _, raw in bag.messages(static):
+        links += _links(bag, static[0], raw)
+    source = "/tf_static"
+    vehicle = FrameTree(links).vehicle_frame()
+    if urdf is not None:
+        fixed = read_urdf(urdf)
+        tree = FrameTree(fixed)
+        # A URDF may name its root as it likes; a vehicle frame by a known name comes first.
+        root = tree.root(fixed[0].child) if fixed else None
+        vehicle = tree.vehicle_frame() or vehicle or root
+        source = f"{urdf.name} and /tf_static" if static else urdf.name
+        links += fixed
+    elif not links:
+        source = "the bag, which has no /tf_static,"
+    return _Frames(FrameTree(links), vehicle, source)
+
+
+def _links(bag: Bag, topic: str, raw: bytes) -> list[FrameTransform]:
+    try:
+        return [link for _, link in message_transforms(bag.decode(topic, raw))]
+    except DamagedMessageError:
+        return []
+
+
+def _still_links(bag: Bag, topic: str) -> Iterable[FrameTransform]:
+    """Links that are repeated without change, as senders did before there was /tf_static."""
+    first: dict[tuple[str, str], FrameTransform] = {}
+    repeated: dict[tuple[str, str], bool] = {}
+    for count, (_, _, raw) in enumerate(bag.messages([topic])):
+        for link in _links(bag, topic, raw):
+            key = (link.parent, link.child)
+            before = first.setdefault(key, link)
+            if before is not link:
+                same = before.T_parent_child.equals(link.T_parent_child, 1e-9)
+                repeated[key] = repeated.get(key, True) and same
+        if count >= _STILL_MESSAGES:
+            break
+    return [first[key] for key, same in repeated.items() if same]
+
+
+def _frame_of(bag: Bag, topic: str) -> str:
+    raw = bag.first_message(topic)
+    try:
+        return "" if raw is None else clean_frame(bag.header(raw).frame_id)
+    except DamagedMessageError:
+        return ""
+
+
+def _topics_text(bag: Bag, motion: MotionTopics) -> str:
+    lines = ["topics:\t# what tells the vehicle's motion: imu, gnss and twist; or pose"]
+    if not motion.chosen:
+        lines[0] = "topics: {}\t# TODO: imu, gnss and twist, or pose: the bag has none by its types"
+    for key, chosen in motion.chosen.items():
+        lines.append(f"  {key}: {_scalar(chosen)}\t# {bag.topics[chosen].type}")
+    for key, others in motion.others.items():
+        lines += [f"  # {key}: {_scalar(o)}\t# would do, too: {bag.topics[o].type}" for o in others]
+    return "\n".join(lines) + "\n\n"
+
+
+def _find_original(folder: Path) -> _Original | None:
+    """Looks for a CaLiV config beside the poses, and beside the folder `input` that holds them."""
+    folders = [folder, folder.parent] if folder.name == "input" else [folder]
+    for candidate in folders:
+        for path in sorted(candidate.iterdir()):
+            if path.suffix in (".yaml", ".yml") and path.is_file():
+                original = _read_original(path)
+                if original:
+                    return original
+    return None
+
+
+def _read_original(path: Path) -> _Original | None:
+    try:
+        raw = read_yaml(path)
+    except ConfigError:
+        return None
+    if not isinstance(raw, dict) or "transform_sensor_1" not in raw:
+        return None
+    root = Field(raw, str(path))
+    extrinsics = {}
+    for name, field in root.names().items():
+        if name.startswith("transform_"):
+            values = _numbers(field, 6)
+            extrinsics[name.removeprefix("transform_")] = (values[3:], values[:3])
+    if "min_bound" not in raw or "max_bound" not in raw:
+        return _Original(path, extrinsics, None)
+    bounds = (_numbers(root.child("min_bound"), 3), _numbers(root.child("max_bound"), 3))
+    return _Original(path, extrinsics, bounds)
+
+
+def _numbers(field: Field, size: int) -> list[float]:
+    """The numbers of a list, which that program writes inside another list."""
+    items = field.items()
+    inner = items[0] if len(items) == 1 else field
+    return [float(v) for v in inner.vector(size)]
+
+
+def _relative(data: Path, config: Path) -> str:
+    return os.path.relpath(data.resolve(), config.resolve().parent)
+
+
+def _align(template: str) -> str:
+    """Puts the comments, which follow a tab, below one another."""
+    lines = [line.split("\t") for line in template.splitlines()]
+    return "".join(f"{line[0]:<30}  {line[1]}\n" if line[1:] else f"{line[0]}\n" for line in lines)
+
+
+def _scalar(text: str) -> str:
+    """A string as YAML reads it back, in quotes only if it needs them."""
+    plain = re.fullmatch(r"[\w./][\w./ -]*(?<! )", text) and yaml.safe_load(text) == text
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def _list(values: Sequence[float]) -> str:
+    shown: list[Any] = [round(float(v), 9) for v in values]
+    return yaml.safe_dump(shown, default_flow_style=True, width=1000).strip()
+
+
+def _origin(source: str) -> str:
+    if source:
+        return f"taken from {source}"
+    return "TODO: these zeros are no guess; measure, or read it off a drawing"
+
+
+def _comment(text: str) -> str:
+    """Text of the data, such as a frame's name, that cannot end the comment that it stands in."""
+    return re.sub(r"[^\S ]|[^ -~\u00a1-\uffff]", "?", text)
+
+
+def _lidar_text(
+    name: str,
+    topic: str,
+    topic_note: str,
+    xyz: Sequence[float],
+    rpy_deg: Sequence[float],
+    origin: str,
+) -> str:
+    return _LIDAR_TEMPLATE.format(
+        name=_scalar(name),
+        topic=_scalar(topic),
+        topic_note=_comment(topic_note),
+        origin=_comment(origin),
+        xyz=_list(xyz),
+        rpy_deg=_list(rpy_deg),
+    )
+
+
+def _target_text(target: tuple[Sequence[float], Sequence[float]] | None, source: str) -> str:
+    if target is None:
+        return _NO_TARGET_TEMPLATE
+    return _TARGET_TEMPLATE.format(source=source, min=_list(target[0]), max=_list(target[1]))
+
+
+_TEMPLATE = """\
+# Drafted by 'caliv-graph init'. Metres and degrees; paths are relative to this file.
+# T_vehicle_lidar maps points of a LiDAR's cloud into the vehicle frame: x forward, y left, z up.
+
+data:
+  format: {format}
+  path: {path}
+
+{motion}lidars:\t# rename them as you like: front, rear, ...
+{lidars}
+
+reference: {reference}\t# the LiDAR that the others are calibrated to
+
+{target}
+
+solve:
+  mode: auto\t# auto (the guess decides only what the drive leaves open), staged, joint
+
+robust:
+  kernel: huber\t# what becomes of bad scans: huber, tls, trimmed, none
+
+require: [s2s]\t# what exit code 0 promises to have determined: s2s, s2v_rotation, s2v
+"""
+
+_LIDAR_TEMPLATE = """\
+  {name}:
+    topic: {topic}\t# {topic_note}
+    initial:\t# T_vehicle_lidar, {origin}
+      xyz: {xyz}\t# metres forward, left, up
+      rpy_deg: {rpy_deg}\t# degrees; pitch > 0 is nose down, yaw > 0 left
+    sigma:\t# how far off it may be, 1 sigma: a number, or one per vehicle axis
+      xyz: 0.058\t# metres; 0.058 is anything up to +-0.1 m
+      rpy_deg: 1.73\t# degrees; 1.73 is anything up to +-3 degrees
+    min_range: 1.0\t# metres; nearer returns (the vehicle's own body) are dropped
+    max_range: 200.0\t# metres; farther returns are dropped"""
+
+_TARGET_TEMPLATE = """\
+target:\t# a box in which the target, and nothing else above the ground, stands
+  min: {min}\t# metres, taken from {source}
+  max: {max}\t# metres
+  frame: map\t# map (the frame of the poses) or start (the vehicle's first pose)"""
+
+_NO_TARGET_TEMPLATE = """\
+# TODO: a box in which the target, and nothing else above the ground, stands: metres, in the frame
+# of the poses (map) or of the vehicle's first pose (start). Without it the target is searched for.
+# target:
+#   min: [10.0, -14.0, -1.0]
+#   max: [20.0, -4.0, 3.0]
+#   frame: map"""
+
+_SEARCHED_TARGET_TEMPLATE = """\
+# The target is searched for. If that fails, or others stand near it, give a box in which it, and
+# nothing else above the ground, stands: metres, in the map, or from the vehicle's first pose.
+# target:
+#   min: [10.0, -14.0, -1.0]
+#   max: [20.0, -4.0, 3.0]
+#   frame: start"""
+
+_IMU_TEMPLATE = """\
+imu:
+  T_vehicle_imu:\t# {origin}
+    xyz: {xyz}\t# metres forward, left, up
+    rpy_deg: {rpy_deg}\t# degrees
+
+"""
+
+_GNSS_TEMPLATE = """\
+gnss:\t# the antenna in the vehicle frame, {origin}
+  lever_arm: {xyz}\t# metres forward, left, up
+
+"""

@@ -1,0 +1,156 @@
+"""Does a drive say the same twice? Its two halves, calibrated each by itself.
+
+The early stages of `pipeline.calibrate` are done once; the target's clouds are then shared out to
+two halves, each is solved, and the two results are tested against each other as those of two drives
+would be (`fusion.compare`): on the joint covariance, along the directions that both determine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.calibration.assemble import assemble
+from caliv_graph.calibration.estimate import estimate
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.errors import RegistrationError, SolveError, TargetError
+from caliv_graph.fusion.compare import Comparison, compare
+from caliv_graph.fusion.terms import drive_digest
+from caliv_graph.pipeline import Prepared, prepare
+from caliv_graph.products import (
+    Calibration,
+    MotionData,
+    Recording,
+    TargetCloud,
+    TargetObservation,
+)
+
+PASS_GAP_NS = 5_000_000_000
+"""A LiDAR that has not seen the target for so long passes it once more."""
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """The halves of a drive against each other.
+
+    Attributes:
+        halves: what they are, in words.
+        comparison: of the two results; None if a half could not be calibrated.
+        by_passes: whether they are passes of the target; if not, they share the errors of the
+            trajectory, and agree better than two drives would.
+        reason: why not.
+    """
+
+    halves: tuple[str, str]
+    comparison: Comparison | None
+    by_passes: bool = False
+    reason: str = ""
+
+
+Halves = tuple[tuple[TargetCloud, ...], tuple[TargetCloud, ...]]
+
+
+def split(observation: TargetObservation, fewest: int) -> Halves | None:
+    """Shares the clouds of a target out to two halves by passes.
+
+    Args:
+        observation: of the target.
+        fewest: clouds that each LiDAR needs in each half.
+
+    Returns:
+        The two halves; None if a LiDAR passed the target only once.
+    """
+    halves: tuple[list[TargetCloud], list[TargetCloud]] = ([], [])
+    for name in dict.fromkeys(cloud.lidar for cloud in observation.clouds):
+        clouds = [cloud for cloud in observation.clouds if cloud.lidar == name]
+        stamps = np.array([cloud.stamp_ns for cloud in clouds], dtype=np.int64)
+        begins = np.flatnonzero(np.diff(stamps) > PASS_GAP_NS) + 1
+        begins = begins[(begins >= fewest) & (len(clouds) - begins >= fewest)]
+        if not len(begins):
+            return None
+        middle = int(begins[np.abs(begins - len(clouds) / 2).argmin()])
+        halves[0].extend(clouds[:middle])
+        halves[1].extend(clouds[middle:])
+    return tuple(halves[0]), tuple(halves[1])
+
+
+def alternate(observation: TargetObservation) -> Halves:
+    """Shares the clouds of a target out to two halves in turns, per LiDAR."""
+    halves: tuple[list[TargetCloud], list[TargetCloud]] = ([], [])
+    for name in dict.fromkeys(cloud.lidar for cloud in observation.clouds):
+        clouds = [cloud for cloud in observation.clouds if cloud.lidar == name]
+        halves[0].extend(clouds[::2])
+        halves[1].extend(clouds[1::2])
+    return tuple(halves[0]), tuple(halves[1])
+
+
+def split_halves(
+    recording: Recording,
+    config: Config,
+    progress: Progress,
+    p_value: float,
+    motion: MotionData | None = None,
+) -> Repeatability:
+    """Calibrates the two halves of a drive and compares them.
+
+    The halves are those of the passes of the target if every LiDAR has two: then little but the
+    extrinsics is common to them. Otherwise every other scan: such halves share the errors of
+    the trajectory, so that they agree better than two drives would.
+
+    Args:
+        recording: the drive.
+        config: as for `calibrate`.
+        progress: told of every stage.
+        p_value: chance of a false alarm over all tests.
+        motion: what the recording tells of the vehicle's motion, if it has been read already.
+
+    Raises:
+        RecordingError, TrajectoryError: the recording could not be read.
+    """
+    motion = recording.motion() if motion is None else motion
+    try:
+        prepared = prepare([recording], config, {0: motion}, progress)
+    except TargetError as e:
+        return Repeatability(("", ""), None, reason=str(e))
+    observations = prepared.observations
+    fewest = config.extraction.min_scans
+    names, halves = ("first passes", "later passes"), [split(o, fewest) for o in observations]
+    by_passes = None not in halves
+    if not by_passes:
+        names = ("every other scan", "the scans in between")
+        halves = [alternate(o) for o in observations]
+    digest = drive_digest(motion)
+    results: list[Calibration] = []
+    for half, name in enumerate(names):
+        parts = tuple(
+            replace(o, clouds=of[half]) for o, of in zip(observations, halves, strict=True) if of
+        )
+        try:
+            with progress.stage(f"calibrating by half the scans: {name}", None):
+                results.append(
+                    _calibrated(
+                        recording,
+                        replace(prepared, observations=parts),
+                        config,
+                        progress,
+                        f"{digest} {name}",
+                    )
+                )
+        except (TargetError, RegistrationError, SolveError) as e:
+            return Repeatability(names, None, by_passes, f"{name}: {e}")
+    return Repeatability(names, compare(results[0], results[1], names, p_value), by_passes)
+
+
+def _calibrated(
+    recording: Recording,
+    prepared: Prepared,
+    config: Config,
+    progress: Progress,
+    digest: str,
+) -> Calibration:
+    stamps = {cloud.stamp_ns for o in prepared.observations for cloud in o.clouds}
+    own = [ground for ground in prepared.grounds if ground.stamp_ns in stamps]
+    solution = estimate(prepared.observations, prepared.trajectories, config, progress, own)
+    return assemble(solution, config, [recording], [digest])

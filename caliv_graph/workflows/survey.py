@@ -1,0 +1,164 @@
+"""What a recorded drive determines, before it is calibrated.
+
+The early stages of `pipeline.calibrate`: trajectory, target, ground, a rough registration and one
+solve of the graph, which puts the extrinsics near enough to read the information off. Shape and
+extrinsics are not refined together, which is what takes the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from caliv_graph.calibration.estimate import prealigned, symmetries_of_targets
+from caliv_graph.calibration.problem import pose_problem, usable
+from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.solve import (
+    OFFSET_DETERMINED_S,
+    SolveState,
+    reduced_registered,
+    solve_registered,
+    with_determined_offsets,
+)
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.pipeline import prepare
+from caliv_graph.products import (
+    Array,
+    GroundObservation,
+    Recording,
+    TargetObservation,
+)
+from caliv_graph.registration.register import JointRegistration, register_jointly
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.uncertainty.predicted import (
+    PredictedCovariance,
+    predict_covariance,
+    undetermined_offsets,
+)
+
+ROUGH_ITERATIONS = 40
+"""Of the registration at most: millimetres do not change what a drive determines."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What recorded drives tell.
+
+    Attributes:
+        names: of the recordings.
+        outlook: sigmas, covariance, directions; extrinsics are rough estimates.
+        scans: (target, LiDAR) -> number of clouds that count.
+        unmet: what `require` and `limits` of the config ask for and will not get, a sentence each.
+        warnings: what a person should know, a line each.
+    """
+
+    names: tuple[str, ...]
+    outlook: PredictedCovariance
+    scans: Mapping[tuple[str, str], int]
+    unmet: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def survey(recordings: Sequence[Recording], config: Config, progress: Progress) -> Survey:
+    """Finds out what recorded drives of one vehicle determine.
+
+    Args:
+        recordings: opened drives (`readers.open_recording`).
+        config: as for `calibrate`.
+        progress: told of every stage.
+
+    Raises:
+        CalivError: something is wrong with the input; the message says what to do.
+    """
+    motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    prepared = prepare(recordings, config, motions, progress)
+    with threadpool_limits(limits=1):
+        found = survey_observations(
+            prepared.observations, prepared.trajectories, prepared.grounds, config, progress
+        )
+    return replace(
+        found,
+        names=tuple(recording.name for recording in recordings),
+        warnings=(*prepared.warnings, *found.warnings),
+    )
+
+
+def survey_observations(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
+    grounds: Sequence[GroundObservation],
+    config: Config,
+    progress: Progress,
+) -> Survey:
+    """The same from extracted targets and grounds; without names and the warnings before it.
+
+    Args:
+        observations: clouds of each target placement.
+        trajectories: one per drive.
+        grounds: the ground as the LiDARs saw it.
+        config: modes, kernels, priors.
+        progress: told of every stage.
+
+    Raises:
+        RegistrationError, SolveError: it could not be done.
+    """
+    observations = usable(observations)
+    problem = pose_problem(observations, trajectories, config)
+    limit = min(config.registration.max_iterations, ROUGH_ITERATIONS)
+    registrations = []
+    with progress.stage("registering the clouds roughly", len(observations)) as advance:
+        for m, observation in enumerate(observations):
+            state = JointRegistration(
+                observation, config, rough=True, shares=problem.view_weights(m)
+            )
+            registrations.append(register_jointly(state, prealigned(problem, m), limit))
+            advance()
+    with progress.stage("reading the information off the graph", None):
+        turns, alike = symmetries_of_targets(registrations, config)
+        solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
+        problem, offsets_s = with_determined_offsets(solved, registrations)
+        if problem.offsets != solved.problem.offsets:
+            solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
+        D = reduced_registered(solved, registrations).D
+    found = _verdict(solved, D, offsets_s, observations, config)
+    return replace(found, warnings=(*alike, *found.warnings))
+
+
+def _verdict(
+    solved: SolveState,
+    D: Array,
+    offsets_s: Mapping[str, float],
+    observations: Sequence[TargetObservation],
+    config: Config,
+) -> Survey:
+    problem = solved.problem
+    scans: dict[tuple[str, str], int] = {}
+    for j in np.flatnonzero(solved.weights.values >= 0.5).tolist():
+        target = observations[int(problem.cloud_placement[j])].name
+        key = (target, problem.lidars[int(problem.cloud_lidar[j])])
+        scans[key] = scans.get(key, 0) + 1
+    outlook = predict_covariance(
+        D,
+        problem.lidars,
+        problem.reference,
+        {
+            name: problem.extrinsic(solved.values, name)
+            if name in problem.lidars
+            else lidar.initial.pose()
+            for name, lidar in config.lidars.items()
+        },
+        {
+            name: problem.guess_sigmas(name) if name in problem.lidars else lidar.sigma.sigmas()
+            for name, lidar in config.lidars.items()
+        },
+        {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},
+        offsets_s,
+    )
+    unmet = unmet_requirements(outlook.calibration, config).unmet
+    return Survey(
+        (), outlook, scans, unmet, tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
+    )

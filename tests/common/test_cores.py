@@ -1,0 +1,56 @@
+"""Work that is shared out, and work that is not."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from caliv_graph.common.cores import cores, on_one_core, parts, share_out
+
+
+def test_on_one_core_all_is_done_here_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2})
+    assert cores() == 3
+    done: list[tuple[int, int]] = []
+    with on_one_core():
+        assert cores() == 1
+        share_out(lambda i: done.append((i, threading.get_ident())), range(20))
+    assert done == [(i, threading.get_ident()) for i in range(20)]
+    assert cores() == 3
+
+
+def test_work_is_shared_out_and_all_of_it_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1})
+    both = threading.Barrier(2, timeout=20.0)
+    done = [0] * 2
+
+    def work(i: int) -> None:
+        both.wait()  # two at a time, or never
+        done[i] = i + 1
+
+    share_out(work, range(2))
+    assert done == [1, 2]
+
+
+def test_what_goes_wrong_in_a_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for usable in ({0}, {0, 1}):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable)
+        with pytest.raises(ZeroDivisionError):
+            share_out(lambda i: i // 0, range(3))
+
+
+def test_one_core_is_given_back_after_an_error() -> None:
+    before = cores()
+    with pytest.raises(ValueError, match="stop"), on_one_core():
+        raise ValueError("stop")
+    assert cores() == before
+
+
+@pytest.mark.parametrize(("count", "number"), [(0, 3), (2, 5), (10, 3), (9, 3), (7, 1)])
+def test_parts_are_all_of_it_in_order_and_about_equal(count: int, number: int) -> None:
+    cut = parts(count, number)
+    assert [i for part in cut for i in range(count)[part]] == list(range(count))
+    sizes = [part.stop - part.start for part in cut]
+    assert all(size > 0 for size in sizes)
+    assert not sizes or max(sizes) - min(sizes) <= 1

@@ -1,0 +1,95 @@
+"""YAML that was made to do harm, or that a broken disk made."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from caliv_graph.common.yaml_text import YamlProblemError, parse_yaml
+from caliv_graph.config.load import read_yaml
+from caliv_graph.errors import ConfigError
+
+
+def problem_of(text: str) -> str:
+    with pytest.raises(YamlProblemError) as caught:
+        parse_yaml(text)
+    return str(caught.value)
+
+
+def bomb(levels: int) -> str:
+    """Each list holds the one before it ten times."""
+    lists = ["&a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lists += [f"&a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, levels)]
+    return f"x: [{', '.join(lists)}]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("lidars: " + "[" * 100_000, "nested deeper than 50 levels"),
+        ("lidars:\n" + "- " * 50_000 + "x\n", "nested deeper than 50 levels"),
+        ("a: " + "{a: " * 51 + "}" * 51, "nested deeper than 50 levels"),
+        (bomb(12), "aliases stand for"),
+        ("a: &a {b: *a}\n", "'*a' stands for what it is part of"),
+        ("a: &a [*a]\n", "'*a' stands for what it is part of"),
+        ("a: 0x" + "f" * 5000, "a number of 5002 digits"),
+        ("a: " + "9" * 5000, "a number of 5000 digits"),
+        ("a: 1" + ":59" * 2000, "a number of 6001 digits"),
+        ("a: !!int ''", "not what it seems"),
+        ("a: !!timestamp now", "not what it seems"),
+        ("a: !!map x", "expected a mapping node"),
+        ("a: 2001-99-99", "month must be in 1..12"),
+        ("a: !!python/object/apply:os.system [exit]", "could not determine a constructor"),
+        ("? [a]\n: 1", "unhashable"),
+        ("? &a [*a]\n: 1", "stands for what it is part of"),
+        ("a: 1\na: 2\n", "'a' stands twice"),
+        ("a: 1\n---\nb: 2\n", "another document"),
+        ("a: *b", "undefined alias"),
+        (f"a: !{'x' * 5000} b", "could not determine a constructor"),
+        ('a: "\\ud800"', "invalid Unicode"),
+        ("a\x00b", "control characters"),
+    ],
+    ids=lambda value: value[:20] if isinstance(value, str) else "",
+)
+def test_hostile_text_is_refused_at_once(text: str, said: str) -> None:
+    start = time.monotonic()
+
+    message = problem_of(text)
+
+    assert said in message
+    assert "\n" not in message
+    assert len(message) < 300
+    assert time.monotonic() - start < 2.0
+
+
+def test_what_people_and_programs_write_is_read() -> None:
+    nested = "a: " + "[" * 40 + "]" * 40
+    assert parse_yaml(nested)
+    shared = [[f"{k}.pcd", [float(k), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]] for k in range(3000)]
+    # The dumper writes the second sensor's poses, the same list, as an alias.
+    text = yaml.safe_dump({f"sensor_{n}": shared for n in range(5)})
+    assert "*" in text
+    assert parse_yaml(text)["sensor_4"] == shared
+    assert parse_yaml("base: &b {x: 1}\nmore: {<<: *b, y: 2}\n")["more"] == {"x": 1, "y": 2}
+    assert parse_yaml("a: " + "9" * 30)["a"] == 10**30 - 1
+    assert parse_yaml("") is None
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_bytes(b"\xef\xbb\xbflidars: 1\n")
+
+    assert read_yaml(path) == {"lidars": 1}
+
+
+def test_no_line_is_named_where_none_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("a: 1\nb: [1, 2\n")
+    with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML in line 3: did not find"):
+        read_yaml(path)
+    path.write_text("a: 2001-99-99\n")
+    with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML: a value is not"):
+        read_yaml(path)

@@ -1,0 +1,701 @@
+"""Planes of known truth in scans of a LiDAR that looks down on them, and what is no plane."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import load_config, parse_config
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import tangent_axes
+from caliv_graph.products import (
+    Array,
+    GroundObservation,
+    LidarScan,
+    MotionData,
+    TargetCloud,
+    TargetObservation,
+    Trajectory,
+)
+from caliv_graph.readers.caliv_folder import CalivFolder
+from caliv_graph.simulation import load_scenario, simulate_drive
+from caliv_graph.targets.ground.planes import (
+    CELL_POINTS,
+    DISTANCE_FLOOR_M,
+    NORMAL_FLOOR_RAD,
+    GroundMeter,
+    GroundPlane,
+    measure_ground,
+    measure_grounds,
+    near_points,
+    nearest_scans,
+)
+from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.select import GivenTrajectory
+from tests.samples import pose
+
+ROOT = Path(__file__).parents[2]
+RELEASED = ROOT.parent / "shared" / "data" / "caliv_released"
+
+HEIGHT_M = 2.0
+NOSE_DOWN = gtsam.Rot3.Pitch(math.radians(10.0))
+UP_LIDAR = np.array([-math.sin(math.radians(10.0)), 0.0, math.cos(math.radians(10.0))])
+
+RING = np.array(
+    [
+        [math.cos(-0.2) * math.cos(a), math.cos(-0.2) * math.sin(a), math.sin(-0.2)]
+        for a in np.linspace(-1.0, 1.0, 1600)
+    ]
+)
+"""One ring of a LiDAR, of 0.07 degrees."""
+
+Depth = Callable[[Array], Array]
+
+
+def beams(columns: int = 120, channels: int = 26) -> Array:
+    """(n, 3) unit directions in the lidar frame, 120 by 25 degrees, column by column."""
+    azimuth = np.radians(np.linspace(-60.0, 60.0, columns))[:, None]
+    elevation = np.radians(np.linspace(-12.5, 12.5, channels))[None]
+    return np.stack(
+        np.broadcast_arrays(
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0.0 * azimuth,
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+
+
+def level(directions: Array) -> Array:
+    """How far it is to the level ground, directions with z up from 2 m above it."""
+    down = -directions[:, 2]
+    return np.where(down > 1e-6, HEIGHT_M / np.maximum(down, 1e-6), np.inf)
+
+
+def wall(x_m: float, height_m: float, half_width_m: float = 100.0) -> Depth:
+    """An upright wall ahead, on the ground."""
+
+    def depth(directions: Array) -> Array:
+        ahead = directions[:, 0] > 1e-6
+        distance = np.where(ahead, x_m / np.maximum(directions[:, 0], 1e-6), np.inf)
+        hit = np.where(ahead[:, None], distance[:, None] * directions, 0.0)
+        on = ahead & (hit[:, 2] + HEIGHT_M < height_m) & (np.abs(hit[:, 1]) < half_width_m)
+        return np.where(on, distance, np.inf)
+
+    return depth
+
+
+def plateau(x_m: float, end_m: float, half_width_m: float, height_m: float) -> Depth:
+    """A level surface between x and end, so far above the ground."""
+
+    def depth(directions: Array) -> Array:
+        down = np.maximum(-directions[:, 2], 1e-6)
+        distance = (HEIGHT_M - height_m) / down
+        hit = distance[:, None] * directions
+        on = (directions[:, 2] < 0.0) & (hit[:, 0] > x_m) & (hit[:, 0] < end_m)
+        return np.where(on & (np.abs(hit[:, 1]) < half_width_m), distance, np.inf)
+
+    return depth
+
+
+def terrain(height: Callable[[Array], Array]) -> Depth:
+    """Ground of a height over x, found by marching along the beams and then halving."""
+
+    def depth(directions: Array) -> Array:
+        def above(distance: Array) -> Array:
+            return HEIGHT_M + distance * directions[:, 2] - height(distance * directions[:, 0])
+
+        low, high = np.zeros(len(directions)), np.full(len(directions), np.inf)
+        for end in np.arange(0.25, 60.0, 0.25):
+            hit = np.isinf(high) & (above(np.full(len(directions), end)) < 0.0)
+            high[hit] = end
+            low[np.isinf(high)] = end
+        found = np.isfinite(high)
+        high[~found] = low[~found]
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            under = above(middle) < 0.0
+            high, low = np.where(under, middle, high), np.where(under, low, middle)
+        return np.where(found, high, np.inf)
+
+    return depth
+
+
+def scan_of(
+    *surfaces: Depth, sigma_m: float = 0.0, seed: int = 0, directions: Array | None = None
+) -> LidarScan:
+    """What is seen first along each beam, with noise along the beam."""
+    directions = beams() if directions is None else directions
+    level_directions = directions @ NOSE_DOWN.matrix().T
+    distance = np.min([surface(level_directions) for surface in surfaces], axis=0)
+    seen = np.isfinite(distance) & (distance < 100.0)
+    distance = distance + sigma_m * np.random.default_rng(seed).normal(size=len(distance))
+    return LidarScan("front", 0, (directions * distance[:, None])[seen], "made up")
+
+
+def measured(scan: LidarScan, up_lidar: Array = UP_LIDAR, sigma_m: float = 0.01) -> GroundPlane:
+    plane = measure_ground(scan, up_lidar, sigma_m)
+    assert plane is not None
+    return plane
+
+
+def errors(plane: GroundPlane, normal: Array = UP_LIDAR, distance_m: float = HEIGHT_M) -> Array:
+    """(3,) off along the plane's axes and in distance."""
+    return np.append(
+        plane.axes_lidar @ (plane.normal_lidar - normal), plane.distance_m - distance_m
+    )
+
+
+# ------------------------------------------------------------------ the plane
+
+
+def test_level_ground_by_hand() -> None:
+    plane = measured(scan_of(level))
+
+    assert plane.normal_lidar == pytest.approx(UP_LIDAR, abs=1e-9)
+    assert plane.distance_m == pytest.approx(HEIGHT_M, abs=1e-9)
+    assert plane.axes_lidar @ plane.axes_lidar.T == pytest.approx(np.eye(2), abs=1e-12)
+    assert plane.axes_lidar @ UP_LIDAR == pytest.approx([0.0, 0.0], abs=1e-9)
+    # The centre is on the plane, ahead and in the middle.
+    assert plane.centre_lidar @ UP_LIDAR == pytest.approx(-HEIGHT_M, abs=1e-9)
+    assert plane.centre_lidar[1] == pytest.approx(0.0, abs=0.2)
+    assert 5.0 < plane.centre_lidar[0] < 12.0
+    assert plane.scatter_m < 1e-9
+    assert plane.radius_m == 15.0
+
+
+@pytest.mark.parametrize("sigma_m", [0.01, 0.03])
+def test_noise_along_the_beam_biases_nothing_and_is_what_the_covariance_says(
+    sigma_m: float,
+) -> None:
+    off, squares = [], []
+    for seed in range(150):
+        plane = measured(scan_of(level, sigma_m=sigma_m, seed=seed), sigma_m=sigma_m)
+        off.append(errors(plane))
+        squares.append(off[-1] @ np.linalg.solve(plane.cov, off[-1]))
+    bias, spread = np.mean(off, axis=0), np.std(off, axis=0)
+    assert np.abs(bias[:2]).max() < 2e-5 * sigma_m / 0.01
+    assert abs(bias[2]) < 1.5e-4 * sigma_m / 0.01
+    assert spread == pytest.approx(np.sqrt(np.diag(plane.cov)), rel=0.35)
+    # 450 degrees of freedom: 392 to 511 in 95 of 100 cases.
+    assert 370.0 < sum(squares) < 540.0
+
+
+def test_the_covariance_is_that_of_the_distance_at_the_lidar() -> None:
+    plane = measured(scan_of(level, sigma_m=0.01, seed=3))
+    # About the centre of the patch, height and tilt hardly correlate; seen from the LiDAR they do.
+    place = plane.axes_lidar @ plane.centre_lidar
+    shift = np.eye(3)
+    shift[2, :2] = place
+    there = shift @ plane.cov @ shift.T
+    correlation = plane.cov[2, :2] @ np.linalg.solve(plane.cov[:2, :2], plane.cov[2, :2])
+    assert correlation / plane.cov[2, 2] > 0.8
+    left = there[2, :2] @ np.linalg.solve(there[:2, :2], there[2, :2])
+    assert left / there[2, 2] < 0.3
+    floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
+    added = np.diag(floors**2) + np.outer(plane.beyond, plane.beyond)
+    assert plane.cov_with_floors - plane.cov == pytest.approx(added)
+    # The ground is level: what it seems to be bent by is noise, and less than the floors.
+    assert np.all(np.abs(plane.beyond) < 2.0 * floors)
+
+
+@pytest.mark.parametrize("tilt_deg", [3.0, 10.0])
+def test_guess_may_be_off(tilt_deg: float) -> None:
+    scan = scan_of(level, wall(18.0, 3.0), sigma_m=0.01, seed=4)
+    right = measured(scan)
+    for azimuth in np.radians(np.arange(0.0, 360.0, 45.0)):
+        axis = math.radians(tilt_deg) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        plane = measured(scan, gtsam.Rot3.Expmap(axis).matrix() @ UP_LIDAR)
+        # Not the same points in every cell, but the same plane.
+        assert errors(plane)[:2] == pytest.approx([0.0, 0.0], abs=2e-4)
+        assert plane.distance_m == pytest.approx(right.distance_m, abs=1e-3)
+
+
+def test_turning_the_lidar_turns_the_plane() -> None:
+    scan = scan_of(level, wall(14.0, 3.0), sigma_m=0.01, seed=5)
+    plane = measured(scan)
+    R = gtsam.Rot3.RzRyRx(2.0, -0.7, 1.3).matrix()
+    turned = measured(replace(scan, points_lidar=scan.points_lidar @ R.T), R @ UP_LIDAR)
+    assert turned.normal_lidar == pytest.approx(R @ plane.normal_lidar, abs=1e-4)
+    assert turned.distance_m == pytest.approx(plane.distance_m, abs=1e-3)
+
+
+def test_a_slope_is_a_plane_too() -> None:
+    slope = math.tan(math.radians(6.0))
+    plane = measured(scan_of(terrain(lambda x: slope * x)))
+    # Nose down by 10 degrees on ground that rises by 6: 4 degrees to it, and 2 cos 6 m above it.
+    four = math.radians(16.0)
+    assert plane.normal_lidar == pytest.approx([-math.sin(four), 0.0, math.cos(four)], abs=1e-6)
+    assert plane.distance_m == pytest.approx(HEIGHT_M * math.cos(math.radians(6.0)), abs=1e-6)
+
+
+# ------------------------------------------------------------------ what stands on it
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        wall(8.0, 3.0),
+        wall(7.0, 1.0, 0.4),
+        wall(7.0, 0.06, 3.0),
+        plateau(8.0, 12.0, 2.0, 0.7),
+        plateau(6.0, 30.0, 1.2, 0.15),
+    ],
+    ids=["wall", "target", "kerb", "table", "pavement"],
+)
+def test_things_that_stand_on_it_do_not_move_it(surface: Depth) -> None:
+    off = np.mean(
+        [errors(measured(scan_of(level, surface, sigma_m=0.01, seed=seed))) for seed in range(10)],
+        axis=0,
+    )
+    assert np.abs(off[:2]).max() < NORMAL_FLOOR_RAD / 5.0
+    assert abs(off[2]) < DISTANCE_FLOOR_M / 2.0
+
+
+def test_the_vehicle_s_own_bonnet_is_not_the_ground() -> None:
+    # A dense LiDAR that looks steeply down: two thirds of its returns are of a bonnet 1 m below.
+    directions = np.concatenate([beams(240, 40), beams(60, 20)])
+    directions[: 240 * 40] = directions[: 240 * 40] @ gtsam.Rot3.Pitch(0.45).matrix().T
+    scan = scan_of(level, plateau(0.8, 2.4, 0.9, 1.0), sigma_m=0.01, seed=2, directions=directions)
+    on_bonnet = np.abs(scan.points_lidar @ UP_LIDAR + 1.0) < 0.05
+    on_ground = np.abs(scan.points_lidar @ UP_LIDAR + HEIGHT_M) < 0.05
+    assert on_bonnet.sum() > on_ground.sum() / 2
+    plane = measured(scan)
+    assert np.abs(errors(plane)[:2]).max() < 3e-4
+    assert plane.distance_m == pytest.approx(HEIGHT_M, abs=1.5e-3)
+
+
+def test_grass_is_not_the_ground() -> None:
+    # On a third of the ground beams end anywhere in the last 0.3 m above it, more often below.
+    off = []
+    for seed in range(20):
+        scan = scan_of(level, sigma_m=0.01, seed=seed)
+        rng = np.random.default_rng(seed)
+        height = 0.3 * rng.uniform(0.0, 1.0, len(scan.points_lidar)) ** 2
+        grass = scan.points_lidar[:, 1] > 0.25 * scan.points_lidar[:, 0]
+        points = np.where(
+            grass[:, None],
+            scan.points_lidar * (1.0 - height / HEIGHT_M)[:, None],
+            scan.points_lidar,
+        )
+        plane = measure_ground(replace(scan, points_lidar=points), UP_LIDAR, 0.01)
+        if plane is not None:
+            off.append(errors(plane))
+    assert len(off) > 10
+    assert np.abs(np.mean(off, axis=0)[:2]).max() < NORMAL_FLOOR_RAD / 5.0
+    assert abs(np.mean(off, axis=0)[2]) < DISTANCE_FLOOR_M / 2.0
+
+
+def test_scattered_returns_do_not_matter() -> None:
+    scan = scan_of(level, sigma_m=0.01, seed=7)
+    rng = np.random.default_rng(0)
+    stray = scan.points_lidar * rng.uniform(0.3, 1.0, (len(scan.points_lidar), 1))
+    mixed = np.where(rng.random((len(stray), 1)) < 0.15, stray, scan.points_lidar)
+    plane = measured(replace(scan, points_lidar=mixed))
+    assert np.abs(errors(plane)[:2]).max() < 3e-4
+    assert plane.distance_m == pytest.approx(HEIGHT_M, abs=2e-3)
+
+
+def test_sparse_clouds_will_do() -> None:
+    scan = scan_of(level, wall(10.0, 2.0), sigma_m=0.01, directions=beams(30, 13))
+    assert len(scan.points_lidar) < 400
+    plane = measured(scan)
+    assert plane.points < 200
+    assert np.abs(errors(plane)[:2]).max() < NORMAL_FLOOR_RAD
+    assert abs(errors(plane)[2]) < 2.0 * DISTANCE_FLOOR_M
+
+
+# ------------------------------------------------------------------ what is no plane
+
+
+def rise(foot_m: float, x_m: Array) -> Array:
+    return 0.15 * np.maximum(x_m - foot_m, 0.0)
+
+
+def test_ramp_ahead_leaves_the_near_part_or_nothing() -> None:
+    for foot_m in (6.0, 7.0, 8.0, 9.0, 11.0, 13.0):
+        rises = terrain(partial(rise, foot_m))
+        plane = measure_ground(scan_of(rises, sigma_m=0.01), UP_LIDAR, 0.01)
+        if plane is not None:
+            # Level, or the ramp: never the mean of both. 0.15 is 8.5 degrees.
+            tilt = math.asin(float(np.cross(UP_LIDAR, plane.normal_lidar)[1]))
+            assert min(abs(tilt), abs(abs(tilt) - math.atan(0.15))) < 1.5e-3, foot_m
+        if foot_m > 10.0:
+            assert plane is not None
+            assert abs(errors(plane)[2]) < 2.0 * DISTANCE_FLOOR_M
+
+
+def test_stairs_are_refused() -> None:
+    stairs = terrain(lambda x: 0.1 * np.floor(np.maximum(x - 5.0, 0.0) / 1.5))
+    assert measure_ground(scan_of(stairs, sigma_m=0.01), UP_LIDAR, 0.01) is None
+
+
+def test_a_step_leaves_the_level_that_the_vehicle_is_on() -> None:
+    # Of what is seen within 15 m half is up the step; within 10 m little.
+    step = terrain(lambda x: np.where(x > 9.0, 0.1, 0.0))
+    plane = measured(scan_of(step, sigma_m=0.01))
+    assert plane.radius_m == 10.0
+    assert abs(errors(plane)[2]) < 2.0 * DISTANCE_FLOOR_M
+    # With the step so near, both levels could be the vehicle's.
+    near = terrain(lambda x: np.where(x > 6.5, -0.2, 0.0))
+    assert measure_ground(scan_of(near, sigma_m=0.01), UP_LIDAR, 0.01) is None
+
+
+def test_a_roof_larger_than_the_ground_is_refused() -> None:
+    roof = plateau(1.0, 30.0, 100.0, 1.2)
+    beside = plateau(1.0, 12.0, 2.6, 1.2)
+    # A lorry's: of the ground less is seen than of the roof; alone it could be the ground.
+    assert measure_ground(scan_of(level, beside, sigma_m=0.01), UP_LIDAR, 0.01) is None
+    assert measure_ground(scan_of(roof, sigma_m=0.01), UP_LIDAR, 0.01) is not None
+
+
+def test_what_is_bent_over_15_m_may_be_a_plane_over_10() -> None:
+    plane = measured(scan_of(terrain(lambda x: -(x**2) / 1000.0), sigma_m=0.01))
+    assert plane.radius_m == 10.0
+
+
+@pytest.mark.parametrize("radius_m", [2000.0, -3000.0])
+def test_a_crest_or_a_dip_is_owned_up_to(radius_m: float) -> None:
+    # The patch, 4.5 to 15 m ahead, lies x^2 / 2R above the ground at the wheels: 20 mm of 2 km.
+    scans = [
+        scan_of(terrain(lambda x: x**2 / (2.0 * radius_m)), sigma_m=0.005, seed=seed)
+        for seed in range(8)
+    ]
+    planes = [measured(scan, sigma_m=0.005) for scan in scans]
+    off = np.mean([errors(plane) for plane in planes], axis=0)
+    assert abs(off[2]) > 5.0 * DISTANCE_FLOOR_M
+    # It is no plane, and the bend says by how much and in which direction it is wrong.
+    beyond = np.mean([plane.beyond for plane in planes], axis=0)
+    assert off + beyond == pytest.approx(np.zeros(3), abs=0.25 * abs(off[2]))
+    for plane in planes:
+        wrong = errors(plane)
+        assert wrong @ np.linalg.solve(plane.cov_with_floors, wrong) < 6.0
+
+
+@pytest.mark.parametrize("radius_m", [100.0, -100.0, 300.0])
+def test_bent_ground_is_refused(radius_m: float) -> None:
+    bent = terrain(lambda x: x**2 / (2.0 * radius_m))
+    assert measure_ground(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is None
+
+
+def test_hardly_bent_ground_is_not() -> None:
+    # 5 mm over the half of 15 m.
+    bent = terrain(lambda x: x**2 / (2.0 * 10_000.0))
+    assert measure_ground(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is not None
+
+
+@pytest.mark.parametrize(
+    "scan",
+    [
+        LidarScan("front", 0, np.zeros((0, 3)), "empty"),
+        LidarScan("front", 0, np.array([[5.0, 0.0, -1.0]] * 3), "three points"),
+        scan_of(wall(6.0, 50.0)),
+        scan_of(level, directions=RING[np.abs(RING[:, 1]) < 0.35]),
+    ],
+    ids=["empty", "few", "wall", "one ring"],
+)
+def test_no_ground_is_no_plane(scan: LidarScan) -> None:
+    assert measure_ground(scan, UP_LIDAR, 0.01) is None
+
+
+def test_ceiling_is_not_the_ground() -> None:
+    scan = scan_of(level, sigma_m=0.01)
+    assert measure_ground(replace(scan, points_lidar=-scan.points_lidar), UP_LIDAR, 0.01) is None
+
+
+def test_no_place_has_more_than_its_share() -> None:
+    rng = np.random.default_rng(0)
+    heap = np.array([4.5, 0.5, -2.0]) + rng.uniform(-0.4, 0.4, (5000, 3)) * [1.0, 1.0, 0.0]
+    wide = np.column_stack([rng.uniform(-14.0, 14.0, (300, 2)), np.full(300, -2.0)])
+    near = near_points(np.concatenate([heap, wide]), np.array([0.0, 0.0, 1.0]))
+    # The heap lies across four cells at most.
+    assert np.sum(near < 5000) <= 4 * CELL_POINTS
+    assert np.sum(near >= 5000) > 280
+    assert np.all(np.diff(near) > 0)
+
+
+def test_axes_are_at_right_angles() -> None:
+    for normal in np.random.default_rng(0).normal(size=(20, 3)):
+        unit = normal / np.linalg.norm(normal)
+        axes = np.vstack([tangent_axes(unit), unit])
+        assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+# ------------------------------------------------------------------ drives
+
+CONFIG = parse_config(
+    {
+        "lidars": {
+            "front": {"topic": "a", "initial": {"xyz": [1.0, 0.0, 2.0], "rpy_deg": [1.0, 8.0, 0]}}
+        }
+    },
+    "made up",
+    Path(),
+)
+
+SECOND_NS = 1_000_000_000
+
+
+def pitching(rate_rad_s: float) -> GivenTrajectory:
+    """A vehicle that stands and pitches evenly about its frame's origin."""
+    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
+    poses = tuple(
+        gtsam.Pose3(gtsam.Rot3.Pitch(rate_rad_s * (t - SECOND_NS // 2) / SECOND_NS), np.zeros(3))
+        for t in stamps
+    )
+    return GivenTrajectory(Trajectory(stamps.astype(np.int64), poses))
+
+
+def test_meter_compensates_the_motion() -> None:
+    # A sweep of 0.1 s, during which the vehicle noses down by 20 mrad; the LiDAR at its origin.
+    rate = 0.2
+    trajectory = pitching(rate)
+    columns, channels = 120, 26
+    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
+    points = []
+    for direction, time_s in zip(beams(columns, channels), times_s, strict=True):
+        R = gtsam.Rot3.Pitch(math.radians(8.0) + rate * time_s).matrix()
+        down = float((R @ direction)[2])
+        points.append(direction * (HEIGHT_M / -down if down < -1e-3 else np.nan))
+    cloud = np.array(points)
+    seen = np.isfinite(cloud[:, 0])
+    scan = LidarScan("front", SECOND_NS // 2, cloud[seen], "sweep", times_s[seen])
+    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 8.0, 0]}}}
+    config = parse_config({"lidars": mounted}, "made up", Path())
+
+    observation = GroundMeter(config, trajectory, 3).measure(scan)
+    assert observation is not None
+    eight = math.radians(8.0)
+    expected = [-math.sin(eight), 0.0, math.cos(eight)]
+    assert observation.normal_lidar == pytest.approx(expected, abs=1e-5)
+    assert observation.distance_m == pytest.approx(HEIGHT_M, abs=1e-4)
+    assert (observation.lidar, observation.drive, observation.stamp_ns) == (
+        "front",
+        3,
+        SECOND_NS // 2,
+    )
+    assert np.sqrt(np.diag(observation.cov)) == pytest.approx(
+        [NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M], rel=0.05
+    )
+    # Without the times it would be off by milliradians.
+    naive = GroundMeter(config, trajectory, 3).measure(replace(scan, point_times_s=None))
+    assert naive is None or np.abs(naive.normal_lidar - expected).max() > 2e-3
+
+
+def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
+    # 2 m/s ahead while turning by 0.3 rad/s: with a pitch that is 2 degrees off, the ground seems
+    # to rise by 7 mm from the first column of the sweep to the last.
+    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
+    moving = tuple(
+        gtsam.Pose3.Expmap((t / SECOND_NS - 0.5) * np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0]))
+        for t in stamps
+    )
+    trajectory = GivenTrajectory(Trajectory(stamps.astype(np.int64), moving))
+    true = pose((1.0, 0.2, HEIGHT_M), (1.0, 8.0, -2.0))
+    guess = pose((1.05, 0.15, 1.9), (2.5, 6.0, 1.0))
+    columns, channels = 120, 26
+    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
+    directions = beams(columns, channels)
+    # The vehicle stays level: all columns see the ground as if it stood.
+    down = -(directions @ true.rotation().matrix().T)[:, 2]
+    seen = down > 0.02
+    points = directions[seen] * (HEIGHT_M / down[seen])[:, None]
+    scan = LidarScan("front", SECOND_NS // 2, points, "sweep", times_s[seen])
+    lidar = {"topic": "a", "initial": {"xyz": [1.05, 0.15, 1.9], "rpy_deg": [2.5, 6.0, 1.0]}}
+    config = parse_config({"lidars": {"front": lidar}}, "made up", Path())
+
+    found = GroundMeter(config, trajectory, 0).measure(scan)
+    assert found is not None
+    assert found.R_vehicle_lidar == pytest.approx(guess.rotation().matrix(), abs=1e-12)
+    assert found.by_extrinsic is not None
+    normal = true.rotation().matrix()[2]
+    off = np.append(found.axes_lidar @ (found.normal_lidar - normal), found.distance_m - HEIGHT_M)
+    w = gtsam.Rot3.Logmap(guess.rotation().between(true.rotation()))
+    corrected = off + found.by_extrinsic @ w
+    assert np.abs(off[:2]).max() > 4e-4
+    assert abs(off[2]) > 4e-4
+    assert np.abs(corrected[:2]).max() < 4e-5
+    assert abs(corrected[2]) < 2e-4
+    # Clouds of one instant have nothing to be corrected.
+    at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
+    assert at_once is not None
+    assert at_once.by_extrinsic is None
+
+
+def test_meter_says_why_there_is_no_ground() -> None:
+    meter = GroundMeter(CONFIG, pitching(0.0), 1)
+    empty = LidarScan("front", 5, np.zeros((0, 3)), "empty")
+    assert meter.measure(empty) is None
+    assert meter.measure(replace(scan_of(level), stamp_ns=6)) is not None
+    assert meter.warnings() == ()
+    assert meter.measure(empty) is None
+    assert meter.warnings() == (
+        "ground: lidar 'front' has it in 1 of 3 scans of drive 2: "
+        "2 under 60 points near the ground",
+    )
+
+
+def test_meter_refuses_stamps_outside_the_trajectory() -> None:
+    meter = GroundMeter(CONFIG, pitching(0.0), 0)
+    with pytest.raises(TrajectoryError, match="outside the given poses"):
+        meter.measure(replace(scan_of(level), stamp_ns=2 * SECOND_NS))
+
+
+def test_ground_as_of_another_stamp() -> None:
+    # The vehicle noses down by 0.2 rad/s; the scan is taken 50 ms before the pose it speaks for.
+    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 10.0, 0]}}}
+    config = parse_config({"lidars": mounted}, "made up", Path())
+    meter = GroundMeter(config, pitching(0.2), 0)
+    scan = replace(scan_of(level), stamp_ns=SECOND_NS // 2)
+    at_ns = SECOND_NS // 2 + 50_000_000
+    found = meter.measure(scan, at_ns)
+    assert found is not None
+    assert found.stamp_ns == at_ns
+    tilt = math.radians(10.0) + 0.2 * 0.05
+    assert found.normal_lidar == pytest.approx([-math.sin(tilt), 0.0, math.cos(tilt)], abs=1e-6)
+    assert found.distance_m == pytest.approx(HEIGHT_M, abs=1e-6)
+
+
+def test_nearest_scans() -> None:
+    ms = 1_000_000
+    scans = [0, 100 * ms, 200 * ms, 500 * ms]
+    # To the nearest, unless another pose is nearer to it, or it is more than 60 ms away.
+    poses = [20 * ms, 40 * ms, 149 * ms, 200 * ms, 439 * ms, 561 * ms]
+    assert nearest_scans(poses, scans) == {0: 20 * ms, 100 * ms: 149 * ms, 200 * ms: 200 * ms}
+    assert nearest_scans([440 * ms], scans) == {500 * ms: 440 * ms}
+    assert nearest_scans([], scans) == {}
+    assert nearest_scans(poses, []) == {}
+
+
+class TwoLidars:
+    """A recording in memory: `front` at 0.2, 0.4, ... s, `rear` 30 ms later."""
+
+    name = "made up"
+    lidars = ("front", "rear")
+
+    def __init__(self) -> None:
+        self.read: list[tuple[str, int]] = []
+
+    def scan_stamps_ns(self, lidar: str) -> list[int]:
+        return [200_000_000 * i + 30_000_000 * (lidar == "rear") for i in range(1, 5)]
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        for stamp_ns in self.scan_stamps_ns(lidar):
+            if wanted is None or stamp_ns in wanted:
+                self.read.append((lidar, stamp_ns))
+                yield replace(scan_of(level), lidar=lidar, stamp_ns=stamp_ns)
+
+    def motion(self) -> MotionData:
+        return MotionData("made up")
+
+    def warnings(self) -> tuple[str, ...]:
+        return ()
+
+
+def test_all_lidars_see_the_ground_when_one_sees_the_target() -> None:
+    lidar = {"topic": "a", "initial": {"xyz": [0, 0, 2], "rpy_deg": [0, 10.0, 0]}}
+    lidars = {name: lidar | {"topic": name} for name in ("front", "rear", "blind")}
+    config = parse_config({"lidars": lidars}, "made up", Path())
+    # The front LiDAR sees the target twice, the rear one once.
+    seen = [("front", 400_000_000), ("front", 600_000_000), ("rear", 830_000_000)]
+    clouds = tuple(TargetCloud(name, 0, t, np.zeros((1, 3)), "cloud") for name, t in seen)
+    targets = [TargetObservation(0, "target", np.zeros(3), clouds)]
+    recording, progress = TwoLidars(), SilentProgress()
+    found, warnings = measure_grounds([recording], [pitching(0.0)], targets, config, progress)
+    assert [(o.lidar, o.stamp_ns // 1_000_000) for o in found] == [
+        ("front", 400),
+        ("front", 600),
+        ("front", 830),
+        ("rear", 400),
+        ("rear", 600),
+        ("rear", 830),
+    ]
+    assert len(recording.read) == 6
+    assert warnings == ()
+    assert all(o.distance_m == pytest.approx(HEIGHT_M, abs=1e-6) for o in found)
+    off = config.model_copy(update={"ground": config.ground.model_copy(update={"use": False})})
+    assert measure_grounds([recording], [pitching(0.0)], targets, off, progress) == ((), ())
+    assert len(recording.read) == 6
+
+
+def simulated(name: str, every: int) -> dict[str, list[tuple[GroundPlane | None, Array, float]]]:
+    """Planes in every n-th scan of a scenario; true normal and distance of the level ground."""
+    recording = simulate_drive(load_scenario(ROOT / "configs" / "scenarios" / f"{name}.yaml"), 11)
+    truth = recording.truth
+    out: dict[str, list[tuple[GroundPlane | None, Array, float]]] = {}
+    for lidar in recording.lidars:
+        stamps = recording.scan_stamps_ns(lidar)[::every]
+        guess = recording.guesses[lidar]
+        R_guess = pose((0.0, 0.0, 0.0), guess.rpy_deg).rotation().matrix()
+        for scan in recording.scans(lidar, set(stamps)):
+            since_ns = scan.stamp_ns - truth.start_ns
+            heave_m = truth.heave_m[since_ns // 100_000_000]
+            (X,) = truth.drive.poses(np.array([since_ns]), truth.level_z_map + heave_m)
+            T = X.compose(truth.T_vehicle_lidar[lidar])
+            up = (X.rotation().matrix() @ R_guess)[2]
+            normal = T.rotation().matrix()[2]
+            height = float(T.translation()[2] - recording.world.ground_z_map)
+            out.setdefault(lidar, []).append((measure_ground(scan, up, 0.01), normal, height))
+    return out
+
+
+def test_simulated_drive_unbiased_and_as_good_as_said() -> None:
+    for rows in simulated("figure_eight", 12).values():
+        assert len(rows) > 45
+        off, squares = [], []
+        for plane, normal, height in rows:
+            assert plane is not None
+            off.append(errors(plane, normal, height))
+            squares.append(off[-1] @ np.linalg.solve(plane.cov, off[-1]))
+        bias = np.mean(off, axis=0)
+        assert np.abs(bias[:2]).max() < 2e-5
+        assert abs(bias[2]) < 1.5e-4
+        assert 0.7 < np.mean(squares) / 3.0 < 1.4
+
+
+def test_simulated_ramp_is_the_level_ground_or_nothing() -> None:
+    for rows in simulated("ramp", 8).values():
+        off = np.array(
+            [errors(plane, normal, height) for plane, normal, height in rows if plane is not None]
+        )
+        # Planes of the ramps would be off by 150 mrad and decimetres.
+        assert len(off) > 0.8 * len(rows)
+        assert np.abs(off[:, :2]).max() < 2.0 * NORMAL_FLOOR_RAD
+        assert np.abs(off[:, 2]).max() < 3.0 * DISTANCE_FLOOR_M
+        assert np.abs(off[:, :2].mean(axis=0)).max() < 1e-4
+        assert abs(off[:, 2].mean()) < 5e-4
+
+
+@pytest.mark.skipif(not RELEASED.is_dir(), reason="the authors' drive is not there")
+def test_authors_drive_agrees_with_their_extrinsics() -> None:
+    config: Config = load_config(ROOT / "configs" / "caliv_released.yaml")
+    recording = CalivFolder(RELEASED, config.lidars)
+    trajectory = GivenTrajectory(given_trajectory(recording.motion()))
+    meter = GroundMeter(config, trajectory, 0)
+    published = {
+        "sensor_1": pose((2.259, 0.0, 1.938), (0.0, 10.0, 0.0)),
+        "sensor_2": pose((-0.3987347, 0.002735673, 2.098425312), (0.0, 10.0, 180.0)),
+    }
+    for name, T in published.items():
+        stamps = set(recording.scan_stamps_ns(name)[::3])
+        found: list[GroundObservation] = []
+        for scan in recording.scans(name, stamps):
+            observation = meter.measure(scan)
+            assert observation is not None
+            found.append(observation)
+        normals = np.array([T.rotation().matrix() @ o.normal_lidar for o in found])
+        heights = [o.distance_m - n @ T.translation() for o, n in zip(found, normals, strict=True)]
+        # Their vehicle frame is on the ground; it leans out of the turn by a little over 1 mrad.
+        assert np.mean(heights) == pytest.approx(0.0, abs=1e-3)
+        assert normals.mean(axis=0)[:2] == pytest.approx([0.0, -1.2e-3], abs=5e-4)
+    assert meter.warnings() == ()

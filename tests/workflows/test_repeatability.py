@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.products import TargetCloud, TargetObservation
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.workflows.repeatability import alternate, split, split_halves
+from tests.kept import KeptDrive
+from tests.workflows.test_survey import QUICK, scenario_of
+
+SECOND = 1_000_000_000
+
+
+def observation(**stamps_s: list[float]) -> TargetObservation:
+    clouds = tuple(
+        TargetCloud(name, 0, round(stamp * SECOND), np.zeros((1, 3)), "")
+        for name, stamps in stamps_s.items()
+        for stamp in stamps
+    )
+    return TargetObservation(0, "target", np.zeros(3), clouds)
+
+
+def seconds(half: tuple[TargetCloud, ...], lidar: str) -> list[float]:
+    return [cloud.stamp_ns / SECOND for cloud in half if cloud.lidar == lidar]
+
+
+def test_passes_are_what_is_between_long_gaps() -> None:
+    halves = split(observation(front=[0, 1, 2, 20, 21], rear=[8, 9, 30, 31, 32]), 2)
+
+    assert halves is not None
+    first, second = halves
+    assert (seconds(first, "front"), seconds(second, "front")) == ([0, 1, 2], [20, 21])
+    assert (seconds(first, "rear"), seconds(second, "rear")) == ([8, 9], [30, 31, 32])
+
+
+def test_of_many_passes_the_halves_are_about_as_large() -> None:
+    halves = split(observation(front=[0, 10, 20, 20.1, 20.2, 20.3, 30, 40]), 1)
+
+    assert halves is not None
+    assert [len(half) for half in halves] in ([2, 6], [6, 2])
+
+
+def test_one_pass_is_not_split_by_passes() -> None:
+    assert split(observation(front=[0, 1, 20, 21], rear=[0, 1, 2, 3]), 2) is None
+    # A glimpse of it is no pass.
+    assert split(observation(front=[0, 1, 20], rear=[0, 1, 20, 21]), 2) is None
+
+
+def test_scans_in_turns() -> None:
+    first, second = alternate(observation(front=[0, 1, 2], rear=[0.5, 1.5]))
+
+    assert (seconds(first, "front"), seconds(second, "front")) == ([0, 2], [1])
+    assert (seconds(first, "rear"), seconds(second, "rear")) == ([0.5], [1.5])
+
+
+def test_halves_of_a_drive_agree() -> None:
+    recording = KeptDrive(scenario_of("arc"), 2)
+    config = parse_config(config_of(recording, has_bag=True), "arc", Path())
+    config = config.model_copy(update={"registration": QUICK})
+    found = split_halves(recording, config, SilentProgress(), 0.01)
+
+    assert not found.by_passes
+    assert found.comparison is not None
+    assert found.halves == ("every other scan", "the scans in between")
+    assert not found.comparison.moved
+    (pair,) = found.comparison.pairs
+    assert all(pair.told)
+    assert 0.0 < pair.chi2 < 20.0
+    # An arc leaves the turn about its centre open: that is no axis to compare.
+    assert not found.comparison.lidars["front"].told[2]

@@ -13,6 +13,7 @@ from typing import Protocol
 import gtsam
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -369,6 +370,36 @@ class Iteration:
 
 
 @dataclass(frozen=True)
+class LinearisedGraph:
+    """The solved graph at the estimate, linearised; Gauss-Markov pose errors are eliminated.
+
+    M coordinates of all variables, J clouds. `d^T information d / 2 - gradient^T d` is minus the
+    log-likelihood of a step d of the variables, without the initial guesses.
+
+    Attributes:
+        information: (M, M) of poses, ground, trusted extrinsics and clouds, with the gauge prior
+            on the target frames.
+        gradient: (M,).
+        information_guesses: (M, M) of the initial guesses.
+        cloud_jacobian: (6 J, M) derivative of the clouds' poses T_target_lidar (left
+            perturbations) with respect to the variables.
+        cloud_information: (6 J, 6 J) of these poses, robust weights included.
+        cloud_gradient: (6 J,) derivative of minus the clouds' log-likelihood.
+        by_vehicle: (J, 6, 6) derivative of each cloud's pose with respect to its vehicle pose.
+        by_extrinsic: (J, 6, 6) with respect to its LiDAR's T_vehicle_lidar, right perturbation.
+    """
+
+    information: Array
+    gradient: Array
+    information_guesses: Array
+    cloud_jacobian: scipy.sparse.csr_array
+    cloud_information: Array
+    cloud_gradient: Array
+    by_vehicle: Array
+    by_extrinsic: Array
+
+
+@dataclass(frozen=True)
 class Solution:
     """The solved factor graph.
 
@@ -394,7 +425,9 @@ class Solution:
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
         graph: the factor graph.
+        factor_kinds: of each of its factors, in order: `calibration.graph.FactorKind`.
         values: its values.
+        linearised: the graph at these values.
         stage_times_s: seconds per stage.
         time_offsets: per LiDAR whose offset was estimated its value and sigma in seconds: header
             stamp minus true acquisition time.
@@ -421,7 +454,9 @@ class Solution:
     iterations: int
     converged: bool
     graph: gtsam.NonlinearFactorGraph
+    factor_kinds: tuple[str, ...]
     values: gtsam.Values
+    linearised: LinearisedGraph
     stage_times_s: Mapping[str, float] = field(default_factory=dict)
     time_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

@@ -9,6 +9,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.conventions import AXES
 from caliv_graph.products import (
@@ -16,6 +17,7 @@ from caliv_graph.products import (
     Calibration,
     Direction,
     LidarResult,
+    LinearisedGraph,
     Mixture,
     PoseNoise,
     Registration,
@@ -147,6 +149,17 @@ def make_solution(placements: int = 1) -> Solution:
         iterations=4,
         converged=True,
         graph=gtsam.NonlinearFactorGraph(),
+        factor_kinds=(),
         values=gtsam.Values(),
+        linearised=LinearisedGraph(
+            information=np.zeros((12, 12)),
+            gradient=np.zeros(12),
+            information_guesses=np.eye(12),
+            cloud_jacobian=scipy.sparse.csr_array((6 * placements, 12)),
+            cloud_information=np.zeros((6 * placements, 6 * placements)),
+            cloud_gradient=np.zeros(6 * placements),
+            by_vehicle=np.zeros((placements, 6, 6)),
+            by_extrinsic=np.zeros((placements, 6, 6)),
+        ),
         stage_times_s={"solve": 0.5},
     )

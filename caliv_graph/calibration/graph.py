@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -35,33 +36,68 @@ GAUGE_PRIOR = 1.0
 own place and orientation are eliminated: what moves all clouds of a target alike is no quantity."""
 
 
+FactorKind = Literal[
+    "motion",
+    "given_pose",
+    "pose_error_start",
+    "pose_error_step",
+    "time_offset",
+    "extrinsic_prior",
+    "cloud",
+    "ground_prior",
+    "ground_height",
+    "ground_tilt",
+    "ground_plane",
+    "standing",
+    "parallel",
+]
+
+
+class CalibrationGraph(gtsam.NonlinearFactorGraph):
+    """A factor graph that knows of which kind each of its factors is.
+
+    Attributes:
+        kinds: of every factor, in order.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kinds: list[FactorKind] = []
+
+    def append(self, kind: FactorKind, factor: gtsam.NonlinearFactor) -> None:
+        """Adds a factor."""
+        self.add(factor)
+        self.kinds.append(kind)
+
+
 def pose_error_sigmas(noise: PoseNoise) -> Array:
     """(6,) stationary sigmas of the slow error."""
     return np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
 
 
-def motion_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+def motion_graph(problem: Problem) -> CalibrationGraph:
     """What motion data say of the vehicle's poses: a joint Gaussian for each drive that has them.
 
     Hundreds of poses with all their correlations take a while to hand over: build it once.
     """
-    graph = gtsam.NonlinearFactorGraph()
+    graph = CalibrationGraph()
     drives = problem.drives()
     for drive, information in problem.motion.items():
         of_drive = np.flatnonzero(drives == drive).tolist()
-        graph.add(
+        graph.append(
+            "motion",
             marginal_factor(
                 [key_vehicle(i) for i in of_drive],
                 information,
                 tuple(problem.T_map_vehicle[i] for i in of_drive),
-            )
+            ),
         )
     return graph
 
 
 def pose_graph(
-    problem: Problem, noise: PoseNoise, motion: gtsam.NonlinearFactorGraph | None = None
-) -> gtsam.NonlinearFactorGraph:
+    problem: Problem, noise: PoseNoise, motion: CalibrationGraph | None = None
+) -> CalibrationGraph:
     """What is known of the vehicle's poses without any LiDAR.
 
     Given poses have white and slow errors; those of a smoothed trajectory a joint Gaussian.
@@ -76,57 +112,63 @@ def pose_graph(
     stationary = pose_error_sigmas(noise)
     for i in np.flatnonzero(given).tolist():
         T = problem.T_map_vehicle[i]
-        graph.add(
+        graph.append(
+            "given_pose",
             given_pose_factor(
                 key_vehicle(i),
                 key_pose_error(i),
                 T,
                 noise.white_rotation_rad,
                 noise.white_position_m,
-            )
+            ),
         )
         if i == 0 or drives[i] != drives[i - 1]:
-            graph.add(
-                gtsam.PriorFactorVector(
-                    key_pose_error(i), np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(stationary)
-                )
+            start = gtsam.noiseModel.Diagonal.Sigmas(stationary)
+            graph.append(
+                "pose_error_start",
+                gtsam.PriorFactorVector(key_pose_error(i), np.zeros(6), start),
             )
         else:
             decay = float(np.exp(-(times[i] - times[i - 1]) / noise.drift_time_s))
             step = stationary * np.sqrt(1.0 - decay**2)
-            graph.add(gauss_markov_factor(key_pose_error(i - 1), key_pose_error(i), decay, step))
+            graph.append(
+                "pose_error_step",
+                gauss_markov_factor(key_pose_error(i - 1), key_pose_error(i), decay, step),
+            )
     return graph
 
 
-def prior_graph(problem: Problem, lidars: Sequence[str]) -> gtsam.NonlinearFactorGraph:
+def prior_graph(problem: Problem, lidars: Sequence[str]) -> CalibrationGraph:
     """The initial guesses of the named LiDARs."""
-    graph = gtsam.NonlinearFactorGraph()
+    graph = CalibrationGraph()
     for name in lidars:
-        graph.add(
+        graph.append(
+            "extrinsic_prior",
             extrinsic_prior(
                 problem.extrinsic_keys_of(name), problem.guesses[name], problem.prior_sigmas[name]
-            )
+            ),
         )
     return graph
 
 
-def offset_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+def offset_graph(problem: Problem) -> CalibrationGraph:
     """How far off a LiDAR's clock may be, for those whose offset is free."""
-    graph = gtsam.NonlinearFactorGraph()
+    graph = CalibrationGraph()
     for key in problem.offset_keys():
         sigma = gtsam.noiseModel.Isotropic.Sigma(1, OFFSET_SIGMA_S)
-        graph.add(gtsam.PriorFactorVector(key, np.zeros(1), sigma))
+        graph.append("time_offset", gtsam.PriorFactorVector(key, np.zeros(1), sigma))
     return graph
 
 
 def cloud_graph(
     problem: Problem, measured: Sequence[gtsam.Pose3], information: Array
-) -> gtsam.NonlinearFactorGraph:
+) -> CalibrationGraph:
     """One pose factor per registered cloud; `information` (J, 6, 6) has the weights in it."""
-    graph = gtsam.NonlinearFactorGraph()
+    graph = CalibrationGraph()
     for j, Z in enumerate(measured):
-        graph.add(
-            target_pose_factor(problem.cloud_keys(j), Z, information[j], problem.cloud_twist(j))
+        graph.append(
+            "cloud",
+            target_pose_factor(problem.cloud_keys(j), Z, information[j], problem.cloud_twist(j)),
         )
     return graph
 
@@ -177,11 +219,12 @@ def _median_pose(poses: Sequence[gtsam.Pose3]) -> gtsam.Pose3:
     return poses[int(total.argmin())]
 
 
-def merged(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+def merged(*graphs: CalibrationGraph) -> CalibrationGraph:
     """All factors of several graphs in one."""
-    out = gtsam.NonlinearFactorGraph()
+    out = CalibrationGraph()
     for graph in graphs:
         out.push_back(graph)
+        out.kinds += graph.kinds
     return out
 
 
@@ -363,7 +406,7 @@ def add_shape(
         H_clouds: (6 J, 6 J).
         gradient: (6 J,).
     """
-    J = _cloud_rows(system, lines)
+    J = cloud_rows(system, lines)
     return _with_rows(system, J, J.T @ H_clouds, gradient)
 
 
@@ -376,8 +419,11 @@ def _with_rows(
     return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
-def _cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.csr_array:
-    """(6 J, M) how the poses of all clouds move with the variables of a system."""
+def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.csr_array:
+    """(6 J, M) derivatives of the poses of all clouds with respect to the variables of a system.
+
+    Left perturbations of the predicted T_target_lidar by right perturbations of the variables.
+    """
     starts = _starts(system)
     rows, columns, entries = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
@@ -416,7 +462,7 @@ def adjusted_residuals(
         SolveError: some variable is not determined.
     """
     gradient = H_clouds @ residuals.ravel()
-    J = _cloud_rows(system, lines)
+    J = cloud_rows(system, lines)
     seen = J.T @ H_clouds
     full = _with_rows(system, J, seen, gradient)
     try:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
 from caliv_graph.config.model import GroundConfig
 from caliv_graph.conventions import key_ground, key_height, key_parallel, key_vehicle
@@ -317,7 +318,7 @@ def ground_graph(
     observations: Sequence[GroundObservation],
     config: GroundConfig,
     weights: GroundWeights | None = None,
-) -> gtsam.NonlinearFactorGraph:
+) -> CalibrationGraph:
     """All that the ground says; empty if it is not to be used or was not seen.
 
     Args:
@@ -326,7 +327,7 @@ def ground_graph(
         config: which of the roles of SPEC 3 the user wants, and their sigmas.
         weights: of `ground_weights`; None: all full.
     """
-    graph = gtsam.NonlinearFactorGraph()
+    graph = CalibrationGraph()
     if not config.use:
         return graph
     taken = _taken(problem, observations)
@@ -334,12 +335,12 @@ def ground_graph(
     drives = _drives(observations, taken)
     anchors = {drive: ground_anchor(problem, drive) for drive in drives}
     for drive in drives:
-        graph.add(_plane_prior(problem, drive))
+        graph.append("ground_prior", _plane_prior(problem, drive))
         if config.vehicle_height is not None:
-            graph.add(_centred(key_height(drive), np.array([config.sigma])))
+            graph.append("ground_height", _centred(key_height(drive), np.array([config.sigma])))
         if config.parallel_sigma_deg is not None:
             sigma = math.radians(config.parallel_sigma_deg)
-            graph.add(_centred(key_parallel(drive), np.full(2, sigma)))
+            graph.append("ground_tilt", _centred(key_parallel(drive), np.full(2, sigma)))
     worth = weights.planes * _place_shares(problem, observations, taken)
     believed = zip(
         observations, taken.tolist(), worth.tolist(), weights.heave_m.tolist(), strict=True
@@ -348,7 +349,8 @@ def ground_graph(
         if i >= 0 and weight > 0.0:
             keys = (key_vehicle(i), *problem.extrinsic_keys_of(o.lidar))
             plane, anchor = key_ground(o.drive), anchors[o.drive]
-            graph.add(ground_plane_factor(keys, plane, anchor, o, weight, heave_m))
+            factor = ground_plane_factor(keys, plane, anchor, o, weight, heave_m)
+            graph.append("ground_plane", factor)
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)
     ):
@@ -356,13 +358,11 @@ def ground_graph(
             continue
         X, plane = key_vehicle(i), key_ground(drive)
         if config.vehicle_height is not None:
-            graph.add(
-                standing_factor(
-                    X, plane, key_height(drive), anchors[drive], config.vehicle_height, weight
-                )
-            )
+            height = config.vehicle_height
+            factor = standing_factor(X, plane, key_height(drive), anchors[drive], height, weight)
+            graph.append("standing", factor)
         if config.parallel_sigma_deg is not None:
-            graph.add(parallel_factor(X, plane, key_parallel(drive), weight))
+            graph.append("parallel", parallel_factor(X, plane, key_parallel(drive), weight))
     return graph
 
 
@@ -458,32 +458,6 @@ def _residuals(
             said, _ = _measured(o, extrinsics[o.lidar].rotation().matrix())
             out[row] = np.append(o.axes_lidar @ T.rotation().matrix().T @ n, d) - said
     return out
-
-
-def ground_squares(
-    problem: Problem,
-    observations: Sequence[GroundObservation],
-    values: gtsam.Values,
-    weights: GroundWeights | None = None,
-) -> Array:
-    """(n,) squared whitened residuals, 3 degrees of freedom each; NaN where not taken.
-
-    Args:
-        problem: LiDARs and poses.
-        observations: the planes.
-        values: the estimate, with the drives' planes.
-        weights: of `ground_weights`, for the heave that they found; None: as at first.
-    """
-    heave = (weights or full_weights(problem, observations)).heave_m
-    taken = _taken(problem, observations)
-    poses = [values.atPose3(key) for key in problem.pose_keys()]
-    r = _residuals(problem, observations, taken, poses, values)
-    return np.array(
-        [
-            row @ np.linalg.solve(_cov(o, h), row) if i >= 0 else np.nan
-            for row, o, i, h in zip(r, observations, taken, heave, strict=True)
-        ]
-    )
 
 
 def ground_weights(

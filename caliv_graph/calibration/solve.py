@@ -16,10 +16,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.graph import (
+    CalibrationGraph,
     CloudLinearisation,
     DenseSystem,
     add_shape,
     cloud_graph,
+    cloud_rows,
     dense_system,
     initial_values,
     linearise_clouds,
@@ -55,6 +57,7 @@ from caliv_graph.products import (
     Array,
     BoolArray,
     GroundObservation,
+    LinearisedGraph,
     PoseNoise,
     Registration,
     Solution,
@@ -89,7 +92,7 @@ class SolveState:
     noise: PoseNoise
     scale: float
     weights: RobustWeights
-    motion: gtsam.NonlinearFactorGraph
+    motion: CalibrationGraph
     sound: BoolArray
     """(J,) the clouds that the noise was measured by."""
     grounds: tuple[GroundObservation, ...] = ()
@@ -102,17 +105,23 @@ class SolveState:
 class Reduced:
     """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
 
-    `D` and `c`: the quadratic `e^T D e / 2 - c^T e` of the data in a step e of the extrinsics.
+    Attributes:
+        D: (6n, 6n) and
+        c: (6n,) of the data's quadratic `e^T D e / 2 - c^T e` in a step e of the extrinsics.
+        system: the linearised graph with the clouds' quadratic in it.
+        clouds: (6 J, 6 J) and (6 J,) that quadratic, in left perturbations of the clouds' poses.
+        lines: derivatives of these poses with respect to the variables.
     """
 
     D: Array
     c: Array
+    system: DenseSystem
+    clouds: tuple[Array, Array]
+    lines: CloudLinearisation
     _to_axes: Array
-    _keys: tuple[int, ...]
     _G: Array
     _g: Array
     _values: gtsam.Values
-    _system: DenseSystem
 
     def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
         """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
@@ -126,7 +135,7 @@ class Reduced:
         out = {}
         for i, name in enumerate(problem.lidars):
             if name in problem.offsets:
-                variance = self._system.covariance_of(key_offset(i), tangent)[0, 0]
+                variance = self.system.covariance_of(key_offset(i), tangent)[0, 0]
                 value = float(self._values.atVector(key_offset(i))[0])
                 out[name] = (value, float(np.sqrt(variance)))
         return out
@@ -144,7 +153,25 @@ class Reduced:
         """All values after a step (6n,) of the extrinsics, the rest following."""
         tangent = np.linalg.solve(self._to_axes, step)
         rest = self._g - self._G @ tangent
-        return retract(self._values, self._keys, np.concatenate([rest, tangent]))
+        return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
+
+    def linearised(self, problem: Problem) -> LinearisedGraph:
+        """The same as numbers, with the guesses' information, for score tests."""
+        H, gradient = self.clouds
+        guesses = np.zeros_like(self.system.H)
+        of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
+        prior = self._to_axes.T @ problem.guess_information() @ self._to_axes
+        guesses[of_extrinsics, of_extrinsics] = prior
+        return LinearisedGraph(
+            information=self.system.H,
+            gradient=self.system.b,
+            information_guesses=guesses,
+            cloud_jacobian=cloud_rows(self.system, self.lines),
+            cloud_information=H,
+            cloud_gradient=gradient,
+            by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
+            by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
+        )
 
 
 def solve_registered(
@@ -378,7 +405,7 @@ def explained_parts(registrations: Sequence[Registration]) -> Array:
     return np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
 
 
-def base_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+def base_graph(state: SolveState) -> CalibrationGraph:
     """What stays the same while clouds are weighed anew: poses, ground and trusted extrinsics."""
     problem = state.problem
     return merged(
@@ -389,17 +416,17 @@ def base_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     )
 
 
-def guessed_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+def guessed_graph(state: SolveState) -> CalibrationGraph:
     """What stays the same, and the guesses of the extrinsics that are not trusted."""
     return merged(base_graph(state), _guess_graph(state.problem))
 
 
-def _guess_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+def _guess_graph(problem: Problem) -> CalibrationGraph:
     """The guesses of the extrinsics that are not trusted."""
     return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
 
 
-def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
+def _ground_graph(state: SolveState) -> CalibrationGraph:
     """What the ground says, as far as it is believed."""
     return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
 
@@ -407,7 +434,7 @@ def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
 def reduce_to_extrinsics(
     problem: Problem,
     values: gtsam.Values,
-    graph: gtsam.NonlinearFactorGraph,
+    graph: CalibrationGraph,
     clouds: tuple[Array, Array],
     lines: CloudLinearisation,
 ) -> Reduced:
@@ -428,7 +455,17 @@ def reduce_to_extrinsics(
     Q = problem.to_vehicle_axes(values)
     inverse = np.linalg.inv(Q)
     D = inverse.T @ D @ inverse
-    return Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
+    return Reduced(
+        D=0.5 * (D + D.T),
+        c=inverse.T @ c,
+        system=system,
+        clouds=clouds,
+        lines=lines,
+        _to_axes=Q,
+        _G=G,
+        _g=g,
+        _values=values,
+    )
 
 
 def offset_from_guesses(state: SolveState) -> Array:
@@ -445,7 +482,7 @@ def offset_from_guesses(state: SolveState) -> Array:
 def packed_solution(
     state: SolveState,
     registrations: Sequence[Registration],
-    steady: gtsam.NonlinearFactorGraph,
+    reduced: Reduced,
     information: Array,
     information_data: Array,
     cov: Array,
@@ -453,36 +490,30 @@ def packed_solution(
     iterations: int,
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
-    gradient_data: Array,
 ) -> Solution:
-    """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds.
+    """Packs the result, the whole graph and its linearisation.
 
     Args:
         state: after its last step.
-        registrations: the clouds where they have come to lie.
-        steady: `base_graph` of the last step.
+        registrations: the registered clouds.
+        reduced: linearisation at the result.
         information: (J, 6, 6) of the graph's pose factors, without robust weights.
-        information_data: (6 n, 6 n) what the data say of the extrinsics, vehicle axes.
+        information_data: (6 n, 6 n) of the extrinsics by the data alone, vehicle axes.
         cov: (6 n, 6 n) of the result, vehicle axes.
         held: axes of the reference LiDAR that were held at the guess.
         iterations: of the loop.
-        converged: whether it came to rest.
+        converged: whether its last step was below its tolerance.
         time_offsets: LiDAR -> offset and sigma, seconds.
-        gradient_data: (6 n,) of the data at the result.
 
     Raises:
         SolveError: the covariance is not finite.
     """
-    problem, measured = state.problem, measured_poses(registrations)[0]
-    graph = merged(
-        steady,
-        _guess_graph(problem),
-        cloud_graph(problem, measured, information * state.weights.values[:, None, None]),
-    )
     if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
         raise SolveError("the covariance of the extrinsics is not finite")
-    left = cloud_residuals(linearise_clouds(problem, state.values), measured)
-    white = _whitened(left, information)
+    problem, measured = state.problem, measured_poses(registrations)[0]
+    weighted = information * state.weights.values[:, None, None]
+    graph = merged(guessed_graph(state), cloud_graph(problem, measured, weighted))
+    residuals = cloud_residuals(linearise_clouds(problem, state.values), measured)
     cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
     return Solution(
         mode=state.config.solve.mode,
@@ -496,7 +527,7 @@ def packed_solution(
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
         cloud_weights=tuple(np.split(state.weights.values, cuts)),
-        residuals=tuple(np.split(white, cuts)),
+        residuals=tuple(np.split(_whitened(residuals, information), cuts)),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         information_data=information_data,
@@ -505,10 +536,12 @@ def packed_solution(
         held=held,
         iterations=iterations,
         converged=converged,
-        time_offsets=time_offsets,
         graph=graph,
+        factor_kinds=tuple(graph.kinds),
         values=state.values,
-        gradient_data=gradient_data,
+        linearised=reduced.linearised(problem),
+        time_offsets=time_offsets,
+        gradient_data=reduced.c,
     )
 
 

@@ -14,7 +14,6 @@ from caliv_graph.calibration.solve import (
     COUPLED_STEPS,
     Reduced,
     SolveState,
-    base_graph,
     measured_poses,
     packed_solution,
     reduced_registered,
@@ -81,12 +80,12 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     state.values.update(key_extrinsic(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
     offsets = reduced.time_offsets(problem, cov)
-    gradient_data = reduced_registered(state, registrations).c
+    reduced = reduced_registered(state, registrations)
     state.graph_seconds += time.perf_counter() - begun
     return packed_solution(
         state,
         registrations,
-        base_graph(state),
+        reduced,
         measured_poses(registrations, state.turns)[1] / state.scale**2,
         information_data,
         cov,
@@ -94,7 +93,6 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
         iterations=1,
         converged=converged and turned,
         time_offsets=offsets,
-        gradient_data=gradient_data,
     )
 
 

@@ -12,7 +12,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.score_tests import cloud_counts, score_tests
+from caliv_graph.calibration.check import cloud_counts
+from caliv_graph.calibration.score_tests import score_tests
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import SolveConfig
 from caliv_graph.pipeline import calibrate

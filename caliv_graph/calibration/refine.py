@@ -171,9 +171,7 @@ class _Loop:
     def _weigh(self, squared: Array) -> float:
         """Updates the robust weights; their largest change."""
         state, change = self.state, 0.0
-        if state.config.robust.kernel != "tls":
-            # Truncated weights stay as the annealed solve of the pose factors left them: a dropped
-            # cloud has no part in the shape that would judge it.
+        if state.weights.kernel.in_joint_loop:
             explained = np.concatenate(
                 [explained_part(shape.inlier_ratio) for shape in self.states]
             )

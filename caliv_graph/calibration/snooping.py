@@ -13,9 +13,10 @@ from caliv_graph.calibration.graph import (
     linearise_clouds,
     with_given_poses,
 )
+from caliv_graph.calibration.kernels import DOF
 from caliv_graph.calibration.noise import fit_pose_noise
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.robust import DOF, MIN_WEIGHT, deletion_squares, own_blocks
+from caliv_graph.calibration.robust import MIN_WEIGHT, deletion_squares, own_blocks
 from caliv_graph.calibration.solve import (
     SolveState,
     cloud_residuals,
@@ -64,7 +65,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     Raises:
         SolveError: the graph is singular.
     """
-    if state.config.robust.kernel == "none" or not state.sound.any():
+    if not state.weights.kernel.drops or not state.sound.any():
         return
     problem, fitted = state.problem, (state.noise, state.scale)
     sound, weights, values = state.sound, state.weights.values, state.values

@@ -211,7 +211,7 @@ def solve_registered(
     # Before the noise is known, weights would take the slow error of the poses for outliers, and
     # the variances would then find none of it: solve plainly, and leave out what is far off.
     plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
-    state.weights, kernel = plain, state.weights
+    state.weights, robust = plain, state.weights
     explained = explained_parts(registrations)
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
@@ -221,8 +221,8 @@ def solve_registered(
     state.noise, state.scale = fit_pose_noise(
         problem, measured, single, state.sound, given, config.noise
     )
-    state.weights = kernel
-    rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
+    state.weights = robust
+    rounds = REWEIGHTINGS * state.weights.kernel.patience
     _reweight(state, measured, information, explained, rounds)
     state.graph_seconds += time.perf_counter() - begun
     return state
@@ -251,7 +251,7 @@ def _reweight(
             squares_without_own_pose(problem, lines, r, single, state.values, state.noise),
             explained,
         )
-        if change < WEIGHT_TOLERANCE and state.weights.settled:
+        if change < WEIGHT_TOLERANCE and state.weights.kernel.settled:
             break
 
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.robust import DOF, explained_part
+from caliv_graph.calibration.kernels import DOF
+from caliv_graph.calibration.robust import explained_part
 from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array, IntArray, Solution
 from caliv_graph.results.run import RunRecord

@@ -32,7 +32,7 @@ from caliv_graph.uncertainty.consistency import Assumed, CloudCount
 def _headings(
     trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData]
 ) -> dict[int, HeadingDisagreement]:
-    """Per drive that tells it, how the orientation source and the direction of travel differ."""
+    """Heading of the orientation source against the direction of travel, per drive index."""
     out = {}
     for index, trajectory in enumerate(trajectories):
         if isinstance(trajectory, SmoothedTrajectory):
@@ -56,7 +56,7 @@ def check(
         solution: the solved graph.
         recordings: the drives.
         trajectories: one per drive.
-        motions: what each drive, by its index, tells of the vehicle's motion.
+        motions: motion data of each drive, by its index.
 
     Returns:
         The calibration, inconsistent if something contradicts something; and warnings: headings
@@ -71,7 +71,7 @@ def check(
     try:
         between = score_tests(solution, trajectories, trusted)
     except SolveError as e:
-        # The result stands; that it was tested must not be believed.
+        # The result stands, and the user must know that it was not tested.
         between = ()
         untested = (f"parts of the drive were not tested against each other: {e}",)
     found = consistency.contradictions(
@@ -113,7 +113,7 @@ def cloud_counts(
     observed = [c for r in solution.registrations for c in r.observation.clouds]
     weights = np.concatenate(solution.cloud_weights)
     down = weights < 0.5
-    if solution.mode != "staged":  # which puts the translation back to the guess: nothing fits
+    if solution.mode != "staged":  # `staged` holds the translation at the guess, so no cloud fits
         down |= (np.concatenate(solution.residuals) ** 2).sum(axis=1) > FAR_OFF
     middles, turns, rates = _middles(solution), [], []
     for cloud in observed:
@@ -175,7 +175,7 @@ def registration_sigma(solution: Solution) -> tuple[float, float]:
 
 
 def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...]:
-    """What the ground was assumed to tell of the vehicle, and what it came out as.
+    """Height and tilt of the vehicle above the ground: the assumption and the estimate.
 
     Args:
         solution: the solved graph.

@@ -6,7 +6,7 @@ stages. `joint` and `auto` go on (`refine`): expectation-maximisation whose M-st
 solve.
 
 Gauge: the target frames stay where they are, for the shapes are free; the map is held by the given
-poses, the extrinsics by the data or the guesses (SPEC 3, `auto`).
+poses, the extrinsics by the data or the guesses (mode `auto`, `caliv_graph/uncertainty/README.md`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import replace
 import gtsam
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.graph import linearise_clouds
+from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
@@ -42,7 +42,7 @@ def estimate(
     progress: Progress,
     grounds: Sequence[GroundObservation] = (),
 ) -> Solution:
-    """Registers, solves and refines, as `solve.mode` says.
+    """Registers, solves and refines, by `solve.mode`.
 
     Args:
         observations: clouds of each target placement.

@@ -14,17 +14,17 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from caliv_graph.calibration.graph import CalibrationGraph, CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import squares_without_own_pose
+from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
     WEIGHT_TOLERANCE,
-    Reduced,
     SolveState,
     base_graph,
     offset_from_guesses,
-    packed_solution,
-    reduce_to_extrinsics,
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, Iteration, Solution
@@ -43,8 +43,8 @@ from caliv_graph.uncertainty.observability import (
 )
 
 SHAPES_BEGUN_AGAIN = 8
-"""Iteration of the joint loop after which normals and mixture begin anew, now that annealing has
-come to its end, or near it."""
+"""Iteration of the joint loop after which normals and mixture are made anew: annealing is at its
+end, or near it."""
 
 REFINEMENTS = 20
 """Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
@@ -54,13 +54,13 @@ LAST_REFINEMENTS = 4
 """Iterations that are left at the noise level, at least."""
 
 DECIDED_AFTER = 9
-"""Iterations after which the number of undetermined directions is no longer changed, so that one
-at the threshold does not make the estimate jump for ever."""
+"""Iteration from which the number of undetermined directions is fixed, so that a direction at the
+threshold does not make the estimate jump for ever."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
 STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
-what 100 clouds of a chair can tell. Or else in joint standard deviations of the extrinsics."""
+the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
 
 def refinements(sigma_range_m: float) -> int:
@@ -84,7 +84,7 @@ def refined(
         advance: called after each.
 
     Raises:
-        SolveError: a pose or a target is tied to nothing.
+        SolveError: a pose or a target has no measurement.
     """
     loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
     _begin_shapes(state, states, normals=False)
@@ -191,10 +191,9 @@ class _Loop:
 
 
 def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
-    """A new mixture, and if asked for new normals, where the graph puts the clouds.
+    """A new mixture, and if asked for new normals, at the poses of the graph.
 
-    EM ends near where it starts: what it starts from shall not depend on the way that the
-    registration took from the initial guess.
+    EM ends near its start: the start shall not depend on the initial guess.
     """
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
@@ -275,10 +274,10 @@ class _Shapes:
 
 @dataclass
 class _ShapeMeasurements:
-    """What each cloud by itself, given the shape at its best, would have its pose be.
+    """The pose of each cloud by itself, given the shape.
 
     Attributes:
-        pull: (J, 6) left perturbations that lead there from the predicted poses.
+        pull: (J, 6) left perturbations from the predicted poses to these.
         information: (J, 6, 6) without robust weights.
     """
 
@@ -291,7 +290,7 @@ def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurement
     weights = state.weights.values
     blocks, gradient = shapes.single
     information = blocks / weights[:, None, None] / state.scale**2
-    # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
+    # A small ridge: a cloud that sees one plane of the target has a singular block.
     ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
     information = information + ridge[:, None, None] * np.eye(6)
     force = gradient / weights[:, None] / state.scale**2

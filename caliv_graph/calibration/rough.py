@@ -117,20 +117,20 @@ def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
 def symmetries_of_targets(
     registrations: Sequence[Registration], config: Config
 ) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
-    """Per placement the turn that its target looks the same after, any turn; and what to tell.
+    """Per placement the continuous symmetry of its target; and a warning for each.
 
-    How far a cloud of a drum is turned about it is not in the cloud: it comes from noise and from
-    how the beams fell, and is forgotten wherever clouds speak.
+    The rotation of a cloud about a drum is unobservable: it comes from noise and from where the
+    beams fell, and is marginalised.
     """
     turns: list[Symmetry | None] = []
-    told = []
+    warnings = []
     sigma = max(max(lidar.sigma.rpy_rad()) for lidar in config.lidars.values())
     for registration in registrations:
         found = symmetries(registration.mixture, views_of(registration), config.noise.lidar_range_m)
         turns.append(next((s for s in found if s.continuous and s.upright), None))
-        told += [
+        warnings += [
             symmetry_sentence(s, registration.observation.name, sigma)
             for s in found
             if alarming(s, sigma)
         ]
-    return tuple(turns), tuple(told)
+    return tuple(turns), tuple(warnings)

@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
-from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
+from caliv_graph.calibration.ground import TOGETHER_NS
+from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
 from caliv_graph.config.model import ExtractionConfig, PoseConfig, PoseSigmaConfig

@@ -13,7 +13,6 @@ import pytest
 
 from caliv_graph.calibration.graph import (
     cloud_graph,
-    dense_system,
     initial_values,
     merged,
     optimise,
@@ -23,15 +22,18 @@ from caliv_graph.calibration.graph import (
 from caliv_graph.calibration.ground import (
     GroundWeights,
     full_weights,
-    ground_anchor,
+    ground_centre,
     ground_graph,
-    ground_plane_factor,
     ground_values,
-    ground_weights,
+)
+from caliv_graph.calibration.ground_factors import (
+    ground_plane_factor,
     parallel_factor,
     plane_normal,
     standing_factor,
 )
+from caliv_graph.calibration.ground_weights import ground_weights
+from caliv_graph.calibration.linear import dense_system
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, moved_map
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
@@ -140,7 +142,7 @@ def observed(
                 seen_from(
                     T,
                     g,
-                    ground_anchor(problem, drive),
+                    ground_centre(problem, drive),
                     lidar=name,
                     drive=drive,
                     stamp_ns=stamp_ns,
@@ -731,7 +733,7 @@ def test_heave_is_in_the_sigma_of_the_distance_and_in_nothing_else() -> None:
     case, observations = one_later(40_000_000, 0.0, count=2)
     g = np.array([0.0, 0.0, GROUND_Z])
     keys = (X, *case.problem.extrinsic_keys_of(observations[2].lidar))
-    anchor = ground_anchor(case.problem, 0)
+    anchor = ground_centre(case.problem, 0)
     factor = ground_plane_factor(keys, G, anchor, observations[2], 0.5, 0.007)
     plain = ground_plane_factor(keys, G, anchor, observations[2])
     values = with_planes(case.truth, g)

@@ -14,16 +14,14 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.calibration.graph import (
-    add_shape,
     cloud_graph,
-    dense_system,
     initial_values,
-    linearise_clouds,
     merged,
     optimise,
     pose_graph,
     prior_graph,
 )
+from caliv_graph.calibration.linear import add_shape, dense_system, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import AXES, key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference

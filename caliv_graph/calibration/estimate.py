@@ -48,7 +48,7 @@ def estimate(
         observations: clouds of each target placement.
         trajectories: one per drive.
         config: modes, kernels, priors.
-        progress: told of every stage.
+        progress: reports every stage.
         grounds: the ground under the vehicle, as the LiDARs saw it. The paper's procedure,
             `staged`, does without.
 

@@ -50,7 +50,8 @@ def packed_solution(
         information_data: (6 n, 6 n) of the extrinsics by the data alone, vehicle axes.
         cov: (6 n, 6 n) of the result, vehicle axes.
         held: axes of the reference LiDAR that were held at the guess.
-        iterations, converged: of the loop.
+        iterations: of the loop.
+        converged: whether its last step was below its tolerance.
         time_offsets: LiDAR -> offset and sigma, seconds.
 
     Raises:

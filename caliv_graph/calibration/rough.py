@@ -71,7 +71,7 @@ def rough_solve(
         observations: clouds of its placements, in order.
         grounds: the ground as the LiDARs saw it.
         config: kernels, noise, ground.
-        progress: told of every stage.
+        progress: reports every stage.
         iterations: of each registration at most.
         look_for_symmetries: whether to marginalise what a target that looks the same after a
             rotation cannot determine.

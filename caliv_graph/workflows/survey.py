@@ -63,7 +63,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     Args:
         recordings: opened drives (`readers.open_recording`).
         config: as for `calibrate`.
-        progress: told of every stage.
+        progress: reports every stage.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -95,7 +95,7 @@ def survey_observations(
         trajectories: one per drive.
         grounds: the ground as the LiDARs saw it.
         config: modes, kernels, priors.
-        progress: told of every stage.
+        progress: reports every stage.
 
     Raises:
         RegistrationError, SolveError: it could not be done.

@@ -28,6 +28,11 @@ def _whitened(residuals: Array, information: Array) -> Array:
     return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
 
 
+def _check_finite(*matrices: Array) -> None:
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        raise SolveError("the covariance of the extrinsics is not finite")
+
+
 def packed_solution(
     state: SolveState,
     registrations: Sequence[Registration],
@@ -57,13 +62,12 @@ def packed_solution(
     Raises:
         SolveError: the covariance is not finite.
     """
-    if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
-        raise SolveError("the covariance of the extrinsics is not finite")
+    _check_finite(cov, information_data)
     problem, measured = state.problem, measured_poses(registrations)[0]
     weights = state.weights.values
     clouds = cloud_graph(problem, measured, information * weights[:, None, None])
     graph = merged(guessed_graph(state), clouds)
-    residuals = cloud_residuals(reduced.lines, measured)
+    residuals = _whitened(cloud_residuals(reduced.lines, measured), information)
     cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
     return Solution(
         mode=state.config.solve.mode,
@@ -74,7 +78,7 @@ def packed_solution(
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
         cloud_weights=tuple(np.split(weights, cuts)),
-        residuals=tuple(np.split(_whitened(residuals, information), cuts)),
+        residuals=tuple(np.split(residuals, cuts)),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         information_data=information_data,

@@ -37,12 +37,12 @@ from caliv_graph.registration.symmetry import (
     Symmetry,
     alarming,
     symmetries,
-    symmetry_sentence,
     views_of,
 )
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import undetermined_offsets
+from caliv_graph.wording.symmetries import symmetry_sentence
 
 
 def estimate(

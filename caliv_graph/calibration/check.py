@@ -25,6 +25,7 @@ from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagree
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
+from caliv_graph.wording.contradictions import contradiction_sentence
 
 
 def _headings(
@@ -94,6 +95,7 @@ def check(
         )
     )
     if found:
-        calibration = replace(calibration, status="inconsistent", contradictions=found)
+        sentences = tuple(contradiction_sentence(each) for each in found)
+        calibration = replace(calibration, status="inconsistent", contradictions=sentences)
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)

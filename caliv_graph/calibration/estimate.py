@@ -41,7 +41,7 @@ from caliv_graph.registration.symmetry import (
 )
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.uncertainty.predicted import undetermined_offsets
+from caliv_graph.wording.offsets import undetermined_offset_sentences
 from caliv_graph.wording.symmetries import symmetry_sentence
 
 
@@ -100,7 +100,7 @@ def _estimate(
         solve = solve_registered(problem, registrations, grounds, config)
         times["graph"] = solve.graph_seconds
         problem, offsets_s = with_determined_offsets(solve, registrations)
-        warnings = tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
+        warnings = tuple(undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S))
         if warnings:
             solve = solve_registered(problem, registrations, grounds, config)
             times["graph"] += solve.graph_seconds

@@ -24,7 +24,13 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, IntArray, Solution
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
-from caliv_graph.uncertainty.consistency import Assumed, CloudCount, ScoreTest, ScoreTestKind
+from caliv_graph.uncertainty.consistency import (
+    Assumed,
+    AssumedKind,
+    CloudCount,
+    ScoreTest,
+    ScoreTestKind,
+)
 
 LEAST_TURN_RAD_S = 0.02
 """Yaw rate from which a cloud was taken in a turn: 2 m/s on a radius of 100 m."""
@@ -357,14 +363,12 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
         raw = factor.unwhitenedError(solution.values)
         sigmas = raw / np.where(raw == 0.0, 1.0, factor.whitenedError(solution.values))
         if letters == ("h",):
-            what, unit, axes = "height of the vehicle above the ground", "m", [""]
-            remedy = "Check ground.vehicle_height and ground.sigma"
+            kinds: list[AssumedKind] = ["height"]
         else:
-            what, unit, axes = "tilt of the vehicle against the ground", "rad", [" (x)", " (y)"]
-            remedy = "Check ground.parallel_sigma_deg and imu.T_vehicle_imu"
-        for axis, value, sigma in zip(axes, raw.tolist(), sigmas.tolist(), strict=True):
+            kinds = ["tilt_x", "tilt_y"]
+        for kind, value, sigma in zip(kinds, raw.tolist(), sigmas.tolist(), strict=True):
             if value:
-                out.append(Assumed(f"{drive}: {what}{axis}", value, abs(sigma), unit, remedy))
+                out.append(Assumed(drive, kind, value, abs(sigma)))
     return tuple(out)
 
 

@@ -37,8 +37,9 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
+from caliv_graph.wording.directions import named_prediction
+from caliv_graph.wording.offsets import undetermined_offset_sentences
 
 ROUGH_ITERATIONS = 40
 """Of the registration at most: millimetres do not change what a drive determines."""
@@ -159,6 +160,5 @@ def _verdict(
         offsets_s,
     )
     unmet = unmet_requirements(outlook.calibration, config).unmet
-    return Survey(
-        (), outlook, scans, unmet, tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
-    )
+    warnings = tuple(undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S))
+    return Survey((), named_prediction(outlook), scans, unmet, warnings)

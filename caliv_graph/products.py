@@ -437,9 +437,9 @@ class Direction:
         vector: per LiDAR (6,), vehicle axes, rotation (rad) then translation (m).
         sigma_data: 1 sigma of the data along it; inf if they say nothing. In units of `vector`.
         sigma_prior: 1 sigma of the prior along it, same units.
-        text: how a person says it.
+        text: its name for the user; empty until `wording.directions.named` fills it in.
         together: whether all LiDARs move as one, so that sensor-to-sensor is left alone.
-        remedy: the manoeuvre or the setting that would determine it, as a person says it.
+        remedy: the manoeuvre or the setting that would determine it; filled in with `text`.
     """
 
     vector: Mapping[str, Array]

@@ -192,7 +192,11 @@ def _describe_apart(parts: Mapping[str, Array]) -> str:
     # Which way each of them moves is in the vector; the text names the axes, the largest first.
     of_any = np.max(list(sizes.values()), axis=0)
     order = np.argsort(-of_any, kind="stable").tolist()
-    affected = " and ".join(AXES[i] for i in order if of_any[i] > NOTABLE)
+    affected = _listed([AXES[i] for i in order if of_any[i] > NOTABLE])
     quoted = [f"'{name}'" for name in names]
-    between = " and ".join([", ".join(quoted[:-1]), quoted[-1]])
-    return f"relative {affected} between lidars {between}"
+    return f"relative {affected} between lidars {_listed(quoted)}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    """The words as a person lists them: a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

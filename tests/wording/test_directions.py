@@ -97,9 +97,13 @@ def test_axes_that_move_alone_together_are_named_together() -> None:
 def test_lidars_that_move_apart_are_named_with_their_axes() -> None:
     up, down = np.zeros(6), np.zeros(6)
     up[5], down[5], down[2] = 0.01, -0.005, 0.5e-3
+    tilted = down + np.array([0.4e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     assert describe({"front": up, "rear": down}, LIDARS) == (
         "relative z and yaw between lidars 'front' and 'rear'"
+    )
+    assert describe({"front": up, "rear": tilted}, LIDARS) == (
+        "relative z, yaw and roll between lidars 'front' and 'rear'"
     )
     three = {**LIDARS, "left": pose(*MOUNTINGS["left"])}
     assert describe({"front": up, "rear": down, "left": -up}, three) == (

@@ -11,7 +11,7 @@ one more measurement, give estimates. `caliv_graph/uncertainty/README.md` quotes
 
 With --result: how far a calibration is from the thresholds. Ratios of sigmas along the scaled
 eigenvectors, which `spectrum` takes, and of the generalized eigenproblem of data and guesses;
-diagonal of the projector on the undetermined subspace.
+diagonal of the projector on the undetermined subspace; estimate and sigmas with other scaled units.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run f
 
 from caliv_graph.config.model import PoseSigmaConfig
 from caliv_graph.conventions import AXES
-from caliv_graph.fusion.terms import guess_of, own_term
-from caliv_graph.geometry.se3 import skew
-from caliv_graph.products import Array
+from caliv_graph.fusion.terms import fuse, guess_of, own_term
+from caliv_graph.geometry.se3 import skew, vehicle_axes_difference
+from caliv_graph.products import Array, Calibration
 from caliv_graph.results.files import read_calibration
 from caliv_graph.uncertainty.observability import (
     UNDETERMINED_RATIO,
+    UNIT,
     WEAK_RATIO,
     covariance_with_prior_in_null_space,
     scaling,
@@ -206,7 +207,35 @@ def margins(path: Path) -> str:
         for name, part in zip(names, diagonal, strict=True):
             cells = " | ".join(f"{x:.3f}" for x in part / part.sum())
             lines.append(f"| {name} | {part.sum():.3f} | {cells} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *_other_units(calibration, path)])
+
+
+def _other_units(calibration: Calibration, path: Path) -> Iterator[str]:
+    """What becomes of estimate and sigmas if a scaled unit is 5 or 20 mm instead of 10."""
+    term = own_term(calibration, str(path))
+    guesses = {name: guess_of(calibration, name) for name in calibration.lidars}
+    usual = fuse([term], guesses)
+    sigma = np.sqrt(np.diag(usual.cov))
+    yield "| a unit of | undetermined | estimate moves by at most | sigmas change by at most |"
+    yield "|---|---|---|---|"
+    for factor in (0.5, 2.0):
+        UNIT[3:] *= factor
+        try:
+            other = fuse([term], guesses)
+            lost = int(spectrum(term.information, usual.prior).undetermined.sum())
+        finally:
+            UNIT[3:] /= factor
+        moved = np.concatenate(
+            [
+                vehicle_axes_difference(T, usual.T_vehicle_lidar[name])
+                for name, T in other.T_vehicle_lidar.items()
+            ]
+        )
+        change = np.abs(np.sqrt(np.diag(other.cov)) / sigma - 1.0).max()
+        yield (
+            f"| {10.0 * factor:g} mm | {lost} | {np.abs(moved / sigma).max():.3f} sigma | "
+            f"{change:.1%} |"
+        )
 
 
 if __name__ == "__main__":

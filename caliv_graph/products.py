@@ -474,9 +474,9 @@ class Direction:
         vector: per LiDAR (6,), vehicle axes, rotation (rad) then translation (m).
         sigma_data: 1 sigma of the data along it; inf if unobservable. In units of `vector`.
         sigma_prior: 1 sigma of the prior along it, same units.
-        text: the direction in words.
+        text: its name for the user; empty until `wording.directions.named` fills it in.
         together: whether all LiDARs move as one, so that S2S does not change.
-        remedy: the manoeuvre or the setting that would determine it, in words.
+        remedy: the manoeuvre or the setting that would determine it; filled in with `text`.
     """
 
     vector: Mapping[str, Array]

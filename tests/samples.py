@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import (
     Array,
     Calibration,
@@ -163,3 +164,18 @@ def make_solution(placements: int = 1) -> Solution:
         ),
         stage_times_s={"solve": 0.5},
     )
+
+
+def twist_of_all(twist: Sequence[float], lidars: Mapping[str, gtsam.Pose3]) -> dict[str, Array]:
+    """What each LiDAR does, by differences, if all are moved by a small twist of the vehicle."""
+    step = 1e-6
+    motion = gtsam.Pose3.Expmap(step * np.array(twist))
+    return {
+        name: vehicle_axes_difference(motion.compose(T), T) / step for name, T in lidars.items()
+    }
+
+
+def turn_about(centre_xy: tuple[float, float]) -> list[float]:
+    """Twist of a rotation about the vertical through a point of the vehicle frame."""
+    x, y = centre_xy
+    return [0.0, 0.0, 1.0, y, -x, 0.0]

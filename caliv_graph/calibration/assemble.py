@@ -29,6 +29,7 @@ from caliv_graph.products import (
     Solution,
 )
 from caliv_graph.uncertainty.observability import assess
+from caliv_graph.wording.directions import named
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -48,11 +49,14 @@ def assemble(
         recordings: the drives, for the provenance.
         digests: of the drives (`drive_digest`).
     """
-    uncertainty = assess(
-        solution.information_data,
-        solution.information_prior,
+    uncertainty = named(
+        assess(
+            solution.information_data,
+            solution.information_prior,
+            solution.T_vehicle_lidar,
+            solution.held,
+        ),
         solution.T_vehicle_lidar,
-        solution.held,
     )
     names = config.lidar_order()
     index = {name: i for i, name in enumerate(solution.lidars)}

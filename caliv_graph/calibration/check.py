@@ -26,7 +26,8 @@ from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagree
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
-from caliv_graph.uncertainty.consistency import Assumed, CloudCount
+from caliv_graph.uncertainty.consistency import Assumed, AssumedKind, CloudCount
+from caliv_graph.wording.contradictions import contradiction_sentence
 
 
 def _headings(
@@ -96,7 +97,8 @@ def check(
         )
     )
     if found:
-        calibration = replace(calibration, status="inconsistent", contradictions=found)
+        sentences = tuple(contradiction_sentence(each) for each in found)
+        calibration = replace(calibration, status="inconsistent", contradictions=sentences)
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)
 
@@ -189,15 +191,10 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
         drive = drives[gtsam.symbolIndex(factor.keys()[0])]
         raw = factor.unwhitenedError(solution.values)
         sigmas = raw / np.where(raw == 0.0, 1.0, factor.whitenedError(solution.values))
-        if kind == "ground_height":
-            what, unit, axes = "height of the vehicle above the ground", "m", [""]
-            remedy = "Check ground.vehicle_height and ground.sigma"
-        else:
-            what, unit, axes = "tilt of the vehicle against the ground", "rad", [" (x)", " (y)"]
-            remedy = "Check ground.parallel_sigma_deg and imu.T_vehicle_imu"
+        axes: list[AssumedKind] = ["height"] if kind == "ground_height" else ["tilt_x", "tilt_y"]
         for axis, value, sigma in zip(axes, raw.tolist(), sigmas.tolist(), strict=True):
             if value:
-                out.append(Assumed(f"{drive}: {what}{axis}", value, abs(sigma), unit, remedy))
+                out.append(Assumed(drive, axis, value, abs(sigma)))
     return tuple(out)
 
 

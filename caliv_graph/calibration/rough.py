@@ -28,10 +28,10 @@ from caliv_graph.registration.symmetry import (
     Symmetry,
     alarming,
     symmetries,
-    symmetry_sentence,
     views_of,
 )
-from caliv_graph.uncertainty.predicted import undetermined_offsets
+from caliv_graph.wording.offsets import undetermined_offset_sentences
+from caliv_graph.wording.symmetries import symmetry_sentence
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def rough_solve(
         if problem.offsets != solve.problem.offsets:
             solve = solve_registered(problem, registrations, grounds, config, found)
             graph_s += solve.graph_seconds
-    offsets = tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
+    offsets = tuple(undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S))
     return RoughSolve(
         solve, tuple(registrations), offsets_s, (*offsets, *alike), registration_s, graph_s
     )

@@ -46,8 +46,9 @@ from caliv_graph.trajectory.chain import POSE, STATE, Chain
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
+from caliv_graph.wording.directions import named_prediction
+from caliv_graph.wording.offsets import undetermined_offset_sentences
 
 Ground = Literal["none", "plane", "height"]
 """What is made of the ground: nothing; a plane of unknown height; one that the vehicle stands on at
@@ -209,13 +210,13 @@ def predict_drives(
     )
     return Prediction(
         names=tuple(scenario.name for scenario, _ in planned),
-        outlook=outlook,
+        outlook=named_prediction(outlook),
         sightings=tuple(seen),
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
             *_warnings(planned, seen, lidars, assumptions.time_offset),
-            *undetermined_offsets(offsets_s, OFFSET_DETERMINED_S),
+            *undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
 

@@ -257,40 +257,6 @@ def marginalise_symmetry(H: Array, gradient: Array, symmetry: Symmetry) -> tuple
     return 0.5 * (H + H.T), gradient - along @ pulled[:, -1]
 
 
-def symmetry_sentence(symmetry: Symmetry, name: str, sigma_rad: float) -> str:
-    """What a symmetry means for the calibration, as a person says it.
-
-    Args:
-        symmetry: of the target.
-        name: of the target.
-        sigma_rad: 1 sigma of the initial guess of a LiDAR's rotation, the largest of all LiDARs.
-    """
-    about = "the vertical" if symmetry.upright else "a level axis"
-    beside = ""
-    if len(symmetry.unseen):
-        beside = f" (as far as it was seen: {100.0 * symmetry.compared:.0f} percent of it)"
-    if symmetry.continuous:
-        return (
-            f"{name}: it looks the same after any turn about {about}{beside}: no cloud of it tells "
-            "how a LiDAR is turned about it, only where it is. Drive around it, or take a target "
-            "with corners, a chair"
-        )
-    turn = math.degrees(symmetry.turn_rad)
-    # Registration ends at the nearer of two solutions.
-    needed, usual = 0.5 * turn, 3.0 * math.degrees(sigma_rad)
-    verdict = (
-        f"the guesses are right to {usual:.0f} degrees (3 sigma), so that they are not"
-        if usual < needed
-        else f"the guesses may be off by {usual:.0f} degrees (3 sigma): give better ones, or take "
-        "a target that looks different from every side"
-    )
-    return (
-        f"{name}: it looks the same after a turn by {turn:.0f} degrees about {about}{beside}: "
-        f"LiDARs would be off by such a turn about it if their guesses were off by more than "
-        f"{needed:.0f} degrees; {verdict}"
-    )
-
-
 def alarming(symmetry: Symmetry, sigma_rad: float) -> bool:
     """Whether a symmetry may spoil a calibration whose guesses have this sigma of rotation."""
     return symmetry.continuous or 3.0 * sigma_rad >= 0.5 * symmetry.turn_rad

@@ -33,6 +33,7 @@ from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
 )
+from caliv_graph.wording.directions import named_prediction
 
 ROUGH_ITERATIONS = 40
 """Of the registration at most: millimetres do not change what a drive determines."""
@@ -140,4 +141,4 @@ def _verdict(
         solved.offsets_s,
     )
     unmet = unmet_requirements(outlook.calibration, config).unmet
-    return Survey((), outlook, scans, unmet, solved.warnings)
+    return Survey((), named_prediction(outlook), scans, unmet, solved.warnings)

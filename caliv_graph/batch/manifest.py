@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.config.load import parse_config, read_yaml, validated
 from caliv_graph.config.model import Config, Requirement, SolveMode, check_limit_keys
-from caliv_graph.config.sections import Positive, _one_line, _Section
+from caliv_graph.config.sections import Positive, Section
 from caliv_graph.errors import ConfigError
 
 MOST_CHARACTERS = 80
@@ -51,7 +51,7 @@ class Job:
     limits: Mapping[str, float] | None = None
 
 
-class _Settings(_Section):
+class _Settings(Section):
     """What a job says, or the defaults for all."""
 
     config: Path | None = Field(None, description="the config, relative to the manifest")
@@ -100,7 +100,7 @@ class _JobEntry(_Settings):
         return [raw] if isinstance(raw, str) else raw
 
 
-class _Manifest(_Section):
+class _Manifest(Section):
     """The file."""
 
     defaults: _Settings = _Settings()
@@ -124,13 +124,8 @@ def load_manifest(path: Path) -> tuple[Job, ...]:
     Raises:
         ConfigError: it is missing, not YAML, not a manifest, or two jobs would share a folder.
     """
-    raw = read_yaml(path)
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{path}: holds no manifest: expected 'jobs' with a list")
-    try:
-        manifest = _Manifest.model_validate(raw)
-    except ValidationError as e:
-        raise ConfigError(f"{path}: {_one_line(e, _Manifest)}") from None
+    expected = "manifest: expected 'jobs' with a list"
+    manifest = validated(_Manifest, read_yaml(path), str(path), expected)
     base = path.parent.absolute()
     jobs = tuple(_job(entry, manifest.defaults, base, path) for entry in manifest.jobs)
     seen: dict[str, str] = {}

@@ -11,11 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, field_validator, model_validator
 
 from caliv_graph.config.sections import (
     Finite,
@@ -23,8 +19,8 @@ from caliv_graph.config.sections import (
     Place,
     Positive,
     PositiveTriple,
+    Section,
     Triple,
-    _Section,
 )
 
 _LEAST_SIGMA = 1e-6
@@ -61,7 +57,7 @@ def name_problem(name: str) -> str:
     )
 
 
-class PoseConfig(_Section):
+class PoseConfig(Section):
     """A pose as people measure it: `T_parent_child`."""
 
     xyz: Place = Field(description="metres, in the parent frame")
@@ -78,7 +74,7 @@ class PoseConfig(_Section):
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(self.xyz))
 
 
-class PoseSigmaConfig(_Section):
+class PoseSigmaConfig(Section):
     """How far off the initial guess may be, 1 sigma, per vehicle axis."""
 
     xyz: Positive | PositiveTriple = Field(0.058, description="metres; 0.058 is a uniform +-0.1 m")
@@ -111,7 +107,7 @@ class PoseSigmaConfig(_Section):
         return np.array([*self.rpy_rad(), *self.xyz_m()])
 
 
-class LidarConfig(_Section):
+class LidarConfig(Section):
     """One LiDAR, by the user's name for it."""
 
     topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
@@ -132,14 +128,14 @@ class LidarConfig(_Section):
         return self
 
 
-class DataConfig(_Section):
+class DataConfig(Section):
     """Where the recording is."""
 
     format: Literal["rosbag", "caliv"] = "rosbag"
     path: Path | None = Field(None, description="folder or file, relative to the config")
 
 
-class TopicsConfig(_Section):
+class TopicsConfig(Section):
     """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
 
     imu: str | None = None
@@ -148,7 +144,7 @@ class TopicsConfig(_Section):
     pose: str | None = None
 
 
-class TargetRegion(_Section):
+class TargetRegion(Section):
     """An axis-aligned box in which the target, and nothing else above the ground, stands."""
 
     min: Triple = Field(description="metres, lower corner")
@@ -165,7 +161,7 @@ class TargetRegion(_Section):
         return self
 
 
-class GroundConfig(_Section):
+class GroundConfig(Section):
     """The ground as a source of roll, pitch and height."""
 
     use: bool = True
@@ -178,7 +174,7 @@ class GroundConfig(_Section):
     )
 
 
-class ImuConfig(_Section):
+class ImuConfig(Section):
     """PoseConfig of the IMU."""
 
     T_vehicle_imu: PoseConfig = PoseConfig(xyz=(0.0, 0.0, 0.0))
@@ -193,13 +189,13 @@ class ImuConfig(_Section):
     )
 
 
-class GnssConfig(_Section):
+class GnssConfig(Section):
     """PoseConfig of the GNSS antenna."""
 
     lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
 
 
-class NoiseConfig(_Section):
+class NoiseConfig(Section):
     """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
 
     lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
@@ -234,7 +230,7 @@ class NoiseConfig(_Section):
     orientation_deg: Positive | None = None
 
 
-class SolveConfig(_Section):
+class SolveConfig(Section):
     """How the graph is solved."""
 
     mode: SolveMode = Field(
@@ -245,7 +241,7 @@ class SolveConfig(_Section):
     time_offset: bool = Field(False, description="estimate a constant time offset per LiDAR")
 
 
-class RobustConfig(_Section):
+class RobustConfig(Section):
     """What stands in for the paper's percentile filter."""
 
     kernel: RobustKernel = "huber"
@@ -258,7 +254,7 @@ class RobustConfig(_Section):
     )
 
 
-class ExtractionConfig(_Section):
+class ExtractionConfig(Section):
     """How target points are cut out of the clouds."""
 
     ground_distance: Positive = Field(
@@ -286,7 +282,7 @@ class ExtractionConfig(_Section):
     )
 
 
-class RegistrationConfig(_Section):
+class RegistrationConfig(Section):
     """The mixture that all clouds of a target are registered to."""
 
     components: Annotated[int, Field(ge=20)] = Field(
@@ -315,7 +311,7 @@ def check_limit_keys(keys: Iterable[str]) -> None:
             )
 
 
-class Config(_Section):
+class Config(Section):
     """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
 
     data: DataConfig = DataConfig()

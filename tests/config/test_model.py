@@ -14,7 +14,7 @@ from caliv_graph.config.load import dump_config, load_config, parse_config
 from caliv_graph.config.model import Config, PoseSigmaConfig
 from caliv_graph.errors import ConfigError
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 REGION = {"min": [10, -14, -1], "max": [20, -4, 3]}
 
@@ -130,6 +130,9 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
         ({"limits": {"s2v_yaw": 0.1}}, "unknown limit 's2v_yaw'"),
         ({"limits": {"s2v_yaw_deg": 0}}, "'limits.s2v_yaw_deg': "),
         ({"extraction": {"min_points": 10.5}}, "'extraction.min_points': "),
+        ({"lidars": {"float": lidar(min_range=-1)["front"]}}, "'lidars.float.min_range': "),
+        ({"lidars": {"up[1]": lidar(sigma={"xyz": 0})["front"]}}, "'lidars.up[1].sigma.xyz': "),
+        ({"solve": 3}, "'solve': must be keys with values (got '3')"),
     ],
 )  # fmt: skip
 def test_what_is_not_valid_is_named_with_its_place(sections: dict[str, Any], part: str) -> None:

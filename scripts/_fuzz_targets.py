@@ -46,7 +46,8 @@ from caliv_graph.readers.pointcloud2 import (
     decode_pointcloud2,
 )
 from caliv_graph.readers.rosbag import RosbagRecording
-from caliv_graph.results.files import calibration_document, read_calibration_file, read_truth
+from caliv_graph.results.calibration_file import calibration_document, read_calibration_file
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.model import dump_scenario, load_scenario, parse_scenario
 from scripts import _fuzz_seeds as seeds
 

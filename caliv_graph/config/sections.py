@@ -17,6 +17,18 @@ _MOST_OF_A_VEHICLE_M = 100.0
 _SHOWN_CHARACTERS = 60
 """Of a wrong value, in a message."""
 
+_SENTENCES = {
+    "model_type": "must be keys with values",
+    "dict_type": "must be keys with values",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "too_short": "must have {min_length} or more items, has {actual_length}",
+    "too_long": "must have {max_length} or fewer items, has {actual_length}",
+}
+"""Instead of pydantic's, which speak of Python, by the type of the error."""
+
 
 def _finite(value: float) -> float:
     if not math.isfinite(value):
@@ -82,14 +94,20 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
         return f"unknown key '{where}': {_nearest(str(keys[-1]), models[0])}{rest}"
     if first["type"] == "missing":
         return f"'{where}' is missing{rest}"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "model_type":  # pydantic names the class, which the user does not know
-        message = "must be keys with values"
+    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    if first["type"] in _SENTENCES:
+        message = _SENTENCES[first["type"]].format(**first.get("ctx", {}))
     if not keys:
         return f"{message}{rest}"
-    given = first["input"]
-    shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:_SHOWN_CHARACTERS]!r})"
-    return f"'{where}': {message}{shown}{rest}"
+    return f"'{where}': {message}{_shown(first['input'])}{rest}"
+
+
+def _shown(value: Any) -> str:
+    """A wrong value for a message; a long list tells nothing there, nor do keys."""
+    text = str(value)
+    if isinstance(value, Mapping) or (isinstance(value, list) and len(text) > _SHOWN_CHARACTERS):
+        return ""
+    return f" (got {text[:_SHOWN_CHARACTERS]!r})"
 
 
 def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], Any]:

@@ -9,13 +9,14 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gtsam
 import yaml
+from pydantic import BaseModel, BeforeValidator, RootModel
 
-from caliv_graph.common.fields import Field
-from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.config.load import parse_config, read_yaml, validated
+from caliv_graph.config.sections import Finite, Triple
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import rpy
 from caliv_graph.readers.bag import Bag, DamagedMessageError
@@ -57,6 +58,25 @@ class Draft:
     lidars: tuple[str, ...]
     unknown: tuple[str, ...]
     origin: str
+
+
+def _inner_list(raw: Any) -> Any:
+    """The numbers of a list, which the CaLiV authors' program writes inside another list."""
+    return raw[0] if isinstance(raw, list) and len(raw) == 1 else raw
+
+
+_Numbers6 = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+
+class _Transforms(RootModel[dict[str, Annotated[_Numbers6, BeforeValidator(_inner_list)]]]):
+    """`transform_sensor_N`: roll, pitch, yaw in degrees, then metres, of T_vehicle_lidar."""
+
+
+class _Bounds(BaseModel):
+    """The target's region in the map, metres."""
+
+    min_bound: Annotated[Triple, BeforeValidator(_inner_list)]
+    max_bound: Annotated[Triple, BeforeValidator(_inner_list)]
 
 
 @dataclass(frozen=True)
@@ -312,23 +332,17 @@ def _read_original(path: Path) -> _Original | None:
         return None
     if not isinstance(raw, dict) or "transform_sensor_1" not in raw:
         return None
-    root = Field(raw, str(path))
-    extrinsics = {}
-    for name, field in root.names().items():
-        if name.startswith("transform_"):
-            values = _numbers(field, 6)
-            extrinsics[name.removeprefix("transform_")] = (values[3:], values[:3])
+    expected = "CaLiV config"
+    values = {key: value for key, value in raw.items() if str(key).startswith("transform_")}
+    transforms = validated(_Transforms, values, str(path), expected).root
+    extrinsics = {
+        name.removeprefix("transform_"): (numbers[3:], numbers[:3])
+        for name, numbers in transforms.items()
+    }
     if "min_bound" not in raw or "max_bound" not in raw:
         return _Original(path, extrinsics, None)
-    bounds = (_numbers(root.child("min_bound"), 3), _numbers(root.child("max_bound"), 3))
-    return _Original(path, extrinsics, bounds)
-
-
-def _numbers(field: Field, size: int) -> list[float]:
-    """The numbers of a list, which that program writes inside another list."""
-    items = field.items()
-    inner = items[0] if len(items) == 1 else field
-    return [float(v) for v in inner.vector(size)]
+    bounds = validated(_Bounds, raw, str(path), expected)
+    return _Original(path, extrinsics, (bounds.min_bound, bounds.max_bound))
 
 
 def _relative(data: Path, config: Path) -> str:

@@ -128,7 +128,7 @@ def test_a_damaged_caliv_config_is_named(drive: Path, tmp_path: Path) -> None:
     result = init(drive, "--out", tmp_path / "out.yaml")
 
     assert isinstance(result.exception, ConfigError)
-    assert "transform_sensor_1[0][2]: expected a finite number" in str(result.exception)
+    assert "'transform_sensor_1.2': must be a finite number (got 'nan')" in str(result.exception)
     assert not (tmp_path / "out.yaml").exists()
 
 

@@ -460,7 +460,8 @@ def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> No
 
 def test_plotly_waits_until_there_is_something_to_write() -> None:
     code = (
-        "import sys, caliv_graph.pipeline, caliv_graph.results.files, caliv_graph.report.tables\n"
+        "import sys, caliv_graph.pipeline, caliv_graph.report.tables\n"
+        "import caliv_graph.results.calibration_file\n"
         "print([m for m in ('plotly', 'jinja2') if m in sys.modules])"
     )
     done = subprocess.run(

@@ -13,7 +13,7 @@ import yaml
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.observability import (
     REMEDY_APART,

@@ -6,12 +6,12 @@ The models list the keys that are read, in the order in which problems are repor
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any, Literal, Self, get_args
 
 import gtsam
 import numpy as np
-from pydantic import Field, StrictBool, ValidationInfo, field_validator
+from pydantic import Field, StrictBool, ValidationInfo, field_validator, model_validator
 from scipy.linalg import block_diag
 
 from caliv_graph.config.model import name_problem
@@ -35,7 +35,8 @@ from caliv_graph.results.values import (
 from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
 
-SCHEMA = "caliv-graph/calibration/1"
+Schema = Literal["caliv-graph/calibration/1"]
+(SCHEMA,) = get_args(Schema)
 
 Status = Literal["ok", "partial", "inconsistent"]
 
@@ -81,12 +82,7 @@ class _LidarPart(Part):
     saw_target: StrictBool | None = None
 
     def result(self, has_data: bool) -> LidarResult:
-        """The LiDAR's part of the calibration.
-
-        Args:
-            has_data: whether the information of the data is not zero: then the LiDAR saw the
-                target. Used where the file does not say `saw_target`.
-        """
+        """The result of the LiDAR; one whose data has information saw the target."""
         offset = self.time_offset
         return LidarResult(
             T_vehicle_lidar=self.T_vehicle_lidar.pose(),
@@ -104,28 +100,21 @@ class _OrderedPart(Part):
 
     order: list[Text] = Field(min_length=1)
 
-    @field_validator("order")
+    @field_validator("*")
     @classmethod
-    def _each_once(cls, order: list[str]) -> list[str]:
-        if len(set(order)) < len(order):
+    def _of_all_lidars(cls, value: Any, info: ValidationInfo) -> Any:
+        if info.field_name == "order" and len(set(value)) < len(value):
             raise ValueError("names a LiDAR twice")
-        return order
-
-    @field_validator("covariance", "data_information", check_fields=False)
-    @classmethod
-    def _matrix_of_all(cls, rows: list[list[float]], info: ValidationInfo) -> list[list[float]]:
-        # A field with a problem is missing here, and is reported itself.
-        return check_matrix(rows, 6 * len(info.data["order"])) if "order" in info.data else rows
-
-    @field_validator("data_gradient", check_fields=False)
-    @classmethod
-    def _vector_of_all(
-        cls, numbers: list[float] | None, info: ValidationInfo
-    ) -> list[float] | None:
-        size = 6 * len(info.data.get("order", ()))
-        if numbers is not None and size and len(numbers) != size:
-            raise ValueError(f"must be {size} numbers, has {len(numbers)}")
-        return numbers
+        # An order with a problem is missing here, and is reported itself.
+        order = info.data.get("order", ())
+        size = 6 * len(order)
+        if size and info.field_name in ("covariance", "data_information"):
+            check_matrix(value, size)
+        if size and info.field_name == "data_gradient" and value is not None and len(value) != size:
+            raise ValueError(f"must be {size} numbers, has {len(value)}")
+        if info.field_name == "T_vehicle_lidar" and not set(order) <= value.keys():
+            raise ValueError(f"must have a pose of each of {', '.join(order)}")
+        return value
 
 
 class _EarlierPart(_OrderedPart):
@@ -135,14 +124,6 @@ class _EarlierPart(_OrderedPart):
     T_vehicle_lidar: dict[Text, PosePart]
     data_information: Matrix
     data_gradient: list[Finite]
-
-    @field_validator("T_vehicle_lidar")
-    @classmethod
-    def _pose_of_each(cls, poses: dict[str, PosePart], info: ValidationInfo) -> dict[str, PosePart]:
-        missing = [name for name in info.data.get("order", ()) if name not in poses]
-        if missing:
-            raise ValueError(f"'{missing[0]}' is missing")
-        return poses
 
     def term(self) -> DataTerm:
         """The same in vehicle axes."""
@@ -204,7 +185,7 @@ class _PairPart(Part):
 class CalibrationModel(Part):
     """A calibration.yaml."""
 
-    schema_: Text = Field(alias="schema")
+    schema_: Schema = Field(alias="schema")
     lidars: dict[Text, _LidarPart] = Field(min_length=1)
     joint: _JointPart
     status: Status
@@ -215,13 +196,6 @@ class CalibrationModel(Part):
     contradictions: tuple[Text, ...] = ()
     provenance: dict[Text, Any] = Field({})
 
-    @field_validator("schema_")
-    @classmethod
-    def _known_schema(cls, schema: str) -> str:
-        if schema != SCHEMA:
-            raise ValueError(f"is not known; this version reads '{SCHEMA}'")
-        return schema
-
     @field_validator("lidars")
     @classmethod
     def _names_can_be_shown(cls, lidars: dict[str, _LidarPart]) -> dict[str, _LidarPart]:
@@ -229,39 +203,26 @@ class CalibrationModel(Part):
             raise ValueError(problem)
         return lidars
 
-    @field_validator("joint")
-    @classmethod
-    def _orders_all_lidars(cls, joint: _JointPart, info: ValidationInfo) -> _JointPart:
-        # LiDARs with a problem are missing here, and are reported themselves.
-        lidars = list(info.data.get("lidars", joint.order))
-        if sorted(joint.order) != sorted(lidars):
-            raise ValueError(f"order {joint.order} must have the LiDARs of the file, {lidars}")
-        return joint
-
-    @field_validator("reference")
-    @classmethod
-    def _reference_is_known(cls, reference: str, info: ValidationInfo) -> str:
-        if reference not in info.data.get("lidars", [reference]):
-            raise ValueError(f"must be a LiDAR of the file: {', '.join(info.data['lidars'])}")
-        return reference
-
-    @field_validator("observability")
-    @classmethod
-    def _directions_are_known(
-        cls, part: _ObservabilityPart, info: ValidationInfo
-    ) -> _ObservabilityPart:
-        for direction in (*part.undetermined, *part.weak):
-            _check_known(direction.direction, info)
-        return part
-
-    @field_validator("sensor_to_sensor")
-    @classmethod
-    def _pairs_are_known(
-        cls, pairs: list[_PairPart] | None, info: ValidationInfo
-    ) -> list[_PairPart] | None:
-        for pair in pairs or ():
-            _check_known([pair.from_, pair.to], info)
-        return pairs
+    @model_validator(mode="after")
+    def _knows_all_names(self) -> Self:
+        if sorted(self.joint.order) != sorted(self.lidars):
+            raise ValueError(
+                f"'joint.order': {self.joint.order} must be the LiDARs of the file, "
+                f"{list(self.lidars)}"
+            )
+        directions = (*self.observability.undetermined, *self.observability.weak)
+        pairs = self.sensor_to_sensor or ()
+        named = {
+            "reference": [self.reference],
+            "observability": [name for part in directions for name in part.direction],
+            "sensor_to_sensor": [name for pair in pairs for name in (pair.from_, pair.to)],
+        }
+        for place, names in named.items():
+            for name in names:
+                if name not in self.lidars:
+                    known = ", ".join(self.lidars)
+                    raise ValueError(f"'{place}': '{name}' is not a LiDAR of the file: {known}")
+        return self
 
     def calibration(self) -> Calibration:
         """The calibration. The LiDARs are in the order of the matrices."""
@@ -304,11 +265,3 @@ class TruthModel(Part):
     """A truth.yaml; a calibration.yaml is one, too."""
 
     lidars: dict[Text, _TrueLidarPart] = Field(min_length=1)
-
-
-def _check_known(names: Iterable[str], info: ValidationInfo) -> None:
-    """Raises ValueError where a name is not one of the file's LiDARs."""
-    for name in names:
-        if name not in info.data.get("lidars", [name]):
-            known = ", ".join(info.data["lidars"])
-            raise ValueError(f"'{name}' is not a LiDAR of the file: {known}")

@@ -1,4 +1,4 @@
-"""What sections of YAML files are made of: number types, the base model, and its error messages."""
+"""Parts of YAML files: the number types, the base model, and the sentence about a problem."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
     """
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    # A key that is unknown stands in the file, whatever it looks like.
+    # An unknown key is a key of the file, even if it looks like the branch of a union.
     is_unknown = first["type"] == "extra_forbidden"
     unknown = first["loc"][-1:] if is_unknown else ()
     known = first["loc"][: len(first["loc"]) - len(unknown)]
@@ -103,7 +103,7 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A wrong value for a message; a long list tells nothing there, nor do keys."""
+    """A wrong value for a message; a long list, or keys with values, would not help there."""
     text = str(value)
     if isinstance(value, Mapping) or (isinstance(value, list) and len(text) > _SHOWN_CHARACTERS):
         return ""
@@ -114,7 +114,7 @@ def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], 
     """Follows a location of pydantic, which names the branches of unions too.
 
     Returns:
-        The keys of the file in it, and the annotation of what stands there.
+        The keys of the file in it, and the annotation of the value at that place.
     """
     keys: list[int | str] = []
     annotation = root
@@ -135,7 +135,7 @@ def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], 
 
 
 def _tags(model: type[BaseModel]) -> set[Any]:
-    """What tells a model from the others of a union: the values of fields that have only one."""
+    """The tags of a model in a union: the values of fields that allow only one."""
     values = [get_args(field.annotation) for field in model.model_fields.values()]
     kinds = [get_origin(field.annotation) for field in model.model_fields.values()]
     return {v[0] for v, kind in zip(values, kinds, strict=True) if kind is Literal and len(v) == 1}

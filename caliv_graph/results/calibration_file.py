@@ -1,4 +1,4 @@
-"""calibration.yaml: what `calibrate` writes, and reading it back.
+"""calibration.yaml: writing it, and reading it back.
 
 `sensor_to_sensor`, `rpy_deg` and `sigma_vehicle_axes` are derived from the rest. `guess`,
 `data_gradient` and `earlier` are what `compare`, `merge` and `--prior` need beside the information
@@ -42,7 +42,7 @@ _HEADER = """\
 
 @dataclass(frozen=True)
 class CalibrationFile:
-    """What a calibration.yaml says.
+    """The content of a calibration.yaml.
 
     Attributes:
         calibration: the result.
@@ -58,7 +58,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
     """The content of calibration.yaml, plain values only.
 
     Raises:
-        ValueError: a pose or a covariance is not finite; nobody should ever see such a file.
+        ValueError: a pose or a covariance is not finite: such a file is never written.
     """
     _check_finite(calibration)
     document = {
@@ -174,7 +174,7 @@ def _gradient_document(calibration: Calibration) -> dict[str, Any]:
 
 
 def _earlier_documents(calibration: Calibration) -> dict[str, Any]:
-    """What earlier drives said, in right perturbations as everything under `joint`."""
+    """The data of earlier drives, in right perturbations as everything under `joint`."""
     documents = []
     for term in calibration.earlier:
         axes = block_diag(*(right_to_vehicle_axes(T) for T in term.T_vehicle_lidar.values()))
@@ -221,7 +221,7 @@ def _direction_document(direction: Direction) -> dict[str, Any]:
 def _pose_document(pose: gtsam.Pose3) -> dict[str, Any]:
     quaternion: Any = pose.rotation().toQuaternion()
     xyzw = np.array([quaternion.x(), quaternion.y(), quaternion.z(), quaternion.w()])
-    # Of the two that mean the same, the one whose last number that is not zero is positive.
+    # q and -q are the same rotation: write the one whose last nonzero number is positive.
     if xyzw[np.flatnonzero(np.abs(xyzw) > 1e-12)[-1]] < 0.0:
         xyzw = -xyzw
     parts = {
@@ -229,7 +229,7 @@ def _pose_document(pose: gtsam.Pose3) -> dict[str, Any]:
         "quaternion_xyzw": xyzw,
         "rpy_deg": np.degrees(pose.rotation().rpy()),
     }
-    # Beside numbers of the order of one, what is below the last digit is noise.
+    # The numbers are of the order of one: digits below the last are noise.
     return {key: np.round(values, _DIGITS).tolist() for key, values in parts.items()}
 
 

@@ -82,7 +82,7 @@ def check_matrix(rows: list[list[float]], size: int) -> list[list[float]]:
         i = int(np.argmin(diagonal))
         raise ValueError(f"is no covariance: {diagonal[i]:g} on the diagonal, in row {i + 1}")
     sigma = np.sqrt(diagonal)
-    # A row of zeros stays one; anything else beside a zero on the diagonal shows as indefinite.
+    # A row of zeros stays zero; other numbers beside a zero on the diagonal show as indefinite.
     scale = np.where(sigma > 0.0, sigma, sigma.max() or 1.0)
     scaled = matrix / np.outer(scale, scale)
     asymmetry = np.abs(scaled - scaled.T)

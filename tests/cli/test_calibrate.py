@@ -45,7 +45,7 @@ class Pipeline:
             calibration=self.calibration,
             solution=make_solution(),
             warnings=self.warnings,
-            evidence=None,
+            record=None,
         )
 
 

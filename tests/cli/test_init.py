@@ -293,7 +293,7 @@ def test_a_urdf_places_nothing_in_a_caliv_folder(drive: Path, tmp_path: Path) ->
     result = init(drive, "--urdf", tmp_path / "car.urdf", "--out", tmp_path / "config.yaml")
 
     assert isinstance(result.exception, ConfigError)
-    assert "is no bag" in str(result.exception)
+    assert "is not a bag" in str(result.exception)
 
 
 def test_a_bag_without_clouds_is_no_drive(tmp_path: Path) -> None:

@@ -346,5 +346,5 @@ def test_a_key_that_stands_twice_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("lidars:\n  front: {topic: a}\n  front: {topic: b}\n")
 
-    with pytest.raises(ConfigError, match="in line 3: key 'front' stands twice"):
+    with pytest.raises(ConfigError, match="in line 3: key 'front' is given twice"):
         load_config(path)

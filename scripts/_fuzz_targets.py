@@ -240,7 +240,7 @@ def _motion(folder: Path) -> Callable[[bytes], None]:
         found = collector.finish()
         assert all(isinstance(note, str) for note in collector.notes())
         if found is None:
-            raise DamagedMessageError("tells nothing")
+            raise DamagedMessageError("has no measurements")
         kind = {GnssCollector: "gnss", ImuCollector: "imu", TwistCollector: "twist"}
         _check_motion(MotionData("fuzz", **{kind.get(collector_type, "poses"): found}))
 

@@ -1,12 +1,11 @@
 """A simulated drive past a target, described: vehicle, sensors, world, noise.
 
 Frozen models with units in the `Field` descriptions; `configs/scenarios/` holds commented ones.
-Nothing here draws, moves or casts: `drives`, `worlds`, `lidar` and `motion` turn the models into
-that.
+Nothing here draws random numbers or casts rays: the room `simulation` does.
 
 The noise of IMU, GNSS, velocity and orientation is that of table I of CaLiV, read as follows. All
-figures are 1 sigma of white noise per sample and axis, at the rates of SPEC 8 (IMU and orientation
-100 Hz, GNSS and velocity 10 Hz). The GPS's 1.5e-7 degrees of latitude and longitude are an angle at
+figures are 1 sigma of white noise per sample and axis, at 100 Hz for IMU and orientation and 10 Hz
+for GNSS and velocity. The GPS's 1.5e-7 degrees of latitude and longitude are an angle at
 the centre of the earth: 1.5e-7 pi / 180 x 6378 km = 16.7 mm, taken for north and east alike, as on
 the equator. The orientation's 0.005 rad is a rotation about each axis of the IMU.
 """

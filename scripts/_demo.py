@@ -22,7 +22,8 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, Calibration, Direction
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.simulation.writer import write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined

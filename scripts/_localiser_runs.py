@@ -21,7 +21,7 @@ from caliv_graph.geometry.se3 import (
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.scenario.model import Scenario, StandstillDrive, dump_scenario
 from caliv_graph.scenario.shapes import World
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive

@@ -40,7 +40,8 @@ from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, Calibration
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.drives import CurvatureProfile
 from caliv_graph.scenario.model import Scenario, parse_scenario
 from caliv_graph.simulation.bag import BagWriter

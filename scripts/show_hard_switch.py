@@ -35,7 +35,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.fusion.terms import fuse, guess_of, own_term
 from caliv_graph.geometry.se3 import skew, vehicle_axes_difference
 from caliv_graph.products import Array, Calibration
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.uncertainty.observability import (
     UNDETERMINED_RATIO,
     UNIT,

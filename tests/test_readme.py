@@ -16,7 +16,8 @@ from caliv_graph.cli.main import app
 from caliv_graph.common import exits
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config, GroundConfig, LidarConfig
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.simulation import load_scenario, simulate_caliv
 
 ROOT = Path(__file__).resolve().parents[1]

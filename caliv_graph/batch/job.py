@@ -54,7 +54,7 @@ class FinishedJob:
             self.config,
             self.stages,
             self.warnings,
-            self.run.evidence,
+            self.run.record,
         )
 
 

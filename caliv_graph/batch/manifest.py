@@ -1,4 +1,4 @@
-"""The manifest of a batch: which drives are to be calibrated, by which configs."""
+"""The manifest of a batch: its drives, and the config of each."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.config.load import parse_config, read_yaml, validated
 from caliv_graph.config.model import Config, Requirement, SolveMode, check_limit_keys
-from caliv_graph.config.sections import Positive, _one_line, _Section
+from caliv_graph.config.sections import Positive, Section
 from caliv_graph.errors import ConfigError
 
 MOST_CHARACTERS = 80
 """Of a name: a file system allows 255 bytes, and scratch names beside it are longer."""
 
 RESERVED = ("index.html", "summary.csv", "summary.json")
-"""What stands beside the jobs' folders."""
+"""Names of the files beside the folders of the jobs."""
 
 _NAME = re.compile(r"\w(?:[\w.-]*[\w-])?")
 _VEHICLE = re.compile(r"\w(?:[\w. -]*[\w.-])?")
@@ -33,7 +33,7 @@ class Job:
     Attributes:
         name: of the job and of its folder.
         config: the config.
-        vehicle: what the jobs of one vehicle have in common; None: compared with no other.
+        vehicle: jobs of the same vehicle are compared; None: with no other job.
         data: drives instead of the config's; empty: the config's.
         prior: an earlier calibration; None: none.
         mode: instead of the config's `solve.mode`.
@@ -51,8 +51,8 @@ class Job:
     limits: Mapping[str, float] | None = None
 
 
-class _Settings(_Section):
-    """What a job says, or the defaults for all."""
+class _Settings(Section):
+    """The settings of a job, or the defaults of all jobs."""
 
     config: Path | None = Field(None, description="the config, relative to the manifest")
     vehicle: str | None = Field(None, description="jobs of one vehicle are compared")
@@ -100,7 +100,7 @@ class _JobEntry(_Settings):
         return [raw] if isinstance(raw, str) else raw
 
 
-class _Manifest(_Section):
+class _Manifest(Section):
     """The file."""
 
     defaults: _Settings = _Settings()
@@ -116,7 +116,7 @@ class _Manifest(_Section):
 
 
 def load_manifest(path: Path) -> tuple[Job, ...]:
-    """Reads a manifest. Whether configs and drives are there, their jobs will tell.
+    """Reads a manifest. Each job checks its config and drives when it runs.
 
     Args:
         path: the file; paths in it are relative to its folder.
@@ -124,23 +124,18 @@ def load_manifest(path: Path) -> tuple[Job, ...]:
     Raises:
         ConfigError: it is missing, not YAML, not a manifest, or two jobs would share a folder.
     """
-    raw = read_yaml(path)
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{path}: holds no manifest: expected 'jobs' with a list")
-    try:
-        manifest = _Manifest.model_validate(raw)
-    except ValidationError as e:
-        raise ConfigError(f"{path}: {_one_line(e, _Manifest)}") from None
+    expected = "manifest: expected 'jobs' with a list"
+    manifest = validated(_Manifest, read_yaml(path), str(path), expected)
     base = path.parent.absolute()
     jobs = tuple(_job(entry, manifest.defaults, base, path) for entry in manifest.jobs)
     seen: dict[str, str] = {}
     for job in jobs:
-        # Some file systems do not tell cases apart.
+        # Some file systems ignore case.
         folder = job.name.casefold()
         if folder in seen:
             first = "twice" if seen[folder] == job.name else f"beside '{seen[folder]}'"
             raise ConfigError(
-                f"{path}: job name '{job.name}' stands {first}: each job has a folder of its own. "
+                f"{path}: job name '{job.name}' is used {first}: each job has its own folder. "
                 "Rename one"
             )
         seen[folder] = job.name
@@ -179,7 +174,7 @@ def _without_limits(require: Any) -> Any:
 
 def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> Job:
     def setting(key: str) -> Any:
-        # A job says `prior: null` where the default prior is not to count.
+        # `prior: null` in a job switches the default prior off.
         return getattr(entry if key in entry.model_fields_set else defaults, key)
 
     config, prior = setting("config"), setting("prior")
@@ -203,7 +198,7 @@ def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> J
 def _plain(raw: Any, pattern: re.Pattern[str], also: str) -> str:
     """A name that is safe as a folder, in a table and on a page."""
     if not isinstance(raw, str):
-        raise ValueError("is no text to YAML: write it in quotes")
+        raise ValueError("is not text in YAML: write it in quotes")
     # One spelling of what looks the same.
     name = unicodedata.normalize("NFC", raw)
     if len(name) > MOST_CHARACTERS or len(name.encode(errors="replace")) > 2 * MOST_CHARACTERS:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
-from pydantic import (
-    ValidationError,
-)
+from pydantic import BaseModel, ValidationError
 
 from caliv_graph.common.inputs import read_input
 from caliv_graph.common.yaml_text import YamlProblemError, parse_yaml
 from caliv_graph.config.model import Config
-from caliv_graph.config.sections import _one_line
+from caliv_graph.config.sections import first_problem
 from caliv_graph.errors import ConfigError
 
+Model = TypeVar("Model", bound=BaseModel)
+
 _MOST_BYTES = 200_000_000
-"""Of a YAML file. The poses of a drive of hours take a tenth of it, and a recording that is given
-by mistake is not read to its end."""
+"""Of a YAML file: ten times the poses of a drive of hours. A recording that is given by mistake is
+larger, and is not read to its end."""
 
 
 def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
@@ -45,23 +45,39 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
         raise error(f"{path}: not valid YAML{where}{e}") from None
 
 
+def validated(model: type[Model], raw: Any, source: str, expected: str) -> Model:
+    """Validates what a YAML file holds.
+
+    Args:
+        model: of the whole file.
+        raw: what the YAML file held.
+        source: the name of the file in messages.
+        expected: what the file should hold, for the message about a file without keys.
+
+    Raises:
+        ConfigError: with the first problem, in one line.
+    """
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{source}: holds no {expected}")
+    try:
+        return model.model_validate(raw)
+    except ValidationError as e:
+        raise ConfigError(f"{source}: {first_problem(e, model)}") from None
+
+
 def parse_config(raw: Any, source: str, base: Path) -> Config:
     """Validates a configuration.
 
     Args:
         raw: what the YAML file held.
-        source: what to call it in messages.
-        base: folder that its paths are relative to.
+        source: the name of the file in messages.
+        base: the folder that its paths are relative to.
 
     Raises:
-        ConfigError: with the first thing wrong, in one line.
+        ConfigError: with the first problem, in one line.
     """
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{source}: holds no configuration: expected keys such as 'lidars'")
-    try:
-        config = Config.model_validate(raw)
-    except ValidationError as e:
-        raise ConfigError(f"{source}: {_one_line(e, Config)}") from None
+    expected = "configuration: expected keys such as 'lidars'"
+    config = validated(Config, raw, source, expected)
     if config.data.path is None:
         return config
     data = config.data.model_copy(update={"path": (base / config.data.path).absolute()})

@@ -11,11 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, field_validator, model_validator
 
 from caliv_graph.config.sections import (
     Finite,
@@ -23,12 +19,12 @@ from caliv_graph.config.sections import (
     Place,
     Positive,
     PositiveTriple,
+    Section,
     Triple,
-    _Section,
 )
 
 _LEAST_SIGMA = 1e-6
-"""Of a guess, metres or degrees: GTSAM takes much less for a constraint."""
+"""Of a guess, metres or degrees: GTSAM treats much smaller ones as constraints."""
 
 
 if TYPE_CHECKING:
@@ -44,14 +40,14 @@ LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
 
 
 _MOST_CHARACTERS = 100
-"""Of a LiDAR's name, which stands in the columns of tables."""
+"""Of a LiDAR's name, a column of tables."""
 
 
 def name_problem(name: str) -> str:
-    """What is wrong with a name for a LiDAR; empty: nothing.
+    """The problem of a name for a LiDAR; empty: none.
 
-    Names go to tables, terminals and other programs' files, where a line end or an escape would do
-    what nobody asked for.
+    Names go to tables, terminals and files of other programs, where line ends and escape sequences
+    do damage.
     """
     if name.strip() == name != "" and name.isprintable() and len(name) <= _MOST_CHARACTERS:
         return ""
@@ -61,7 +57,7 @@ def name_problem(name: str) -> str:
     )
 
 
-class PoseConfig(_Section):
+class PoseConfig(Section):
     """A pose as people measure it: `T_parent_child`."""
 
     xyz: Place = Field(description="metres, in the parent frame")
@@ -78,7 +74,7 @@ class PoseConfig(_Section):
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(self.xyz))
 
 
-class PoseSigmaConfig(_Section):
+class PoseSigmaConfig(Section):
     """How far off the initial guess may be, 1 sigma, per vehicle axis."""
 
     xyz: Positive | PositiveTriple = Field(0.058, description="metres; 0.058 is a uniform +-0.1 m")
@@ -111,7 +107,7 @@ class PoseSigmaConfig(_Section):
         return np.array([*self.rpy_rad(), *self.xyz_m()])
 
 
-class LidarConfig(_Section):
+class LidarConfig(Section):
     """One LiDAR, by the user's name for it."""
 
     topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
@@ -132,14 +128,14 @@ class LidarConfig(_Section):
         return self
 
 
-class DataConfig(_Section):
+class DataConfig(Section):
     """Where the recording is."""
 
     format: Literal["rosbag", "caliv"] = "rosbag"
     path: Path | None = Field(None, description="folder or file, relative to the config")
 
 
-class TopicsConfig(_Section):
+class TopicsConfig(Section):
     """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
 
     imu: str | None = None
@@ -148,7 +144,7 @@ class TopicsConfig(_Section):
     pose: str | None = None
 
 
-class TargetRegion(_Section):
+class TargetRegion(Section):
     """An axis-aligned box in which the target, and nothing else above the ground, stands."""
 
     min: Triple = Field(description="metres, lower corner")
@@ -165,7 +161,7 @@ class TargetRegion(_Section):
         return self
 
 
-class GroundConfig(_Section):
+class GroundConfig(Section):
     """The ground as a source of roll, pitch and height."""
 
     use: bool = True
@@ -178,7 +174,7 @@ class GroundConfig(_Section):
     )
 
 
-class ImuConfig(_Section):
+class ImuConfig(Section):
     """PoseConfig of the IMU."""
 
     T_vehicle_imu: PoseConfig = PoseConfig(xyz=(0.0, 0.0, 0.0))
@@ -193,13 +189,13 @@ class ImuConfig(_Section):
     )
 
 
-class GnssConfig(_Section):
+class GnssConfig(Section):
     """PoseConfig of the GNSS antenna."""
 
     lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
 
 
-class NoiseConfig(_Section):
+class NoiseConfig(Section):
     """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
 
     lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
@@ -234,7 +230,7 @@ class NoiseConfig(_Section):
     orientation_deg: Positive | None = None
 
 
-class SolveConfig(_Section):
+class SolveConfig(Section):
     """How the graph is solved."""
 
     mode: SolveMode = Field(
@@ -245,8 +241,8 @@ class SolveConfig(_Section):
     time_offset: bool = Field(False, description="estimate a constant time offset per LiDAR")
 
 
-class RobustConfig(_Section):
-    """What stands in for the paper's percentile filter."""
+class RobustConfig(Section):
+    """The robust kernel, in the place of the paper's percentile filter."""
 
     kernel: RobustKernel = "huber"
     huber_k: Positive = Field(1.5, description="whitened residual per sqrt(dof) where Huber bends")
@@ -258,7 +254,7 @@ class RobustConfig(_Section):
     )
 
 
-class ExtractionConfig(_Section):
+class ExtractionConfig(Section):
     """How target points are cut out of the clouds."""
 
     ground_distance: Positive = Field(
@@ -271,7 +267,8 @@ class ExtractionConfig(_Section):
         6, description="neighbours of the statistical outlier filter; 0: no filter"
     )
     outlier_ratio: Positive = Field(
-        3.0, description="a point this many standard deviations lonelier than the rest is dropped"
+        3.0,
+        description="standard deviations by which the neighbours of a dropped point are too far",
     )
     min_points: Annotated[int, Field(ge=10)] = Field(
         50, description="a scan with fewer target points does not see the target"
@@ -286,7 +283,7 @@ class ExtractionConfig(_Section):
     )
 
 
-class RegistrationConfig(_Section):
+class RegistrationConfig(Section):
     """The mixture that all clouds of a target are registered to."""
 
     components: Annotated[int, Field(ge=20)] = Field(
@@ -305,7 +302,7 @@ def check_limit_keys(keys: Iterable[str]) -> None:
     """Checks the names of limits on sigmas.
 
     Raises:
-        ValueError: one is no `LIMIT_KEY`; the message says what they look like.
+        ValueError: one is not a `LIMIT_KEY`; the message describes them.
     """
     for key in keys:
         if not LIMIT_KEY.match(key):
@@ -315,8 +312,8 @@ def check_limit_keys(keys: Iterable[str]) -> None:
             )
 
 
-class Config(_Section):
-    """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
+class Config(Section):
+    """The whole configuration; every section but `lidars` has defaults."""
 
     data: DataConfig = DataConfig()
     topics: TopicsConfig = TopicsConfig()
@@ -346,7 +343,7 @@ class Config(_Section):
     @model_validator(mode="before")
     @classmethod
     def _empty_sections(cls, raw: Any) -> Any:
-        """`topics:` with nothing below it means its defaults, as a person would expect."""
+        """`topics:` with nothing below it means its defaults."""
         if not isinstance(raw, Mapping):
             return raw
         return {key: value for key, value in raw.items() if value is not None or key == "lidars"}
@@ -368,7 +365,7 @@ class Config(_Section):
         limits: Any = {}
         for given in found:
             if not isinstance(given, Mapping):
-                limits = given  # what is wrong with it, the field's own check says
+                limits = given  # the check of the field reports it
                 break
             limits = {**limits, **given}
         return {**raw, "require": names, "limits": limits}

@@ -1,26 +1,33 @@
-"""What sections of YAML files are made of: number types, the base model, and its error messages."""
+"""Parts of YAML files: the number types, the base model, and the sentence about a problem."""
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, get_args, get_origin
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 _LEAST, _MOST = 1e-12, 1e12
-"""Of any quantity of the config in its unit, far beyond all that is meant: squares and their
-inverses stay numbers."""
-
+"""Bounds of a quantity in its unit, far beyond any use: squares and their inverses stay finite."""
 
 _MOST_OF_A_VEHICLE_M = 100.0
+
+_SHOWN_CHARACTERS = 60
+"""Of a wrong value, in a message."""
+
+_SENTENCES = {
+    "model_type": "must be keys with values",
+    "dict_type": "must be keys with values",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "too_short": "must have {min_length} or more items, has {actual_length}",
+    "too_long": "must have {max_length} or fewer items, has {actual_length}",
+}
+"""Instead of pydantic's, which speak of Python, by the type of the error."""
 
 
 def _finite(value: float) -> float:
@@ -47,90 +54,101 @@ def _on_a_vehicle(xyz: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 Finite = Annotated[float, AfterValidator(_finite)]
-
-
 Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite), AfterValidator(_not_tiny)]
-
-
 NonNegative = Annotated[float, Field(ge=0.0), AfterValidator(_finite)]
-
-
 Triple = tuple[Finite, Finite, Finite]
-
-
 Place = Annotated[Triple, AfterValidator(_on_a_vehicle)]
-
-
 PositiveTriple = tuple[Positive, Positive, Positive]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A part of a YAML file: frozen, and an unknown key is an error."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def _nearest(key: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
-    return hint
+def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
+    """The first problem of a YAML file in one line: the place, what is wrong there, the value.
 
+    An unknown key comes first: a typo also causes a missing key.
 
-def _section_at(location: tuple[int | str, ...], root: type[BaseModel]) -> type[BaseModel]:
-    """The model that owns the key at `location` (its last item is the key itself)."""
-    annotation: Any = root
-    for item in location[:-1]:
-        annotation = _inner(annotation, item)
-    model = _model_in(annotation)
-    return model or root
-
-
-def _inner(annotation: Any, item: int | str) -> Any:
-    """The annotation of what `item` selects: a field, a dictionary's value, an item of a list."""
-    model = _model_in(annotation)
-    if isinstance(item, int) or model is None:
-        return annotation
-    if get_origin(annotation) is dict:
-        return get_args(annotation)[1]
-    field = model.model_fields.get(item)
-    return field.annotation if field else annotation
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The first model in an annotation such as `tuple[TargetRegion, ...] | None`."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in get_args(annotation):
-        model = _model_in(inner)
-        if model is not None:
-            return model
-    return None
-
-
-def _one_line(error: ValidationError, root: type[BaseModel]) -> str:
-    """The first thing wrong, as one line a person can act upon; a typo before what it hides."""
+    Args:
+        error: of the validation of the whole file.
+        root: the model of the whole file.
+    """
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    # Pydantic names the branches of a union too: they are no keys of the file. An unknown key is
-    # one of the file, whatever it looks like.
-    unknown = first["loc"][-1:] if first["type"] == "extra_forbidden" else ()
-    location = tuple(
-        item
-        for item in first["loc"][: len(first["loc"]) - len(unknown)]
-        if not (isinstance(item, str) and (item == "float" or "[" in item))
-    )
-    location += unknown
-    where = ".".join(str(item) for item in location)
-    # What a typo leaves missing is no second error.
-    alike = [e for e in errors if e["type"] == first["type"] or first["type"] != "extra_forbidden"]
-    others = len({tuple(e["loc"])[: len(location)] for e in alike}) - 1
+    # An unknown key is a key of the file, even if it looks like the branch of a union.
+    is_unknown = first["type"] == "extra_forbidden"
+    unknown = first["loc"][-1:] if is_unknown else ()
+    known = first["loc"][: len(first["loc"]) - len(unknown)]
+    keys, section = _follow(known, root)
+    keys += unknown
+    where = ".".join(str(key) for key in keys)
+    # A key that is missing because of a typo is no second problem.
+    alike = [e for e in errors if not is_unknown or e["type"] == first["type"]]
+    others = len({tuple(e["loc"])[: len(keys)] for e in alike}) - 1
     rest = f" (and {others} more)" if others > 0 else ""
-    if first["type"] == "extra_forbidden":
-        known = list(_section_at(location, root).model_fields)
-        return f"unknown key '{where}': {_nearest(str(location[-1]), known)}{rest}"
+    if is_unknown:
+        models = _models_in(section) or [root]
+        return f"unknown key '{where}': {_nearest(str(keys[-1]), models[0])}{rest}"
     if first["type"] == "missing":
         return f"'{where}' is missing{rest}"
-    message = first["msg"].removeprefix("Value error, ")
-    if not location:
+    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    if first["type"] in _SENTENCES:
+        message = _SENTENCES[first["type"]].format(**first.get("ctx", {}))
+    if not keys:
         return f"{message}{rest}"
-    given = first["input"]
-    shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:60]!r})"
-    return f"'{where}': {message}{shown}{rest}"
+    return f"'{where}': {message}{_shown(first['input'])}{rest}"
+
+
+def _shown(value: Any) -> str:
+    """A wrong value for a message; a long list, or keys with values, would not help there."""
+    text = str(value)
+    if isinstance(value, Mapping) or (isinstance(value, list) and len(text) > _SHOWN_CHARACTERS):
+        return ""
+    return f" (got {text[:_SHOWN_CHARACTERS]!r})"
+
+
+def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], Any]:
+    """Follows a location of pydantic, which names the branches of unions too.
+
+    Returns:
+        The keys of the file in it, and the annotation of the value at that place.
+    """
+    keys: list[int | str] = []
+    annotation = root
+    for item in location:
+        models = _models_in(annotation)
+        tagged = [model for model in models if item in _tags(model)] if len(models) > 1 else []
+        if get_origin(annotation) is dict:
+            # The user chooses these keys: a LiDAR may have the name of a branch.
+            keys.append(item)
+            annotation = get_args(annotation)[1]
+        elif tagged:
+            annotation = tagged[0]
+        elif isinstance(item, int) or not (item == "float" or "[" in item):
+            keys.append(item)
+            fields = [m.model_fields[item] for m in models if item in m.model_fields]
+            annotation = fields[0].annotation if fields else annotation
+    return keys, annotation
+
+
+def _tags(model: type[BaseModel]) -> set[Any]:
+    """The tags of a model in a union: the values of fields that allow only one."""
+    values = [get_args(field.annotation) for field in model.model_fields.values()]
+    kinds = [get_origin(field.annotation) for field in model.model_fields.values()]
+    return {v[0] for v, kind in zip(values, kinds, strict=True) if kind is Literal and len(v) == 1}
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models in an annotation such as `tuple[TargetRegion, ...] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for inner in get_args(annotation) for model in _models_in(inner)]
+
+
+def _nearest(key: str, model: type[BaseModel]) -> str:
+    known = list(model.model_fields)
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"

@@ -1,32 +1,28 @@
 """A simulated drive past a target, described: vehicle, sensors, world, noise.
 
 Frozen models with units in the `Field` descriptions; `configs/scenarios/` holds commented ones.
-Nothing here draws, moves or casts: `drives`, `worlds`, `lidar` and `motion` turn the models into
-that.
+Nothing here draws random numbers or casts rays: the room `simulation` does.
 
 The noise of IMU, GNSS, velocity and orientation is that of table I of CaLiV, read as follows. All
-figures are 1 sigma of white noise per sample and axis, at the rates of SPEC 8 (IMU and orientation
-100 Hz, GNSS and velocity 10 Hz). The GPS's 1.5e-7 degrees of latitude and longitude are an angle at
+figures are 1 sigma of white noise per sample and axis, at 100 Hz for IMU and orientation and 10 Hz
+for GNSS and velocity. The GPS's 1.5e-7 degrees of latitude and longitude are an angle at
 the centre of the earth: 1.5e-7 pi / 180 x 6378 km = 16.7 mm, taken for north and east alike, as on
 the equator. The orientation's 0.005 rad is a rotation about each axis of the IMU.
 """
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from caliv_graph.config.load import read_yaml
+from caliv_graph.config.load import read_yaml, validated
 from caliv_graph.config.model import PoseConfig
-from caliv_graph.config.sections import Finite, NonNegative, Positive, PositiveTriple
-from caliv_graph.errors import ConfigError
+from caliv_graph.config.sections import Finite, NonNegative, Positive, PositiveTriple, Section
 
 Pair = tuple[Finite, Finite]
 Turn = Literal["left", "right"]
@@ -34,24 +30,7 @@ PerAxis = NonNegative | tuple[NonNegative, NonNegative, NonNegative]
 TimeField = Literal["t", "time", "timestamp", "time_stamp"]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known_keys(cls, raw: Any) -> Any:
-        """Names the nearest known key, which pydantic's own message does not."""
-        if isinstance(raw, Mapping):
-            for key in raw:
-                if key not in cls.model_fields:
-                    known = list(cls.model_fields)
-                    close = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-                    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-                    raise ValueError(f"unknown key '{key}': {hint}")
-        return raw
-
-
-class _DriveSection(_Section):
+class _DriveSection(Section):
     """What all drives have. The vehicle frame is on the ground at the rear axle."""
 
     start_xy_m: Pair = Field((0.0, 0.0), description="metres, start in the map")
@@ -83,7 +62,7 @@ class _TimedSection(_MovingSection):
         return self
 
 
-class _TransitionSection(_Section):
+class _TransitionSection(Section):
     transition_m: Positive = Field(
         3.0, description="metres of path over which one curvature goes over into the other"
     )
@@ -132,7 +111,7 @@ DriveModel = Annotated[
 ]
 
 
-class SweepModel(_Section):
+class SweepModel(Section):
     """A cloud taken column by column while the vehicle moves."""
 
     duration_s: Positive | None = Field(
@@ -161,7 +140,7 @@ class SweepModel(_Section):
         return self
 
 
-class EdgeModel(_Section):
+class EdgeModel(Section):
     """What a beam of finite width returns at an edge, and beams that return nothing."""
 
     divergence_mrad: Positive = Field(
@@ -184,7 +163,7 @@ class EdgeModel(_Section):
     )
 
 
-class LidarModel(_Section):
+class LidarModel(Section):
     """A LiDAR. Without `sweep` it takes its whole cloud at one instant, as in CARLA.
 
     A beam is given by its elevation over the LiDAR's xy plane and its azimuth about the
@@ -263,7 +242,7 @@ class LidarModel(_Section):
         return self
 
 
-class RampModel(_Section):
+class RampModel(Section):
     """A smooth rise of the ground: up a flank, a level top, down a flank.
 
     The steepest place of a flank has a slope of 35/16 height_m / flank_m.
@@ -279,7 +258,7 @@ class RampModel(_Section):
     )
 
 
-class GroundModel(_Section):
+class GroundModel(Section):
     """Flat ground, a square about the map's origin, with ramps on it."""
 
     height_m: Finite = Field(0.0, description="metres, its z in the map")
@@ -287,7 +266,7 @@ class GroundModel(_Section):
     ramps: tuple[RampModel, ...] = Field((), description="absent: flat all over")
 
 
-class MoveModel(_Section):
+class MoveModel(Section):
     """Somebody carries an object to another place. In between nobody is there."""
 
     begin_s: NonNegative = Field(description="seconds since the start of the drive, picked up")
@@ -302,7 +281,7 @@ class MoveModel(_Section):
         return self
 
 
-class _ObjectSection(_Section):
+class _ObjectSection(Section):
     xy_m: Pair = Field(description="metres, its origin in the map; it stands on the ground")
     yaw_deg: Finite = Field(0.0, description="degrees, its +x (a chair's front) from map +x")
     moves: tuple[MoveModel, ...] = Field(
@@ -372,7 +351,7 @@ ObjectModel = Annotated[
 ]
 
 
-class WalkerModel(_Section):
+class WalkerModel(Section):
     """A person, 1.75 m tall, who walks to and fro along a line."""
 
     from_xy_m: Pair = Field(description="metres, one end of the line in the map")
@@ -386,7 +365,7 @@ class WalkerModel(_Section):
         return self
 
 
-class WorldModel(_Section):
+class WorldModel(Section):
     """What stands around the drive."""
 
     ground: GroundModel = GroundModel()
@@ -416,7 +395,7 @@ class WorldModel(_Section):
         return self
 
 
-class CropModel(_Section):
+class CropModel(Section):
     """Which beams are cast and written, so that a scan is cheap and small.
 
     A beam that is kept returns what it returns without cropping, noise included.
@@ -431,7 +410,7 @@ class CropModel(_Section):
     )
 
 
-class PoseNoiseModel(_Section):
+class PoseNoiseModel(Section):
     """Errors of the poses in a CaLiV folder: those of a filter, partly correlated in time."""
 
     position_sigma_m: NonNegative = Field(
@@ -450,14 +429,14 @@ class PoseNoiseModel(_Section):
     )
 
 
-class _SampledSection(_Section):
+class _SampledSection(Section):
     """What is published at a rate."""
 
     enabled: bool = Field(True, description="false: the vehicle has none")
     phase_s: NonNegative = Field(0.0, description="seconds, stamp of the first sample")
 
 
-class OrientationModel(_Section):
+class OrientationModel(Section):
     """The orientation that the IMU reports: of the IMU in ENU axes."""
 
     enabled: bool = Field(True, description="false: messages say that there is none")
@@ -497,14 +476,14 @@ class ImuModel(_SampledSection):
     orientation: OrientationModel = OrientationModel()
 
 
-class OutageModel(_Section):
+class OutageModel(Section):
     """A time without a fix."""
 
     start_s: NonNegative = Field(description="seconds since the start of the drive")
     duration_s: Positive = Field(description="seconds")
 
 
-class JumpModel(_Section):
+class JumpModel(Section):
     """A time during which all fixes are off by the same, as by a reflected signal."""
 
     start_s: NonNegative = Field(description="seconds since the start of the drive")
@@ -551,14 +530,14 @@ class VelocityModel(_SampledSection):
     )
 
 
-class BodyBoxModel(_Section):
+class BodyBoxModel(Section):
     """A box that is part of the vehicle."""
 
     centre_m: tuple[Finite, Finite, Finite] = Field(description="metres, vehicle frame")
     size_m: PositiveTriple = Field(description="metres along the vehicle's x, y, z")
 
 
-class BagModel(_Section):
+class BagModel(Section):
     """How the bag is written."""
 
     start_time_s: Annotated[int, Field(ge=0)] = Field(
@@ -572,7 +551,7 @@ class BagModel(_Section):
     )
 
 
-class SuspensionModel(_Section):
+class SuspensionModel(Section):
     """What the vehicle frame's height above the ground, nominally zero, does.
 
     Heave lifts vehicle and LiDARs while a cloud is taken. It is white from scan to scan and
@@ -587,14 +566,14 @@ class SuspensionModel(_Section):
     )
 
 
-class InitialGuessModel(_Section):
+class InitialGuessModel(Section):
     """How far the written config's initial guess is off, drawn uniformly per LiDAR and axis."""
 
     translation_m: NonNegative = Field(0.1, description="metres, largest error per vehicle axis")
     rotation_deg: NonNegative = Field(3.0, description="degrees, largest roll, pitch, yaw error")
 
 
-class Scenario(_Section):
+class Scenario(Section):
     """A simulated drive past one or more targets."""
 
     name: str = Field(
@@ -633,34 +612,18 @@ class Scenario(_Section):
         return self
 
 
-def _one_line(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    where = ".".join(str(item) for item in first["loc"]) or "the file"
-    more = error.error_count() - 1
-    rest = f" (and {more} more)" if more else ""
-    if first["type"] == "missing":
-        return f"'{where}' is missing{rest}"
-    given = first["input"]
-    shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:60]!r})"
-    return f"'{where}': {first['msg'].removeprefix('Value error, ')}{shown}{rest}"
-
-
 def parse_scenario(raw: Any, source: str) -> Scenario:
     """Validates a scenario.
 
     Args:
         raw: what the YAML file held.
-        source: what to call it in messages.
+        source: the name of the file in messages.
 
     Raises:
-        ConfigError: with the first thing wrong, in one line.
+        ConfigError: with the first problem, in one line.
     """
-    if not isinstance(raw, Mapping):
-        raise ConfigError(f"{source}: holds no scenario: expected keys such as 'drive', 'lidars'")
-    try:
-        return Scenario.model_validate(raw)
-    except ValidationError as e:
-        raise ConfigError(f"{source}: {_one_line(e)}") from None
+    expected = "scenario: expected keys such as 'drive', 'lidars'"
+    return validated(Scenario, raw, source, expected)
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -14,7 +14,7 @@ from caliv_graph.config.load import dump_config, load_config, parse_config
 from caliv_graph.config.model import Config, PoseSigmaConfig
 from caliv_graph.errors import ConfigError
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 REGION = {"min": [10, -14, -1], "max": [20, -4, 3]}
 
@@ -130,6 +130,9 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
         ({"limits": {"s2v_yaw": 0.1}}, "unknown limit 's2v_yaw'"),
         ({"limits": {"s2v_yaw_deg": 0}}, "'limits.s2v_yaw_deg': "),
         ({"extraction": {"min_points": 10.5}}, "'extraction.min_points': "),
+        ({"lidars": {"float": lidar(min_range=-1)["front"]}}, "'lidars.float.min_range': "),
+        ({"lidars": {"up[1]": lidar(sigma={"xyz": 0})["front"]}}, "'lidars.up[1].sigma.xyz': "),
+        ({"solve": 3}, "'solve': must be keys with values (got '3')"),
     ],
 )  # fmt: skip
 def test_what_is_not_valid_is_named_with_its_place(sections: dict[str, Any], part: str) -> None:
@@ -312,10 +315,10 @@ def test_the_config_of_the_published_drive_shows_the_defaults() -> None:
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        ({"limits": 5, "require": ["s2s"]}, "'limits': Input should be a valid dictionary"),
-        ({"require": [{"limits": [1]}]}, "'limits': Input should be a valid dictionary"),
+        ({"limits": 5, "require": ["s2s"]}, "'limits': must be keys with values"),
+        ({"require": [{"limits": [1]}]}, "'limits': must be keys with values"),
         ({"target": {"min": [0, 0, 0], "mx": [1, 1, 1]}}, "unknown key 'target.0.mx'"),
-        ({"target": []}, "'target': Tuple should have at least 1 item"),
+        ({"target": []}, "'target': must have 1 or more items, has 0"),
         (
             {
                 "lidars": {
@@ -343,5 +346,5 @@ def test_a_key_that_stands_twice_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("lidars:\n  front: {topic: a}\n  front: {topic: b}\n")
 
-    with pytest.raises(ConfigError, match="in line 3: key 'front' stands twice"):
+    with pytest.raises(ConfigError, match="in line 3: key 'front' is given twice"):
         load_config(path)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from scripts import show_hard_switch
 from tests.samples import make_calibration
 

@@ -14,7 +14,7 @@ import yaml
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from caliv_graph.uncertainty.observability import UNIT, assess, scaling
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import (

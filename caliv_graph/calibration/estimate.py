@@ -33,13 +33,8 @@ from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import GroundObservation, Registration, Solution, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.registration.symmetry import (
-    Symmetry,
-    alarming,
-    symmetries,
-    symmetry_sentence,
-    views_of,
-)
+from caliv_graph.registration.self_comparison import views_of
+from caliv_graph.registration.symmetry import Symmetry, alarming, symmetries, symmetry_sentence
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import undetermined_offsets
@@ -87,7 +82,7 @@ def _estimate(
     limit = config.registration.max_iterations
     begun = time.perf_counter()
     states = [
-        JointRegistration(o, config, rough=True, shares=problem.view_weights(m))
+        JointRegistration(o, config, rough=True, view_weights=problem.view_weights(m))
         for m, o in enumerate(observations)
     ]
     registrations = []
@@ -113,7 +108,7 @@ def _estimate(
     extrinsics = {name: problem.extrinsic(solve.values, name) for name in problem.lidars}
     observations = [_deskewed(o, extrinsics, trajectories) for o in observations]
     states = [
-        JointRegistration(o, config, normals=False, shares=problem.view_weights(m))
+        JointRegistration(o, config, normals=False, view_weights=problem.view_weights(m))
         for m, o in enumerate(observations)
     ]
     again = []

@@ -113,7 +113,7 @@ def survey_observations(
     with progress.stage("registering the clouds roughly", len(observations)) as advance:
         for m, observation in enumerate(observations):
             state = JointRegistration(
-                observation, config, rough=True, shares=problem.view_weights(m)
+                observation, config, rough=True, view_weights=problem.view_weights(m)
             )
             registrations.append(register_jointly(state, prealigned(problem, m), limit))
             advance()

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.products import Array, Registration
-from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
     MAX_STEP,
     JointRegistration,
@@ -420,7 +420,7 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
         along=np.zeros((1, 4 * len(minima))),
         moments=np.zeros((len(minima), 1, 10)),
         coupling=np.zeros((1, 10, 3, 6)),
-        turnable=np.eye(3)[None],
+        orientation_information=np.eye(3)[None],
         torque=np.zeros((1, 3)),
     )
 

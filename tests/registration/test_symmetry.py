@@ -14,16 +14,14 @@ import pytest
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Registration
 from caliv_graph.registration.register import FINE_SIGMA_M, JointRegistration
+from caliv_graph.registration.self_comparison import View, ViewIndex, views_of
 from caliv_graph.registration.symmetry import (
     Symmetry,
-    View,
-    _Seen,
     alarming,
     marginalise_symmetry,
     refit,
     symmetries,
     symmetry_sentence,
-    views_of,
 )
 from caliv_graph.scenario.model import (
     BoxModel,
@@ -104,7 +102,7 @@ def test_a_chair_is_the_same_after_no_turn(azimuths: tuple[float, ...]) -> None:
 def test_the_smallest_turn_of_a_shape_seen_from_all_sides(name: str, expected: float) -> None:
     symmetry = upright(name, ALL_AROUND)
     assert symmetry is not None
-    assert math.degrees(symmetry.turn_rad) == pytest.approx(expected)
+    assert math.degrees(symmetry.angle_rad) == pytest.approx(expected)
     assert symmetry.compared > 0.9
     # The axis goes through the middle of the shape, which stands at the target's origin.
     assert np.abs(symmetry.centre_target[:2]).max() < 5e-3
@@ -114,7 +112,7 @@ def test_a_cube_of_which_two_lidars_see_opposite_corners_is_the_same_after_half_
     # Each sees two faces, and none of the other's.
     symmetry = upright("cube", OPPOSITE)
     assert symmetry is not None
-    assert symmetry.turn_rad in (math.pi / 2.0, math.pi)
+    assert symmetry.angle_rad in (math.pi / 2.0, math.pi)
 
 
 def test_a_drum_seen_from_one_side_is_known_by_what_was_seen() -> None:
@@ -153,7 +151,7 @@ def test_another_frame_changes_nothing() -> None:
     after = next((s for s in found(moved) if s.upright), None)
     assert before is not None
     assert after is not None
-    assert before.turn_rad == after.turn_rad
+    assert before.angle_rad == after.angle_rad
     expected = T.transformFrom(before.centre_target)
     np.testing.assert_allclose(after.centre_target[:2], expected[:2], atol=2e-3)
 
@@ -163,7 +161,7 @@ def test_what_one_view_says_of_a_surface(whole: bool) -> None:
     # A square of 1 m, 5 m ahead, in steps of 25 mm, seen head on.
     y, z = np.meshgrid(np.arange(-0.5, 0.501, 0.025), np.arange(-0.5, 0.501, 0.025))
     square = np.column_stack([np.full(y.size, 5.0), y.ravel(), z.ravel()])
-    view = _Seen.of(View(np.zeros(3), square, whole))
+    view = ViewIndex.of(View(np.zeros(3), square, whole))
     asked = np.array(
         [
             [5.0, 0.1, 0.1],  # on it
@@ -225,7 +223,7 @@ def test_the_generator_moves_points_about_the_axis() -> None:
     symmetry = Symmetry(
         axis_target=np.array([0.0, 0.0, 1.0]),
         centre_target=np.array([0.3, -0.2, 0.5]),
-        turn_rad=0.0,
+        angle_rad=0.0,
         fitted_rad=1.0,
         compared=1.0,
         contradicted=0.0,

@@ -611,7 +611,7 @@ def test_a_common_turn_is_in_the_null_space() -> None:
     assert common(quadratic)[:3] == pytest.approx(np.zeros(3), abs=1e-3)
 
 
-def test_clouds_of_disjoint_skins_say_nothing_of_each_other() -> None:
+def test_clouds_of_disjoint_skins_have_no_information_on_each_other() -> None:
     _, _, _, quadratic = skins()
     information = RELATIVE.T @ quadratic.joint() @ RELATIVE
     sigma = np.diag(information) ** -0.5
@@ -620,7 +620,7 @@ def test_clouds_of_disjoint_skins_say_nothing_of_each_other() -> None:
     assert sigma[3:].min() > 0.6
 
 
-def test_clouds_of_disjoint_skins_know_less_of_each_other_than_the_blocks_claim() -> None:
+def test_clouds_of_disjoint_skins_have_less_relative_information_than_the_blocks() -> None:
     _, _, _, quadratic = skins()
     joint = np.diag(RELATIVE.T @ quadratic.joint() @ RELATIVE)
     claimed = 0.25 * np.diag(quadratic.blocks.sum(axis=0))

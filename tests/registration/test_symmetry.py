@@ -128,7 +128,7 @@ def test_a_drum_seen_from_one_side_is_known_by_what_was_seen() -> None:
     assert again.axis_target[2] > math.cos(10e-3)
 
 
-def test_one_side_of_a_box_says_nothing_of_turns_about_the_vertical() -> None:
+def test_one_side_of_a_box_shows_no_symmetry_about_the_vertical() -> None:
     # Turned, the face that was seen is where nobody looked, whichever way.
     assert upright("box", tuple(np.linspace(18.0, 22.0, 10).tolist())) is None
 
@@ -157,7 +157,7 @@ def test_another_frame_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_what_one_view_says_of_a_surface(whole: bool) -> None:
+def test_one_view_against_expected_surfaces(whole: bool) -> None:
     # A square of 1 m, 5 m ahead, in steps of 25 mm, seen head on.
     y, z = np.meshgrid(np.arange(-0.5, 0.501, 0.025), np.arange(-0.5, 0.501, 0.025))
     square = np.column_stack([np.full(y.size, 5.0), y.ravel(), z.ravel()])
@@ -185,7 +185,7 @@ def test_what_one_view_says_of_a_surface(whole: bool) -> None:
     assert not pierced.any()
 
 
-def test_nothing_is_claimed_of_a_shape_that_nobody_saw() -> None:
+def test_a_shape_without_views_has_no_symmetry() -> None:
     assert symmetries(seen("cube", ALL_AROUND).mixture, (), SIGMA_M) == ()
 
 
@@ -194,29 +194,29 @@ def test_nothing_is_claimed_of_a_shape_that_nobody_saw() -> None:
 
 def quadratic_of(name: str) -> tuple[Array, Array]:
     H = seen(name, A_QUARTER).information_joint
-    # Pulls towards some other poses: a pull that turns all clouds and the shape alike is none.
+    # Gradients towards other poses, in the range of H: a common motion has none.
     return H, H @ np.random.default_rng(1).normal(size=len(H))
 
 
-def test_turns_about_the_axis_are_forgotten_and_nothing_else() -> None:
+def test_rotations_about_the_axis_are_marginalised_and_nothing_else() -> None:
     symmetry = upright("cylinder", A_QUARTER)
     assert symmetry is not None
     H, g = quadratic_of("cylinder")
-    forgot, gradient = marginalise_symmetry(H, g, symmetry)
+    marginalised, gradient = marginalise_symmetry(H, g, symmetry)
     count = len(H) // 6
     turns = np.kron(np.eye(count), symmetry.generator()[:, None])
     scale = np.abs(H).max()
-    assert np.abs(forgot @ turns).max() < 1e-7 * scale
+    assert np.abs(marginalised @ turns).max() < 1e-7 * scale
     assert np.abs(turns.T @ gradient).max() < 1e-6 * np.abs(g).max()
-    # A Schur complement: of all turns the quadratic takes the best, never a better one.
-    values = np.linalg.eigvalsh(H - forgot)
+    # A Schur complement: information is lost along the rotations, one direction per cloud.
+    values = np.linalg.eigvalsh(H - marginalised)
     assert values.min() > -1e-9 * scale
     assert (values > 1e-9 * scale).sum() <= count
-    # Of any step, what is lost is what the best turns regain.
+    # The marginal cost of a step is its cost with the best rotations added.
     step = np.random.default_rng(2).normal(size=len(H))
     best = np.linalg.lstsq(turns.T @ H @ turns, -turns.T @ (H @ step), rcond=None)[0]
     regained = step + turns @ best
-    assert step @ forgot @ step == pytest.approx(regained @ H @ regained, rel=1e-6)
+    assert step @ marginalised @ step == pytest.approx(regained @ H @ regained, rel=1e-6)
 
 
 def test_the_generator_moves_points_about_the_axis() -> None:
@@ -260,7 +260,7 @@ def test_a_drum_alone_claims_its_yaw_and_the_symmetry_takes_it_back() -> None:
     assert np.sqrt(np.mean((radius[side] - 0.35) ** 2)) < 2.0 * SIGMA_M
 
 
-def test_what_a_person_is_told() -> None:
+def test_sentences_about_symmetries() -> None:
     drum, cube = upright("cylinder", A_QUARTER), upright("cube", ALL_AROUND)
     assert drum is not None
     assert cube is not None

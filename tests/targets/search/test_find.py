@@ -50,7 +50,7 @@ from caliv_graph.scenario.model import (
 )
 from caliv_graph.simulation import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.noise import perturbed_extrinsic
-from caliv_graph.targets.cloud.extract import RegionExtractor
+from caliv_graph.targets.cloud.region import RegionExtractor
 from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.targets.search.find import MAX_SCANS, REGION_MARGIN_M
 from caliv_graph.trajectory.select import GivenTrajectory
@@ -273,12 +273,11 @@ class TestFindsTheChair:
         extractor = RegionExtractor(found.region, drive.config, drive.trajectory)
         off = []
         for name in drive.config.lidars:
-            for scan in drive.recording.scans(name):
-                cloud = extractor.extract(scan, 0)
-                if cloud is not None:
-                    T = drive.trajectory.poses_at([scan.stamp_ns])
-                    at = drive.truth[name].transformFrom(cloud.points_lidar.mean(axis=0))
-                    off.append(np.linalg.norm((T[0][0] @ at + T[1][0])[:2] - CHAIR_XY_M))
+            scans = drive.recording.scans(name)
+            for cloud in extractor.choose([extractor.candidates(s, 0) for s in scans], name):
+                T = drive.trajectory.poses_at([cloud.stamp_ns])
+                at = drive.truth[name].transformFrom(cloud.points_lidar.mean(axis=0))
+                off.append(np.linalg.norm((T[0][0] @ at + T[1][0])[:2] - CHAIR_XY_M))
         assert len(off) >= sum(found.scans.values()) > 20
         assert max(off) < 0.5
 

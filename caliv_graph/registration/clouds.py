@@ -86,11 +86,15 @@ class CloudStack:
         """Number of clouds."""
         return len(self.starts)
 
+    @property
+    def sizes(self) -> IntArray:
+        """(J,) number of points of each cloud."""
+        return np.diff(np.append(self.starts, len(self.points)))
+
     @cached_property
     def centres(self) -> Array:
         """(J, 3) mean of each cloud's points, lidar frame."""
-        sizes = np.diff(np.append(self.starts, len(self.points)))
-        return np.asarray(self.sum_per_cloud(self.points) / sizes[:, None])
+        return np.asarray(self.sum_per_cloud(self.points) / self.sizes[:, None])
 
     @cached_property
     def features(self) -> Array:

@@ -129,7 +129,7 @@ class _Components:
     Attributes:
         tree: of means and scaled normals. Components lie on surfaces: boxes halved in the middle
             fit them better than those halved in number, and the search is a sixth faster.
-        neighbours: components that are looked at per point, k.
+        neighbours: number of components per point, k.
         log_peak: (K,) logarithm of prior times density at the mean.
         above: (K,) factor of the squared height above the surface in the log-density.
         aside: (K,) factor of the squared distance along the surface.
@@ -167,6 +167,13 @@ class _Components:
         self, points: Array, normals: Array, beams: Array, flatness: Array, reach_m: float
     ) -> tuple[IntArray, Array, Array, Array]:
         """Densities of points under their nearest components.
+
+        The distance of a point from a component along the surface is measured where the point's
+        beam meets the component's plane. The noise is along the beam. On a slanted surface it
+        displaces the point along the surface too, and would choose the component: at the far edge
+        of a face the last component would get the points with positive noise, at the near edge
+        those with negative noise. Every face would rotate about its middle, and with it a LiDAR by
+        0.5 mrad.
 
         Args:
             points: (n, 3) metres, target frame.
@@ -213,16 +220,10 @@ def expect(
 ) -> Responsibilities:
     """E-step: responsibilities of the nearest components (GMMCalib's, with oriented components).
 
-    The distance of a point from a component along the surface is measured where the point's beam
-    meets the component's plane. The noise is along the beam. On a slanted surface it displaces the
-    point along the surface too, and would choose the component: at the far edge of a face the last
-    component would get the points with positive noise, at the near edge those with negative noise.
-    Every face would rotate about its middle, and with it a LiDAR by 0.5 mrad.
-
-    The lever of a residual in the gradient ends at that place too. The lever of the noisy point is
-    correlated with its residual: least squares would rotate all surfaces edge-on to their beams,
-    where the noise across them is smaller. For a point y at height h above a plane of normal n,
-    with beam b, the place is `y - h b / (n^T b)`.
+    For a point y at height h above a plane of normal n, with beam b, the lever of the residual in
+    the gradient ends where the beam meets the plane, at `y - h b / (n^T b)`. The lever of the noisy
+    point is correlated with its residual: least squares would rotate all surfaces edge-on to their
+    beams, where the noise across them is smaller.
 
     Args:
         stack: the clouds.
@@ -237,7 +238,6 @@ def expect(
     alpha = np.empty(near.shape)
     forces, directions = np.empty(alpha.shape), np.empty(stack.points.shape)
     levers, slides = np.empty(stack.points.shape), np.empty(len(stack.points))
-    reach_m = REACH_SIGMAS * stack.sigma_range_m
     a, _ = information_weights(mixture)
 
     def of_part(part: slice) -> None:
@@ -247,7 +247,7 @@ def expect(
         normals = np.einsum("nij,nj->ni", rotation, stack.normals[part])
         beams = np.einsum("nij,nj->ni", rotation, stack.beams[part])
         found, density, height, slide = components.densities(
-            points, normals, beams, stack.flatness[part], reach_m
+            points, normals, beams, stack.flatness[part], REACH_SIGMAS * stack.sigma_range_m
         )
         inliers = density.sum(axis=1)
         slides[part] = np.einsum("nk,nk->n", density, slide) / np.maximum(inliers, 1e-300)
@@ -258,21 +258,14 @@ def expect(
         levers[part] = cross(beams, np.column_stack(summed))
         forces[part], directions[part] = force, beams
 
-    # Every part is computed by itself, so that the result is the same on any number of cores.
+    # Parts are independent: the result is the same on any number of cores.
     share_out(of_part, parts(len(near), len(near) // PART_POINTS + 1))
-    inlier = stack.sum_per_cloud(alpha.sum(axis=1)) / np.diff(
-        np.append(stack.starts, len(stack.points))
-    )
-    on_components = [
-        np.bincount(
-            near.ravel(), (forces * directions[:, axis, None]).ravel(), len(mixture.weights)
-        )
-        for axis in range(3)
-    ]
+    moved = [(forces * direction[:, None]).ravel() for direction in directions.T]
+    on_components = [np.bincount(near.ravel(), m, len(mixture.weights)) for m in moved]
     return Responsibilities(
         component=near,
         alpha=alpha * cloud_weights[stack.cloud][:, None],
-        inlier_ratio=inlier,
+        inlier_ratio=stack.sum_per_cloud(alpha.sum(axis=1)) / stack.sizes,
         levers=stack.sum_per_cloud(levers),
         component_levers=cross(np.column_stack(on_components), mixture.normals_target),
         slides_m=slides,

@@ -21,7 +21,7 @@ PART_CLOUDS = 8
 """Clouds whose points are summed together: their sums stay in the processor's cache."""
 
 PRIOR_COUNT = 1e-12
-"""Points' worth of weight that keeps a component without points defined. More would add up over all
+"""Weight, in points, that keeps a component without points defined. More would add up over all
 components to information on the place of the target, which no cloud has."""
 
 MOMENTS = slice(0, 10)

@@ -38,7 +38,7 @@ def extract_targets(
         recordings: the drives.
         trajectories: one per drive; scans outside its span are left out.
         config: regions, initial guesses, ranges, filters.
-        progress: told of every scan.
+        progress: advances with every scan.
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; one per place for
@@ -97,8 +97,8 @@ def _regions(
         regions.append((found.region,))
         labels.append(label)
         lines = [
-            f"{label}: lidar '{name}' does not see it in any of {found.looked_at[name]} scans "
-            "looked at"
+            f"{label}: lidar '{name}' does not see it in any of the {found.looked_at[name]} scans "
+            "that were read"
             for name, scans in found.scans.items()
             if scans == 0 and found.looked_at[name]
         ]

@@ -156,7 +156,7 @@ def measure_grounds(
         trajectories: one per drive.
         targets: the stamps of their clouds are the poses of the graph.
         config: initial guesses, noise, and whether the ground is to be used.
-        progress: told of every scan.
+        progress: advances with every scan.
 
     Returns:
         Observations by drive, LiDAR and stamp, each at the stamp of a pose; and warnings.

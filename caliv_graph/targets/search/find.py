@@ -89,7 +89,7 @@ def find_target(
         recordings: the drives.
         trajectories: one per drive.
         config: initial guesses and their sigmas, ranges, minimum points and scans.
-        progress: told of every scan.
+        progress: advances with every scan.
 
     Returns:
         One target per drive, in their order.

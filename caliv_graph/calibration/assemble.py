@@ -29,6 +29,7 @@ from caliv_graph.products import (
     Solution,
 )
 from caliv_graph.uncertainty.observability import assess
+from caliv_graph.wording.directions import named
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -48,11 +49,14 @@ def assemble(
         recordings: the drives, for the provenance.
         digests: of the drives (`drive_digest`).
     """
-    uncertainty = assess(
-        solution.information_data,
-        solution.information_prior,
+    uncertainty = named(
+        assess(
+            solution.information_data,
+            solution.information_prior,
+            solution.T_vehicle_lidar,
+            solution.held,
+        ),
         solution.T_vehicle_lidar,
-        solution.held,
     )
     names = config.lidar_order()
     index = {name: i for i, name in enumerate(solution.lidars)}
@@ -74,18 +78,18 @@ def assemble(
             cov_joint[block, block] = guess_covariance(guesses[name], poses[name])
     cov_joint += to_right @ solution.cov @ to_right.T
     information += to_right @ information_data @ to_right.T
-    lidars = {}
-    for row, name in enumerate(names):
-        block = slice(6 * row, 6 * row + 6)
-        lidars[name] = LidarResult(
+    lidars = {
+        name: LidarResult(
             T_vehicle_lidar=poses[name],
-            cov=cov_joint[block, block],
+            cov=cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
             determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
             scans_used=used.get(name, 0),
             saw_target=used.get(name, 0) > 0,
             time_offset=solution.time_offsets.get(name),
             guess=guesses[name],
         )
+        for row, name in enumerate(names)
+    }
     complete = not uncertainty.undetermined and all(
         all(lidar.determined.values()) for lidar in lidars.values()
     )
@@ -105,10 +109,10 @@ def assemble(
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
-    """Information and gradient of the data (vehicle axes), less what `fixed: true` put in.
+    """Information and gradient of the data (vehicle axes), without what `fixed: true` added.
 
-    The solve takes a trusted mounting for one more measurement; it is still a guess, and two
-    calibrations that share it must not count it twice.
+    The solve counts a trusted extrinsic as a measurement. It is still a guess, and two calibrations
+    that share it must not count it twice.
     """
     information = solution.information_data.copy()
     gradient = None if solution.gradient_data is None else solution.gradient_data.copy()
@@ -124,7 +128,7 @@ def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Ar
             moved = vehicle_axes_difference(solution.T_vehicle_lidar[name], guess.T_vehicle_lidar)
             gradient[rows] += certainty * moved
         if name not in seen:
-            # Nothing is left but the rounding of large numbers.
+            # Only the rounding of large numbers is left.
             information[rows], information[:, rows] = 0.0, 0.0
             if gradient is not None:
                 gradient[rows] = 0.0

@@ -18,8 +18,8 @@ DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
 """(6,) 1 sigma of a guess for which nothing is stated: the defaults of the config."""
 
 TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
-"""Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
-0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
+"""Sigmas of an extrinsic that the user trusts (`fixed: true`): 0.1 mm and 0.01 mrad, far below what
+any drive determines, and still an invertible covariance."""
 
 
 def configured_guess(config: Config, name: str) -> Guess:

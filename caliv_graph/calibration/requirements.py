@@ -54,7 +54,7 @@ def _unmet(calibration: Calibration, requirement: str) -> list[str]:
 
 
 def sigmas_s2v(calibration: Calibration, name: str) -> Array:
-    """(6,) sigmas of a LiDAR's mounting in vehicle axes, rad and m."""
+    """(6,) sigmas of a LiDAR's extrinsic in vehicle axes, rad and m."""
     lidar = calibration.lidars[name]
     return np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
 

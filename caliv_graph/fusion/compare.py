@@ -33,6 +33,7 @@ from caliv_graph.uncertainty.observability import (
     spectrum,
 )
 from caliv_graph.uncertainty.pairs import sensor_pairs
+from caliv_graph.wording.directions import named
 
 ALPHA = 0.01
 """Chance of a false alarm when nothing has moved, over all tests of one comparison."""
@@ -281,7 +282,7 @@ def _told(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) ->
         data=unit[:, None] * W / np.sqrt(information),
         leak=leak,
         lost=U,
-        undetermined=tuple(d.text for d in assess(D, prior, poses).undetermined),
+        undetermined=tuple(d.text for d in named(assess(D, prior, poses), poses).undetermined),
     )
 
 

@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
-from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
+from caliv_graph.calibration.ground import TOGETHER_NS
+from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
 from caliv_graph.config.model import ExtractionConfig, PoseConfig, PoseSigmaConfig
@@ -46,8 +47,9 @@ from caliv_graph.trajectory.chain import POSE, STATE, Chain
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
+from caliv_graph.wording.directions import named_prediction
+from caliv_graph.wording.offsets import undetermined_offset_sentences
 
 Ground = Literal["none", "plane", "height"]
 """What is made of the ground: nothing; a plane of unknown height; one that the vehicle stands on at
@@ -209,13 +211,13 @@ def predict_drives(
     )
     return Prediction(
         names=tuple(scenario.name for scenario, _ in planned),
-        outlook=outlook,
+        outlook=named_prediction(outlook),
         sightings=tuple(seen),
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
             *_warnings(planned, seen, lidars, assumptions.time_offset),
-            *undetermined_offsets(offsets_s, OFFSET_DETERMINED_S),
+            *undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
 

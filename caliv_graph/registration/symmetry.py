@@ -178,40 +178,6 @@ def marginalise_symmetry(H: Array, gradient: Array, symmetry: Symmetry) -> tuple
     return 0.5 * (H + H.T), gradient - along @ solved[:, -1]
 
 
-def symmetry_sentence(symmetry: Symmetry, name: str, sigma_rad: float) -> str:
-    """States what a symmetry means for the calibration.
-
-    Args:
-        symmetry: of the target.
-        name: of the target.
-        sigma_rad: 1 sigma of the initial guess of a LiDAR's rotation, the largest of all LiDARs.
-    """
-    about = "the vertical" if symmetry.upright else "a horizontal axis"
-    beside = ""
-    if len(symmetry.unseen):
-        beside = f" (as far as it was seen: {100.0 * symmetry.compared:.0f} percent of it)"
-    if symmetry.continuous:
-        return (
-            f"{name}: it looks the same after any turn about {about}{beside}: its clouds determine "
-            "where a LiDAR is, but not the LiDAR's rotation about that axis. Drive around it, or "
-            "take a target with corners, a chair"
-        )
-    angle = math.degrees(symmetry.angle_rad)
-    # Registration converges to the nearer of two solutions.
-    needed, usual = 0.5 * angle, 3.0 * math.degrees(sigma_rad)
-    verdict = (
-        f"the guesses are right to {usual:.0f} degrees (3 sigma), so this does not happen"
-        if usual < needed
-        else f"the guesses may be off by {usual:.0f} degrees (3 sigma): give better ones, or take "
-        "a target that looks different from every side"
-    )
-    return (
-        f"{name}: it looks the same after a turn by {angle:.0f} degrees about {about}{beside}: "
-        f"a LiDAR whose guess is off by more than {needed:.0f} degrees is calibrated {angle:.0f} "
-        f"degrees off about it; {verdict}"
-    )
-
-
 def alarming(symmetry: Symmetry, sigma_rad: float) -> bool:
     """Whether a symmetry can bias a calibration whose guesses have this sigma of rotation (rad)."""
     return symmetry.continuous or 3.0 * sigma_rad >= 0.5 * symmetry.angle_rad

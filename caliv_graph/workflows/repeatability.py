@@ -102,7 +102,7 @@ def split_halves(
     Args:
         recording: the drive.
         config: as for `calibrate`.
-        progress: told of every stage.
+        progress: reports every stage.
         p_value: chance of a false alarm over all tests.
         motion: what the recording tells of the vehicle's motion, if it has been read already.
 

@@ -10,22 +10,24 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
-    GAUGE_PRIOR,
-    CloudLinearisation,
-    DenseSystem,
-    add_shape,
-    adjusted_residuals,
     cloud_graph,
-    dense_system,
     initial_values,
-    linearise_clouds,
     merged,
     optimise,
     pose_error_sigmas,
     pose_graph,
     prior_graph,
-    retract,
     with_given_poses,
+)
+from caliv_graph.calibration.linear import (
+    GAUGE_PRIOR,
+    CloudLinearisation,
+    DenseSystem,
+    add_shape,
+    adjusted_residuals,
+    dense_system,
+    linearise_clouds,
+    retract,
 )
 from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.errors import SolveError

@@ -26,7 +26,7 @@ from caliv_graph.products import (
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.targets.cloud.extract import extract_targets
-from caliv_graph.targets.ground.planes import measure_grounds
+from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 
 

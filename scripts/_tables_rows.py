@@ -33,7 +33,7 @@ from caliv_graph.results.run import CalibrationRun
 from caliv_graph.simulation import SimulatedRecording, SimulatedTruth
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.targets.ground.planes import GroundMeter
+from caliv_graph.targets.ground.measure import GroundMeter
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs

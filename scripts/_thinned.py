@@ -53,7 +53,7 @@ GROUND_NEAR_TARGET = 400
 GROUND_RADIUS_M = 15.5
 GROUND_PER_M2 = 3
 """Beams per square metre of the ground about the vehicle. Whole clouds have more, of which
-`targets.ground_planes` looks at ten; with three, what the noise leaves of a plane (0.02 mrad and
+`targets.ground.planes` looks at ten; with three, what the noise leaves of a plane (0.02 mrad and
 0.2 mm) is still far below the floors that it adds (0.5 mrad and 2 mm)."""
 
 SKY_STRIDE = 16

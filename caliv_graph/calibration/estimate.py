@@ -88,7 +88,7 @@ def _estimate(
             _deskewed(o, extrinsics, trajectories),
             config,
             normals=False,
-            shares=problem.view_weights(m),
+            view_weights=problem.view_weights(m),
         )
         for m, o in enumerate(observations)
     ]

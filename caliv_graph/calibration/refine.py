@@ -28,7 +28,7 @@ from caliv_graph.calibration.solve import (
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, Iteration, Solution
-from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
     FINE_SIGMA_M,
     JointRegistration,

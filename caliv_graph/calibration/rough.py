@@ -24,11 +24,11 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.products import GroundObservation, Registration, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
+from caliv_graph.registration.self_comparison import views_of
 from caliv_graph.registration.symmetry import (
     Symmetry,
     alarming,
     symmetries,
-    views_of,
 )
 from caliv_graph.wording.offsets import undetermined_offset_sentences
 from caliv_graph.wording.symmetries import symmetry_sentence
@@ -84,7 +84,7 @@ def rough_solve(
     with progress.stage("registering the clouds", len(observations)) as advance:
         for m, observation in enumerate(observations):
             state = JointRegistration(
-                observation, config, rough=True, shares=problem.view_weights(m)
+                observation, config, rough=True, view_weights=problem.view_weights(m)
             )
             registrations.append(register_jointly(state, prealigned(problem, m), iterations))
             advance()

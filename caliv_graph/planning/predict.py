@@ -41,7 +41,8 @@ from caliv_graph.scenario.drives import Drive, make_drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.targets.cloud.views import view_weights
-from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, MAX_APART_NS, NORMAL_FLOOR_RAD
+from caliv_graph.targets.ground.measure import MAX_APART_NS
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,

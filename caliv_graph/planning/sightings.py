@@ -18,8 +18,7 @@ from caliv_graph.scenario.drives import Drive, sample_stamps
 from caliv_graph.scenario.model import LidarModel, ObjectModel, Scenario, WorldModel
 from caliv_graph.scenario.shapes import make_world
 from caliv_graph.scenario.terrain import Terrain, make_terrain
-from caliv_graph.targets.cloud.extract import TOTAL_PER_LIDARS
-from caliv_graph.targets.cloud.views import evenly_spread
+from caliv_graph.targets.cloud.views import clouds_per_lidar, evenly_spread
 
 SEEN_PART = 0.87
 """Part of the surface that faces a LiDAR that returns points: the rest hides behind itself. 480
@@ -272,9 +271,7 @@ def thinned(shares: Array, seeing: int, extraction: ExtractionConfig) -> IntArra
     """
     if len(shares) < extraction.min_scans:
         return np.zeros(0, dtype=np.int64)
-    most = extraction.max_scans
-    most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
-    return evenly_spread(shares, most)
+    return evenly_spread(shares, clouds_per_lidar(extraction.max_scans, seeing))
 
 
 def sees_ground(model: LidarModel) -> bool:

@@ -25,7 +25,7 @@ def symmetry_sentence(symmetry: Symmetry, name: str, sigma_rad: float) -> str:
             "determine the rotation of a LiDAR about that axis. Drive around it, or use a target "
             "with corners, such as a chair"
         )
-    turn = math.degrees(symmetry.turn_rad)
+    turn = math.degrees(symmetry.angle_rad)
     # Registration converges to the nearer of two solutions.
     limit, guess = 0.5 * turn, 3.0 * math.degrees(sigma_rad)
     verdict = (

@@ -61,11 +61,8 @@ from caliv_graph.products import (
     Trajectory,
 )
 from caliv_graph.simulation import load_scenario, simulate_drive
-from caliv_graph.targets.ground.planes import (
-    DISTANCE_FLOOR_M,
-    NORMAL_FLOOR_RAD,
-    measure_grounds,
-)
+from caliv_graph.targets.ground.measure import measure_grounds
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.uncertainty.observability import scaling
 from tests.calibration.problems import Case, make_case, moved, predictions

@@ -17,7 +17,7 @@ def upright(turn_deg: float, unseen: int = 0) -> Symmetry:
     return Symmetry(
         axis_target=np.array([0.0, 0.0, 1.0]),
         centre_target=np.zeros(3),
-        turn_rad=math.radians(turn_deg),
+        angle_rad=math.radians(turn_deg),
         fitted_rad=math.radians(turn_deg or 160.0),
         compared=0.6,
         contradicted=0.02,

@@ -12,7 +12,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
@@ -36,7 +35,7 @@ from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets.ground.measure import GroundMeter
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs, sigmas_s2s, sigmas_s2v
 
 PERCENTILE = 10.0
 """The paper's k."""

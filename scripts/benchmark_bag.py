@@ -35,7 +35,6 @@ import numpy as np
 from rosbags.interfaces import Connection
 from scipy.special import jn_zeros
 
-from caliv_graph.calibration.requirements import sigmas_s2s
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError
@@ -48,6 +47,7 @@ from caliv_graph.simulation.bag import BagWriter
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
+from caliv_graph.uncertainty.pairs import sigmas_s2s
 from scripts._command import COMMAND, Usage, between, calibrate_measured, exit_code_of
 
 RATE_HZ = 10.0

@@ -4,30 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 import caliv_graph
-from caliv_graph.calibration.guesses import configured_guess, guess_covariance
+from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
-from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import (
-    right_to_vehicle_axes,
     vehicle_axes_difference,
 )
 from caliv_graph.products import (
     Array,
     Calibration,
     Guess,
-    LidarResult,
     Recording,
     Solution,
 )
+from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess
 from caliv_graph.wording.directions import named
 
@@ -58,54 +55,21 @@ def assemble(
         ),
         solution.T_vehicle_lidar,
     )
-    names = config.lidar_order()
-    index = {name: i for i, name in enumerate(solution.lidars)}
-    used = _scans_used(solution)
-    size = 6 * len(names)
-    to_right = np.zeros((size, 6 * len(solution.lidars)))
-    cov_joint, information = np.zeros((size, size)), np.zeros((size, size))
-    guesses = {name: configured_guess(config, name) for name in names}
-    information_data, gradient_data = _without_trust(solution, guesses)
-    poses: dict[str, gtsam.Pose3] = {}
-    for row, name in enumerate(names):
-        block = slice(6 * row, 6 * row + 6)
-        if name in index:
-            poses[name] = solution.T_vehicle_lidar[name]
-            column = slice(6 * index[name], 6 * index[name] + 6)
-            to_right[block, column] = right_to_vehicle_axes(poses[name]).T
-        else:
-            poses[name] = guesses[name].T_vehicle_lidar
-            cov_joint[block, block] = guess_covariance(guesses[name], poses[name])
-    cov_joint += to_right @ solution.cov @ to_right.T
-    information += to_right @ information_data @ to_right.T
-    lidars = {
-        name: LidarResult(
-            T_vehicle_lidar=poses[name],
-            cov=cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
-            determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
-            scans_used=used.get(name, 0),
-            saw_target=used.get(name, 0) > 0,
-            time_offset=solution.time_offsets.get(name),
-            guess=guesses[name],
-        )
-        for row, name in enumerate(names)
-    }
-    complete = not uncertainty.undetermined and all(
-        all(lidar.determined.values()) for lidar in lidars.values()
+    guesses = {name: configured_guess(config, name) for name in config.lidar_order()}
+    information, gradient = _without_trust(solution, guesses)
+    draft = assemble_matrices(
+        {name: solution.T_vehicle_lidar[name] for name in solution.lidars},
+        guesses,
+        solution.cov,
+        information,
+        uncertainty,
+        solution.reference,
+        _scans_used(solution),
+        gradient,
+        solution.time_offsets,
     )
-    draft = Calibration(
-        status="ok" if complete else "partial",
-        reference=solution.reference,
-        lidars=lidars,
-        cov_joint=0.5 * (cov_joint + cov_joint.T),
-        information_data=0.5 * (information + information.T),
-        undetermined=uncertainty.undetermined,
-        weak=uncertainty.weak,
-        unmet=(),
-        provenance=_provenance(config, recordings, solution, digests),
-        gradient_data=None if gradient_data is None else to_right @ gradient_data,
-    )
-    return unmet_requirements(draft, config)
+    provenance = _provenance(config, recordings, solution, digests)
+    return unmet_requirements(replace(draft, provenance=provenance), config)
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config, PoseSigmaConfig
-from caliv_graph.geometry.se3 import (
-    right_to_vehicle_axes,
-)
 from caliv_graph.products import (
-    Array,
     Guess,
 )
 
@@ -27,9 +22,3 @@ def configured_guess(config: Config, name: str) -> Guess:
     lidar = config.lidars[name]
     sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
     return Guess(lidar.initial.pose(), sigmas, lidar.fixed)
-
-
-def guess_covariance(guess: Guess, T_vehicle_lidar: gtsam.Pose3) -> Array:
-    """(6, 6) covariance of a guess, right perturbation of `T_vehicle_lidar`."""
-    axes = right_to_vehicle_axes(T_vehicle_lidar)
-    return np.asarray(axes.T @ np.diag(guess.sigmas**2) @ axes)

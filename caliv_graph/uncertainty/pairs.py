@@ -1,4 +1,4 @@
-"""Pairs of LiDARs: which there are, their covariance, and which of their axes are determined."""
+"""Sigmas of LiDARs and of pairs of LiDARs, and which axes of a pair are determined."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.covariance import relative_covariance, relative_jacobian
+from caliv_graph.geometry.covariance import (
+    parent_axes_covariance,
+    relative_covariance,
+    relative_jacobian,
+)
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration
 from caliv_graph.uncertainty.observability import (
@@ -35,6 +39,19 @@ def pair_covariance(calibration: Calibration, source: str, to: str) -> Array:
     """Covariance of `T_to_from`, (6, 6), right perturbation (frame of `from`), priors included."""
     a, b = (calibration.lidars[name].T_vehicle_lidar for name in (source, to))
     return relative_covariance(a, b, _block(calibration, calibration.cov_joint, source, to))
+
+
+def sigmas_s2v(calibration: Calibration, name: str) -> Array:
+    """(6,) sigmas of a LiDAR's extrinsic in vehicle axes, rad and m."""
+    lidar = calibration.lidars[name]
+    return np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
+
+
+def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
+    """(6,) sigmas of `source` against `to` in vehicle axes, rad and m."""
+    cov = pair_covariance(calibration, source, to)
+    T_vehicle_source = calibration.lidars[source].T_vehicle_lidar
+    return np.sqrt(np.diag(parent_axes_covariance(T_vehicle_source, cov)))
 
 
 def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:

@@ -35,8 +35,8 @@ from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import SimulatedTruth
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.smoothing import smooth_trajectory
 from scripts._ukf import filter_trajectory
 
 SCENARIOS = ("paper_arc", "figure_eight")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import MotionData, Recording, Trajectory
+from caliv_graph.products import MotionData, Trajectory
 
 
 def given_trajectory(motion: MotionData) -> Trajectory:
@@ -22,13 +20,3 @@ def given_trajectory(motion: MotionData) -> Trajectory:
             f"{motion.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"
         )
     return Trajectory(poses.stamps_ns, poses.T_map_vehicle)
-
-
-def given_trajectories(recordings: Sequence[Recording]) -> tuple[Trajectory, ...]:
-    """The given vehicle poses of each drive, as a trajectory.
-
-    Raises:
-        TrajectoryError: a recording has fewer than two poses.
-        RecordingError: its poses could not be read.
-    """
-    return tuple(given_trajectory(recording.motion()) for recording in recordings)

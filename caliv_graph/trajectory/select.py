@@ -17,8 +17,8 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
 from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
-from caliv_graph.trajectory.smoothing import smooth_trajectory
 
 TWIST_WINDOW_NS = 50_000_000
 """Half the time over which the vehicle's velocity is averaged."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -13,7 +13,6 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain
-from caliv_graph.trajectory.factors import marginal_factor
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
 
 MERGE_NS = 1_000
@@ -40,16 +39,16 @@ class States:
     gyro_bias: Array
     yaw_bias_rad: float = 0.0
 
-    def first(self, n: int) -> States:
-        """The first n nodes."""
-        return replace(
-            self,
-            R_map_imu=self.R_map_imu[:n],
-            p_map_imu=self.p_map_imu[:n],
-            velocity_map=self.velocity_map[:n],
-            force_bias=self.force_bias[:n],
-            gyro_bias=self.gyro_bias[:n],
-        )
+
+def poses_of_vehicle(
+    states: States, nodes: IntArray, T_vehicle_imu: gtsam.Pose3
+) -> tuple[gtsam.Pose3, ...]:
+    """T_map_vehicle of some nodes, by their indices."""
+    T_imu_vehicle = T_vehicle_imu.inverse()
+    return tuple(
+        gtsam.Pose3(gtsam.Rot3(R), p).compose(T_imu_vehicle)
+        for R, p in zip(states.R_map_imu[nodes], states.p_map_imu[nodes], strict=True)
+    )
 
 
 def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> DeadReckoning:
@@ -231,19 +230,5 @@ class SmoothedTrajectory:
         inverse = np.linalg.inv(Ad)
         turned = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
         information = turned.reshape(POSE * m, POSE * m)
-        return 0.5 * (information + information.T), self.node_poses(i)
-
-    def joint_factor(
-        self, keys: Sequence[int], stamps_ns: Sequence[int] | IntArray
-    ) -> gtsam.LinearContainerFactor:
-        """`joint_information` as one native factor on `keys`, for another graph."""
-        information, poses = self.joint_information(stamps_ns)
-        return marginal_factor(list(keys), information, poses)
-
-    def node_poses(self, i: IntArray) -> tuple[gtsam.Pose3, ...]:
-        """T_map_vehicle of nodes by their indices."""
-        T_iv = self.T_vehicle_imu.inverse()
-        return tuple(
-            gtsam.Pose3(gtsam.Rot3(R), p).compose(T_iv)
-            for R, p in zip(self.states.R_map_imu[i], self.states.p_map_imu[i], strict=True)
-        )
+        poses = poses_of_vehicle(self.states, i, self.T_vehicle_imu)
+        return 0.5 * (information + information.T), poses

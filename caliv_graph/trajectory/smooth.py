@@ -26,7 +26,7 @@ from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.outliers import solve_without_outliers
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
-from caliv_graph.trajectory.solve import chain_of, pose_covariances, solve_from_the_start
+from caliv_graph.trajectory.solve import chain_of, covariances_of, solve_from_the_start
 
 BIAS_SIGMAS = 5.0
 """Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
@@ -54,12 +54,8 @@ def smooth_trajectory(
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
     robust = solve_without_outliers(data, nodes, states)
     data, estimate = robust.data, robust.estimate
-    chain = chain_of(estimate, data.yaw_bias)
-    cov_imu = pose_covariances(chain, data, estimate.states)
-    yaw_bias = None
-    if data.yaw_bias:
-        sigma = float(np.sqrt(chain.common_covariance()[0, 0]))
-        yaw_bias = (estimate.states.yaw_bias_rad, sigma)
+    linear = estimate.graph.factors.linearize(estimate.values)
+    cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
     warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov_imu),
@@ -70,12 +66,12 @@ def smooth_trajectory(
         states=estimate.states,
         T_vehicle_imu=data.T_vehicle_imu,
         gravity_m_s2=data.gravity_m_s2,
-        yaw_bias=yaw_bias,
+        yaw_bias=None if yaw_sigma is None else (estimate.states.yaw_bias_rad, yaw_sigma),
         gnss_rejected=_rejected_stamps(data, robust.dropped),
         origin_deg_m=None if data.positions is None else data.positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
-        chain=chain,
+        chain=chain_of(linear, len(nodes), data.yaw_bias),
         inertial=data.inertial,
         factor_kinds=tuple(estimate.graph.kinds),
     )

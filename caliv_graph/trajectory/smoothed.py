@@ -9,11 +9,13 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.marginals import Marginals, node_ordering
 
 MERGE_NS = 1_000
 """Stamps nearer to each other share a node: a vehicle moves by less than 0.05 mm."""
@@ -194,6 +196,15 @@ class SmoothedTrajectory:
         arm = self.T_vehicle_imu.inverse().translation()
         at_origin = np.einsum("nji,nj->ni", R, v) + np.cross(rates, arm)
         return at_origin @ R_vi.T, rates @ R_vi.T
+
+    def bias_sigmas(self) -> tuple[Array, Array]:
+        """1 sigma of the biases at the nodes: (n, 3) m/s^2 and (n, 3) rad/s, imu frame."""
+        n = len(self.nodes_ns)
+        linear = self.graph.linearize(self.values)
+        marginals = Marginals(linear, node_ordering(n, self.yaw_bias is not None))
+        cov = marginals.covariances([key_bias(i) for i in range(n)])
+        sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        return sigmas[:, :3], sigmas[:, 3:]
 
     def _node_indices(self, stamps_ns: Sequence[int] | IntArray) -> IntArray:
         stamps = np.asarray(stamps_ns, dtype=np.int64)

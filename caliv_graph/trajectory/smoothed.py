@@ -1,4 +1,4 @@
-"""What a smoothed drive offers: poses at any time, and their joint information."""
+"""The smoothed trajectory: poses at any time, and their joint information."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpo
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 
 MERGE_NS = 1_000
-"""Stamps nearer to each other share a node: a vehicle moves by less than 0.05 mm."""
+"""Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def poses_of_vehicle(
 
 
 def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> DeadReckoning:
-    """Dead reckoning with the biases found, linear between nodes."""
+    """Dead reckoning with the biases of an estimate, linear between nodes."""
     at = inertial.stamps_ns
     return DeadReckoning(
         at,
@@ -71,7 +71,7 @@ def within_span(
     Args:
         stamps_ns: (m,) in any order.
         span_ns: first and last that there may be.
-        whose: span it is, for the message.
+        whose: name of the span, for the message.
 
     Raises:
         TrajectoryError: a stamp is outside.
@@ -91,22 +91,22 @@ class SmoothedTrajectory:
 
     Attributes:
         trajectory: poses, covariances, velocities at the wanted stamps within the span.
-        lost_ns: wanted stamps outside the span: the IMU says nothing about them.
-        warnings: what was left out or looks wrong, a line each.
+        lost_ns: wanted stamps outside the span of the IMU.
+        warnings: about data that were left out or look wrong, a line each.
         noise_sources: sensor -> where its noise figures are from.
         nodes_ns: (n,) stamps of the nodes.
         states: estimates at the nodes.
-        T_vehicle_imu: mounting that was used.
-        gravity_m_s2: that was used, along -z of the map.
+        T_vehicle_imu: extrinsic that was used.
+        gravity_m_s2: magnitude that was used, along -z of the map.
         yaw_bias: (value, sigma) in radians of the orientation source, if estimated.
         gnss_rejected: (k,) stamps of fixes that were dropped as outliers.
         origin_deg_m: latitude, longitude and altitude of the map's origin, None without GNSS.
         graph: the factors, over T_map_imu (i), velocity (v), bias (b), yaw bias (y).
-        values: the estimate that belongs to it.
-        chain: its information at the estimate.
+        values: the estimate, as values of the graph.
+        chain: the graph's information at the estimate.
         inertial: the IMU samples used.
         factor_kinds: of each factor of the graph, in order: `imu`, `gnss`, `orientation`,
-            `velocity`, or `prior` for what is assumed.
+            `velocity`, or `prior`.
     """
 
     trajectory: Trajectory
@@ -136,7 +136,7 @@ class SmoothedTrajectory:
         return without_bias(self.inertial, self.nodes_ns, self.states)
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
-        """Vehicle poses at any times within the span: the estimate, carried on by the IMU.
+        """Vehicle poses at any times within the span: the IMU's motion from the node before.
 
         Args:
             stamps_ns: (m,) in any order.
@@ -156,8 +156,9 @@ class SmoothedTrajectory:
         i = np.clip(np.searchsorted(self.nodes_ns, stamps, "right") - 1, 0, len(self.nodes_ns) - 2)
         R, p, v = self._carried(i, stamps)
         miss_R, miss_p, miss_v = self._misses
-        # What the IMU misses the next node by is spread over the interval: linearly in rotation, a
-        # cubic in position, so that position and velocity agree at both nodes.
+        # Dead reckoning misses the next node. The difference is distributed over the interval:
+        # linearly in rotation, as a cubic in position, so that position and velocity agree at both
+        # nodes.
         T = (self.nodes_ns[i + 1] - self.nodes_ns[i])[:, None] * 1e-9
         s = (stamps - self.nodes_ns[i])[:, None] * 1e-9 / T
         R = R @ exp_so3(s * miss_R[i])
@@ -221,10 +222,10 @@ class SmoothedTrajectory:
     def joint_information(
         self, stamps_ns: Sequence[int] | IntArray
     ) -> tuple[Array, tuple[gtsam.Pose3, ...]]:
-        """The Gaussian that all motion data put on the vehicle's poses at some stamps together.
+        """The joint Gaussian of the vehicle's poses at some stamps, given all motion data.
 
         Args:
-            stamps_ns: (m,) increasing, of those that the trajectory was asked for.
+            stamps_ns: (m,) increasing, among the wanted stamps.
 
         Returns:
             Information (6 m, 6 m), right perturbations, rotation then translation, rad and m,
@@ -239,7 +240,7 @@ class SmoothedTrajectory:
         # d_imu = Ad(T_imu_vehicle) d_vehicle, as T_map_vehicle = T_map_imu T_imu_vehicle.
         Ad = np.asarray(self.T_vehicle_imu.AdjointMap())
         inverse = np.linalg.inv(Ad)
-        turned = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
-        information = turned.reshape(POSE * m, POSE * m)
+        rotated = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
+        information = rotated.reshape(POSE * m, POSE * m)
         poses = poses_of_vehicle(self.states, i, self.T_vehicle_imu)
         return 0.5 * (information + information.T), poses

@@ -121,8 +121,8 @@ def optimise(
 ) -> gtsam.Values:
     """Gauss-Newton, with Levenberg-Marquardt damping where a full step does not descend.
 
-    GTSAM's `LevenbergMarquardtOptimizer` ends in the same place (1e-13 m) and takes 10 times as
-    long on a graph with factors in Python (`scripts/benchmark_trajectory.py --solvers`).
+    GTSAM's optimisers end in the same place (1e-13 m) and take 6 to 14 times as long on a graph
+    with factors in Python (`scripts/benchmark_trajectory.py --solvers`).
 
     Args:
         graph: over n nodes.

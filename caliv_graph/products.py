@@ -194,7 +194,8 @@ class Trajectory:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n poses.
         cov: (n, 6, 6) marginal covariance of each pose, right perturbation (vehicle frame),
-            rotation then translation, rad and m; None: not known.
+            rotation then translation, rad and m; of given poses as the messages state it, NaN where
+            unknown. None: not known.
     """
 
     stamps_ns: IntArray

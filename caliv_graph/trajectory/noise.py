@@ -27,6 +27,11 @@ PAPER_VELOCITY_M_S = 0.1
 DEFAULT_FORCE_WALK_M_S3 = 5e-4
 DEFAULT_GYRO_WALK_RAD_S2 = 1e-5
 
+MIN_POSE_ROTATION_RAD = 2e-5
+MIN_POSE_POSITION_M = 2e-4
+"""Smallest sigmas taken from a message of a given pose: below what any cloud of a target resolves.
+Some drivers state 1e-9 instead of an unknown covariance."""
+
 
 @dataclass(frozen=True)
 class ImuNoise:
@@ -138,6 +143,39 @@ def orientation_covariances(imu: ImuSamples, config: Config) -> tuple[Array, str
     return _per_message(
         len(imu.stamps_ns), configured, imu.orientation_cov, PAPER_ORIENTATION_RAD**2 * np.eye(3)
     )
+
+
+def given_pose_covariances(cov: Array | None, config: Config) -> Array | None:
+    """Covariances of the white errors of given poses; the config's figures before the messages'.
+
+    Args:
+        cov: (m, 6, 6) of the messages, rotation then position, NaN where unknown; None: no message
+            states one.
+        config: `noise.pose_rotation_deg` and `noise.pose_position_m`.
+
+    Returns:
+        (m, 6, 6) with no sigma below `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`, NaN where
+        unknown. None: all unknown, or the config gives both figures.
+    """
+    rotation_deg, position_m = config.noise.pose_rotation_deg, config.noise.pose_position_m
+    if cov is None or (rotation_deg is not None and position_m is not None):
+        return None
+    out, known = cov.copy(), stated(cov)
+    if not known.any():
+        return None
+    for block, sigma in (
+        (slice(0, 3), None if rotation_deg is None else math.radians(rotation_deg)),
+        (slice(3, 6), position_m),
+    ):
+        if sigma is not None:
+            out[:, block, :] = 0.0
+            out[:, :, block] = 0.0
+            out[:, block, block] = sigma**2 * np.eye(3)
+    least = np.array([MIN_POSE_ROTATION_RAD] * 3 + [MIN_POSE_POSITION_M] * 3) ** 2
+    at = np.arange(6)
+    out[:, at, at] = np.maximum(out[:, at, at], least)
+    out[~known] = np.nan
+    return out
 
 
 def gnss_covariances(gnss: GnssFixes, config: Config) -> tuple[Array, str]:

@@ -16,7 +16,8 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
-from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.given import error_covariances, given_trajectory
+from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
 
@@ -52,7 +53,7 @@ class GivenTrajectory:
     """Given poses; between two of them angular velocity and velocity are constant.
 
     Attributes:
-        trajectory: the poses at their own stamps.
+        trajectory: the poses at their own stamps, and the covariances that their messages state.
         lost_ns: wanted stamps outside their span.
         warnings: a line each.
     """
@@ -90,6 +91,22 @@ class GivenTrajectory:
         s = (stamps - self.span_ns[0]) * 1e-9
         position = np.stack([np.interp(s, seconds, axis) for axis in t.T], axis=1)
         return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
+
+    def error_covariances(self, stamps_ns: Sequence[int] | IntArray) -> Array | None:
+        """Covariances of the poses' errors as the messages state them.
+
+        Args:
+            stamps_ns: (m,) in any order.
+
+        Returns:
+            (m, 6, 6) rotation in vehicle axes (rad), then position in map axes (m); NaN where
+            unknown. None: no message states one.
+
+        Raises:
+            TrajectoryError: a stamp is outside the span.
+        """
+        stamps = within_span(stamps_ns, self.span_ns, "the given poses")
+        return error_covariances(self.trajectory, stamps)
 
 
 def wanted_stamps(recording: Recording) -> IntArray:
@@ -137,11 +154,11 @@ def takes_given_poses(motion: MotionData, config: Config) -> bool:
 
 def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
-    given = GivenTrajectory(trajectory)
-    begin, end = given.span_ns
+    begin, end = GivenTrajectory(trajectory).span_ns
     lost = stamps[(stamps < begin) | (stamps > end)]
+    warnings = _unknown_covariances(trajectory, motion.name)
     if not len(lost):
-        return given
+        return GivenTrajectory(trajectory, (), warnings)
     if len(lost) == len(stamps):
         raise TrajectoryError(
             f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
@@ -150,7 +167,20 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     line = (
         f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
     )
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line,))
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line, *warnings))
+
+
+def _unknown_covariances(trajectory: Trajectory, name: str) -> tuple[str, ...]:
+    """A line if some messages state a covariance and others do not."""
+    if trajectory.cov is None:
+        return ()
+    known = stated(trajectory.cov)
+    if known.all() or not known.any():
+        return ()
+    return (
+        f"{name}: {int((~known).sum())} of {len(known)} vehicle poses state no covariance: their "
+        "white error is estimated",
+    )
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:

@@ -1,4 +1,4 @@
-"""Given poses become a trajectory, unchanged."""
+"""Given poses become a trajectory, unchanged, with the covariances of their messages."""
 
 from __future__ import annotations
 
@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import GivenPoses, MotionData
+from caliv_graph.products import Array, GivenPoses, MotionData, Trajectory
 from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.noise import (
+    MIN_POSE_POSITION_M,
+    MIN_POSE_ROTATION_RAD,
+    given_pose_covariances,
+)
+from caliv_graph.trajectory.select import GivenTrajectory, smooth_trajectories
+from tests.trajectory.motions import Sensors, config_for
 
 
 def recorded(*stamps_ns: int) -> MotionData:
@@ -39,3 +46,93 @@ def test_one_pose_is_no_drive(stamps: tuple[int, ...]) -> None:
 def test_a_drive_without_poses_is_an_error() -> None:
     with pytest.raises(TrajectoryError, match="drive/: has no vehicle poses"):
         given_trajectory(MotionData("drive/"))
+
+
+SIGMAS = np.array([0.001, 0.002, 0.003, 0.01, 0.02, 0.03])
+UNKNOWN = np.full((6, 6), np.nan)
+
+
+def facing_north(*covs: Array) -> Trajectory:
+    """Poses a microsecond apart, the vehicle's x axis along the map's y."""
+    poses = tuple(gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.zeros(3)) for _ in covs)
+    return Trajectory(np.arange(len(covs), dtype=np.int64) * 1000, poses, np.array(covs))
+
+
+def test_covariances_are_turned_into_the_axes_of_the_errors() -> None:
+    given = GivenTrajectory(facing_north(np.diag(SIGMAS**2), 4.0 * np.diag(SIGMAS**2)))
+    cov = given.error_covariances([0, 1000, 250])
+    assert cov is not None
+    # Rotation stays in vehicle axes; forward (10 mm) is north, left (20 mm) is west.
+    expected = np.diag(SIGMAS[[0, 1, 2, 4, 3, 5]] ** 2)
+    np.testing.assert_allclose(cov[0], expected, atol=1e-15)
+    np.testing.assert_allclose(cov[1], 4.0 * expected, atol=1e-15)
+    np.testing.assert_allclose(cov[2], 1.75 * expected, atol=1e-15)
+
+
+def test_a_pose_next_to_one_of_unknown_covariance_keeps_its_own() -> None:
+    given = GivenTrajectory(facing_north(UNKNOWN, np.diag(SIGMAS**2), UNKNOWN))
+    cov = given.error_covariances([0, 999, 1000, 1001])
+    assert cov is not None
+    assert np.isfinite(cov).all(axis=(1, 2)).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    "cov", [np.zeros((6, 6)), UNKNOWN, -np.eye(6), np.diag([1.0, 1, 1, 1, 1, 0])], ids=str
+)
+def test_a_covariance_that_is_none_is_unknown(cov: Array) -> None:
+    assert GivenTrajectory(facing_north(cov, cov)).error_covariances([0, 10]) is None
+
+
+def test_the_config_goes_before_the_messages() -> None:
+    full = np.diag(SIGMAS**2)
+    full[0, 4] = full[4, 0] = 0.5 * SIGMAS[0] * SIGMAS[4]
+    position = config_for(Sensors(), noise={"pose_position_m": 0.5})
+    both = config_for(Sensors(), noise={"pose_position_m": 0.5, "pose_rotation_deg": 1.0})
+    silent = config_for(Sensors())
+
+    cov = given_pose_covariances(np.array([full, UNKNOWN]), position)
+    kept = given_pose_covariances(full[None], silent)
+
+    assert cov is not None
+    assert kept is not None
+    np.testing.assert_allclose(cov[0], np.diag([*SIGMAS[:3] ** 2, 0.25, 0.25, 0.25]))
+    assert np.isnan(cov[1]).all()
+    np.testing.assert_array_equal(kept[0], full)
+    assert given_pose_covariances(full[None], both) is None
+    assert given_pose_covariances(None, silent) is None
+
+
+def test_no_message_is_trusted_without_bound() -> None:
+    cov = given_pose_covariances(1e-18 * np.eye(6)[None], config_for(Sensors()))
+    assert cov is not None
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(cov[0])), [MIN_POSE_ROTATION_RAD] * 3 + [MIN_POSE_POSITION_M] * 3
+    )
+
+
+class PosesOnly:
+    """A recording of which nothing but the poses is read."""
+
+    name = "drive/"
+    lidars = ()
+
+    def __init__(self, *covs: Array) -> None:
+        given = facing_north(*covs)
+        self._poses = GivenPoses(given.stamps_ns, given.T_map_vehicle, given.cov)
+
+    def motion(self) -> MotionData:
+        return MotionData("drive/", poses=self._poses)
+
+
+def test_messages_that_state_none_among_others_are_reported() -> None:
+    known = np.diag(SIGMAS**2)
+    for covs, lines in (
+        ((known, known), ()),
+        ((UNKNOWN, UNKNOWN), ()),
+        (
+            (known, UNKNOWN, known),
+            ("drive/: 1 of 3 vehicle poses state no covariance: their white error is estimated",),
+        ),
+    ):
+        (given,) = smooth_trajectories([PosesOnly(*covs)], config_for(Sensors()), [[0]])  # type: ignore[list-item]
+        assert given.warnings == lines

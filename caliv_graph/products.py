@@ -195,27 +195,13 @@ class Trajectory:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n poses.
         cov: (n, 6, 6) marginal covariance of each pose, right perturbation (vehicle frame),
-            rotation then translation, rad and m; None: not known.
-        velocity_vehicle: (n, 3) m/s of the vehicle's origin in vehicle axes; None: not known.
-        angular_velocity_vehicle: (n, 3) rad/s in vehicle axes; None: not known.
+            rotation then translation, rad and m; of given poses as the messages state it, NaN where
+            unknown. None: not known.
     """
 
     stamps_ns: IntArray
     T_map_vehicle: tuple[gtsam.Pose3, ...]
     cov: Array | None = None
-    velocity_vehicle: Array | None = None
-    angular_velocity_vehicle: Array | None = None
-
-    def pose_at(self, stamp_ns: int) -> gtsam.Pose3:
-        """The pose at a stamp of the trajectory.
-
-        Raises:
-            KeyError: the trajectory has no such stamp.
-        """
-        index = int(np.searchsorted(self.stamps_ns, stamp_ns))
-        if index == len(self.stamps_ns) or self.stamps_ns[index] != stamp_ns:
-            raise KeyError(stamp_ns)
-        return self.T_map_vehicle[index]
 
 
 @dataclass(frozen=True)

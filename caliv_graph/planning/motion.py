@@ -28,7 +28,7 @@ Source = Literal["sensors", "poses"]
 """Where the vehicle's poses come from: IMU, GNSS and velocity, or given with the recording."""
 
 NODE_NS = NANOSECONDS_PER_SECOND // 10
-"""Nodes are no farther apart, as in `trajectory.smoothing`."""
+"""Nodes are no farther apart, as in `trajectory.nodes`."""
 
 MERGE_NS = 1_000_000
 """Stamps nearer than this share a node."""

@@ -170,7 +170,8 @@ class PoseNoise:
 
     The errors of filtered poses are correlated in time, so white noise alone is the wrong model:
     a first-order Gauss-Markov process (exponential correlation) stands for the drift. Position
-    errors are in map axes, rotation errors in vehicle axes; all axes alike.
+    errors are in map axes, rotation errors in vehicle axes; all axes alike. The covariance that a
+    pose's message states replaces the white part.
 
     Attributes:
         white_rotation_rad: 1 sigma of the white part, per axis.

@@ -99,15 +99,27 @@ def given_pose_factor(
     T_map_vehicle: gtsam.Pose3,
     sigma_rotation_rad: float,
     sigma_position_m: float,
+    cov: Array | None = None,
 ) -> gtsam.CustomFactor:
     """A given pose with a white error and the Gauss-Markov error b_i.
 
     `r = [Log(R_given^T R) - b_rotation, t - t_given - b_position]`: rotation in vehicle axes,
     position in map axes, since a position filter's error does not turn with the vehicle.
+
+    Args:
+        key_pose: of X_i.
+        key_pose_error: of b_i.
+        T_map_vehicle: as given.
+        sigma_rotation_rad: of the white error, per axis.
+        sigma_position_m: of the white error, per axis.
+        cov: (6, 6) of the white error, in place of the two sigmas; None: the sigmas.
     """
     R_given = T_map_vehicle.rotation()
     t_given = T_map_vehicle.translation()
     sigmas = np.array([sigma_rotation_rad] * 3 + [sigma_position_m] * 3)
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    if cov is not None:
+        noise = gtsam.noiseModel.Gaussian.Covariance(cov)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T = values.atPose3(key_pose)
@@ -120,9 +132,7 @@ def given_pose_factor(
             jacobians[1] = -np.eye(6)
         return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
 
-    return gtsam.CustomFactor(
-        gtsam.noiseModel.Diagonal.Sigmas(sigmas), [key_pose, key_pose_error], error
-    )
+    return gtsam.CustomFactor(noise, [key_pose, key_pose_error], error)
 
 
 def gauss_markov_factor(

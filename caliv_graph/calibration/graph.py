@@ -98,6 +98,7 @@ def pose_graph(
     graph = merged(motion_graph(problem) if motion is None else motion)
     times, drives, given = problem.times_s(), problem.drives(), problem.given()
     stationary = pose_error_sigmas(noise)
+    stated = problem.stated()
     for i in np.flatnonzero(given).tolist():
         T = problem.T_map_vehicle[i]
         graph.append(
@@ -108,6 +109,7 @@ def pose_graph(
                 T,
                 noise.white_rotation_rad,
                 noise.white_position_m,
+                problem.stated_cov[i] if problem.stated_cov is not None and stated[i] else None,
             ),
         )
         if i == 0 or drives[i] != drives[i - 1]:

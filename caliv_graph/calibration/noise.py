@@ -103,9 +103,12 @@ def sound_clouds(
     r, _, B, R = _stacked(problem, lines, measured, information, values, every)
     rotation = noise.white_rotation_rad**2 + noise.drift_rotation_rad**2
     position = noise.white_position_m**2 + noise.drift_position_m**2
-    spread = np.array([rotation] * 3 + [position] * 3)
+    spread = np.tile([rotation] * 3 + [position] * 3, (problem.clouds, 1))
+    stated = problem.stated()[problem.cloud_pose]
+    spread[stated] = [noise.drift_rotation_rad**2] * 3 + [noise.drift_position_m**2] * 3
     given = problem.given()[problem.cloud_pose]
-    V = R + np.einsum("jax,x,jbx->jab", B * given[:, None, None], spread, B)
+    V = R + np.einsum("jax,jx,jbx->jab", B * given[:, None, None], spread, B)
+    V += _stated_effect(problem, B, every)
     V += np.einsum("jax,jxy,jby->jab", B, _motion_covariance(problem, values, every), B)
     r = r.reshape(-1, 6)
     squared = np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0])
@@ -122,6 +125,10 @@ def fit_pose_noise(
 ) -> tuple[PoseNoise, float]:
     """Variances of the given poses and the scale of the registration's sigmas.
 
+    Where a pose's message states a covariance, that is the white part of its error: nothing is
+    fitted for it, while the Gauss-Markov part is fitted for all. If all poses state one, the white
+    figures returned are the root mean square of theirs.
+
     Args:
         problem: the clouds and poses.
         measured: registered pose of each cloud.
@@ -135,7 +142,8 @@ def fit_pose_noise(
     likelihood = _RestrictedLikelihood.at(problem, measured, information, sound, values, first)
     # What the config states is kept; without given poses there are no pose errors to estimate.
     free = np.array([g is None for g in _names(config)])
-    free &= problem.given().any() | (np.arange(5) == 4)
+    fitted = problem.given() & ~problem.stated()
+    free &= np.array([fitted.any()] * 2 + [problem.given().any()] * 2 + [True])
 
     def logarithms(x: Array) -> Array:
         full = likelihood.prior.copy()
@@ -154,6 +162,9 @@ def fit_pose_noise(
     )
     bounded = np.clip(logarithms(found.x), np.log(FLOORS), np.log(CEILINGS))
     value = np.exp(bounded).tolist()
+    if problem.stated_cov is not None and problem.stated().any() and not fitted.any():
+        variances = np.diagonal(problem.stated_cov[problem.stated()], axis1=1, axis2=2)
+        value[:2] = np.sqrt([variances[:, :3].mean(), variances[:, 3:].mean()]).tolist()
     noise = PoseNoise(value[0], value[1], value[2], value[3], first.drift_time_s)
     return noise, float(value[4])
 
@@ -165,7 +176,7 @@ class _RestrictedLikelihood:
     Attributes:
         residuals: (6m,) of the clouds at the given poses.
         design: (6m, p) their derivatives with respect to extrinsics, targets and time offsets.
-        known: (6m, 6m) covariance that smoothed poses bring.
+        known: (6m, 6m) covariance that smoothed poses bring, and the stated white errors.
         parts: (6m, 6m) each, what the variances multiply: white rotation and position,
             Gauss-Markov rotation and position, registration.
         ridge: (p, p) weak information on what the design multiplies.
@@ -201,10 +212,13 @@ class _RestrictedLikelihood:
         slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
         joint = _motion_covariance(problem, values, chosen, together=True)
         known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
+        known += _stated_effect(problem, B, chosen, same)
         # Rotation and position parts of what a pose error does to the clouds' residuals.
+        unstated = ~problem.stated()[problem.cloud_pose[chosen]]
         B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
         effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
         spread = [e @ e.T for e in effect]
+        same = same * np.outer(unstated, unstated)
         ones = np.ones((6, 6))
         return cls(
             residuals=r,
@@ -292,9 +306,36 @@ def squares_without_own_pose(
         error = np.concatenate([turn, X.translation() - given.translation()])
         found[i] = error - values.atVector(key_pose_error(i))
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
-    B = B * problem.given()[problem.cloud_pose][:, None, None]
-    V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B)
+    stated = _stated_effect(problem, B, np.arange(problem.clouds))
+    fitted = problem.given() & ~problem.stated()
+    B = B * fitted[problem.cloud_pose][:, None, None]
+    V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B) + stated
     return np.asarray(np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0]))
+
+
+def _stated_effect(
+    problem: Problem, B: Array, chosen: IntArray, same: Array | None = None
+) -> Array:
+    """What the stated white errors of given poses add to the covariance of the clouds' residuals.
+
+    Args:
+        problem: the clouds and poses.
+        B: (m, 6, 6) effects of the pose errors on the chosen clouds.
+        chosen: (m,) clouds.
+        same: (m, m) 1 where two clouds share a pose; None: only each cloud's own.
+
+    Returns:
+        (m, 6, 6), or with `same` (m, 6, m, 6); zero where no covariance is stated.
+    """
+    m, pose = len(chosen), problem.cloud_pose[chosen]
+    stated = problem.stated()[pose]
+    if problem.stated_cov is None or not stated.any():
+        return np.zeros((m, 6, 6) if same is None else (m, 6, m, 6))
+    cov = np.zeros((m, 6, 6))
+    cov[stated] = problem.stated_cov[pose[stated]]
+    if same is None:
+        return np.asarray(np.einsum("jax,jxy,jby->jab", B, cov, B))
+    return np.asarray(np.einsum("pax,pxy,qby,pq->paqb", B, cov, B, same, optimize=True))
 
 
 def _motion_covariance(

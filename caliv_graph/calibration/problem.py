@@ -23,7 +23,8 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.cloud.views import view_weights
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.trajectory.noise import given_pose_covariances
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 HEAVE_SIGMA_M = 0.005
@@ -56,6 +57,9 @@ class Problem:
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is.
+        stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
+            it, rotation in vehicle axes, then position in map axes, rad and m; NaN: not stated, its
+            white error is fitted. None: no pose has one.
         weights_of_views: (J,) weight of each cloud for repeated views of one place, 0 to 1
             (`targets.cloud.views`); None: all one.
     """
@@ -75,6 +79,7 @@ class Problem:
     motion: Mapping[int, Array] = field(default_factory=dict)
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
+    stated_cov: Array | None = None
     weights_of_views: Array | None = None
 
     @property
@@ -152,6 +157,12 @@ class Problem:
     def given(self) -> BoolArray:
         """(n,) whether each pose was given, not smoothed from motion data."""
         return ~np.isin(self.drives(), list(self.motion))
+
+    def stated(self) -> BoolArray:
+        """(n,) whether each pose is given with the covariance of its white error."""
+        if self.stated_cov is None:
+            return np.zeros(len(self.poses), dtype=bool)
+        return np.asarray(np.isfinite(self.stated_cov).all(axis=(1, 2)))
 
     def drives(self) -> IntArray:
         """(n,) drive of each pose."""
@@ -252,6 +263,7 @@ def pose_problem(
         },
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
+        stated_cov=_stated_covariances(trajectories, poses, config),
         weights_of_views=np.concatenate([_view_weights(o, of_pose, config) for o in observations]),
     )
 
@@ -274,6 +286,23 @@ def _view_weights(
             places.append(T.transformTo(observation.centre_map))
         out[own] = view_weights(np.array(places))
     return out
+
+
+def _stated_covariances(
+    trajectories: Sequence[VehicleTrajectory],
+    poses: Sequence[tuple[int, int]],
+    config: Config,
+) -> Array | None:
+    """(n, 6, 6) covariances that the messages of given poses state; see `Problem.stated_cov`."""
+    out = np.full((len(poses), 6, 6), np.nan)
+    drives = np.array([drive for drive, _ in poses])
+    for d, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, GivenTrajectory) and (drives == d).any():
+            stamps = [stamp for drive, stamp in poses if drive == d]
+            cov = given_pose_covariances(trajectory.error_covariances(stamps), config)
+            if cov is not None:
+                out[drives == d] = cov
+    return out if np.isfinite(out).any() else None
 
 
 def _with_heave(information: Array) -> Array:

@@ -201,11 +201,11 @@ class NoiseConfig(Section):
     lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
     pose_position_m: Positive | None = Field(
         None,
-        description="metres, white error of each given pose; absent: from its message, or estimated",
+        description="metres, white error of each given pose; absent: its message, or fitted",
     )
     pose_rotation_deg: Positive | None = Field(
         None,
-        description="degrees, white error of each given pose; absent: from its message, or estimated",
+        description="degrees, white error of each given pose; absent: its message, or fitted",
     )
     pose_drift_position_m: Positive | None = Field(
         None, description="metres, slowly varying error of the given poses over the drive"

@@ -11,7 +11,7 @@ import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -37,14 +37,8 @@ from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
-if TYPE_CHECKING:
-    from caliv_graph.report.figures import Figure
-
 MOST_LISTED = 40
 """Down-weighted clouds in the table; the figure has all."""
-
-MOST_SOLID = 2
-"""Placements, and drives, with a 3-D view: a browser draws about a dozen of them at once."""
 
 FAR_SIGMAS = 3.0
 """From which a mounting counts as far from its guess."""
@@ -100,10 +94,9 @@ def render_report(
     pages = environment()
     pages.globals["figures_of"] = figures_of
     pages.globals["median"] = lambda values: float(np.median(np.abs(values)))
-    from caliv_graph.report.figures import without_template
+    from caliv_graph.report.figures.sections import report_figures
 
-    with without_template():
-        sections = _sections(calibration, solution, evidence)
+    sections = report_figures(calibration, solution, evidence)
     figures = {f.name: f for figures in sections.values() for f in figures}
     clouds = down_weighted(solution, config.robust)
     template = pages.get_template("report.html.j2")
@@ -358,39 +351,3 @@ def _versions() -> list[tuple[str, str]]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return rows
-
-
-def _sections(
-    calibration: Calibration, solution: Solution, evidence: RunRecord
-) -> dict[str, list[Figure]]:
-    """The figures of each section of the page."""
-    from caliv_graph.report import figures as draw
-
-    lidars = list(calibration.lidars)
-    drives = list(zip(range(len(evidence.drives)), evidence.drives, strict=True))
-    targets: list[Figure | None] = []
-    scenes: list[Figure | None] = []
-    motions: list[Figure | None] = []
-    for m in range(len(solution.registrations)):
-        solid, flat = draw.target_figures(m, solution, calibration)
-        targets += [solid, flat] if m < MOST_SOLID else [flat]
-    for drive, name in drives:
-        trajectory = evidence.trajectories[drive]
-        if drive < MOST_SOLID:
-            scans = evidence.scene.get(drive, ())
-            scenes.append(draw.scene_figure(drive, trajectory, scans, calibration, name))
-        motions.append(draw.path_figure(drive, trajectory, solution, name, lidars))
-        if isinstance(trajectory, SmoothedTrajectory):
-            motions.append(draw.motion_figure(drive, trajectory, name))
-        motions.append(draw.correction_figure(drive, trajectory, solution, name))
-    kinds = all_residuals(solution, evidence)
-    sections: dict[str, list[Figure | None]] = {
-        "extrinsics": [draw.sigma_figure(calibration)],
-        "observability": [draw.spectrum_figure(solution), draw.correlation_figure(calibration)],
-        "alignment": [*targets, *scenes],
-        "residuals": [*map(draw.residual_figure, kinds, range(1, len(kinds) + 1))],
-        "weights": [draw.weight_figure(solution, lidars)],
-        "trajectory": motions,
-        "convergence": [draw.course_figure(solution)],
-    }
-    return {name: [f for f in found if f is not None] for name, found in sections.items()}

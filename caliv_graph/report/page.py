@@ -8,7 +8,7 @@ import jinja2
 from markupsafe import Markup
 
 if TYPE_CHECKING:
-    from caliv_graph.report.figures import Figure
+    from caliv_graph.report.figures.drawing import Figure
 
 
 def environment() -> jinja2.Environment:
@@ -24,7 +24,7 @@ def environment() -> jinja2.Environment:
 
 def script_data(figure: Figure) -> Markup:
     """A figure's data for a script element: no text in it can end the element."""
-    from caliv_graph.report.figures import figure_json
+    from caliv_graph.report.figures.drawing import figure_json
 
     text = figure_json(figure)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

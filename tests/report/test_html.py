@@ -317,7 +317,7 @@ def test_names_do_not_run(bag: Ran) -> None:
 
 
 def test_long_names_are_short_in_figures_only_while_they_differ() -> None:
-    from caliv_graph.report.figures import labels
+    from caliv_graph.report.figures.drawing import labels
 
     long = "velodyne_front_left_upper"
 
@@ -382,7 +382,7 @@ def test_several_recordings_and_targets_are_told_apart(bag: Ran) -> None:
 
 
 def test_a_target_is_shown_upright_where_it_stands(bag: Ran) -> None:
-    from caliv_graph.report.figures import target_figures
+    from caliv_graph.report.figures.alignment import target_figures
 
     solution, calibration = bag.run.solution, bag.run.calibration
     solid, flat = target_figures(0, solution, calibration)
@@ -615,7 +615,7 @@ def test_every_figure_is_drawn_without_network_or_complaint(bag: Ran, tmp_path: 
         "path_0",
         "motion_0",
         "correction_0",
-        "course",
+        "convergence",
     } <= figures
     drawn = re.findall(r'<div class="([^"]*)" data-figure="(\w+)" data-drawn="yes"', told.dom)
     assert {name for _, name in drawn} == figures

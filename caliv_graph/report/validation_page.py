@@ -1,7 +1,7 @@
-"""validation.html: one self-contained page with pictures before and after, coloured by LiDAR.
+"""validation.html: one self-contained page with figures before and after, coloured by LiDAR.
 
-Interactive figures rather than image files: one zooms in on the two millimetres that matter, and
-nothing but what the report needs anyway has to be installed.
+The figures are interactive, so that a reader can zoom in on two millimetres. They need no packages
+beyond those of report.html.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import caliv_graph
 from caliv_graph.report.figures.drawing import without_template
 from caliv_graph.report.figures.structure import validation_figures
 from caliv_graph.report.page import environment, script_data
-from caliv_graph.report.validation import repeatability_sentences, tables
+from caliv_graph.report.validation import repeatability_sentences, tables, validation_status
 from caliv_graph.validation.validate import Validation
 from caliv_graph.workflows.repeatability import Repeatability
 
@@ -22,11 +22,11 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
 
     Args:
         found: the validation.
-        repeated: split-half repeatability, if it was asked for.
-        p_value: limit of the tests in it.
+        repeated: split-half repeatability; None: not tested.
+        p_value: limit of its tests.
 
     Returns:
-        A whole HTML document of a few megabytes, most of them plotly.js.
+        An HTML document of a few megabytes, most of them plotly.js.
     """
     from plotly.offline import get_plotlyjs
 
@@ -37,7 +37,7 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
         .get_template("validation.html.j2")
         .render(
             found=found,
-            status=_status(found),
+            status=validation_status(found),
             tables=tables(found),
             repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
             figures=figures,
@@ -46,11 +46,3 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
             version=caliv_graph.__version__,
         )
     )
-
-
-def _status(found: Validation) -> str:
-    """A class of the page's style."""
-    if not found.has_structure:
-        return "partial"
-    bad = found.verdict.contradicts or (found.verdict.better or 1.0) < 1.0
-    return "inconsistent" if bad else "ok"

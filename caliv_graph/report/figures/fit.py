@@ -26,7 +26,8 @@ from caliv_graph.report.figures.drawing import (
     small,
     to_seconds,
 )
-from caliv_graph.report.residuals import Residuals, figures_of
+from caliv_graph.report.numbers import two_digits
+from caliv_graph.report.residuals import Residuals
 
 
 def residual_figure(residuals: Residuals, number: int) -> Figure:
@@ -80,8 +81,8 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
         f"{residuals.rms:.2f}, {100.0 * residuals.beyond_three:.1f} % beyond 3 (normal "
         f"distribution: 0.3 %; the line is N(0, 1)). "
         + "; ".join(
-            f"{quantity}: median |r| {figures_of(np.median(np.abs(v)))} {unit}, 95 % below "
-            f"{figures_of(np.percentile(np.abs(v), 95))} {unit}"
+            f"{quantity}: median |r| {two_digits(np.median(np.abs(v)))} {unit}, 95 % below "
+            f"{two_digits(np.percentile(np.abs(v), 95))} {unit}"
             for quantity, (unit, v) in residuals.physical.items()
         )
         + ". The outermost bars hold all values beyond the panel."

@@ -20,6 +20,7 @@ from caliv_graph.report.figures.drawing import (
     labels,
     small,
 )
+from caliv_graph.report.numbers import rounded
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO, WEAK_RATIO, spectrum
 
 
@@ -60,7 +61,7 @@ def sigma_figure(calibration: Calibration) -> Figure | None:
                 continue
             figure.add_scatter(
                 x=[at for at, _ in kinds[column]],
-                y=[_rounded(sigma) for _, sigma in kinds[column]],
+                y=[rounded(sigma, 4) for _, sigma in kinds[column]],
                 mode="markers",
                 marker=marker,
                 name=what,
@@ -184,7 +185,3 @@ def correlation_figure(calibration: Calibration) -> Figure:
         "two errors occur together. (held): not determined by this drive.",
         figure,
     )
-
-
-def _rounded(value: float, digits: int = 4) -> float:
-    return float(f"{value:.{digits}g}")

@@ -324,7 +324,7 @@ def test_on_an_existing_scheduler(
     ("address", "said"),
     [
         ("tcp://127.0.0.1:9", "no Dask scheduler answers there within 10 s (Connection refused)"),
-        ("somewhere", "is no address of a scheduler: expected tcp://host:port"),
+        ("somewhere", "is not an address of a scheduler: expected tcp://host:port"),
     ],
 )
 def test_a_scheduler_that_is_not_there(
@@ -393,7 +393,7 @@ def test_a_folder_of_something_else_is_refused(fleet: Path, tmp_path: Path) -> N
     result = run("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
 
     assert result.returncode == 2
-    assert "holds no batch (summary.json). Give another --out" in result.stderr
+    assert "is not the folder of a batch (no summary.json). Give another --out" in result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 
 

@@ -200,7 +200,7 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
                 {
                     "moved": f"{1e3 * moved[i]:.3g}" if determined else "not determined",
                     "prior": f"{1e3 * prior:.3g}",
-                    "after": two_digits(1e3 * after[i]) if determined else "as the guess",
+                    "after": two_digits(1e3 * after[i]),
                     "sigmas": fixed(float(moved[i] / prior), 1) if determined else "",
                     "far": bool(determined and abs(moved[i]) > FAR_SIGMAS * prior),
                     "determined": determined,

@@ -86,7 +86,7 @@ def target_figures(
     finish(flat, 340)
     return (
         Figure(f"target_{placement}", note, solid, solid=True),
-        Figure(f"target_flat_{placement}", f"The same from above and from the side: {note}", flat),
+        Figure(f"target_flat_{placement}", f"{note} Views from above and from the side.", flat),
     )
 
 

@@ -221,7 +221,7 @@ def test_what_is_done_is_not_done_again_and_what_has_changed_is(
     assert (mon["exit"], mon["reused"]) == (3, False)
     assert "s2v_yaw_deg" in mon["unmet"][0]
     assert (tue["state"], tue["folder"]) == ("failed", None)
-    assert tue["message"].endswith("(its folder still holds an older result)")
+    assert tue["message"].endswith("(its folder still contains an older result)")
     assert records(out)["tue"] == before["tue"]
     assert records(out)["mon"] != before["mon"]
 
@@ -359,7 +359,7 @@ def test_without_dask_it_says_how_to_get_it(fleet: Path, tmp_path: Path) -> None
 
     assert result.returncode == 2
     assert result.stderr == (
-        "error: batch: needs Dask, which is not installed. Install it with "
+        "error: batch: Dask is not installed. Install it with "
         "pip install 'caliv-graph[batch]'\n"
     )
     assert not (tmp_path / "out").exists()

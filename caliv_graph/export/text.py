@@ -87,7 +87,7 @@ def notice(request: Request, transforms: Sequence[Transform], extra: Sequence[st
         Lines without comment marks; `without_notice` finds the first and the last.
     """
     lines = [f"{_FIRST} {__version__} of {request.source}, status {request.calibration.status}"]
-    lines.append("Metres and radians unless said otherwise; R = Rz(yaw) Ry(pitch) Rx(roll).")
+    lines.append("Metres and radians unless stated otherwise; R = Rz(yaw) Ry(pitch) Rx(roll).")
     for transform in transforms:
         remark = f" {transform.remark}" if transform.remark else ""
         lines.append(

@@ -52,8 +52,8 @@ def _drive_text(drive: DriveSummary, note: str) -> Text:
     return Text(
         f"Drive: {drive.poses} poses, {drive.path_length_m:.1f} m in {drive.duration_s:.1f} s"
         f"{note}, {drive.climb_m:.2f} m up and down; heading changes by "
-        f"{drive.heading_change_deg:+.1f} degrees (positive: left), turns add up to "
-        f"{drive.turned_deg:.1f} degrees."
+        f"{drive.heading_change_deg:+.1f} degrees (positive: left), sum of all "
+        f"turns {drive.turned_deg:.1f} degrees."
     )
 
 

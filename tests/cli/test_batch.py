@@ -359,8 +359,7 @@ def test_without_dask_it_says_how_to_get_it(fleet: Path, tmp_path: Path) -> None
 
     assert result.returncode == 2
     assert result.stderr == (
-        "error: batch: Dask is not installed. Install it with "
-        "pip install 'caliv-graph[batch]'\n"
+        "error: batch: Dask is not installed. Install it with pip install 'caliv-graph[batch]'\n"
     )
     assert not (tmp_path / "out").exists()
 

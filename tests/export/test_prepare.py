@@ -116,8 +116,8 @@ def test_frames_housings_and_the_kit_from_a_recording(calibration: Path, tmp_pat
 def test_the_imu_is_where_the_config_or_the_option_says(calibration: Path, tmp_path: Path) -> None:
     assert prepare(calibration, Options("glim", OUT)).imu is None
 
-    mounting = {"xyz": [0.412, -0.153, 0.608], "rpy_deg": [3.3, 5.1, -31.7]}
-    write_config(tmp_path / "config.yaml", imu={"T_vehicle_imu": mounting})
+    extrinsic = {"xyz": [0.412, -0.153, 0.608], "rpy_deg": [3.3, 5.1, -31.7]}
+    write_config(tmp_path / "config.yaml", imu={"T_vehicle_imu": extrinsic})
     imu = prepare(calibration, Options("glim", OUT)).imu
     assert imu is not None
     assert imu.stated

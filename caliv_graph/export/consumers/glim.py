@@ -19,7 +19,7 @@ _NOTE = "_caliv_graph"
 
 
 def export(request: Request) -> Export:
-    """A `config_sensors.json` with `T_lidar_imu` alone, or `--base` with it changed.
+    """A `config_sensors.json` with `T_lidar_imu` alone, or `--base` with a new value.
 
     Raises:
         ExportError: the pose of the IMU is unknown, or `--base` has not exactly one `T_lidar_imu`.

@@ -1,6 +1,6 @@
-"""Workers of a batch: a Dask cluster of our own on this machine, or an existing scheduler's.
+"""Workers of a batch: a local Dask cluster, or those of an existing scheduler.
 
-Dask comes with an extra, and is imported late: for everything else this program does without.
+Dask is an optional dependency (extra `batch`), so it is imported in the functions.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from caliv_graph.batch.worker import probe
 from caliv_graph.errors import BatchError
 
 CONNECT_S = 10.0
-"""Seconds that a scheduler may take to answer, and then to have a worker."""
+"""Seconds to wait for the answer of a scheduler, and then for its first worker."""
 
 _START_S = 120.0
-"""Seconds that workers of our own may take to start, on a machine that is busy with them."""
+"""Seconds to wait for the first worker of the local cluster on a busy machine."""
 
 _END_S = 0.5
-"""Seconds that a worker gets to end by itself. What it is at is of no more use."""
+"""Seconds to wait for a worker to end by itself; its work is not needed any more."""
 
 _KILL_S = 10.0
-"""Seconds that Dask gets to end its workers, before they are killed over its head."""
+"""Seconds to wait for Dask to end its workers before they are killed."""
 
 _LOGGERS = (
     *("distributed", "distributed.client", "distributed.gc", "distributed.nanny", "asyncio"),
@@ -53,38 +53,38 @@ class Workers:
     """A connection to the workers of a batch.
 
     Attributes:
-        client: Dask's.
-        deaths: per process of our own cluster that ended, how.
+        client: the Dask client.
+        deaths: per process of the local cluster that died, the reason.
     """
 
     def __init__(
         self, client: Any, count: int | None, most: int | None, deaths: dict[int, str]
     ) -> None:
-        """Makes it.
+        """Initialises the connection.
 
         Args:
-            client: Dask's.
-            count: of workers; None: it may change, and is asked for.
-            most: jobs at a time, at most.
-            deaths: filled in as they come.
+            client: the Dask client.
+            count: number of workers; None: the number may change, so the scheduler is asked.
+            most: largest number of jobs at a time.
+            deaths: filled while the batch runs.
         """
         self.client = client
         self.deaths = deaths
         self._count, self._most = count, most
 
     def count(self) -> int:
-        """How many jobs can be done at a time."""
+        """The number of jobs that can run at a time."""
         count = len(self.client.nthreads()) if self._count is None else self._count
         return count if self._most is None else min(count, self._most)
 
     @property
     def connected(self) -> bool:
-        """Whether the scheduler can be spoken to."""
+        """Whether the scheduler is connected."""
         return bool(self.client.status == "running")
 
     @property
     def lost(self) -> bool:
-        """Whether the scheduler is gone for good."""
+        """Whether the connection to the scheduler is lost finally."""
         return self.client.status in ("closing", "closed", "failed")
 
 
@@ -94,16 +94,17 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
 
     Args:
         address: such as tcp://host:8786.
-        most: jobs at a time, at most; None: as many as there are workers.
+        most: largest number of jobs at a time; None: the number of workers.
 
     Raises:
-        BatchError: Dask is not installed, nobody answers within CONNECT_S, or there is no worker.
+        BatchError: Dask is not installed, no scheduler answers within CONNECT_S, or it has no
+            workers.
     """
     distributed = _distributed()
     _await_answer(address)
     client: Any = None
-    with _heard_quietly() as deaths, ExitStack() as stack:
-        # A client waits for the wrong kind of server without end, and its clean-up does so too.
+    with _dask_loggers_redirected() as deaths, ExitStack() as stack:
+        # Client and its cleanup would wait forever for a server that is not a Dask scheduler.
         with suppress(Exception):
             asyncio.run(asyncio.wait_for(_identify(address), CONNECT_S))
             with _interrupts_later():
@@ -113,9 +114,9 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
                 stack.callback(_close, client)
         if client is None:
             raise BatchError(
-                f"--scheduler {address}: something is there, but does not answer within "
-                f"{CONNECT_S:g} s as a Dask scheduler would. Look at the address, and whether "
-                "its version is this environment's"
+                f"--scheduler {address}: a server is there, but does not answer like a Dask "
+                f"scheduler within {CONNECT_S:g} s. Check the address, and that the scheduler has "
+                "the version of Dask of this environment"
             )
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
@@ -129,24 +130,24 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
 
 @contextmanager
 def start(count: int, scratch: Path) -> Iterator[Workers]:
-    """Workers of our own: processes on this machine, one thread each.
+    """Workers of a local cluster: processes on this machine, one thread each.
 
-    They end with the context, whatever they are at, and if this process is killed.
+    They end with the context, even during a job, and when this process is killed.
 
     Args:
-        count: how many.
-        scratch: folder for what Dask writes.
+        count: number of workers.
+        scratch: folder for the files of Dask.
 
     Raises:
-        BatchError: Dask is not installed, or they do not start.
+        BatchError: Dask is not installed, or no worker starts.
     """
     distributed = _distributed()
     dask = import_module("dask")
     before = set(multiprocessing.active_children())
     settings = {
-        "distributed.scheduler.worker-ttl": None,  # native code may hold a worker up for long
+        "distributed.scheduler.worker-ttl": None,  # native code may block a worker for long
         "distributed.comm.timeouts.tcp": "120s",
-        # A job is one piece of work: nothing to spill, and to pause a worker would end the batch.
+        # A job has nothing to spill, and a paused worker would never continue.
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
@@ -157,7 +158,7 @@ def start(count: int, scratch: Path) -> Iterator[Workers]:
             "PYTHONWARNINGS": "ignore",
         },
     }
-    with _heard_quietly() as deaths, dask.config.set(settings), ExitStack() as stack:
+    with _dask_loggers_redirected() as deaths, dask.config.set(settings), ExitStack() as stack:
         stack.callback(_kill_children, before)
         try:
             with _interrupts_later():
@@ -181,14 +182,14 @@ def start(count: int, scratch: Path) -> Iterator[Workers]:
             client.wait_for_workers(1, timeout=_START_S)
         except Exception as e:
             raise BatchError(
-                f"batch: no worker has started within {_START_S:g} s: {str(e) or repr(e)}. Try "
-                "fewer --workers"
+                f"batch: no worker started within {_START_S:g} s: {str(e) or repr(e)}. Try fewer "
+                "--workers"
             ) from None
         yield Workers(client, count, count, deaths)
 
 
 def default_workers() -> int:
-    """Processors that this process may use.
+    """The number of processors that this process may use.
 
     Raises:
         BatchError: Dask is not installed.
@@ -198,15 +199,15 @@ def default_workers() -> int:
 
 
 def check_workers(workers: Workers, token: Path, version: str) -> None:
-    """Whether the workers of a scheduler can do the jobs.
+    """Checks that the workers of a scheduler can run the jobs.
 
     Args:
-        workers: connected.
-        token: a file in the batch's folder.
+        workers: the connection.
+        token: a file in the folder of the batch.
         version: of this program.
 
     Raises:
-        BatchError: one cannot; it and the reason are named.
+        BatchError: a worker cannot; the message names it and the reason.
     """
     answers = workers.client.run(probe, str(token), version, on_error="return")
     for address, answer in answers.items():
@@ -223,18 +224,17 @@ def _distributed() -> Any:
         return import_module("distributed")
     except ImportError:
         raise BatchError(
-            "batch: needs Dask, which is not installed. Install it with "
-            "pip install 'caliv-graph[batch]'"
+            "batch: Dask is not installed. Install it with pip install 'caliv-graph[batch]'"
         ) from None
 
 
 def _await_answer(address: str) -> None:
-    """Waits until somebody listens there: Dask itself would do so with a processor of its own."""
+    """Waits until a server listens there; Dask itself would wait in a busy loop."""
     parts = _ADDRESS.fullmatch(address)
     if parts is None or int(parts["port"]) > 65535:
         raise BatchError(
-            f"--scheduler {address}: is no address of a scheduler: expected tcp://host:port, as "
-            "'dask scheduler' prints it"
+            f"--scheduler {address}: is not an address of a scheduler: expected tcp://host:port, "
+            "as printed by 'dask scheduler'"
         )
     host, port = parts["host"].strip("[]"), int(parts["port"])
     end = time.monotonic() + CONNECT_S
@@ -253,7 +253,7 @@ def _await_answer(address: str) -> None:
 
 
 async def _identify(address: str) -> None:
-    """Asks a scheduler who it is, and drops the line at once if it is none."""
+    """Asks a server for its identity; raises if it is not a Dask scheduler."""
     core: Any = import_module("distributed.core")
     comm = await core.connect(address, timeout=CONNECT_S)
     try:
@@ -266,25 +266,26 @@ async def _identify(address: str) -> None:
 
 
 def _share_of_memory(count: int) -> int:
-    """Bytes for each worker; who takes more is ended before the whole machine stands still."""
+    """Memory limit per worker in bytes; Dask kills a worker that exceeds it."""
     memory: int = import_module("distributed.system").MEMORY_LIMIT
     return memory // count
 
 
 async def _shield_children() -> None:
-    """Has processes that are started from Dask's thread never hear of an interrupt.
+    """Blocks interrupts in the processes that are started from Dask's thread.
 
-    A terminal sends it to all of them, and each would have something to say; the batch hears it in
-    its main thread, and ends them. The mask of a thread goes to what it starts.
+    A terminal sends an interrupt to all processes, and each would print a traceback. The main
+    thread of the batch handles the interrupt and ends the workers. Processes inherit the signal
+    mask of the thread that starts them.
     """
-    # Python starts this with its first process, and takes the mask off the thread that does.
+    # Python starts the tracker with its first process and then resets the mask of that thread.
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
 
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Lets Dask's objects be made before an interrupt counts: those made by half never end."""
+    """Delays interrupts while Dask's objects are created: incomplete ones would never end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -300,12 +301,12 @@ def _interrupts_later() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
     if came:
-        # Whoever asked to be told of it is told now.
+        # The signal is delivered now.
         signal.raise_signal(came[0])
 
 
 class _Listener(logging.Handler):
-    """Hears how workers ended, and keeps what Dask says of itself off the terminal."""
+    """Collects the reasons why workers died, and keeps Dask's messages off the terminal."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -314,14 +315,14 @@ class _Listener(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
         if found := _MEMORY.search(text):
-            self.deaths[int(found[1])] = f"used more than {found[2]} % of its share of the memory"
+            self.deaths[int(found[1])] = f"used more than {found[2]} % of its memory limit"
         elif found := _DEATH.search(text):
             self.deaths.setdefault(int(found[1]), found[2])
 
 
 @contextmanager
-def _heard_quietly() -> Iterator[dict[int, str]]:
-    """Takes Dask's loggers over: stderr is for what a person can act upon."""
+def _dask_loggers_redirected() -> Iterator[dict[int, str]]:
+    """Redirects Dask's loggers: stderr is for messages that a user can act upon."""
     listener = _Listener()
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(list(log.handlers), log.level, log.propagate) for log in loggers]
@@ -337,7 +338,7 @@ def _heard_quietly() -> Iterator[dict[int, str]]:
 
 
 def _end(cluster: Any) -> None:
-    """Ends workers at once: by itself Dask would wait for what they are at."""
+    """Ends workers at once; Dask itself would wait for their jobs."""
 
     async def end() -> None:
         nannies = list(cluster.workers.values())
@@ -356,7 +357,7 @@ def _close(client: Any) -> None:
 
 
 def _kill_children(before: set[Any]) -> None:
-    """Nobody must be left behind, whatever went wrong while they were to end."""
+    """Kills all worker processes that are left after an error."""
     for child in set(multiprocessing.active_children()) - before:
         with suppress(Exception):
             child.kill()

@@ -1,6 +1,6 @@
-"""What a job is made from, as digests: the bytes of its drives and prior, its config, the version.
+"""Digests of the inputs of a job: the bytes of its drives and prior, its config, the version.
 
-A result that is there already stands for a job if all of these are the same.
+An existing result is reused for a job if its digest is the same.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from caliv_graph.config.model import Config
 JOB_SCHEMA = "caliv-graph/batch-job/1"
 
 _SETTLED_NS = 3_000_000_000
-"""A file that was changed this short a time ago may change again within one tick of the file
-system's clock (2 s on FAT, 1 s on some others) and look the same: its digest is not kept."""
+"""The digest of a file that was changed more recently than this is not kept: the file could change
+again within one tick of the file system's clock (2 s on FAT, 1 s on some others) unnoticed."""
 
 
 @dataclass(frozen=True)
 class FileState:
-    """What a file system says of a file; the same as long as nobody writes to it.
+    """Metadata of a file, which changes whenever the file is written.
 
-    The time of the last change of the file's own entry is part of it: tools that set the time of
-    the content back (cp -p, rsync -t, tar) cannot set that one.
+    It includes the time of the last change of the entry (ctime), which tools that restore the time
+    of the content (cp -p, rsync -t, tar) cannot set.
 
     Attributes:
         size: bytes.
@@ -46,10 +46,10 @@ class FileState:
 
     @classmethod
     def of(cls, path: Path) -> FileState:
-        """The state of a file now.
+        """The current state of a file.
 
         Raises:
-            OSError: it cannot be asked for.
+            OSError: the file cannot be accessed.
         """
         stat = path.stat()
         return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
@@ -57,28 +57,29 @@ class FileState:
 
 @dataclass
 class DigestCache:
-    """Digests of files that were read, so that nobody reads gigabytes twice.
+    """Digests of files that were read, so that no file is read twice.
 
     Attributes:
-        entries: per absolute path the file's state when it was read, and SHA-256 of its content.
+        entries: per absolute path the state of the file when it was read, and the SHA-256 of its
+            content.
     """
 
     entries: dict[str, tuple[FileState, str]] = field(default_factory=dict)
 
     def known(self, path: Path) -> str | None:
-        """The digest of a file, if it is the one that was read.
+        """The digest of a file, or None if it was not read or has changed.
 
         Raises:
-            OSError: the file is not there.
+            OSError: the file does not exist.
         """
         entry = self.entries.get(str(path))
         return entry[1] if entry is not None and entry[0] == FileState.of(path) else None
 
     def digest(self, path: Path) -> str:
-        """The digest of a file, read if need be.
+        """The digest of a file; reads the file if necessary.
 
         Raises:
-            OSError: it cannot be read.
+            OSError: the file cannot be read.
         """
         known = self.known(path)
         if known is not None:
@@ -93,17 +94,17 @@ class DigestCache:
         return digest
 
     def dump(self) -> str:
-        """As text that `parse` reads."""
+        """Text for `parse`."""
         files = {
             path: [state.size, state.mtime_ns, state.ctime_ns, state.inode, digest]
             for path, (state, digest) in self.entries.items()
         }
-        # A disk that lost a part of it must not make an old digest stand for new content.
+        # The checksum detects a file that was damaged on the disk.
         return json.dumps({"sha256": _sha256(files), "files": files})
 
     @classmethod
     def parse(cls, text: str) -> DigestCache:
-        """What `dump` wrote; empty if it is anything else."""
+        """The cache of a text of `dump`; empty if the text is damaged."""
         try:
             document = json.loads(text)
             files = document["files"]
@@ -116,10 +117,10 @@ class DigestCache:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The files that a job is made from, with a name for each that does not depend on where.
+    """The input files of a job, with names that do not depend on their folder.
 
     Attributes:
-        drives: per drive, its files.
+        drives: per drive, its files by name.
         prior: the earlier calibration.
     """
 
@@ -128,23 +129,23 @@ class Inputs:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All of them."""
+        """All input files."""
         prior = () if self.prior is None else (self.prior,)
         return (*(path for drive in self.drives for path in drive.values()), *prior)
 
     def states(self) -> dict[Path, FileState]:
-        """The state of each now.
+        """The current state of each file.
 
         Raises:
-            OSError: one is not there.
+            OSError: a file does not exist.
         """
         return {path: FileState.of(path) for path in self.files}
 
     def known(self, cache: DigestCache) -> bool:
-        """Whether all of them were read already.
+        """Whether the digests of all files are known.
 
         Raises:
-            OSError: one is not there.
+            OSError: a file does not exist.
         """
         return all(cache.known(path) is not None for path in self.files)
 
@@ -152,19 +153,19 @@ class Inputs:
 def job_inputs(
     config: Config, data: Sequence[Path], prior: Path | None, out: Path | None = None
 ) -> Inputs | None:
-    """The files that a job reads.
+    """The input files of a job.
 
     Args:
         config: the effective config.
-        data: drives instead of the config's; empty: the config's.
+        data: drives; empty: `data.path` of the config.
         prior: the earlier calibration.
-        out: where results go; nothing below it is input.
+        out: folder of the results, which is not input.
 
     Returns:
-        None if a drive is not there, or not what its reader could read.
+        None if a drive does not exist or has no files of its format.
 
     Raises:
-        OSError: a folder cannot be looked at.
+        OSError: a folder cannot be listed.
     """
     out = None if out is None else out.resolve()
     drives = []
@@ -178,12 +179,12 @@ def job_inputs(
 
 
 def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
-    """Digest of a job; the same exactly if its result is to be the same.
+    """Digest of the inputs of a job: equal digests mean equal results.
 
     Args:
         config: the effective config.
-        inputs: the files; what was not read yet is read.
-        cache: what was; gets what was not.
+        inputs: the input files; those without a known digest are read.
+        cache: known digests; new ones are added.
 
     Returns:
         64 hexadecimal digits.
@@ -191,13 +192,13 @@ def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
     Raises:
         OSError: a file cannot be read.
     """
-    # Where the drive lies is no part of what was asked.
-    asked = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
+    # The path of the drive does not change the result.
+    pathless = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
     return _sha256(
         {
             "schema": JOB_SCHEMA,
             "caliv_graph": caliv_graph.__version__,
-            "config": dump_config(asked),
+            "config": dump_config(pathless),
             "drives": [
                 {name: cache.digest(path) for name, path in drive.items()}
                 for drive in inputs.drives
@@ -208,7 +209,7 @@ def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
 
 
 def _bag_files(path: Path, config: Config, out: Path | None) -> Iterator[tuple[str, Path]]:
-    """All files of a bag: of a folder all that are not hidden."""
+    """All files of a bag; of a folder, all files that are not hidden."""
     if path.is_file():
         yield path.suffix, path
         return

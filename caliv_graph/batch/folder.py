@@ -1,13 +1,13 @@
-"""The folder of a batch: one result per job, the summary beside them, and what a resume needs.
+"""The folder of a batch: one result per job, the summary, and the state for a resume.
 
-    DIR/index.html, summary.csv, summary.json      all jobs, rewritten as they finish
+    DIR/index.html, summary.csv, summary.json      all jobs, rewritten when a job finishes
     DIR/<job>/                                     the result as `calibrate` writes it, and job.json
-    DIR/.digests.json, .lock, .work/               for ourselves
+    DIR/.digests.json, .lock, .work/               internal
 
-A job's folder has its name and not its digest: people and scripts look for `monday/report.html`.
-What it was made from stands in job.json, which comes and goes with the folder: both appear in one
-rename, so that at no moment a result is there without its digest, or the other way round.
-Workers write below `.work/`; only the process that holds the lock puts a result in its place.
+The folder of a job has the job's name, so that people and scripts find `monday/report.html`.
+job.json holds the digest of the inputs. Result and job.json appear together, by one rename, so that
+no result exists without its digest. Workers write below `.work/`; only the process that holds the
+lock moves results to their folders.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ JOB_FILES = (*RESULT_FILES, JOB_FILE)
 _CACHE, _LOCK, _WORK = ".digests.json", ".lock", ".work"
 
 _LEFT_OVER = re.compile(r"\.(.+)\.[0-9a-f]{12}")
-"""How `files` names what it has not put in its place yet."""
+"""Names of the temporary folders of `common.files`."""
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """What job.json says of the result beside it.
+    """The content of job.json about the result in the same folder.
 
     Attributes:
-        digest: of what it was made from (`digests.job_digest`).
-        exit: exit code that `calibrate` would have ended with.
-        seconds: how long it took.
-        warnings: what a person should know, a line each.
-        written: when, UTC, ISO 8601.
+        digest: of the inputs (`digests.job_digest`).
+        exit: exit code of `calibrate` for this job.
+        seconds: duration of the calibration.
+        warnings: one line each.
+        written: time of writing, UTC, ISO 8601.
         files: size in bytes of every file of the result.
         calibration_sha256: of calibration.yaml.
     """
@@ -68,19 +68,19 @@ class JobRecord:
 
 
 class BatchFolder:
-    """The folder of a batch; a context manager that holds it against other batches.
+    """The folder of a batch; a context manager that locks it against other batches.
 
     Attributes:
         path: the folder, absolute.
-        work: where this run's workers write, inside the context; gone after it.
-        cache: digests of files that were read.
+        work: folder for the workers of this run, removed with the end of the context.
+        cache: digests of the files read.
     """
 
     def __init__(self, path: Path) -> None:
-        """Makes it; nothing is looked at yet.
+        """Initialises the object without accessing the disk.
 
         Args:
-            path: the folder; made if need be, with its parents.
+            path: the folder; created if necessary, with its parents.
         """
         self._given = path
         self.path = path.absolute()
@@ -90,11 +90,10 @@ class BatchFolder:
         self._lock: int | None = None
 
     def __enter__(self) -> Self:
-        """Takes the folder.
+        """Creates and locks the folder.
 
         Raises:
-            OutputError: it is not one of a batch, another batch is at work there, or it cannot be
-                written.
+            OutputError: the folder is not one of a batch, is locked, or cannot be written.
         """
         try:
             self._check_ours()
@@ -127,7 +126,7 @@ class BatchFolder:
         self._leave(nothing_done=error is not None)
 
     def record(self, job: str) -> JobRecord | None:
-        """What was made in the folder of a job; None if it holds no whole result of a batch."""
+        """job.json of a job; None if the folder has no complete result of a batch."""
         folder = self.path / job
         try:
             document = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
@@ -144,12 +143,12 @@ class BatchFolder:
         return record
 
     def check_place(self, job: str, force: bool) -> None:
-        """Says before the work whether a job's result may be put in its place.
+        """Checks before the calibration that the result of a job can be written.
 
-        An older result of a batch may be replaced: its digest said that it is of no use.
+        An older result of a batch is replaced, since its digest differs.
 
         Raises:
-            OutputError: something else is there.
+            OutputError: the folder has other content.
         """
         ours = force or (self.path / job / JOB_FILE).is_file()
         check_output_folder(self._given / job, JOB_FILES, force=ours)
@@ -165,11 +164,11 @@ class BatchFolder:
         warnings: tuple[str, ...],
         written: str,
     ) -> JobRecord:
-        """Puts a result in its place, whole and in one step.
+        """Moves a result to the folder of its job in one step.
 
         Args:
             job: name of the job.
-            staged: what its worker wrote; is empty afterwards.
+            staged: folder with the files of the worker; empty afterwards.
             digest: see `JobRecord`.
             exit_code: see `JobRecord`.
             seconds: see `JobRecord`.
@@ -177,7 +176,7 @@ class BatchFolder:
             written: see `JobRecord`.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the folder cannot be written.
         """
         with output_folder(self._given / job, JOB_FILES, force=True) as folder:
             sizes = {}
@@ -201,16 +200,16 @@ class BatchFolder:
         """Replaces files of the summary, each in one step.
 
         Raises:
-            OutputError: one cannot be written.
+            OutputError: a file cannot be written.
         """
         for name, text in files.items():
             atomic_write(self._given / name, text, force=True)
 
     def keep_cache(self) -> None:
-        """Keeps the digests for the next run.
+        """Writes the digests for the next run.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: the file cannot be written.
         """
         atomic_write(self._given / _CACHE, self.cache.dump(), force=True)
 
@@ -224,8 +223,8 @@ class BatchFolder:
             return
         if not _is_summary(self.path / SUMMARY_FILE):
             raise OutputError(
-                f"{self._given}: exists already, and holds no batch ({SUMMARY_FILE}). Give another "
-                "--out"
+                f"{self._given}: exists already, and is not the folder of a batch (no "
+                f"{SUMMARY_FILE}). Give another --out"
             )
 
     def _take_lock(self) -> None:
@@ -237,14 +236,14 @@ class BatchFolder:
             os.close(self._lock)
             self._lock = None
             raise OutputError(
-                f"{self._given}: another batch is at work there ({holder or 'unknown process'}). "
-                "Wait for it, or give another --out"
+                f"{self._given}: another batch uses this folder ({holder or 'unknown process'}). "
+                "Wait until it ends, or give another --out"
             ) from None
         os.ftruncate(self._lock, 0)
         os.write(self._lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
 
     def _sweep(self) -> None:
-        """Removes what a killed batch left half done. Its workers stop when they see it."""
+        """Removes temporary files of a killed batch, whose workers stop when they are gone."""
         shutil.rmtree(self.path / _WORK, ignore_errors=True)
         for entry in self.path.iterdir():
             if not _LEFT_OVER.fullmatch(entry.name):
@@ -255,7 +254,7 @@ class BatchFolder:
                 shutil.rmtree(entry, ignore_errors=True)
 
     def _leave(self, nothing_done: bool) -> None:
-        """Gives the folder back; one that this run made for nothing is taken away again."""
+        """Unlocks the folder; removes it if this run created it and wrote no result."""
         if self._lock is None:
             made = self._made
         else:

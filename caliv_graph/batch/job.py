@@ -1,4 +1,4 @@
-"""The main job from files to files: what `calibrate` does once, and `batch` for every drive."""
+"""One calibration from files to files: `calibrate` runs one, `batch` one per job."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FinishedJob:
-    """A calibration that is ready to be written.
+    """A calibration with all that its result folder contains.
 
     Attributes:
-        run: what the pipeline left.
-        config: the effective one: with the (first) drive's path, whole, so that it can move.
-        stages: what was done, and how long it took.
-        warnings: what a person should know, a line each.
+        run: the result of the pipeline.
+        config: the effective config, with the absolute path of the (first) drive, so that it is
+            valid in any folder.
+        stages: of the run, with their durations.
+        warnings: one line each.
     """
 
     run: CalibrationRun
@@ -44,8 +45,8 @@ class FinishedJob:
         """Writes all files of the result into an empty folder.
 
         Raises:
-            OSError: something cannot be written.
-            OutputError: likewise.
+            OSError: a file cannot be written.
+            OutputError: a file cannot be written.
         """
         write_result(
             folder,
@@ -63,33 +64,33 @@ def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
 
     Args:
         config: the configuration.
-        data: drives instead of `data.path` of the config; empty: that one.
+        data: drives; empty: `data.path` of the config.
 
     Raises:
         ConfigError: a drive is given twice, or there is none.
-        RecordingError: one is missing, incomplete or contradicts itself.
+        RecordingError: a drive is missing, incomplete or inconsistent.
     """
     each_once(data, "--data ", "a drive")
     return [open_recording(config, path) for path in data or (None,)]
 
 
 def check_guesses(config: Config, path: Path) -> None:
-    """Refuses a config that `init` drafted and nobody filled in.
+    """Refuses a draft of `init` whose initial guesses are still zeros.
 
     Args:
         config: the configuration.
         path: its file.
 
     Raises:
-        ConfigError: two LiDARs still have the zeros that `init` writes where it knows no better.
+        ConfigError: two LiDARs have the zeros that `init` writes for unknown guesses.
     """
     unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
     zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
     if len(zeros) > 1:
         fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
         raise ConfigError(
-            f"{path}: {fields} are all zeros, but two LiDARs are not in one place. Measure where "
-            "they are, or read it off a drawing"
+            f"{path}: {fields} are all zeros, but two LiDARs cannot be in the same place. Measure "
+            "their positions, or take them from a drawing"
         )
 
 
@@ -99,18 +100,18 @@ def run_job(
     progress: SilentProgress,
     prior: Calibration | None = None,
 ) -> FinishedJob:
-    """Calibrates, and gathers what is to be written and said.
+    """Calibrates, and collects all warnings.
 
     Args:
         recordings: opened drives.
         config: the configuration.
-        progress: reports every stage.
+        progress: shows the stages.
         prior: an earlier calibration of the vehicle.
 
     Raises:
-        CalivError: something is wrong with the input; the message says what to do.
+        CalivError: the input is invalid or insufficient.
     """
-    # Here, for whoever only looks at a job has no use for the estimator.
+    # Imported here: batch inspects jobs without the estimator.
     from caliv_graph.pipeline import calibrate
 
     run = calibrate(recordings, config, progress, prior)
@@ -130,12 +131,12 @@ def run_job(
 
 
 def _unused_keys(config: Config) -> list[str]:
-    """A line for each key that is set and has no effect."""
+    """A line per section that is set and has no effect."""
     if config.data.format == "rosbag":
         return []
     sections = {"topics": config.topics, "imu": config.imu, "gnss": config.gnss}
     return [
-        f"{name}: has no effect on a CaLiV folder, which brings its poses"
+        f"{name}: has no effect, since a CaLiV folder contains the vehicle poses"
         for name, section in sections.items()
         if section != type(section)()
     ]

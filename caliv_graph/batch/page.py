@@ -1,4 +1,4 @@
-"""index.html: one page for the fleet, without any network; and the same in short for a terminal."""
+"""The summary of a batch: index.html, one self-contained page, and a table for a terminal."""
 
 from __future__ import annotations
 
@@ -12,26 +12,25 @@ from rich.text import Text
 import caliv_graph
 from caliv_graph.batch.summary import Deviation, Row, Spread, Summary
 from caliv_graph.products import LidarResult
-from caliv_graph.report.html import mounting_row
-from caliv_graph.report.layout import SHOWN_AXES, new_table, sentences, titled
+from caliv_graph.report.html import extrinsic_row
+from caliv_graph.report.layout import UNKNOWN, new_table, sentences, titled
+from caliv_graph.report.numbers import SHOWN_AXES
 from caliv_graph.report.page import environment
 from caliv_graph.report.tables import STATUS_STYLES
 from caliv_graph.results.names import REPORT_FILE
 
 FAR_SIGMAS = 3.0
-"""From which a drive counts as far from the others, to the eye: the verdict is a test's."""
-
-_UNTOLD = "-"
+"""A larger difference between drives is highlighted; the verdict comes from a test."""
 
 
 def render_index(summary: Summary) -> str:
-    """The page: every job with its extrinsics, and per vehicle how much its drives differ.
+    """The page: every job with its extrinsics, and per vehicle the differences between its drives.
 
     Args:
         summary: of the batch.
 
     Returns:
-        A whole HTML document. Its links are relative: the folder can be moved, or packed.
+        An HTML document with relative links, so that the folder can be moved.
     """
     template = environment().get_template("batch.html.j2")
     return template.render(
@@ -50,7 +49,7 @@ def render_index(summary: Summary) -> str:
 
 
 def summary_table(summary: Summary) -> RenderableType:
-    """The closing words of `batch`."""
+    """The result of `batch` as a table."""
     table = new_table("job", "exit", "time\ns", "status", "determined", "vehicle")
     for row in summary.rows:
         table.add_row(
@@ -63,9 +62,7 @@ def summary_table(summary: Summary) -> RenderableType:
         )
     parts: list[RenderableType] = [Text(_headline(summary), style="bold")]
     parts += titled("Jobs", table)
-    parts += sentences(
-        "What is wrong:", (f"{row.job}: {row.note}" for row in summary.rows if row.note)
-    )
+    parts += sentences("Problems:", (f"{row.job}: {row.note}" for row in summary.rows if row.note))
     parts += sentences("Vehicles:", (_spread_line(s) for s in summary.spreads()))
     return Group(*parts)
 
@@ -76,8 +73,8 @@ def _headline(summary: Summary) -> str:
     for key, words in (
         ("failed", "failed"),
         ("waiting", "not done yet"),
-        ("not_good_enough", "of the results not good enough"),
-        ("inconsistent", "of them contradict themselves"),
+        ("not_good_enough", "of the results without something required"),
+        ("inconsistent", "of them inconsistent"),
     ):
         if counts[key]:
             text += f", {counts[key]} {words}"
@@ -93,11 +90,11 @@ def _style(summary: Summary) -> str:
 
 
 def _determined(row: Row) -> str:
-    """Axes that were determined, of all LiDARs."""
+    """The number of determined axes of all LiDARs."""
     if row.calibration is None:
-        return _UNTOLD
-    told = [t for lidar in row.calibration.lidars.values() for t in lidar.determined.values()]
-    return f"{sum(told)} of {len(told)}"
+        return UNKNOWN
+    axes = [d for lidar in row.calibration.lidars.values() for d in lidar.determined.values()]
+    return f"{sum(axes)} of {len(axes)}"
 
 
 def _row(row: Row) -> dict[str, Any]:
@@ -107,29 +104,29 @@ def _row(row: Row) -> dict[str, Any]:
         "job": row.job,
         "vehicle": row.vehicle or "",
         "status": row.status,
-        "exit": _UNTOLD if row.exit is None else row.exit,
-        "seconds": _UNTOLD if row.seconds is None else f"{row.seconds:.1f}",
+        "exit": UNKNOWN if row.exit is None else row.exit,
+        "seconds": UNKNOWN if row.seconds is None else f"{row.seconds:.1f}",
         "reused": row.reused,
         "note": row.note,
         "report": str(PurePosixPath(folder) / REPORT_FILE),
         "folder": f"{folder}/",
         "warnings": len(row.warnings),
-        "lidars": [{"name": n, **_mounting_cells(lidar)} for n, lidar in lidars.items()],
+        "lidars": [{"name": n, **_extrinsic_cells(lidar)} for n, lidar in lidars.items()],
         "undetermined": []
         if row.calibration is None
         else [direction.text for direction in row.calibration.undetermined],
     }
 
 
-def _mounting_cells(lidar: LidarResult) -> dict[str, Any]:
-    cells = mounting_row(lidar)
-    trusted = not cells["estimated"]
-    # A value that the drive did not tell is in the report of its job, as the guess that it is.
+def _extrinsic_cells(lidar: LidarResult) -> dict[str, Any]:
+    cells = extrinsic_row(lidar)
+    fixed = not cells["estimated"]
+    # Undetermined values are initial guesses, which only the report of the job shows.
     shown = [
         {
-            "told": cell.determined and not trusted,
-            "value": "fixed" if trusted else cell.value if cell.determined else "not determined",
-            "below": cell.below if cell.determined and not trusted else "",
+            "determined": cell.determined and not fixed,
+            "value": "fixed" if fixed else cell.value if cell.determined else "not determined",
+            "below": f"± {cell.sigma}" if cell.determined and not fixed else "",
         }
         for cell in cells["cells"]
     ]
@@ -155,17 +152,17 @@ def _spread(spread: Spread) -> dict[str, Any]:
 
 def _deviation(deviation: Deviation | None) -> dict[str, Any]:
     if deviation is None:
-        return {"value": "not determined", "job": "", "far": False, "told": False}
+        return {"value": "not determined", "job": "", "far": False, "determined": False}
     return {
         "value": f"{deviation.sigmas:.1f}",
         "job": deviation.job,
         "far": deviation.sigmas > FAR_SIGMAS,
-        "told": True,
+        "determined": True,
     }
 
 
 def _spread_line(spread: Spread) -> str:
-    """How much the drives of a vehicle differ, in a sentence."""
+    """The differences between the drives of a vehicle, in a sentence."""
     if spread.reason:
         return f"{spread.vehicle}: not compared: {spread.reason}"
     found = [
@@ -176,7 +173,7 @@ def _spread_line(spread: Spread) -> str:
     ]
     drives = f"{spread.vehicle}: {len(spread.jobs)} drives"
     if not found:
-        return f"{drives}: there is no axis that they determine in common"
+        return f"{drives}: no axis is determined by two of them"
     sigmas, name, axis, job = max(found)
     most = f"largest difference {sigmas:.1f} sigma ({axis} of {name}, {job})"
     if spread.moved:

@@ -1,4 +1,4 @@
-"""A batch from its jobs to its summary: what is done is skipped, the rest goes to the workers."""
+"""A batch from its jobs to its summary: finished jobs are skipped, the others go to workers."""
 
 from __future__ import annotations
 
@@ -36,22 +36,21 @@ from caliv_graph.results.names import CALIBRATION_FILE
 _POLL_S = 0.2
 
 _COUNT_S = 5.0
-"""Seconds between two questions how many workers there are."""
+"""Seconds between two requests for the number of workers."""
 
 _PATIENCE_S = 300.0
 """Seconds without any worker, or without the scheduler, after which the batch ends."""
 
 _MOST_SUBMISSIONS = 6
-"""Of one job: it may have been lost with a worker that another one took down, or a scheduler that
-was started again."""
+"""Submissions per job: another job may have killed its worker, or the scheduler was restarted."""
 
 _WRITING_SHARE = 0.05
-"""Part of the time that may go into rewriting the summary while jobs run."""
+"""Largest fraction of the time for rewriting the summary while jobs run."""
 
 
 @dataclass
 class _Flight:
-    """A job that a worker has."""
+    """A job that is submitted to the workers."""
 
     future: Any
     submissions: int
@@ -67,24 +66,24 @@ def run_batch(
     force: bool = False,
     manifest: str = "",
 ) -> Summary:
-    """Does all jobs of a batch that are not done yet.
+    """Runs all jobs of a batch that are not done yet.
 
     Args:
         jobs: of the manifest.
-        out: the folder of the batch. An earlier batch there is resumed: whatever was made from the
-            same input, config and version is left as it is.
-        progress: told of every job.
+        out: the folder of the batch. An earlier batch there is resumed: results from the same
+            inputs, config and version are kept.
+        progress: shows the jobs.
         scheduler: address of a Dask scheduler; None: workers on this machine.
-        workers: how many of these; None: as many as there are processors, and jobs.
-        force: do all jobs again, and replace results of `calibrate` in their folders.
-        manifest: the file, for the summary.
+        workers: number of workers; None: the number of processors, or of jobs if smaller.
+        force: run all jobs again, and replace results of `calibrate` in their folders.
+        manifest: path of the manifest, for the summary.
 
     Returns:
-        What became of all of them. It is written beside the results, and while they run.
+        The results of all jobs, which are also written to `out` while the jobs run.
 
     Raises:
-        OutputError: `out` is not a batch's, or cannot be written.
-        BatchError: Dask is missing, or its scheduler or workers are of no use.
+        OutputError: `out` is not the folder of a batch, or cannot be written.
+        BatchError: Dask is not installed, or its scheduler or workers cannot be used.
     """
     with BatchFolder(out) as folder:
         batch = _Batch(jobs, folder, force, manifest)
@@ -115,9 +114,9 @@ class _Batch:
     """The state of a batch.
 
     Attributes:
-        folder: of it, held.
-        rows: what became of each job, in the manifest's order.
-        todo: what is left for workers.
+        folder: the locked folder.
+        rows: the state of each job, in the order of the manifest.
+        todo: jobs for the workers.
     """
 
     def __init__(
@@ -138,11 +137,11 @@ class _Batch:
         return Summary(tuple(self.rows.values()), self._manifest, _now())
 
     def write(self) -> None:
-        """Writes summary and digests as they are now."""
+        """Writes the current summary and digests."""
         start = time.monotonic()
         summary = self.summary()
         self.folder.keep_cache()
-        # The page last: who sees it finds the rest there.
+        # The page last, since it links to the other files.
         self.folder.write(
             {
                 "summary.json": summary_json(summary),
@@ -155,8 +154,8 @@ class _Batch:
         self._unwritten = False
 
     def prepare(self, progress: Progress) -> None:
-        """Finds what is done, what cannot be done, and what is left."""
-        with progress.stage("looking at what is there", len(self._jobs)) as advance:
+        """Sorts the jobs into done, failed and to do."""
+        with progress.stage("checking for finished jobs", len(self._jobs)) as advance:
             for job in self._jobs:
                 try:
                     config = effective_config(job)
@@ -179,7 +178,7 @@ class _Batch:
                         return
                 self._files[job.name] = {str(path) for path in inputs.files}
         except OSError:
-            pass  # what is not there, the job itself will say
+            pass  # the job itself reports a missing file
         self.todo[job.name] = Task(
             name=job.name,
             config=config,
@@ -194,14 +193,14 @@ class _Batch:
         )
 
     def work(self, workers: cluster.Workers, progress: Progress) -> None:
-        """Has the workers do what is left."""
+        """Runs the remaining jobs on the workers."""
         queue = deque((name, 0) for name in self.todo)
         flying: dict[str, _Flight] = {}
         count, counted_s, alive_s = workers.count(), time.monotonic(), time.monotonic()
         with progress.stage("calibrating", len(self._jobs)) as advance:
             finished = len(self._jobs) - len(self.todo)
             if finished:
-                advance(finished, f"{finished} were done or cannot be")
+                advance(finished, f"{finished} were done or failed before")
             while queue or flying:
                 now = time.monotonic()
                 if workers.connected and now - counted_s > _COUNT_S:
@@ -217,7 +216,7 @@ class _Batch:
                     try:
                         task = self._task(name)
                         future = workers.client.submit(run_task, task, key=key, pure=False)
-                    except OSError:  # the scheduler went away a moment ago
+                    except OSError:  # the connection was lost a moment ago
                         queue.append((name, submissions))
                         break
                     flying[name] = _Flight(future, submissions + 1)
@@ -232,14 +231,14 @@ class _Batch:
                 advance(0, self._note(flying))
 
     def _task(self, name: str) -> Task:
-        """A job with what is known by now of its files: others may have read them."""
+        """A job with all digests of its files that are known by now."""
         entries = self.folder.cache.entries
         known = self._files.get(name, set()) & entries.keys()
         cache = DigestCache({path: entries[path] for path in known})
         return replace(self.todo[name], cache=cache.dump())
 
     def _land(self, name: str, flight: _Flight, workers: cluster.Workers) -> bool:
-        """Takes what became of a job; False if it has to be done again."""
+        """Records the outcome of a job; False if the job must be submitted again."""
         future = flight.future
         if future.status == "finished":
             outcome: Outcome = future.result()
@@ -254,7 +253,9 @@ class _Batch:
                 return False
             else:
                 outcome = Outcome(
-                    "failed", None, f"was lost {_MOST_SUBMISSIONS} times with a worker or scheduler"
+                    "failed",
+                    None,
+                    f"was lost {_MOST_SUBMISSIONS} times with its worker or the scheduler",
                 )
         future.release()
         self.folder.cache.entries.update(DigestCache.parse(outcome.cache).entries)
@@ -263,7 +264,7 @@ class _Batch:
         elif outcome.kind == "unchanged":
             record = self.folder.record(name)
             if record is None or not self._take(name, record, reused=True):
-                self._fail(name, None, "its result has changed meanwhile. Run the batch again")
+                self._fail(name, None, "its result changed during the batch. Run the batch again")
         elif outcome.kind == "calibrated" and outcome.staged is not None:
             self._put(name, outcome, outcome.staged)
         else:
@@ -287,7 +288,7 @@ class _Batch:
             self._take(name, record, reused=False)
 
     def _take(self, name: str, record: JobRecord, reused: bool) -> bool:
-        """Takes a result into the summary, if it can be read."""
+        """Adds a result to the summary; False if the result cannot be read."""
         try:
             calibration = read_calibration(self.folder.path / name / CALIBRATION_FILE)
         except CalivError as e:
@@ -312,7 +313,7 @@ class _Batch:
         self, name: str, exit_code: int | None, message: str, trace: tuple[str, ...] = ()
     ) -> None:
         if (self.folder.path / name / CALIBRATION_FILE).is_file():
-            message += " (its folder still holds an older result)"
+            message += " (its folder still contains an older result)"
         text = " ".join(message.split())
         self._set(
             replace(self.rows[name], state="failed", exit=exit_code, message=text, trace=trace)
@@ -325,15 +326,15 @@ class _Batch:
     def _death(self, name: str, workers: cluster.Workers) -> str:
         parts = []
         for attempt in attempts(self.folder.work, name):
-            how = workers.deaths.get(attempt.pid, "ended without a word")
+            how = workers.deaths.get(attempt.pid, "ended without a message")
             parts.append(f"process {attempt.pid} on {attempt.host} {how}")
         return (
-            f"its worker died {len(parts)} times: {'; '.join(parts)}. Signal 9 is mostly the "
-            "system that runs out of memory: give the batch fewer --workers"
+            f"its worker died {len(parts)} times: {'; '.join(parts)}. Signal 9 usually means that "
+            "the system is out of memory: give the batch fewer --workers"
         )
 
     def _give_up(self, names: Sequence[str], workers: cluster.Workers) -> None:
-        what = "there was no worker" if workers.connected else "the scheduler was lost"
+        what = "no worker is left" if workers.connected else "the scheduler is lost"
         if len(names) == len(self.todo):
             raise BatchError(
                 f"batch: {what}, and no job was done. Start it, and run the batch again"
@@ -342,7 +343,7 @@ class _Batch:
             self._fail(name, None, f"{what}. Run the batch again")
 
     def _note(self, flying: dict[str, _Flight]) -> str:
-        """What is going on, as a person wants to know it."""
+        """The jobs that run now, with their stages."""
         parts = []
         for name in flying:
             try:
@@ -353,13 +354,13 @@ class _Batch:
         return "; ".join(parts[:4]) + (f"; {len(parts) - 4} more" if len(parts) > 4 else "")
 
     def _write_now_and_then(self) -> None:
-        """Writes the summary, unless that would take too much of the time."""
+        """Writes the summary, unless writing takes too large a part of the time."""
         if time.monotonic() - self._last_write >= self._write_s / _WRITING_SHARE:
             self.write()
 
 
 def _asked(count: Callable[[], int]) -> int:
-    """How many workers there are; none, if nobody answers."""
+    """The number of workers; 0 if the scheduler does not answer."""
     try:
         return count()
     except Exception:

@@ -1,7 +1,7 @@
-"""What became of a batch: as JSON for programs, as CSV for spreadsheets; `page` makes it a page.
+"""The results of a batch: JSON for programs, CSV for spreadsheets (the HTML page is in `page`).
 
-Metres, radians, seconds; CSV has degrees in columns that say so. What a drive did not determine is
-null, or an empty cell.
+Metres, radians, seconds; the angles in the CSV are in degrees, as its columns say. An undetermined
+value is null or an empty cell.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import merge
-from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, LidarResult
-from caliv_graph.report.layout import SHOWN_AXES
+from caliv_graph.report.numbers import SHOWN_AXES, pose_and_sigmas, rounded
 from caliv_graph.results.names import REPORT_FILE
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What makes a spreadsheet take text for a formula."""
+"""First characters of a text that a spreadsheet interprets as a formula."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +35,16 @@ class Row:
     """One job.
 
     Attributes:
-        job: its name, and its folder's.
-        vehicle: what the jobs of one vehicle have in common; None: not said.
-        state: `waiting`, `done` (there is a result) or `failed`.
-        exit: exit code that `calibrate` would have ended with; None: not known, or not yet.
-        message: why it failed, one line.
-        seconds: how long it took, when it was done.
-        digest: what its result was made from.
-        warnings: what a person should know, a line each.
+        job: name of the job and of its folder.
+        vehicle: name shared by the jobs of one vehicle; None: not given.
+        state: `waiting`, `done` (the result is written) or `failed`.
+        exit: exit code of `calibrate` for this job; None: not known, or not yet.
+        message: reason of the failure, one line.
+        seconds: duration of the calibration.
+        digest: of the inputs of the result (`digests.job_digest`).
+        warnings: one line each.
         calibration: the result.
-        reused: whether the result was there already.
+        reused: whether an earlier batch made the result.
         trace: lines of the traceback of a defect.
     """
 
@@ -63,12 +62,12 @@ class Row:
 
     @property
     def status(self) -> str:
-        """That of the result; of a job without one, its state."""
+        """The status of the result, or the state of a job without a result."""
         return self.state if self.calibration is None else self.calibration.status
 
     @property
     def note(self) -> str:
-        """What is wrong, in short: one line, or nothing."""
+        """The first problem in one line; empty without problems."""
         if self.message or self.calibration is None:
             return self.message
         found = (*self.calibration.contradictions, *self.calibration.unmet)
@@ -78,11 +77,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far, at most, a drive is from the vehicle's other drives.
+    """The largest difference between one drive and the other drives of the vehicle.
 
     Attributes:
-        sigmas: of the difference.
-        job: which one.
+        sigmas: the difference in standard deviations.
+        job: the job of this drive.
     """
 
     sigmas: float
@@ -94,13 +93,13 @@ class Spread:
     """The extrinsics of one vehicle, from drive to drive.
 
     Attributes:
-        vehicle: which.
-        jobs: whose results were compared, each with the others together (`fusion.merge`).
-        left_out: jobs that were not, and why.
-        deviations: per LiDAR (one name) and pair (two: the first against the second), and per axis
-            of `conventions.AXES`, in vehicle axes; None where the drives do not tell.
-        moved: jobs that disagree with the others, after the correction for the number of tests.
-        reason: why nothing was compared; empty: something was.
+        vehicle: name of the vehicle.
+        jobs: the jobs compared, each with all others together (`fusion.merge`).
+        left_out: per job that is not compared, the reason.
+        deviations: per LiDAR (one name) and pair (two names, from and to) and per axis of
+            `conventions.AXES`, in vehicle axes; None where no drive determines the axis.
+        moved: jobs that disagree with the others, corrected for the number of tests.
+        reason: why no job was compared; empty if jobs were compared.
     """
 
     vehicle: str
@@ -118,9 +117,9 @@ class Summary:
     """A batch.
 
     Attributes:
-        rows: per job of the manifest, in its order.
-        manifest: the file.
-        written: when, UTC, ISO 8601.
+        rows: one per job, in the order of the manifest.
+        manifest: path of the manifest.
+        written: time of writing, UTC, ISO 8601.
     """
 
     rows: tuple[Row, ...]
@@ -129,7 +128,7 @@ class Summary:
 
     @property
     def exit(self) -> int:
-        """The worst of the jobs; UNMET also if one failed, or is not done."""
+        """The exit code of the worst job; UNMET also if a job failed or is not done."""
         if any(row.exit == INCONSISTENT for row in self.rows):
             return INCONSISTENT
         good = all(row.state == "done" and row.exit == DONE for row in self.rows)
@@ -137,7 +136,7 @@ class Summary:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Jobs by state, and how many of the results fell short or contradict themselves."""
+        """Numbers of jobs by state, and of results with unmet requirements or contradictions."""
         states = [row.state for row in self.rows]
         exits = [row.exit for row in self.rows if row.state == "done"]
         return {
@@ -150,13 +149,13 @@ class Summary:
         }
 
     def spreads(self) -> list[Spread]:
-        """Per vehicle that the manifest names, in its order."""
+        """One per vehicle of the manifest, in its order."""
         names = dict.fromkeys(row.vehicle for row in self.rows if row.vehicle is not None)
         return [_spread(name, [r for r in self.rows if r.vehicle == name]) for name in names]
 
 
 def summary_document(summary: Summary) -> dict[str, Any]:
-    """The content of summary.json, plain values only."""
+    """The content of summary.json as plain values."""
     return {
         "schema": SUMMARY_SCHEMA,
         "caliv_graph": caliv_graph.__version__,
@@ -170,12 +169,12 @@ def summary_document(summary: Summary) -> dict[str, Any]:
 
 
 def summary_json(summary: Summary) -> str:
-    """summary.json."""
+    """The text of summary.json."""
     return json.dumps(summary_document(summary), indent=2, allow_nan=False) + "\n"
 
 
 def summary_csv(summary: Summary) -> str:
-    """summary.csv: a line per job and LiDAR, or one per job without a result."""
+    """The text of summary.csv: one line per job and LiDAR, or one per job without a result."""
     units = {axis: "m" if axis in "xyz" else "deg" for axis in SHOWN_AXES}
     values = [f"{axis}_{unit}" for axis, unit in units.items()]
     columns = [
@@ -208,7 +207,7 @@ def summary_csv(summary: Summary) -> str:
 
 
 def _csv_cells(lidar: LidarResult, units: Mapping[str, str]) -> dict[str, str]:
-    values, sigmas = _mounting(lidar)
+    values, sigmas = pose_and_sigmas(lidar.T_vehicle_lidar, lidar.cov)
     cells = {}
     for axis, unit in units.items():
         i = AXES.index(axis)
@@ -220,7 +219,7 @@ def _csv_cells(lidar: LidarResult, units: Mapping[str, str]) -> dict[str, str]:
 
 
 def _no_formula(value: Any) -> Any:
-    """Text that a spreadsheet takes for text. Names and messages come from elsewhere."""
+    """A value that a spreadsheet does not interpret as a formula; names are user input."""
     if not isinstance(value, str) or not value.startswith(_FORMULA) or _number(value):
         return value
     return f"'{value}"
@@ -232,13 +231,6 @@ def _number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _mounting(lidar: LidarResult) -> tuple[Array, Array]:
-    """(6,) roll, pitch, yaw, x, y, z and (6,) sigmas in vehicle axes; rad, m."""
-    T = lidar.T_vehicle_lidar
-    sigmas = np.sqrt(np.diag(parent_axes_covariance(T, lidar.cov)))
-    return np.concatenate([T.rotation().rpy(), T.translation()]), sigmas
 
 
 def _row_document(row: Row) -> dict[str, Any]:
@@ -270,11 +262,11 @@ def _row_document(row: Row) -> dict[str, Any]:
 
 
 def _lidar_document(lidar: LidarResult) -> dict[str, Any]:
-    values, sigmas = _mounting(lidar)
+    values, sigmas = pose_and_sigmas(lidar.T_vehicle_lidar, lidar.cov)
 
-    def told(numbers: Array, axes: Sequence[str]) -> list[float | None]:
+    def where_determined(numbers: Array, axes: Sequence[str]) -> list[float | None]:
         return [
-            float(f"{numbers[AXES.index(axis)]:.9g}") if lidar.determined[axis] else None
+            rounded(numbers[AXES.index(axis)], 9) if lidar.determined[axis] else None
             for axis in axes
         ]
 
@@ -282,10 +274,10 @@ def _lidar_document(lidar: LidarResult) -> dict[str, Any]:
     return {
         "saw_target": lidar.saw_target,
         "scans_used": lidar.scans_used,
-        "translation_m": told(values, translation),
-        "rpy_rad": told(values, rotation),
-        "sigma_translation_m": told(sigmas, translation),
-        "sigma_rotation_rad": told(sigmas, rotation),
+        "translation_m": where_determined(values, translation),
+        "rpy_rad": where_determined(values, rotation),
+        "sigma_translation_m": where_determined(sigmas, translation),
+        "sigma_rotation_rad": where_determined(sigmas, rotation),
         "determined": {axis: bool(lidar.determined[axis]) for axis in AXES},
     }
 
@@ -319,12 +311,12 @@ def _spread(vehicle: str, rows: Sequence[Row]) -> Spread:
         if row.calibration is None:
             left_out[row.job] = row.state
         elif row.calibration.status == "inconsistent":
-            left_out[row.job] = "contradicts itself"
+            left_out[row.job] = "inconsistent"
         else:
             results[row.job] = row.calibration
     jobs = tuple(results)
     if len(results) < 2:
-        reason = "takes two drives with a result"
+        reason = "two drives with a result are needed"
         return Spread(vehicle, jobs, left_out, reason=reason)
     try:
         agreement = merge(results).agreement

@@ -1,7 +1,7 @@
 """One job, in the process of a Dask worker.
 
-A worker may die, be cut off or be told to stop at any moment. What it writes is below the work
-folder of the run; that this is gone means that nobody waits for the result any more.
+A worker may die, lose its connection or be stopped at any time. It writes below the work folder of
+the run. When that folder is gone, the batch has ended and the worker stops.
 """
 
 from __future__ import annotations
@@ -27,33 +27,32 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError
 
 MOST_ATTEMPTS = 2
-"""How often a job may take a worker down with it: once may have been somebody else's fault."""
+"""Attempts per job: the first worker may have died for a reason outside the job."""
 
 _LOOK_S = 1.0
-"""Seconds between two looks at whether the result is still wanted."""
+"""Seconds between two checks that the batch still runs."""
 
-_NO_MEMORY = "there was not enough memory. Give the batch fewer --workers"
+_NO_MEMORY = "the memory is not sufficient. Give the batch fewer --workers"
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A worker may have several threads; the pipeline has one."""
+"""A worker may have several threads, but runs one pipeline at a time."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a worker needs to know of a job. All paths are absolute.
+    """The description of a job for a worker. All paths are absolute.
 
     Attributes:
         name: of the job.
         config: the effective config.
-        config_file: where it is from, for messages.
-        data: drives instead of the config's; empty: the config's.
+        config_file: path of the config, for messages.
+        data: drives; empty: `data.path` of the config.
         prior: an earlier calibration.
-        recorded: digest of the result that is there already; None: there is none, or it is to be
-            made again.
-        cache: digests of its files that are known (`DigestCache.dump`).
+        recorded: digest of the existing result; None: there is none, or it is made again.
+        cache: known digests of the input files (`DigestCache.dump`).
         out: folder of the batch.
-        work: folder of this run.
-        version: of the program that runs the batch.
+        work: work folder of this run.
+        version: version of the program that runs the batch.
     """
 
     name: str
@@ -70,7 +69,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Attempt:
-    """Which process took up a job."""
+    """The process of one attempt at a job."""
 
     host: str
     pid: int
@@ -78,19 +77,19 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """The outcome of a job.
 
     Attributes:
-        kind: `calibrated`; `unchanged`: the result that is there is the right one; `failed`;
-            `died`: its workers did, as often as they may.
-        exit: exit code that `calibrate` would have ended with; None if a worker died.
-        message: why it failed, one line.
+        kind: `calibrated`; `unchanged`: the existing result is valid; `failed`; `died`: all
+            attempts ended with the death of the worker.
+        exit: exit code of `calibrate` for this job; None if a worker died.
+        message: reason of the failure, one line.
         trace: lines of the traceback of a defect.
-        digest: of the job.
+        digest: of the inputs.
         staged: folder of the result.
-        warnings: what a person should know, a line each.
-        seconds: how long it took.
-        cache: digests of its files.
+        warnings: one line each.
+        seconds: duration of the calibration.
+        cache: digests of the input files.
     """
 
     kind: Literal["calibrated", "unchanged", "failed", "died"]
@@ -105,11 +104,11 @@ class Outcome:
 
 
 class NotWantedError(Exception):
-    """The batch has ended, or was killed."""
+    """The batch has ended or was killed."""
 
 
 class _WatchedProgress(SilentProgress):
-    """Tells the batch the stage, and stops the job if there is no batch any more."""
+    """Writes the current stage to a file, and stops the job when the batch has ended."""
 
     def __init__(self, task: Task) -> None:
         super().__init__()
@@ -133,12 +132,12 @@ class _WatchedProgress(SilentProgress):
 
 
 def stage_file(work: Path, job: str) -> Path:
-    """Where a worker says what it is doing."""
+    """The file in which a worker writes its current stage."""
     return work / f"{job}.stage"
 
 
 def attempts(work: Path, job: str) -> list[Attempt]:
-    """Who took up a job in this run, in order."""
+    """The attempts at a job in this run, in order."""
     out = []
     for number in range(1, MOST_ATTEMPTS + 1):
         try:
@@ -149,7 +148,7 @@ def attempts(work: Path, job: str) -> list[Attempt]:
 
 
 def run_task(task: Task) -> Outcome:
-    """Does a job, unless it is done or has killed its workers. Whatever goes wrong is an outcome.
+    """Runs a job unless it is done or has used all attempts. Errors become outcomes.
 
     Raises:
         NotWantedError: the batch has ended.
@@ -189,10 +188,10 @@ _MALLOPT = {-1: 512 << 20, -3: 32 << 20}
 
 @functools.cache
 def _keep_freed_memory() -> None:
-    """Lets the C library keep what was freed for the next array.
+    """Lets the C library keep freed memory for the next array.
 
-    Dask has its workers give back all that is freed at once, and with that switches off what makes
-    the library learn: a quarter of the time went into zeroing pages.
+    Dask sets M_TRIM_THRESHOLD for its workers, which disables glibc's dynamic thresholds. A quarter
+    of the run time was then spent on zeroing pages.
     """
     with suppress(OSError, AttributeError):
         for option, value in _MALLOPT.items():
@@ -200,7 +199,7 @@ def _keep_freed_memory() -> None:
 
 
 def _run(task: Task, attempt: int, start: float) -> Outcome:
-    # Here, for the batch itself has no use for the estimator.
+    # Imported here: the process of the batch itself does not need the estimator.
     from threadpoolctl import threadpool_limits
 
     from caliv_graph.batch.digests import DigestCache, job_digest, job_inputs
@@ -216,13 +215,13 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
             f"batch {task.version}. Install the same version on all workers"
         )
     _keep_freed_memory()
-    # The readers know best what is wrong with a drive or a prior.
+    # The readers first: their messages about a drive or a prior are the most specific.
     check_guesses(task.config, task.config_file)
     prior = None if task.prior is None else read_calibration(task.prior)
     recordings = open_recordings(task.config, task.data)
     inputs = job_inputs(task.config, task.data, task.prior, task.out)
     if inputs is None:
-        raise RecordingError(f"{recordings[0].name}: holds no files that could be read")
+        raise RecordingError(f"{recordings[0].name}: has no readable files")
     progress = _WatchedProgress(task)
     cache = DigestCache.parse(task.cache)
     before = inputs.states()
@@ -240,8 +239,8 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     changed = [path for path, state in inputs.states().items() if before[path] != state]
     if changed:
         raise RecordingError(
-            f"{changed[0]}: was written to while it was calibrated from. Run the batch again when "
-            "the recording is whole"
+            f"{changed[0]}: changed during the calibration. Run the batch again when the recording "
+            "is complete"
         )
     return Outcome(
         "calibrated",
@@ -259,7 +258,7 @@ def _attempt_file(work: Path, job: str, number: int) -> Path:
 
 
 def _mark_attempt(task: Task, number: int) -> None:
-    """Says who takes up the job, before it can do any harm."""
+    """Records the process of an attempt before the job starts."""
     attempt = {"host": socket.gethostname(), "pid": os.getpid()}
     try:
         _attempt_file(task.work, task.name, number).write_text(json.dumps(attempt), "utf-8")
@@ -268,25 +267,25 @@ def _mark_attempt(task: Task, number: int) -> None:
 
 
 def probe(token: str, version: str) -> str:
-    """Whether a worker can do the jobs of a batch.
+    """Checks that a worker can run the jobs of a batch.
 
     Args:
-        token: a file in the batch's folder, which all workers have to see.
-        version: of the program that runs the batch.
+        token: a file in the folder of the batch, which every worker must be able to read.
+        version: version of the program that runs the batch.
 
     Returns:
-        What is wrong; empty: nothing.
+        The problem as text; empty: none.
     """
     if version != caliv_graph.__version__:
         return f"has caliv-graph {caliv_graph.__version__}, not {version}: install the same version"
     if not os.access(token, os.R_OK):
-        return f"does not see {token}: put data and --out on a disk that all workers share"
+        return f"cannot read {token}: put data and --out on a disk that all workers share"
     return ""
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepares a worker of our own cluster (Dask calls this where the module is a preload).
+    """Prepares a worker of the local cluster (Dask calls this for a preload module).
 
-    What native code prints is no part of the batch's own output.
+    Output of native code goes to stderr, so that it does not mix with the output of the batch.
     """
     os.dup2(2, 1)

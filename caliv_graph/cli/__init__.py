@@ -1,1 +1,1 @@
-"""The command line: one file per command, each as thin as it can be."""
+"""The command line: one thin file per command."""

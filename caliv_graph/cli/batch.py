@@ -16,7 +16,7 @@ def batch(
         Path,
         typer.Argument(
             metavar="MANIFEST.yaml",
-            help="The jobs; configs/batch.yaml is an example with every key.",
+            help="The jobs; configs/batch.yaml shows every key.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for all results.")],
@@ -25,8 +25,8 @@ def batch(
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="A Dask scheduler that runs already, such as tcp://host:8786, instead of workers "
-            "on this machine. Its workers need caliv-graph, and the same disk.",
+            help="A running Dask scheduler, such as tcp://host:8786, instead of workers on this "
+            "machine. Its workers need caliv-graph and the same disk.",
         ),
     ] = None,
     workers: Annotated[
@@ -37,35 +37,35 @@ def batch(
             max=1024,
             metavar="N",
             help="Worker processes, one job each at a time; default: one per processor. With "
-            "--scheduler: jobs at a time, at most; default: as many as it has workers.",
+            "--scheduler: largest number of jobs at a time; default: its number of workers.",
         ),
     ] = None,
     force: Annotated[
         bool,
         typer.Option(
             "--force",
-            help="Do all jobs again, also those that are done, and replace results of 'calibrate' "
+            help="Run all jobs again, including finished ones, and replace results of 'calibrate' "
             "in their folders.",
         ),
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document, summary.json's content.")
+        bool, typer.Option("--json", help="Print the content of summary.json.")
     ] = False,
 ) -> None:
     r"""Calibrate many drives and vehicles, on all processors or on a Dask cluster.
 
-    DIR gets a folder per job with what 'calibrate' writes, and index.html (every job, its
-    extrinsics and, per vehicle, how much its drives differ), summary.csv and summary.json, which
-    are rewritten as jobs finish.
+    DIR contains one folder per job with the files of 'calibrate', and index.html (all jobs, their
+    extrinsics and, per vehicle, the differences between its drives), summary.csv and summary.json,
+    which are rewritten when a job finishes.
 
-    The same command again resumes: a result that was made from the same bytes of data and prior,
-    the same config and version is left as it is, also after a kill; all else is done again. One
-    failure does not stop the others; a job whose worker dies is tried once more. Needs the extra:
+    The same command resumes a batch, also after a kill: results from the same bytes of data and
+    prior, the same config and the same version are kept; all other jobs run again. A failed job
+    does not stop the others; a job whose worker dies is tried once more. Needs the extra:
     pip install 'caliv-graph\[batch]'
 
-    Exit code: that of the worst job. 4: the data of one contradict each other; 3: one failed (a bad
-    config or drive too), or did not reach what its config requires; 0: all are done and good. 2:
-    nothing was run: a bad manifest, a folder that is not a batch's, or no scheduler.
+    Exit code: that of the worst job. 4: the data of a job contradict each other; 3: a job failed
+    (for a bad config or drive too), or did not reach what its config requires; 0: all jobs are
+    done. 2: no job was run: a bad manifest, a folder with other content, or no scheduler.
 
     Example: caliv-graph batch fleet.yaml --out fleet/
     """

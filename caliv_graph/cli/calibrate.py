@@ -1,4 +1,4 @@
-"""`caliv-graph calibrate`: from drives to extrinsics."""
+"""`caliv-graph calibrate`: extrinsics from one or more drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def calibrate(
         typer.Option(
             "--prior",
             metavar="CALIBRATION.yaml",
-            help="An earlier calibration of this vehicle: what its drive's data say is added.",
+            help="An earlier calibration of this vehicle: the information of its data is added.",
         ),
     ] = None,
     force: Force = False,
@@ -29,14 +29,14 @@ def calibrate(
 ) -> None:
     """Calibrate the LiDARs of a vehicle from one or more drives past a target.
 
-    DIR gets calibration.yaml (extrinsics, covariance, what was not determined), config.yaml (the
-    effective one), target.ply (the reconstructed target), graph.gtsam and graph.values.gtsam (the
-    extrinsics as priors that a GTSAM localiser loads), report.html (what the result is worth, in
-    one page without any network) and log.jsonl (every stage, for programs).
+    DIR contains calibration.yaml (extrinsics, covariance, undetermined directions), config.yaml
+    (the effective config), target.ply (the reconstructed target), graph.gtsam and
+    graph.values.gtsam (the extrinsics as priors for a GTSAM localiser), report.html (quality of the
+    result, self-contained) and log.jsonl (all stages, for programs).
 
     Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
-    for was not reached, or a LiDAR never saw the target. Exit code 4: it is written, but the data
-    contradict each other, the initial guess, or the earlier calibration given with '--prior'.
+    for was not reached, or a LiDAR never saw the target. Exit code 4: the result is written, but
+    the data contradict each other, the initial guess, or the calibration given with '--prior'.
 
     Example: caliv-graph calibrate config.yaml --out result/
     """
@@ -54,7 +54,7 @@ def calibrate(
     settings = load_config(config)
     check_guesses(settings, config)
     earlier = None if prior is None else read_calibration(prior)
-    # Nobody should wait for a result that then has no place to go.
+    # Checked before the calibration, which takes long.
     check_output_folder(out, RESULT_FILES, force)
     recordings = open_recordings(settings, data or ())
     with streams.progress_on_stdout(as_json) as progress:

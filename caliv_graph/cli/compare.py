@@ -1,4 +1,4 @@
-"""`caliv-graph compare`: has a mount moved between two calibrations?"""
+"""`caliv-graph compare`: tests whether a mount moved between two calibrations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def compare(
     p_value: PValue = P_VALUE,
     as_json: AsJson = False,
 ) -> None:
-    """Tell whether a LiDAR's mount has moved between two calibrations of one vehicle.
+    """Test whether the mount of a LiDAR moved between two calibrations of one vehicle.
 
-    Tested are each LiDAR against the vehicle and each pair of LiDARs: a chi-square on the joint
-    covariance of what the two drives themselves say. A guess that both started from plays no part:
-    along a direction that either drive did not determine, nothing can be said. The verdict allows
-    for the number of tests.
+    The command tests each LiDAR against the vehicle and each pair of LiDARs by a chi-square test on
+    the joint covariance of the data of the two drives. The initial guesses are not used: a
+    direction that either drive does not determine is not tested. The verdict is corrected for the
+    number of tests.
 
     Example: caliv-graph compare spring/calibration.yaml autumn/calibration.yaml
     """
@@ -40,7 +40,7 @@ def compare(
     else:
         streams.show(comparison_table(comparison, labels, p_value))
     streams.warn(
-        f"{label}: is inconsistent in itself: what its data say cannot be relied on"
+        f"{label}: its status is inconsistent, so its data are not reliable"
         for label, calibration in zip(labels, calibrations, strict=True)
         if calibration.status == "inconsistent"
     )

@@ -1,4 +1,4 @@
-"""`caliv-graph evaluate`: a calibration against the truth."""
+"""`caliv-graph evaluate`: errors of a calibration, given the true extrinsics."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ def evaluate(
     truth: Annotated[
         Path,
         typer.Argument(
-            metavar="TRUTH.yaml", help="True extrinsics; another calibration.yaml serves as well."
+            metavar="TRUTH.yaml", help="True extrinsics; may be another calibration.yaml."
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
     """Compare a calibration with the truth: sensor-to-vehicle and sensor-to-sensor errors, NEES.
 
-    Errors are in vehicle axes. That of a pair leaves out what its two LiDARs have in common, as in
-    the paper's Evaluation section. NEES is 6 on average if the covariance is right.
+    Errors are in vehicle axes. The error of a pair does not contain the common error of its two
+    LiDARs, as in the Evaluation section of the CaLiV paper. NEES is 6 on average if the covariance
+    is right.
 
     Example: caliv-graph evaluate result/calibration.yaml drive/truth.yaml
     """
@@ -41,7 +42,7 @@ def evaluate(
     if len(unknown) == len(names):
         raise ConfigError(
             f"{truth}: has none of the LiDARs of {calibration} ({', '.join(names)}), but "
-            f"{', '.join(true_T_vehicle_lidar)}. Give them the same names"
+            f"{', '.join(true_T_vehicle_lidar)}. Use the same names in both files"
         )
     evaluation = evaluate_calibration(
         estimate.calibration, true_T_vehicle_lidar, estimate.cov_pairs

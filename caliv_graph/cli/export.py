@@ -1,14 +1,15 @@
-"""`caliv-graph export`: a calibration in the form of a localiser, a robot model or a program."""
+"""`caliv-graph export`: a calibration in the format of a localiser, robot model or program."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from caliv_graph.cli import streams
 from caliv_graph.cli.options import AsJson, CalibrationArgument, Force
+from caliv_graph.export.consumers import consumer_names
 
 if TYPE_CHECKING:
     from caliv_graph.export.request import Export, Request
@@ -16,22 +17,23 @@ if TYPE_CHECKING:
 _POSE = "x,y,z,roll,pitch,yaw"
 
 
+def _known_consumer(name: str) -> str:
+    names = consumer_names()
+    if name not in names:
+        raise typer.BadParameter(f"'{name}' is not one of {', '.join(names)}.")
+    return name
+
+
 def export(
     calibration: CalibrationArgument,
     to: Annotated[
-        Literal[
-            "urdf",
-            "tf",
-            "autoware",
-            "glim",
-            "lio-sam",
-            "fast-lio",
-            "mola",
-            "npz",
-            "json",
-            "gtsam",
-        ],
-        typer.Option("--to", help="Who is to read it."),
+        str,
+        typer.Option(
+            "--to",
+            metavar=f"[{'|'.join(consumer_names())}]",
+            callback=_known_consumer,
+            help="The program that reads the file.",
+        ),
     ],
     out: Annotated[
         Path,
@@ -39,7 +41,7 @@ def export(
             "--out",
             metavar="FILE",
             help="The file to write. tf: .sh gives lines of static_transform_publisher, .py a "
-            "launch file, .mcap a bag with /tf_static. gtsam: a YAML beside it is written, too.",
+            "launch file, .mcap a bag with /tf_static. gtsam: also writes a YAML beside it.",
         ),
     ],
     base: Annotated[
@@ -47,7 +49,7 @@ def export(
         typer.Option(
             "--base",
             metavar="OLD",
-            help="An existing file of the consumer: only the numbers are changed in the copy.",
+            help="An existing file of the program: a copy with new numbers is written.",
         ),
     ] = None,
     lidar: Annotated[
@@ -59,7 +61,7 @@ def export(
         typer.Option(
             "--frame",
             metavar="NAME=FRAME",
-            help="What the LiDAR is called there: link or frame. Default: what is named like it.",
+            help="Link or frame of the LiDAR there. Default: the one with a similar name.",
         ),
     ] = None,
     housing: Annotated[
@@ -68,7 +70,7 @@ def export(
             "--housing",
             metavar="NAME=xyz,rpy",
             help=f"The frame of the LiDAR's clouds in that of its housing, {_POSE} in metres and "
-            "radians: the pose of the housing is written instead.",
+            "radians: the pose of the housing is written.",
         ),
     ] = None,
     parent: Annotated[
@@ -76,7 +78,7 @@ def export(
         typer.Option(
             "--parent",
             metavar="FRAME=xyz,rpy",
-            help="Pose of a frame of OLD in the vehicle frame, such as Autoware's sensor kit.",
+            help="Pose of a parent frame in the vehicle frame, such as Autoware's sensor kit.",
         ),
     ] = None,
     vehicle_frame: Annotated[
@@ -101,7 +103,7 @@ def export(
     bag: Annotated[
         Path | None,
         typer.Option(
-            "--bag", metavar="DRIVE", help="Take frames and housings from its /tf_static."
+            "--bag", metavar="DRIVE", help="A recording: frames and housings from its /tf_static."
         ),
     ] = None,
     letter: Annotated[
@@ -114,7 +116,7 @@ def export(
         str,
         typer.Option(
             "--form",
-            help="tf: lines, launch or mcap instead of what the suffix says. lio-sam, fast-lio: "
+            help="tf: lines, launch or mcap; default: by the suffix of --out. lio-sam, fast-lio: "
             "ros2 (default) or ros1.",
         ),
     ] = "",
@@ -123,18 +125,18 @@ def export(
 ) -> None:
     """Write a calibration for the stack that uses it: URDF, tf2, Autoware, LIO configs, GTSAM.
 
-    Every file says which way its transforms go, and which axes the drive did not determine. With
-    --base an existing file is copied, and only its numbers are changed.
+    A comment in every file states the direction of its transforms and the axes that the drive did
+    not determine. With --base, an existing file is copied, and only its numbers change.
 
     Example: caliv-graph export result/calibration.yaml --to urdf --base old.urdf --out new.urdf
     """
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.export.consumers import export as export_to
-    from caliv_graph.export.prepare import Wishes, prepare
-    from caliv_graph.export.wording import caveats
+    from caliv_graph.export.prepare import Options, prepare
+    from caliv_graph.export.text import caveats
 
     check_output_file(out, force)
-    wishes = Wishes(
+    options = Options(
         consumer=to,
         out=out,
         base=base,
@@ -149,7 +151,7 @@ def export(
         letter=letter,
         form=form,
     )
-    request = prepare(calibration, wishes)
+    request = prepare(calibration, options)
     exported = export_to(to, request)
     for path in exported.beside:
         check_output_file(path, force)
@@ -165,7 +167,7 @@ def export(
 
 
 def _say(request: Request, exported: Export) -> None:
-    from caliv_graph.export.wording import undetermined_axes
+    from caliv_graph.export.text import undetermined_axes
 
     for transform in exported.transforms:
         axes = undetermined_axes(request.calibration.lidars[transform.lidar])
@@ -175,7 +177,7 @@ def _say(request: Request, exported: Export) -> None:
 
 
 def _document(to: str, request: Request, exported: Export, warnings: list[str]) -> dict[str, Any]:
-    from caliv_graph.export.wording import quaternion_xyzw, undetermined_axes
+    from caliv_graph.export.text import quaternion_xyzw, undetermined_axes
 
     return {
         "to": to,

@@ -26,10 +26,10 @@ def init(
 ) -> None:
     """Write a commented config for a drive.
 
-    It names the LiDARs and, of a bag, the topics that tell the motion. Initial guesses are taken
-    from /tf_static or a URDF; of a CaLiV folder, they and the target's region from a config of the
-    CaLiV authors' program (transform_sensor_N, min_bound, max_bound) if one lies beside the data.
-    What is left for you to fill in is marked TODO.
+    The config names the LiDARs and, for a bag, the topics of the vehicle's motion. Initial guesses
+    come from /tf_static or a URDF. For a CaLiV folder, initial guesses and the region of the target
+    come from a config of the CaLiV authors' program (transform_sensor_N, min_bound, max_bound) in
+    the same folder. Values to fill in are marked TODO.
 
     Example: caliv-graph init drive/ --urdf vehicle.urdf --out config.yaml
     """

@@ -1,4 +1,4 @@
-"""`caliv-graph inspect`: what a recording holds."""
+"""`caliv-graph inspect`: the content of a recording."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def inspect(
     config: Annotated[
         Path | None,
         typer.Option(
-            "--config", metavar="CONFIG", help="Also look for the target with this config."
+            "--config", metavar="CONFIG", help="Also search for the target with this config."
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what a recording holds: topics, rates, gaps, clocks, times of points, units, the drive.
+    """Show the content of a recording: topics, rates, gaps, clocks, point times, units, the drive.
 
-    With a config, also which LiDAR sees the target when.
+    With a config, also when each LiDAR sees the target.
 
     Example: caliv-graph inspect drive/ --config config.yaml
     """
@@ -33,7 +33,7 @@ def inspect(
     from caliv_graph.readers import open_recording
     from caliv_graph.readers.discover import open_all
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
-    from caliv_graph.report.tables import inspection_table
+    from caliv_graph.report.inspection_table import inspection_table
 
     settings = None if config is None else load_config(config)
     recording = open_all(data) if settings is None else open_recording(settings, data)

@@ -1,7 +1,7 @@
 """The command line: commands, exit codes, interrupts.
 
-Whatever imports gtsam, open3d or pydantic is imported inside the commands, for `--help` is to
-answer at once.
+Modules that need gtsam, open3d or pydantic are imported inside the commands, so that `--help`
+answers at once.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from caliv_graph.errors import CalivError
 _PROGRAM = "caliv-graph"
 
 _UsageError: Any = typer.BadParameter.__mro__[1]
-"""Base of what typer raises on a wrong command line; it has no public name for it."""
+"""Base class of typer's errors about the command line, which has no public name."""
 
 app = typer.Typer(
     name=_PROGRAM,
@@ -45,7 +45,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help="Calibrates LiDARs to each other and to the vehicle from one drive past a target, with "
-    "covariance and a statement of what the drive could not determine.",
+    "covariance, and names the directions that the drive does not determine.",
     epilog="Exit codes: 0 done; 2 bad usage or input; 3 finished, but something required was not "
     "determined; 4 finished, but the data contradict each other; 130 interrupted; 1 a defect of "
     "the program.",
@@ -53,7 +53,7 @@ app = typer.Typer(
 
 
 def _paragraphs(docstring: str) -> str:
-    """A docstring without the line breaks inside its paragraphs: the terminal makes its own."""
+    """A docstring without the line breaks inside its paragraphs, for typer to wrap."""
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
 
 
@@ -83,16 +83,16 @@ def _options(
 
 
 class _Interrupts:
-    """Turns SIGINT and SIGTERM into KeyboardInterrupt, and remembers that it did.
+    """Turns SIGINT and SIGTERM into KeyboardInterrupt, and records it.
 
-    Native code between here and there may turn the exception into another one.
+    Native code may turn the exception into another one.
     """
 
     def __init__(self) -> None:
         self.came = False
 
     def __enter__(self) -> Self:
-        # SIGINT too: a shell without job control has it ignored in what it starts with '&'.
+        # SIGINT too: a shell without job control starts programs with '&' that ignore it.
         numbers = (signal.SIGINT, signal.SIGTERM)
         self._before = {number: signal.signal(number, self._on_signal) for number in numbers}
         return self
@@ -107,17 +107,17 @@ class _Interrupts:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Runs a command line and turns whatever escapes from it into messages.
+    """Runs a command line and turns all exceptions into messages.
 
     Args:
         arguments: without the program's name.
 
     Returns:
-        The exit code (SPEC 5).
+        The exit code, one of `common.exits`.
     """
     with _Interrupts() as interrupts, warnings.catch_warnings():
         if not sys.warnoptions:
-            # They are for developers; on stderr they would be lines that nobody can act upon.
+            # Python warnings are for developers; a user cannot act upon them.
             warnings.simplefilter("ignore")
         try:
             code = typer.main.get_command(app).main(
@@ -131,9 +131,9 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _explain(problem: BaseException) -> int:
-    """Says what went wrong, and with which exit code to leave."""
+    """Prints the error and returns the exit code."""
     if isinstance(problem, typer.Abort) and isinstance(problem.__context__, EOFError):
-        # Typer takes it for the end of what a person types; here nobody is asked anything.
+        # Typer raises Abort for an EOFError, as if the user had ended an interactive input.
         problem = problem.__context__
     if isinstance(problem, KeyboardInterrupt | typer.Abort):
         return INTERRUPTED
@@ -164,11 +164,11 @@ def _usage_message(problem: Any) -> str:
 def main() -> None:
     """Entry point of `caliv-graph`."""
     code = run(sys.argv[1:])
-    # What there is to do has been done and told. Python gives up its handlers before it ends, and
-    # a signal would then turn a success into a death by signal.
+    # All output is written. Python removes its handlers before it ends, and a signal would then
+    # turn a success into a death by signal.
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     if code == INTERRUPTED:
-        # Python remembers an interrupt that native code came across, and would end by the signal.
+        # After an interrupt in native code, Python would end by the signal.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -24,9 +24,10 @@ def merge(
 ) -> None:
     """Merge several calibrations of one vehicle into one.
 
-    What the drives' data say is summed, and the initial guess, which they share, counts once: the
-    result is that of all drives solved together, without solving again. A drive must not count
-    twice. The files may have different LiDARs and references; those of the first come first.
+    The information of the drives' data is summed, and the common initial guess counts once. The
+    result equals that of all drives solved together, without a new solve. Do not merge calibrations
+    of the same drive. The files may have different LiDARs and references; the order is that of the
+    first file.
 
     Exit code 4: the result is written, but the calibrations contradict each other.
 
@@ -44,7 +45,7 @@ def merge(
     )
 
     if len(calibrations) < 2:
-        raise ConfigError(f"{calibrations[0]}: is one calibration; to merge takes two or more")
+        raise ConfigError(f"{calibrations[0]}: is one calibration; merge needs two or more")
     each_once(calibrations, "", "a calibration")
     check_output_file(out, force)
     merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)

@@ -1,4 +1,4 @@
-"""`caliv-graph observability`: what a recorded drive determines, before it is calibrated."""
+"""`caliv-graph observability`: the directions that a recorded drive determines."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def observability(
     data: Drives = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find out what a recorded drive determines, before calibrating.
+    """Show what a recorded drive determines, before the calibration.
 
-    The expected sigma per LiDAR and axis, the directions that the drive leaves undetermined or
-    weak, each with the manoeuvre that would tell it, and who sees the target. Takes a part of the
-    time of 'calibrate', and asks the same of the data.
+    Prints the expected sigma per LiDAR and axis, the undetermined and weak directions with the
+    manoeuvre that determines each, and the scans that see the target. Takes less time than
+    'calibrate' and needs the same data.
 
     Exit code 3: something that 'require' or 'limits' in the config asks for will not be reached, or
     a LiDAR never saw the target.

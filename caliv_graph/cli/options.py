@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have."""
+"""Arguments and options of several commands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 ConfigArgument = Annotated[
-    Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' drafts one.")
+    Path, typer.Argument(metavar="CONFIG.yaml", help="The config; 'init' writes a draft.")
 ]
 
 CalibrationArgument = Annotated[
@@ -21,7 +21,7 @@ Drives = Annotated[
         "--data",
         metavar="PATH",
         help="The drive, instead of data.path of the config. Repeat the option for several drives "
-        "of one vehicle: they are taken together.",
+        "of one vehicle, which are solved together.",
     ),
 ]
 
@@ -31,7 +31,7 @@ PValue = Annotated[
         "--p-value",
         min=1e-12,
         max=0.5,
-        help="Chance of a false alarm if no mount has moved, over all tests together.",
+        help="Probability of a false alarm over all tests, if no mount moved.",
     ),
 ]
 P_VALUE = 0.01
@@ -42,5 +42,5 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document.")
 
 ResultAsJson = Annotated[
     bool,
-    typer.Option("--json", help="Print one JSON document, calibration.yaml's content and more."),
+    typer.Option("--json", help="Print one JSON document with the content of calibration.yaml."),
 ]

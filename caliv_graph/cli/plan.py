@@ -1,4 +1,4 @@
-"""`caliv-graph plan`: what a drive will tell, before it is driven."""
+"""`caliv-graph plan`: the accuracy that a planned drive will reach."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def plan(
         list[Path],
         typer.Argument(
             metavar="SCENARIO.yaml",
-            help="The drive: vehicle, LiDARs, target. Several: drives of one vehicle, to be solved "
+            help="The drive: vehicle, LiDARs, target. Several: drives of one vehicle, solved "
             "together.",
         ),
     ],
@@ -26,24 +26,26 @@ def plan(
         typer.Option(
             "--sigma",
             metavar="KEY=VALUE",
-            help="Largest sigma wanted: s2v_ or s2s_, then roll_deg, pitch_deg, yaw_deg, x_m, y_m "
-            "or z_m, as in 'limits' of a config. Repeat it for more.",
+            help="Limit of a sigma: s2v_ or s2s_, then roll_deg, pitch_deg, yaw_deg, x_m, y_m or "
+            "z_m, as in 'limits' of a config. Can be repeated.",
         ),
     ] = None,
     ground: Annotated[
         Literal["none", "plane", "height"],
         typer.Option(
             "--ground",
-            help="What is made of the ground: nothing, a plane, or one below the vehicle at a "
-            "known height.",
+            help="How the ground is used: not at all, as a plane, or as a plane at a known height "
+            "below the vehicle.",
         ),
     ] = "height",
     poses: Annotated[
         bool,
-        typer.Option("--poses", help="The recording has poses (a CaLiV folder), no raw sensors."),
+        typer.Option(
+            "--poses", help="The recording has poses (a CaLiV folder) instead of raw sensor data."
+        ),
     ] = False,
     time_offset: Annotated[
-        bool, typer.Option("--time-offset", help="A time offset of each LiDAR is estimated too.")
+        bool, typer.Option("--time-offset", help="Also estimate a time offset of each LiDAR.")
     ] = False,
     out: Annotated[
         Path | None,
@@ -52,14 +54,14 @@ def plan(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Predict what a planned drive will tell: sigma per LiDAR and axis, and what stays open.
+    """Predict the accuracy of a planned drive: sigma per LiDAR and axis, undetermined directions.
 
-    From geometry and noise figures alone: nothing is simulated, and what stands in the way of a
-    view is not looked at. A few manoeuvres (arc, S-curve, figure-eight, over a ramp where the
-    ground tells no height) and target placements are tried as well, and the one that tells enough
-    in the least space is named.
+    The prediction uses geometry and noise levels only: it simulates no clouds and ignores
+    occluders. The command also tries other manoeuvres (arc, S-curve, figure-eight, with a ramp
+    unless the ground has a known height) and target placements, and names the one that keeps all
+    limits in the least space.
 
-    Exit code 3: a sigma asked for will not be reached, or a LiDAR never sees the target.
+    Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target.
 
     Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
     """
@@ -82,7 +84,9 @@ def plan(
     suggestion = suggest(first, goals, assumptions)
     if out is not None:
         if suggestion is None:
-            raise OutputError(f"{out}: not written: in no manoeuvre tried a LiDAR sees the target")
+            raise OutputError(
+                f"{out}: not written: no LiDAR sees the target in any of the manoeuvres tried"
+            )
         atomic_write(out, dump_scenario(suggestion.scenario), force)
     if as_json:
         streams.show_json(plan_document(prediction, goals, met, suggestion))

@@ -1,4 +1,4 @@
-"""`caliv-graph simulate`: a drive with known truth from a YAML file."""
+"""`caliv-graph simulate`: a drive with known truth from a scenario."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ if TYPE_CHECKING:
     from caliv_graph.simulation import SimulatedDrive
 
 _MOST_THREADS = 4
-"""Casting rays at the beams of one cloud gains nothing from more."""
+"""More threads do not speed up the ray casting of one cloud."""
 
 
 def simulate(
     scenario: Annotated[
         Path,
         typer.Argument(
-            metavar="SCENARIO.yaml", help="The drive; configs/scenarios/ has commented ones."
+            metavar="SCENARIO.yaml", help="The drive; configs/scenarios/ has commented examples."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the drive.")],
     seed: Annotated[
-        int, typer.Option("--seed", metavar="N", help="Of all noise, and of the initial guesses.")
+        int,
+        typer.Option("--seed", metavar="N", help="Seed of all noise and of the initial guesses."),
     ] = 0,
     output: Annotated[
         Literal["bag", "caliv", "both"],
@@ -41,9 +42,9 @@ def simulate(
 ) -> None:
     """Simulate a drive past a target, with known truth.
 
-    DIR gets drive/ (the bag), caliv/ (the CaLiV folder), truth.yaml (true extrinsics),
-    trajectory.tum (true poses), scenario.yaml (the effective one) and config.yaml: ready to run,
-    with initial guesses that are off by as much as the scenario says.
+    DIR contains drive/ (the bag), caliv/ (the CaLiV folder), truth.yaml (true extrinsics),
+    trajectory.tum (true poses), scenario.yaml (the effective scenario) and config.yaml, ready to
+    run, with errors of the initial guesses as in the scenario.
 
     Example: caliv-graph simulate configs/scenarios/figure_eight.yaml --out drive/ --seed 1
     """
@@ -74,13 +75,13 @@ def _say(drive: SimulatedDrive, name: str, seed: int) -> None:
     streams.say(f"{name}, seed {seed}: {drive.duration_s:.1f} s")
     for lidar, scans in drive.scans.items():
         if not scans.points:
-            streams.say(f"{lidar}: no cloud with a single point")
+            streams.say(f"{lidar}: all clouds are empty")
             continue
         seen = [count for count in scans.target_points if count]
-        target = f"a target in {len(seen)} of them, with up to {max(seen)} points" if seen else ""
+        target = f"{len(seen)} with a target of up to {max(seen)} points" if seen else "no target"
         streams.say(
             f"{lidar}: {len(scans.points)} clouds of {min(scans.points)} to {max(scans.points)} "
-            f"points, {target or 'no target in any of them'}"
+            f"points, {target}"
         )
     streams.say(
         f"Written to {drive.folder}. Next: caliv-graph calibrate {drive.folder}/config.yaml"

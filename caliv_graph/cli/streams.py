@@ -1,4 +1,4 @@
-"""What goes to stdout and stderr, and in which form."""
+"""Output on stdout and stderr: results, progress, warnings, errors."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
 _PLAIN_WIDTH = 120
-"""Columns of a table that goes to a file or a pipe, where nobody says how many there are."""
+"""Columns of a table in a file or a pipe, which have no width of their own."""
 
 _MOST_CHARACTERS = 1500
-"""Of a message. A damaged file may have names of megabytes."""
+"""Characters of a message. A damaged file may contain names of megabytes."""
 
 
 def one_line(text: str) -> str:
-    """A message as the one line that it has to be, whatever names are quoted in it.
+    """A message as one printable line, whatever names it quotes.
 
-    What a terminal would obey, such as the escapes of colours, is shown instead.
+    Control characters, such as colour escapes, are shown as escape sequences.
     """
     line = " ".join(text.split())
     if len(line) > _MOST_CHARACTERS:
-        # What is wrong stands in front, what to do at the end; between them is what was quoted.
+        # The problem is at the start and the remedy at the end; the middle is quoted input.
         line = f"{line[: _MOST_CHARACTERS // 2]} ... {line[-_MOST_CHARACTERS // 4 :]}"
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
@@ -40,22 +40,22 @@ def error(message: str) -> None:
 
 
 def warn(messages: Iterable[str]) -> None:
-    """Prints warnings to stderr, each once. Only for what has succeeded: a failure is one line."""
+    """Prints warnings to stderr, each once. Only after success: a failure prints one line."""
     for message in dict.fromkeys(messages):
         sys.stderr.write(f"warning: {one_line(message)}\n")
 
 
 def say(text: str) -> None:
-    """Prints to stdout at once, so that a pipe shows where long work stands.
+    """Prints a line to stdout and flushes, so that a pipe shows the progress.
 
     Raises:
-        OutputError: stdout takes no more: a closed pipe, a full disk.
+        OutputError: stdout cannot be written: a closed pipe, a full disk.
     """
     try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
     except OSError as e:
-        # What is still in the buffer would fail again, unasked, while Python shuts down.
+        # Otherwise Python would try to write the rest of the buffer at exit and fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise OutputError(f"standard output: cannot be written: {e.strerror}") from None
 
@@ -64,10 +64,10 @@ def show(table: RenderableType) -> None:
     """Prints a table to stdout.
 
     Raises:
-        OutputError: stdout takes no more.
+        OutputError: stdout cannot be written.
     """
     console = _console()
-    # Rich would answer a closed pipe by ending the program.
+    # Rich itself would end the program on a closed pipe.
     with console.capture() as captured:
         console.print(table, highlight=False)
     say(captured.get().rstrip("\n"))
@@ -77,14 +77,14 @@ def show_json(document: Any) -> None:
     """Prints a JSON document to stdout.
 
     Raises:
-        OutputError: stdout takes no more.
+        OutputError: stdout cannot be written.
     """
     say(json.dumps(document, indent=2, allow_nan=False))
 
 
 @contextmanager
 def progress_on_stdout(as_json: bool) -> Iterator[SilentProgress]:
-    """Shows progress: bars on a terminal, lines elsewhere, nothing if stdout is for JSON."""
+    """Shows progress: bars on a terminal, lines elsewhere, nothing with `--json`."""
     if as_json:
         yield SilentProgress()
     elif sys.stdout.isatty() and not (console := _console()).is_dumb_terminal:
@@ -95,6 +95,6 @@ def progress_on_stdout(as_json: bool) -> Iterator[SilentProgress]:
 
 
 def _console() -> Console:
-    from rich.console import Console  # a tenth of a second that --help does without
+    from rich.console import Console  # takes 0.1 s, which --help saves
 
     return Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)

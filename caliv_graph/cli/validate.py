@@ -1,4 +1,4 @@
-"""`caliv-graph validate`: alignment before and after, on structure that calibration did not use."""
+"""`caliv-graph validate`: alignment on structure that the calibration did not use."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def validate(
         typer.Option(
             "--data",
             metavar="PATH",
-            help="The drive, instead of data.path of the config: the one that was calibrated, or "
-            "another of the same vehicle.",
+            help="The drive, instead of data.path of the config: the calibrated drive or another "
+            "drive of the same vehicle.",
         ),
     ] = None,
     out: Annotated[
@@ -37,7 +37,7 @@ def validate(
         bool,
         typer.Option(
             "--repeat/--no-repeat",
-            help="Calibrate the two halves of the drive as well, and compare them.",
+            help="Also calibrate the two halves of the drive and compare them.",
         ),
     ] = True,
     p_value: PValue = P_VALUE,
@@ -46,15 +46,15 @@ def validate(
 ) -> None:
     """Validate a calibration on walls, poles and objects that it did not use.
 
-    The clouds of all LiDARs are brought into the map, before and after: with the initial guesses of
-    the config, and with the calibration. The target is left out, and the ground, unless the config
-    says 'ground: {use: false}'. Measured are how far the LiDARs have the same wall or pole apart,
-    how thick walls and poles are, for all LiDARs and for each alone, and what noise, trajectory and
-    the calibration's sigmas lead one to expect. DIR gets validation.json and validation.html, with
-    pictures.
+    The clouds of all LiDARs are transformed to the map with the initial guesses of the config
+    (before) and with the calibration (after), without the target, and without the ground unless the
+    config has 'ground: {use: false}'. The command measures the distance between the LiDARs on each
+    wall and pole, and the thickness of walls and poles for all LiDARs and for each LiDAR alone. It
+    compares them with the values expected from noise, trajectory and the sigmas of the calibration.
+    DIR contains validation.json and validation.html.
 
-    Exit code 3: there is nothing to validate on. Exit code 4: what remains is more than noise,
-    trajectory and sigmas explain, by more than 5 sigma.
+    Exit code 3: there is no structure to validate on. Exit code 4: distances or thicknesses exceed
+    the expected values by more than 5 sigma.
 
     Example: caliv-graph validate result/calibration.yaml config.yaml --data drive/ --out checked/
     """
@@ -73,7 +73,7 @@ def validate(
     settings = load_config(config)
     result = read_calibration(calibration)
     if out is not None:
-        # Nobody should wait for a result that then has no place to go.
+        # Checked before the validation, which takes long.
         check_output_folder(out, content, force)
     recording = open_recording(settings, data)
     repeated = None

@@ -1,4 +1,4 @@
-"""Calibrations in the form of those who use them: one file per consumer.
+"""Calibrations in the formats of other programs: one file per consumer in `consumers`.
 
-`consumers.export` is the way in; `request` holds what goes in and comes out.
+`consumers.export` makes an export; `request` has its input and output.
 """

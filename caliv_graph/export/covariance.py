@@ -1,18 +1,13 @@
-"""The joint covariance as npz and JSON, in GTSAM's and in ROS's order."""
+"""The joint covariance in the orders of GTSAM and of ROS."""
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Sequence
-from typing import Any
 
 import gtsam
 import numpy as np
 
-from caliv_graph.conventions import AXES
-from caliv_graph.export.request import DEFAULT_VEHICLE_FRAME, Export, Request, Transform
-from caliv_graph.export.wording import notice, quaternion_xyzw, undetermined_axes
+from caliv_graph.export.request import Request
 from caliv_graph.products import Array
 
 ROS_AXES = ("x", "y", "z", "rot_x", "rot_y", "rot_z")
@@ -21,11 +16,11 @@ ROS_AXES = ("x", "y", "z", "rot_x", "rot_y", "rot_z")
 GTSAM_AXES = ("rot_x", "rot_y", "rot_z", "x", "y", "z")
 """Order of GTSAM's Pose3."""
 
-_GTSAM_SIDE = (
+GTSAM_SIDE = (
     "right: T_vehicle_lidar Exp(d) (Pose3.retract); rotation and translation along the axes of the "
     "LiDAR; rad, m"
 )
-_ROS_SIDE = (
+ROS_SIDE = (
     "left: t + dt and Exp(w) R; translation along, rotation about the fixed axes of the vehicle, "
     "at the LiDAR's origin; m, rad"
 )
@@ -63,80 +58,8 @@ def ros_covariance(T_parent_child: Sequence[gtsam.Pose3], cov: Array) -> Array:
 
 
 def joint_covariance(request: Request) -> Array:
-    """(6n, 6n) of the LiDARs asked for, the others integrated out; GTSAM's order."""
+    """(6n, 6n) of the exported LiDARs, marginalised over the others; GTSAM's order."""
     return _rows(request, request.calibration.cov_joint)
-
-
-def export_npz(request: Request) -> Export:
-    """Arrays for NumPy; texts are arrays of strings, so that nothing needs pickle."""
-    transforms = _transforms(request)
-    poses = [request.T_vehicle_lidar(name) for name in request.lidars]
-    cov = joint_covariance(request)
-    arrays: dict[str, Any] = {
-        "comment": np.array(notice(request, transforms)),
-        "status": np.array(request.calibration.status),
-        "lidars": np.array(request.lidars),
-        "T_vehicle_lidar": np.array([pose.matrix() for pose in poses]),
-        "determined": np.array(
-            [
-                [request.calibration.lidars[name].determined[axis] for axis in AXES]
-                for name in request.lidars
-            ]
-        ),
-        "determined_axes": np.array(AXES),
-        "covariance_gtsam": cov,
-        "order_gtsam": np.array(_order(request.lidars, GTSAM_AXES)),
-        "side_gtsam": np.array(_GTSAM_SIDE),
-        "covariance_ros": ros_covariance(poses, cov),
-        "order_ros": np.array(_order(request.lidars, ROS_AXES)),
-        "side_ros": np.array(_ROS_SIDE),
-    }
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return Export(buffer.getvalue(), transforms)
-
-
-def export_json(request: Request) -> Export:
-    """The same as one JSON document."""
-    transforms = _transforms(request)
-    cov = joint_covariance(request)
-    poses = [request.T_vehicle_lidar(name) for name in request.lidars]
-    document = {
-        "comment": notice(request, transforms).splitlines(),
-        "status": request.calibration.status,
-        "lidars": {
-            name: {
-                "T_vehicle_lidar": {
-                    "matrix": pose.matrix().tolist(),
-                    "translation": pose.translation().tolist(),
-                    "quaternion_xyzw": list(quaternion_xyzw(pose)),
-                },
-                "determined": {
-                    axis: bool(request.calibration.lidars[name].determined[axis]) for axis in AXES
-                },
-                "undetermined": undetermined_axes(request.calibration.lidars[name]),
-            }
-            for name, pose in zip(request.lidars, poses, strict=True)
-        },
-        "covariance_gtsam": {
-            "order": _order(request.lidars, GTSAM_AXES),
-            "side": _GTSAM_SIDE,
-            "matrix": cov.tolist(),
-        },
-        "covariance_ros": {
-            "order": _order(request.lidars, ROS_AXES),
-            "side": _ROS_SIDE,
-            "matrix": ros_covariance(poses, cov).tolist(),
-        },
-    }
-    return Export((json.dumps(document, indent=1, allow_nan=False) + "\n").encode(), transforms)
-
-
-def _transforms(request: Request) -> tuple[Transform, ...]:
-    parent = request.vehicle_frame or DEFAULT_VEHICLE_FRAME
-    return tuple(
-        Transform(name, parent, name, request.T_vehicle_lidar(name)) for name in request.lidars
-    )
 
 
 def _rows(request: Request, matrix: Array) -> Array:
@@ -145,5 +68,6 @@ def _rows(request: Request, matrix: Array) -> Array:
     return np.asarray(matrix[np.ix_(rows, rows)])
 
 
-def _order(lidars: Sequence[str], axes: Sequence[str]) -> list[str]:
+def axes_order(lidars: Sequence[str], axes: Sequence[str]) -> list[str]:
+    """The names of the rows of a joint covariance."""
     return [f"{name}.{axis}" for name in lidars for axis in axes]

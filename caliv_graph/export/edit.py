@@ -1,4 +1,4 @@
-"""Changing numbers in a file of somebody else's, every other byte of which stays."""
+"""Changes of numbers in an existing file; all other bytes stay the same."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import yaml
 from caliv_graph.common.inputs import read_input
 from caliv_graph.errors import ExportError
 from caliv_graph.export.request import Base
-from caliv_graph.export.wording import number
+from caliv_graph.export.text import number, without_notice
 
 _BOM = "\ufeff"
 
 _MOST_BYTES = 100_000_000
-"""Of a file that people edit by hand."""
+"""Largest size of a file that people edit by hand."""
 
 
 @dataclass(frozen=True)
 class Edit:
-    """A piece of text that takes the place of another.
+    """The replacement of a piece of text.
 
     Attributes:
         start: index of the first character replaced.
-        stop: index after the last one; `start` if nothing is replaced.
-        text: what stands there then.
+        stop: index after the last character replaced; `start` for an insertion.
+        text: the new text.
     """
 
     start: int
@@ -36,16 +36,18 @@ class Edit:
 
 
 def read_base(path: Path) -> Base:
-    """Reads a file that is to be changed.
+    """Reads a file to change.
 
     Raises:
-        ExportError: it is missing, or not text in UTF-8.
+        ExportError: the file is missing, or is not text in UTF-8.
     """
     try:
-        # Not read_text: it would change the ends of lines.
+        # Not read_text, which would change the line ends.
         return Base(path, read_input(path, _MOST_BYTES).decode("utf-8"))
     except FileNotFoundError:
-        raise ExportError(f"{path}: no such file. Give --base an existing one, or none") from None
+        raise ExportError(
+            f"{path}: no such file. Give --base an existing file, or leave it out"
+        ) from None
     except UnicodeDecodeError:
         raise ExportError(f"{path}: is not text in UTF-8") from None
     except OSError as e:
@@ -53,7 +55,7 @@ def read_base(path: Path) -> Base:
 
 
 def spliced(text: str, edits: Sequence[Edit]) -> str:
-    """A text with all edits done; they must not overlap."""
+    """A text after all edits, which must not overlap."""
     out, at = [], 0
     for edit in sorted(edits, key=lambda e: e.start):
         out += [text[at : edit.start], edit.text]
@@ -62,14 +64,14 @@ def spliced(text: str, edits: Sequence[Edit]) -> str:
 
 
 def with_comment(comment: str, text: str) -> str:
-    """A text with a comment on top, with the ends of lines that the text has."""
+    """A text with a comment on top, with the line ends of the text."""
     comment = comment.replace("\n", line_end(text))
-    # A byte order mark stands first, or is none.
+    # A byte order mark must stay in front.
     return _BOM + comment + text[1:] if text.startswith(_BOM) else comment + text
 
 
 def line_end(text: str) -> str:
-    """How the lines of a text end."""
+    """The line end of a text."""
     return "\r\n" if "\r\n" in text else "\n"
 
 
@@ -78,7 +80,7 @@ class Entry:
     """A key of a YAML file and its value.
 
     Attributes:
-        path: the keys above it and its own.
+        path: the keys above it and its own key.
         key: the node of the key.
         value: the node of its value.
     """
@@ -89,15 +91,18 @@ class Entry:
 
 
 class YamlFile:
-    """A YAML file whose numbers can be replaced in place."""
+    """A YAML file whose numbers can be replaced in place.
+
+    The comment of an earlier export is removed.
+    """
 
     def __init__(self, base: Base) -> None:
         """Parses a file.
 
         Raises:
-            ExportError: it is not YAML, or holds no keys.
+            ExportError: the file is not YAML, or has no keys.
         """
-        self._base = base
+        self._base = base = Base(base.path, without_notice(base.text))
         try:
             root = yaml.compose(base.text, Loader=yaml.SafeLoader)
         except yaml.MarkedYAMLError as e:
@@ -107,26 +112,26 @@ class YamlFile:
             first = (str(e).splitlines() or ["nested too deeply"])[0]
             raise ExportError(f"{base.path}: not valid YAML: {first}") from None
         if not isinstance(root, yaml.MappingNode):
-            raise ExportError(f"{base.path}: holds no keys with values. Give another --base")
+            raise ExportError(f"{base.path}: has no keys with values. Give another --base")
         self._root = root
         self._edits: list[Edit] = []
 
     @property
     def entries(self) -> Iterator[Entry]:
-        """All keys at all depths, those above before those below."""
+        """All keys at all depths, upper keys before lower ones."""
         yield from _entries(self._root, (), set())
 
     def entry(self, key: str) -> Entry | None:
-        """The one entry with this key, at any depth; None: there is none.
+        """The only entry with this key at any depth; None if there is none.
 
         Raises:
-            ExportError: there are several.
+            ExportError: several entries have this key.
         """
         found = [entry for entry in self.entries if entry.path[-1] == key]
         if len(found) > 1:
             lines = ", ".join(str(entry.key.start_mark.line + 1) for entry in found)
             raise ExportError(
-                f"{self._base.path}: '{key}' stands in lines {lines}: which one is meant? Leave one"
+                f"{self._base.path}: '{key}' is ambiguous: it is in lines {lines}. Leave only one"
             )
         return found[0] if found else None
 
@@ -140,7 +145,7 @@ class YamlFile:
             return
         if isinstance(node, yaml.SequenceNode) and not node.flow_style:
             raise ExportError(
-                f"{self._where(entry)}: expected a list of {len(values)} numbers. Mend --base"
+                f"{self._where(entry)}: expected a list of {len(values)} numbers. Correct --base"
             )
         self._replace(node, f"[{', '.join(map(number, values))}]")
 
@@ -148,7 +153,7 @@ class YamlFile:
         """Replaces the numbers at the keys of a mapping.
 
         Raises:
-            ExportError: it is no mapping, or lacks one of the keys.
+            ExportError: the entry is not a mapping, or lacks one of the keys.
         """
         for key, value in values.items():
             node = self.below(entry).get(key)
@@ -159,7 +164,7 @@ class YamlFile:
             self._replace(node, number(value))
 
     def set_text(self, node: yaml.Node, text: str) -> None:
-        """Replaces a scalar by another, quoted one."""
+        """Replaces a scalar by a quoted one."""
         self._replace(node, f'"{text}"')
 
     def below(self, entry: Entry) -> dict[str, yaml.Node]:
@@ -169,7 +174,7 @@ class YamlFile:
         return {str(key.value): value for key, value in entry.value.value}
 
     def scalar(self, node: yaml.Node | None) -> float | None:
-        """A finite number, or None if it is none."""
+        """The value of a node as a finite number; None if it is not one."""
         if not isinstance(node, yaml.ScalarNode):
             return None
         try:
@@ -183,10 +188,10 @@ class YamlFile:
         return spliced(self._base.text, self._edits)
 
     def _replace(self, node: yaml.Node, text: str) -> None:
-        # The end of a plain scalar may lie behind the blanks that follow it.
+        # The end mark of a plain scalar may be after the blanks that follow it.
         start, stop = node.start_mark.index, node.end_mark.index
         if start == stop:
-            # Where nothing stands, the mark may be anywhere up to the next key.
+            # The mark of a missing value may be anywhere up to the next key.
             raise ExportError(
                 f"{self._base.path}: a value is missing in or above line "
                 f"{node.start_mark.line + 1}. Write one there, such as 0.0"
@@ -199,7 +204,7 @@ class YamlFile:
 
 
 def _entries(node: yaml.Node, path: tuple[str, ...], seen: set[int]) -> Iterator[Entry]:
-    # An alias is the node it stands for, which could be changed only once.
+    # An alias is the same node as its anchor, and can be changed only once.
     if id(node) in seen:
         return
     seen.add(id(node))

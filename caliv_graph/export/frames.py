@@ -1,4 +1,4 @@
-"""Which frame of the user's is which LiDAR's, and poses as the command line takes them."""
+"""Frames of LiDARs among the user's frames, and poses from the command line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _KINDS = """
     lidar laser velodyne vlp hdl vls ouster os hesai pandar at livox mid hap robosense rslidar
     helios bpearl seyond innoviz
 """
-"""Words in the name of a frame that say that it is a LiDAR's, and not which: `vlp16` too."""
+"""Words in the name of a frame that mark it as that of some LiDAR; with digits, too: `vlp16`."""
 
 _FILLING = frozenset(("link", "frame", "sensor", "scan", "mount", "joint", "points", "optical"))
-"""Words that say neither."""
+"""Words without information about the sensor."""
 
 _HOUSING = "base"
-"""Word in the name of a housing: Autoware's `<sensor>_base_link`."""
+"""Word in the name of a housing, as in Autoware's `<sensor>_base_link`."""
 
 
 def parse_pose(text: str, what: str) -> gtsam.Pose3:
@@ -29,10 +29,10 @@ def parse_pose(text: str, what: str) -> gtsam.Pose3:
 
     Args:
         text: the numbers, between commas or blanks.
-        what: the option it comes from, for the message.
+        what: the option, for the message.
 
     Raises:
-        ExportError: these are not three or six finite numbers.
+        ExportError: the text is not three or six finite numbers.
     """
     try:
         values = [float(part) for part in re.split(r"[,\s]+", text.strip())]
@@ -51,7 +51,7 @@ def parse_named(texts: Sequence[str], what: str) -> dict[str, str]:
     """Options of the form NAME=VALUE.
 
     Raises:
-        ExportError: one has another form, or a name stands twice.
+        ExportError: an option has another form, or a name is given twice.
     """
     named: dict[str, str] = {}
     for text in texts:
@@ -59,7 +59,7 @@ def parse_named(texts: Sequence[str], what: str) -> dict[str, str]:
         if not (name and equals and value):
             raise ExportError(f"{what}: '{text}' is not NAME=VALUE")
         if name in named:
-            raise ExportError(f"{what}: '{name}' stands twice")
+            raise ExportError(f"{what}: '{name}' is given twice")
         named[name] = value
     return named
 
@@ -67,13 +67,13 @@ def parse_named(texts: Sequence[str], what: str) -> dict[str, str]:
 def match_frame(lidar: str, candidates: Iterable[str], housing: bool) -> str | None:
     """The frame of a LiDAR among the frames of a file, by its name.
 
-    A frame fits if it is called as the LiDAR is, or so but for words that only say that it is a
-    LiDAR: `lidar_front`, `velodyne_front_link` for `front`.
+    A frame fits if its name equals that of the LiDAR apart from words for a LiDAR in general:
+    `lidar_front` and `velodyne_front_link` fit `front`.
 
     Args:
         lidar: name of the LiDAR.
         candidates: names of frames.
-        housing: whether the frame of its housing is looked for (`<sensor>_base_link`).
+        housing: whether to find the frame of its housing (`<sensor>_base_link`).
 
     Returns:
         The frame, or None if none fits.
@@ -103,13 +103,13 @@ def _fits(name: str, wanted: list[str], housing: bool) -> bool:
     core = [word for word in core if word != _HOUSING]
     if is_housing != housing:
         return False
-    # A LiDAR that is called just 'lidar' is only in a frame that says so.
+    # A LiDAR named just 'lidar' fits only frames with such a word.
     return core == wanted and (bool(wanted) or is_lidar)
 
 
 def _words(name: str) -> tuple[list[str], bool]:
-    """What of a name tells which LiDAR it is, and whether it says that it is one."""
-    # lidar1 is lidar 1, but vlp16 is a model.
+    """The words of a name that identify the LiDAR, and whether it names a LiDAR at all."""
+    # lidar1 is number 1, but vlp16 is a model.
     text = re.sub(r"(lidar|laser|sensor)(?=[0-9])", r"\1_", name.lower())
     words = [word for word in re.split(r"[^a-z0-9]+", text) if word]
     kinds = [word for word in words if word.rstrip("0123456789") in _KINDS.split()]

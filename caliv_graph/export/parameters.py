@@ -1,39 +1,39 @@
-"""ROS parameter files that hold a LiDAR's pose as a list of three and one of nine numbers."""
+"""ROS parameter files with a LiDAR's pose as lists of three and nine numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export.edit import YamlFile, with_comment
 from caliv_graph.export.request import Base, Export, Request, Transform
-from caliv_graph.export.wording import notice, numbers, with_hash, without_notice
+from caliv_graph.export.text import notice, numbers, with_hash
 
 _ROS2 = "ros__parameters"
-"""Key that every parameter file of ROS 2 has."""
+"""Key of every parameter file of ROS 2."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What a consumer wants to have in its file.
+    """The parameters of a consumer.
 
     Attributes:
-        consumer: its name.
-        lidar: the LiDAR it is made from.
-        parent: frame of the transform.
-        child: frame of the transform.
+        consumer: name of the consumer.
+        lidar: name of the LiDAR.
+        parent: parent frame of the transform.
+        child: child frame of the transform.
         T_parent_child: the transform.
-        meaning: which way it goes, in the words of the parameters.
-        ros1: per parameter its numbers, in the version for ROS 1.
-        ros2: likewise for ROS 2.
+        meaning: direction of the transform, as an equation of the parameters.
+        ros1: per parameter its numbers, for ROS 1.
+        ros2: per parameter its numbers, for ROS 2.
         above_ros1: keys above the parameters in a new file for ROS 1.
-        above_ros2: likewise for ROS 2.
-        optional: parameters that a `--base` need not have.
-        extra_ros1: what else the comment is to say for ROS 1.
-        extra_ros2: likewise for ROS 2.
+        above_ros2: keys above the parameters in a new file for ROS 2.
+        optional: parameters that `--base` need not have.
+        extra_ros1: further lines of the comment for ROS 1.
+        extra_ros2: further lines of the comment for ROS 2.
     """
 
     consumer: str
@@ -52,7 +52,7 @@ class Parameters:
 
 
 def parameter_export(request: Request, parameters: Parameters, warnings: tuple[str, ...]) -> Export:
-    """A new parameter file, or `--base` with the parameters changed.
+    """A new parameter file, or `--base` with new values of the parameters.
 
     Raises:
         ExportError: `--base` lacks the parameters.
@@ -73,14 +73,13 @@ def parameter_export(request: Request, parameters: Parameters, warnings: tuple[s
     if request.base is None:
         text = _new(parameters.above_ros1 if is_ros1 else parameters.above_ros2, values)
     else:
-        base = replace(request.base, text=without_notice(request.base.text))
-        text = _changed(base, parameters, values)
+        text = _changed(request.base, parameters, values)
     return Export(with_comment(comment, text).encode(), (transform,), warnings)
 
 
 def _is_ros1(request: Request) -> bool:
     if request.form not in ("", "ros1", "ros2"):
-        raise ExportError(f"--form {request.form}: is none of ros1, ros2")
+        raise ExportError(f"--form {request.form}: is neither ros1 nor ros2")
     if request.form or request.base is None:
         return request.form == "ros1"
     return _ROS2 not in request.base.text

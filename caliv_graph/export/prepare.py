@@ -1,4 +1,4 @@
-"""From what a person gives on the command line to a request."""
+"""The request of an export, from the options of the command line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config, ImuConfig
 from caliv_graph.errors import ExportError
-from caliv_graph.export.consumers import CONSUMERS, check_options
+from caliv_graph.export.consumers import check_options, find_consumer
 from caliv_graph.export.edit import read_base
 from caliv_graph.export.frames import parse_named, parse_pose
 from caliv_graph.export.recording import RecordedFrames, read_frames
@@ -23,23 +23,23 @@ CONFIG_FILE = "config.yaml"
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """Options as they were given; empty or None: not given.
+class Options:
+    """The options of `export`; empty or None: not given.
 
     Attributes:
-        consumer: one of `CONSUMERS`.
-        out: the output.
+        consumer: one of `consumers.consumer_names`.
+        out: path of the output.
         base: an existing file to change.
-        lidars: names of those to export.
+        lidars: names of the LiDARs to export; empty: all.
         frames: NAME=FRAME each.
         housings: NAME=x,y,z,roll,pitch,yaw each, `T_housing_lidar`, metres and radians.
         parents: FRAME=x,y,z,roll,pitch,yaw each, `T_vehicle_frame`.
         vehicle_frame: name of the vehicle frame.
         imu: x,y,z,roll,pitch,yaw of `T_vehicle_imu`.
         config: the config of the calibration.
-        bag: a recording to take frames from.
+        bag: a recording with frames.
         letter: of the keys of a factor graph.
-        form: which of several forms.
+        form: one of the forms of a consumer.
     """
 
     consumer: str
@@ -57,41 +57,41 @@ class Wishes:
     form: str = ""
 
 
-def prepare(path: Path, wishes: Wishes) -> Request:
-    """Reads what an export needs.
+def prepare(path: Path, options: Options) -> Request:
+    """Reads all inputs of an export.
 
     Args:
         path: a calibration.yaml.
-        wishes: what was asked for.
+        options: of the command line.
 
     Raises:
-        ExportError: an option is not what it should be, or names a LiDAR that there is not.
-        ConfigError: the calibration or its config is damaged.
-        RecordingError: the recording is.
+        ExportError: an option is invalid, or names an unknown LiDAR.
+        ConfigError: the calibration or its config is invalid.
+        RecordingError: the recording is damaged.
     """
-    _check(wishes)
+    _check(options)
+    consumer = find_consumer(options.consumer)
     calibration = read_calibration(path)
-    lidars = _chosen(wishes.lidars, calibration, path)
-    frames = parse_named(wishes.frames, "--frame")
-    told = parse_named(wishes.housings, "--housing")
-    for option, names in (("--frame", frames), ("--housing", told)):
+    lidars = _chosen(options.lidars, calibration, path)
+    frames = parse_named(options.frames, "--frame")
+    housing_texts = parse_named(options.housings, "--housing")
+    for option, names in (("--frame", frames), ("--housing", housing_texts)):
         for name in names:
             _check_lidar(name, calibration, path, option)
-    housings = {name: parse_pose(text, f"--housing {name}") for name, text in told.items()}
+    housings = {name: parse_pose(text, f"--housing {name}") for name, text in housing_texts.items()}
     parents = {
         name: parse_pose(text, f"--parent {name}")
-        for name, text in parse_named(wishes.parents, "--parent").items()
+        for name, text in parse_named(options.parents, "--parent").items()
     }
-    config, config_path = _config(path, wishes)
+    config, config_path = _config(path, options)
     topics = {} if config is None else {name: c.topic for name, c in config.lidars.items()}
     bag: RecordedFrames | None = None
     recorded = {}
-    if wishes.bag is not None:
-        bag = read_frames(wishes.bag, {n: t for n, t in topics.items() if n in lidars})
+    if options.bag is not None:
+        bag = read_frames(options.bag, {n: t for n, t in topics.items() if n in lidars})
         for name in lidars:
             housing = bag.housing(name)
-            # Only Autoware's files are about housings unless somebody says so.
-            if housing and wishes.consumer == "autoware" and name not in housings:
+            if housing and consumer.places_housings and name not in housings:
                 housings[name] = housing.T_parent_child
                 recorded[name] = housing.parent
             elif name in bag.clouds and name not in housings:
@@ -100,35 +100,35 @@ def prepare(path: Path, wishes: Wishes) -> Request:
         calibration=calibration,
         source=path.name,
         lidars=lidars,
-        out=wishes.out,
+        out=options.out,
         frames=frames,
         recorded=recorded,
         housings=housings,
         parents=parents,
         tree=None if bag is None else FrameTree(bag.links),
-        vehicle_frame=wishes.vehicle_frame,
-        imu=_imu(wishes, config, config_path),
+        vehicle_frame=options.vehicle_frame,
+        imu=_imu(options, config, config_path),
         topics=topics,
-        base=None if wishes.base is None else read_base(wishes.base),
-        letter=wishes.letter or Request.letter,
-        form=wishes.form,
+        base=None if options.base is None else read_base(options.base),
+        letter=options.letter or Request.letter,
+        form=options.form,
         recorded_ns=0 if bag is None else bag.start_ns,
     )
 
 
-def _check(wishes: Wishes) -> None:
+def _check(options: Options) -> None:
     given = {
-        "--base": wishes.base,
-        "--frame": wishes.frames,
-        "--housing": wishes.housings,
-        "--parent": wishes.parents,
-        "--vehicle-frame": wishes.vehicle_frame,
-        "--imu": wishes.imu,
-        "--bag": wishes.bag,
-        "--letter": wishes.letter,
-        "--form": wishes.form,
+        "--base": options.base,
+        "--frame": options.frames,
+        "--housing": options.housings,
+        "--parent": options.parents,
+        "--vehicle-frame": options.vehicle_frame,
+        "--imu": options.imu,
+        "--bag": options.bag,
+        "--letter": options.letter,
+        "--form": options.form,
     }
-    check_options(wishes.consumer, [option for option, value in given.items() if value])
+    check_options(options.consumer, [option for option, value in given.items() if value])
 
 
 def _chosen(names: Sequence[str], calibration: Calibration, path: Path) -> tuple[str, ...]:
@@ -144,23 +144,25 @@ def _check_lidar(name: str, calibration: Calibration, path: Path, option: str) -
         )
 
 
-def _config(path: Path, wishes: Wishes) -> tuple[Config | None, Path]:
-    """The config of a calibration: the one given, else the one beside it, where one is of use."""
+def _config(path: Path, options: Options) -> tuple[Config | None, Path]:
+    """The config given, else the one in the folder of the calibration if the consumer needs it."""
     beside = path.parent / CONFIG_FILE
-    if wishes.config is not None:
-        return load_config(wishes.config), wishes.config
-    uses = "--imu" in CONSUMERS[wishes.consumer].takes and not wishes.imu
-    if (uses or wishes.bag is not None or wishes.consumer == "mola") and beside.is_file():
+    if options.config is not None:
+        return load_config(options.config), options.config
+    consumer = find_consumer(options.consumer)
+    needs_imu = "--imu" in consumer.options and not options.imu
+    needs_topics = consumer.needs_topics or options.bag is not None
+    if (needs_imu or needs_topics) and beside.is_file():
         return load_config(beside), beside
     return None, beside
 
 
-def _imu(wishes: Wishes, config: Config | None, path: Path) -> ImuExtrinsic | None:
-    if wishes.imu:
-        return ImuExtrinsic(parse_pose(wishes.imu, "--imu"), "--imu")
+def _imu(options: Options, config: Config | None, path: Path) -> ImuExtrinsic | None:
+    if options.imu:
+        return ImuExtrinsic(parse_pose(options.imu, "--imu"), "--imu")
     if config is None:
         return None
-    mounting = config.imu.T_vehicle_imu
-    # The effective config states every key: a default is a statement only where there was an IMU.
-    stated = config.topics.imu is not None or mounting != ImuConfig().T_vehicle_imu
-    return ImuExtrinsic(mounting.pose(), path.name, stated)
+    extrinsic = config.imu.T_vehicle_imu
+    # The effective config has every key, so a default value counts only if there is an IMU.
+    stated = config.topics.imu is not None or extrinsic != ImuConfig().T_vehicle_imu
+    return ImuExtrinsic(extrinsic.pose(), path.name, stated)

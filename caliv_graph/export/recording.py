@@ -13,12 +13,12 @@ from caliv_graph.readers.frames import FrameTransform, clean_frame, message_tran
 
 @dataclass(frozen=True)
 class RecordedFrames:
-    """What a recording says of frames.
+    """The frames of a recording.
 
     Attributes:
         clouds: per LiDAR the frame of its clouds.
-        links: of /tf_static.
-        start_ns: when the recording began.
+        links: transforms of /tf_static.
+        start_ns: start of the recording.
     """
 
     clouds: Mapping[str, str]
@@ -26,7 +26,7 @@ class RecordedFrames:
     start_ns: int
 
     def housing(self, lidar: str) -> FrameTransform | None:
-        """`T_housing_lidar`, where the frame of a LiDAR's clouds hangs on `<sensor>_base_link`."""
+        """`T_housing_lidar`, if the parent of the LiDAR's frame is a `<sensor>_base_link`."""
         frame = self.clouds.get(lidar)
         for link in reversed(self.links):
             if link.child == frame:
@@ -36,15 +36,15 @@ class RecordedFrames:
 
 
 def read_frames(path: Path, topics: Mapping[str, str]) -> RecordedFrames:
-    """Reads what a recording says of frames.
+    """Reads the frames of a recording.
 
     Args:
         path: a bag.
         topics: per LiDAR the topic of its clouds.
 
     Raises:
-        RecordingError: it is no bag, or damaged.
-        ExportError: it has no /tf_static and none of the clouds.
+        RecordingError: the path is not a bag, or the bag is damaged.
+        ExportError: the bag has neither /tf_static nor clouds of the LiDARs.
     """
     bag = Bag(path)
     links: list[FrameTransform] = []
@@ -66,6 +66,6 @@ def read_frames(path: Path, topics: Mapping[str, str]) -> RecordedFrames:
     if not links and not clouds:
         raise ExportError(
             f"{path}: has neither /tf_static nor one of the LiDARs' topics. Give the drive as "
-            "--bag, or none"
+            "--bag, or leave it out"
         )
     return RecordedFrames(clouds, tuple(links), bag.span_ns[0])

@@ -1,8 +1,8 @@
-"""What an export is made from, and what it comes out as."""
+"""Input and output of an exporter, and the declaration of a consumer."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,17 +13,23 @@ from caliv_graph.products import Calibration
 from caliv_graph.readers.frames import FrameTree
 
 DEFAULT_VEHICLE_FRAME = "base_link"
-"""Name of the vehicle frame where nothing else is told (REP-105)."""
+"""Name of the vehicle frame unless another is given (REP-105)."""
+
+FRAME_OPTIONS = frozenset(("--frame", "--housing", "--vehicle-frame", "--bag"))
+"""Options of consumers that place named frames in the vehicle frame."""
+
+IMU_OPTIONS = frozenset(("--base", "--imu"))
+"""Options of consumers that need the pose of the IMU."""
 
 
 @dataclass(frozen=True)
 class ImuExtrinsic:
-    """Where the IMU is.
+    """The pose of the IMU.
 
     Attributes:
-        T_vehicle_imu: its pose.
-        origin: who said so, for comments and messages.
-        stated: False if nobody did, and it is the default of the config.
+        T_vehicle_imu: the pose.
+        origin: file or option that states it, for comments and messages.
+        stated: False if it is only the default of the config.
     """
 
     T_vehicle_imu: gtsam.Pose3
@@ -36,8 +42,8 @@ class Base:
     """An existing file of the consumer, whose other content is kept.
 
     Attributes:
-        path: where it is.
-        text: its content; line ends as they are.
+        path: of the file.
+        text: its content, with unchanged line ends.
     """
 
     path: Path
@@ -45,26 +51,45 @@ class Base:
 
 
 @dataclass(frozen=True)
+class Transform:
+    """One transform of an export: `p_parent = T_parent_child p_child`.
+
+    Attributes:
+        lidar: the LiDAR it comes from.
+        parent: frame.
+        child: frame.
+        T_parent_child: the pose as written.
+        remark: a sentence for the comment; may be empty.
+    """
+
+    lidar: str
+    parent: str
+    child: str
+    T_parent_child: gtsam.Pose3
+    remark: str = ""
+
+
+@dataclass(frozen=True)
 class Request:
-    """What is to be exported, and all that a consumer might need besides.
+    """A calibration to export, with all options of the command line.
 
     Attributes:
         calibration: the result.
-        source: what to call it in comments: the name of its file.
-        lidars: names of those to export, in the calibration's order.
-        frames: per LiDAR the name of the frame that the user gave for it.
-        recorded: per LiDAR the name of the frame that a recording has for it.
-        housings: per LiDAR `T_housing_lidar`, the frame of its cloud in that of its housing.
-        parents: per frame its pose `T_vehicle_frame`, as the user gave it.
-        tree: frames of a recording's `/tf_static`; None: none was given.
+        source: name of its file, for comments.
+        lidars: names of the LiDARs to export, in the order of the calibration.
+        out: path of the output.
+        frames: per LiDAR the name of its frame, given by the user.
+        recorded: per LiDAR the name of its frame in a recording.
+        housings: per LiDAR `T_housing_lidar`, the frame of its clouds in the frame of its housing.
+        parents: per frame its pose `T_vehicle_frame`, given by the user.
+        tree: frames of the `/tf_static` of a recording; None: no recording.
         vehicle_frame: name of the vehicle frame; empty: not given.
-        imu: where the IMU is; None: not known.
-        topics: per LiDAR the topic of its clouds, as far as it is known.
-        base: an existing file to change; None: a new one.
+        imu: pose of the IMU; None: unknown.
+        topics: per LiDAR the topic of its clouds, where known.
+        base: an existing file to change; None: a new file.
         letter: of the keys of a factor graph.
-        form: which of several forms; empty: by the name of the output.
-        out: where the result is to go.
-        recorded_ns: when the recording began that `tree` comes from; 0: not known.
+        form: one of the forms of a consumer; empty: chosen by the name of the output.
+        recorded_ns: start of the recording of `tree`, nanoseconds; 0: unknown.
     """
 
     calibration: Calibration
@@ -84,30 +109,48 @@ class Request:
     form: str = ""
     recorded_ns: int = 0
 
+    @property
+    def parent(self) -> str:
+        """Name of the vehicle frame as given, else `DEFAULT_VEHICLE_FRAME`."""
+        return self.vehicle_frame or DEFAULT_VEHICLE_FRAME
+
     def frame(self, lidar: str) -> str | None:
-        """Name of a LiDAR's frame as it was given, or else recorded; None: neither."""
+        """Name of a LiDAR's frame: given by the user, else recorded, else None."""
         return self.frames.get(lidar) or self.recorded.get(lidar)
 
     def frame_among(self, lidar: str, known: Container[str]) -> str | None:
-        """Likewise, but a recorded one counts only where it is known: nobody insists on it."""
-        told, recorded = self.frames.get(lidar), self.recorded.get(lidar)
-        return told or (recorded if recorded in known else None)
+        """Name of a LiDAR's frame: given by the user, else recorded if it is known, else None."""
+        recorded = self.recorded.get(lidar)
+        return self.frames.get(lidar) or (recorded if recorded in known else None)
 
     def T_vehicle_lidar(self, lidar: str) -> gtsam.Pose3:
-        """PoseConfig of a LiDAR."""
+        """Extrinsic of a LiDAR."""
         return self.calibration.lidars[lidar].T_vehicle_lidar
 
     def T_vehicle_child(self, lidar: str) -> gtsam.Pose3:
-        """Pose of what is exported for a LiDAR: its housing if that is told, else its frame."""
+        """Pose of the exported frame: of the LiDAR's housing if it is known, else of the LiDAR."""
         T_vehicle_lidar = self.T_vehicle_lidar(lidar)
         housing = self.housings.get(lidar)
         return T_vehicle_lidar if housing is None else T_vehicle_lidar.compose(housing.inverse())
 
+    def vehicle_transforms(self, remark: str = "") -> tuple[Transform, ...]:
+        """The exported frame of every LiDAR in the vehicle frame.
+
+        Args:
+            remark: for the comment.
+        """
+        return tuple(
+            Transform(
+                name, self.parent, self.frame(name) or name, self.T_vehicle_child(name), remark
+            )
+            for name in self.lidars
+        )
+
     def one_lidar(self, consumer: str) -> tuple[str, tuple[str, ...]]:
-        """The LiDAR for a consumer that takes one: the reference, if there is a choice.
+        """The LiDAR for a consumer of a single LiDAR: the reference if there are several.
 
         Returns:
-            Its name, and a warning if it was chosen among several.
+            Its name, and a warning if there are several.
         """
         if len(self.lidars) == 1:
             return self.lidars[0], ()
@@ -120,14 +163,14 @@ class Request:
         )
 
     def T_lidar_imu(self, lidar: str, consumer: str) -> tuple[gtsam.Pose3, tuple[str, ...]]:
-        """Pose of the IMU in the frame of a LiDAR, and a warning if nobody said where the IMU is.
+        """Pose of the IMU in the frame of a LiDAR, and a warning if it is only a default.
 
         Raises:
-            ExportError: the IMU's mounting is not known.
+            ExportError: the pose of the IMU is unknown.
         """
         if self.imu is None:
             raise ExportError(
-                f"{consumer}: needs where the IMU is, and there is no config.yaml beside "
+                f"{consumer}: needs the pose of the IMU, and there is no config.yaml beside "
                 f"{self.source}. Give --config CONFIG.yaml, or --imu x,y,z,roll,pitch,yaw of "
                 "T_vehicle_imu"
             )
@@ -135,42 +178,56 @@ class Request:
         if self.imu.stated:
             return T_lidar_imu, ()
         return T_lidar_imu, (
-            f"{self.imu.origin}: names no IMU (topics.imu): it is taken to be at the vehicle "
+            f"{self.imu.origin}: names no IMU (topics.imu), so the IMU is assumed at the vehicle "
             "frame. Give --imu x,y,z,roll,pitch,yaw of T_vehicle_imu if it is elsewhere",
         )
 
 
 @dataclass(frozen=True)
-class Transform:
-    """One transform of an export: `p_parent = T_parent_child p_child`.
-
-    Attributes:
-        lidar: the LiDAR it was made from.
-        parent: frame.
-        child: frame.
-        T_parent_child: the pose as it is written.
-        remark: what else to say of it; may be empty.
-    """
-
-    lidar: str
-    parent: str
-    child: str
-    T_parent_child: gtsam.Pose3
-    remark: str = ""
-
-
-@dataclass(frozen=True)
 class Export:
-    """What is to be written.
+    """The files of an export.
 
     Attributes:
-        content: of the file that was asked for.
-        transforms: what is in it.
-        warnings: what a person should know, a line each.
-        beside: further files by their paths.
+        content: of the file at `Request.out`.
+        transforms: in the file.
+        warnings: one line each.
+        beside: content of further files, by their paths.
     """
 
     content: bytes
     transforms: tuple[Transform, ...]
     warnings: tuple[str, ...] = ()
     beside: Mapping[Path, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Consumer:
+    """The declaration of a consumer, `CONSUMER` in its file.
+
+    Attributes:
+        export: makes the export of a request.
+        options: options of the command line that it uses.
+        needs_topics: whether it needs the topics of the config.
+        places_housings: whether its frames are the housings of LiDARs, so that their poses in the
+            housing are taken from a recording.
+    """
+
+    export: Callable[[Request], Export]
+    options: frozenset[str] = frozenset()
+    needs_topics: bool = False
+    places_housings: bool = False
+
+
+def check_names(consumer: str, transforms: tuple[Transform, ...]) -> None:
+    """Refuses frames with the same name.
+
+    Raises:
+        ExportError: two frames have the same name.
+    """
+    names = [*{transform.parent for transform in transforms}, *(t.child for t in transforms)]
+    for name in names:
+        if names.count(name) > 1:
+            raise ExportError(
+                f"{consumer}: '{name}' would be the name of two frames. Give other names by "
+                "--frame NAME=FRAME or --vehicle-frame FRAME"
+            )

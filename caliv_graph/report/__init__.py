@@ -1,1 +1,1 @@
-"""What people look at: tables on the terminal, and what a recording holds."""
+"""Results for people: tables on the terminal, HTML pages, and the content of a recording."""

@@ -1,4 +1,4 @@
-"""What a bag holds: topics, rates, gaps, clocks, time fields, units; who sees the target when."""
+"""The content of a bag: topics, rates, gaps, clocks, time fields, units, views of the target."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from caliv_graph.report.inspection import (
     Sighting,
     TargetSummary,
     add_targets,
-    centre_of,
     inspect_recording,
     nearest_and_farthest,
     runs_of,
     stamps_seen,
     summarise_drive,
     summarise_points,
+    summarise_targets,
 )
 
 _SAMPLED_CLOUDS = 20
-"""Clouds per LiDAR that are looked into, spread over the drive: a bag can hold many thousands."""
+"""Clouds per LiDAR that are decoded, spread over the drive: a bag can hold many thousands."""
 
 _GAPS_SHOWN = 20
-"""Longest gaps that are listed per topic."""
+"""Gaps listed per topic, the longest ones."""
 
 _RUN_FACTOR = 1.75
-"""Scans of a target no more intervals apart than this belong to one run: one that is lost, two."""
+"""Largest number of scan intervals between two scans of one run."""
 
 
 @dataclass(frozen=True)
@@ -45,19 +45,19 @@ class TopicSummary:
     """One topic.
 
     Attributes:
-        type: of its messages.
-        messages: how many there are.
-        rate_hz: of the median interval between stamps; of a topic that was not read, the mean over
-            the bag; None with fewer than two messages.
-        read: whether it was read; if not, all below is unknown.
-        frame_id: frame in the header of its first message.
+        type: message type.
+        messages: number of messages.
+        rate_hz: from the median interval between stamps; of a topic that was not read, the mean
+            over the bag; None with fewer than two messages.
+        read: whether the topic was read; if not, the attributes below are unknown.
+        frame_id: frame in the header of the first message.
         gaps: number of intervals that are too long for the rate.
-        longest_gaps_s: (from, to) of the longest, in the order of time, in seconds from the bag's
+        longest_gaps_s: (from, to) of the longest gaps in time order, in seconds from the bag's
             first record time.
         header_minus_record_s: (min, median, max); None if no message has a stamp.
         unset: messages without a stamp.
-        backwards: messages stamped before the one recorded before them.
-        duplicates: messages with the stamp of another.
+        backwards: messages with a stamp before that of the previous message.
+        duplicates: messages with the same stamp as another.
     """
 
     type: str
@@ -78,11 +78,11 @@ class PointTimes:
     """The times of a LiDAR's points.
 
     Attributes:
-        field: its name.
-        type: its type.
-        unit: what it was found to hold.
-        first_s: earliest, seconds after the stamp.
-        last_s: latest, seconds after the stamp.
+        field: name of the field.
+        type: type of the field.
+        unit: unit found from its values.
+        first_s: earliest time, seconds after the stamp.
+        last_s: latest time, seconds after the stamp.
     """
 
     field: str
@@ -99,13 +99,13 @@ class BagLidarSummary:
     Attributes:
         topic: of its clouds.
         frame_id: frame in the header of its first cloud.
-        clouds: how many there are.
-        rate_hz: of the median interval; None with fewer than two clouds.
-        sampled: clouds looked into for what follows.
-        points: points per cloud, without NaN and zero returns and those outside the ranges; None
-            if no cloud could be read.
-        times: times of the points; None if they have none that could be believed.
-        times_problem: why times were not believed; empty: nothing was wrong.
+        clouds: number of clouds.
+        rate_hz: from the median interval; None with fewer than two clouds.
+        sampled: number of clouds decoded for the attributes below.
+        points: points per cloud, without NaN, zero returns and points outside the ranges; None if
+            no cloud could be read.
+        times: times of the points; None if there are no valid times.
+        times_problem: why the times are not valid; empty: no problem.
     """
 
     topic: str
@@ -120,12 +120,12 @@ class BagLidarSummary:
 
 @dataclass(frozen=True)
 class ImuSummary:
-    """The units of one IMU.
+    """Magnitudes of one IMU, which reveal wrong units.
 
     Attributes:
         specific_force_m_s2: median of its norm.
         angular_rate_rad_s: 95th percentile of its norm.
-        problems: what is wrong with them.
+        problems: one sentence per problem.
     """
 
     specific_force_m_s2: float
@@ -135,18 +135,18 @@ class ImuSummary:
 
 @dataclass(frozen=True)
 class BagInspection:
-    """What a bag holds.
+    """The content of a bag.
 
     Attributes:
         data: the bag.
         start_ns: first record time.
         duration_s: from the first to the last record time.
-        topics: all of them.
+        topics: all topics.
         lidars: per LiDAR.
-        imus: per topic of IMU samples that was read.
-        gnss_fixes: messages with a fix, per topic of GNSS messages that was read.
-        drive: the motion by given poses; None if there are none.
-        targets: who sees what when; None if nobody was asked to look.
+        imus: per IMU topic that was read.
+        gnss_fixes: number of messages with a fix, per GNSS topic that was read.
+        drive: the motion according to given poses; None without poses.
+        targets: sightings per target; None if no target was searched.
     """
 
     data: str
@@ -160,15 +160,16 @@ class BagInspection:
     targets: tuple[TargetSummary, ...] | None = None
 
     def document(self) -> dict[str, Any]:
-        """The same as plain values, for JSON."""
+        """Plain values for JSON."""
         return asdict(self)
 
 
 def inspect_any(recording: Recording, progress: Progress) -> Inspection | BagInspection:
-    """What a recording of any format holds.
+    """The content of a recording of any format.
 
     Raises:
-        RecordingError: it is damaged.
+        RecordingError: the recording is damaged.
+        TrajectoryError: a CaLiV folder has no vehicle poses.
     """
     if isinstance(recording, RosbagRecording):
         return inspect_bag(recording, progress)
@@ -178,7 +179,7 @@ def inspect_any(recording: Recording, progress: Progress) -> Inspection | BagIns
 def add_any_targets(
     inspection: Inspection | BagInspection, observations: Iterable[TargetObservation]
 ) -> Inspection | BagInspection:
-    """Adds which LiDAR sees the target when.
+    """Adds when each LiDAR sees each target.
 
     Args:
         inspection: of the recording.
@@ -186,16 +187,12 @@ def add_any_targets(
     """
     if isinstance(inspection, Inspection):
         return add_targets(inspection, observations)
-    targets = tuple(
-        TargetSummary(
-            name=observation.name,
-            centre_map_m=centre_of(observation),
-            lidars={
-                lidar: _summarise_sighting(observation, lidar, summary.rate_hz, inspection.start_ns)
-                for lidar, summary in inspection.lidars.items()
-            },
-        )
-        for observation in observations
+    rates_hz = {lidar: summary.rate_hz for lidar, summary in inspection.lidars.items()}
+    start_ns = inspection.start_ns
+    targets = summarise_targets(
+        observations,
+        inspection.lidars,
+        lambda seen, lidar: _summarise_sighting(seen, lidar, rates_hz[lidar], start_ns),
     )
     return replace(inspection, targets=targets)
 
@@ -247,7 +244,7 @@ def _drive(recording: RosbagRecording) -> DriveSummary | None:
     try:
         poses = recording.motion().poses
     except RecordingError:
-        return None  # an IMU in wrong units, of which the inspection tells
+        return None  # wrong IMU units, which the inspection reports
     return None if poses is None else summarise_drive(poses)
 
 
@@ -311,7 +308,7 @@ def _summarise_sighting(
     stamps_ns = stamps_seen(observation, lidar)
     period_ns = NANOSECONDS_PER_SECOND / rate_hz if rate_hz else 0.0
     if len(stamps_ns) > 2:
-        # Of a long drive not every scan is looked at.
+        # Not every scan of a long drive is searched for the target.
         period_ns = max(period_ns, float(np.median(np.diff(stamps_ns))))
     runs = runs_of(stamps_ns, round(_RUN_FACTOR * period_ns))
     return Sighting(

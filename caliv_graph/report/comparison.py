@@ -1,4 +1,4 @@
-"""Calibrations against each other, as tables and as plain values."""
+"""Comparisons and merged calibrations, as tables and as plain values."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from caliv_graph.conventions import AXES
 from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import Merger
 from caliv_graph.report.layout import (
-    SHOWN_AXES,
+    UNKNOWN,
     axis_headings,
     new_table,
     sentences,
     titled,
-    value_and_sigma,
 )
+from caliv_graph.report.numbers import SHOWN_AXES, value_and_sigma
 from caliv_graph.report.tables import calibration_table
-
-_UNTOLD = "-"
 
 
 def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: float) -> Group:
     """Movements with their sigmas, and the verdict.
 
     Args:
-        comparison: what was found.
-        labels: of the earlier and the later calibration.
-        p_value: the limit that was applied.
+        comparison: the result of the comparison.
+        labels: names of the earlier and the later calibration.
+        p_value: the limit applied.
     """
     table = new_table("", *axis_headings("mm", "mrad"), "chi2\ndof", "p\ncorrected", "moved")
     for movement in comparison.movements:
@@ -39,16 +37,18 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
     )[1:]
     if not all(all(m.told) for m in comparison.movements):
         parts.append(
-            Text(f"{_UNTOLD}: not determined by both: nothing can be said.", style="yellow")
+            Text(
+                f"{UNKNOWN}: not determined by both calibrations, so not compared.", style="yellow"
+            )
         )
     for label, texts in zip(labels, comparison.undetermined, strict=True):
-        parts += sentences(f"What {label} could not tell:", texts)
+        parts += sentences(f"Not determined by {label}:", texts)
     parts += sentences(
         "Not compared:", (f"LiDAR '{n}': {why}" for n, why in comparison.not_compared.items())
     )
     style = "bold red" if comparison.moved else "bold green" if _any(comparison) else "bold yellow"
     together = (
-        f" (all at once: chi2 {comparison.chi2:.1f} of {comparison.dof} dof, p "
+        f" (joint test: chi2 {comparison.chi2:.1f} with {comparison.dof} dof, p "
         f"{comparison.p_value:.3g}; limit {p_value:g} after correction for {_tests(comparison)} "
         "tests)"
         if comparison.dof
@@ -59,27 +59,29 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
 
 
 def merger_table(merger: Merger, p_value: float) -> RenderableType:
-    """The merged calibration, and whether its parts agree."""
+    """The merged calibration, and whether its inputs agree."""
     table = new_table("", "tests", "smallest p\ncorrected", "verdict")
     for label, comparison in merger.agreement.items():
         tested = [m.p_corrected for m in comparison.movements if m.dof]
         table.add_row(
             Text(label),
             str(_tests(comparison)),
-            f"{min(tested):.3g}" if tested else _UNTOLD,
+            f"{min(tested):.3g}" if tested else UNKNOWN,
             Text("disagrees", style="bold red")
             if comparison.moved
             else Text("agrees" if tested else "nothing to compare"),
         )
     parts: list[RenderableType] = [calibration_table(merger.calibration)]
-    parts += titled(f"Each against the others together (limit {p_value:g} over all)", table)
+    parts += titled(
+        f"Each calibration against all others together (limit {p_value:g} over all tests)", table
+    )
     return Group(*parts)
 
 
 def comparison_document(
     comparison: Comparison, labels: tuple[str, str], p_value: float
 ) -> dict[str, Any]:
-    """A comparison in plain values: metres, radians; null where nothing can be said."""
+    """A comparison as plain values: metres, radians; null where not determined."""
     return {
         "first": labels[0],
         "second": labels[1],
@@ -106,7 +108,7 @@ def comparison_document(
 
 
 def agreement_document(merger: Merger, p_value: float) -> dict[str, Any]:
-    """Per calibration, how it compares with the others together."""
+    """Per calibration, its comparison with all others together."""
     others = ("the others", "this")
     return {
         label: comparison_document(comparison, others, p_value)
@@ -115,23 +117,23 @@ def agreement_document(merger: Merger, p_value: float) -> dict[str, Any]:
 
 
 def _movement_document(movement: Movement) -> dict[str, Any]:
-    def told(values: Any, axes: slice) -> list[float | None]:
+    def where_determined(values: Any, axes: slice) -> list[float | None]:
         pairs = zip(values[axes], movement.told[axes], strict=True)
         return [float(value) if known else None for value, known in pairs]
 
     rotation, translation = slice(0, 3), slice(3, 6)
     tested = movement.dof > 0
     return {
-        "rotation_rad": told(movement.movement, rotation),
-        "translation_m": told(movement.movement, translation),
-        "sigma_rotation_rad": told(movement.sigma, rotation),
-        "sigma_translation_m": told(movement.sigma, translation),
+        "rotation_rad": where_determined(movement.movement, rotation),
+        "translation_m": where_determined(movement.movement, translation),
+        "sigma_rotation_rad": where_determined(movement.sigma, rotation),
+        "sigma_translation_m": where_determined(movement.sigma, translation),
         "determined": dict(zip(AXES, movement.told, strict=True)),
         "chi2": movement.chi2 if tested else None,
         "dof": movement.dof,
         "p_value": movement.p_value if tested else None,
-        "p_rotation": told(movement.p_axes, rotation),
-        "p_translation": told(movement.p_axes, translation),
+        "p_rotation": where_determined(movement.p_axes, rotation),
+        "p_translation": where_determined(movement.p_axes, translation),
         "p_corrected": movement.p_corrected if tested else None,
         "moved": movement.moved if tested else None,
     }
@@ -148,7 +150,7 @@ def _cells(movement: Movement) -> list[Text]:
     for axis in SHOWN_AXES:
         i = AXES.index(axis)
         if not movement.told[i]:
-            cells.append(Text(_UNTOLD, style="yellow"))
+            cells.append(Text(UNKNOWN, style="yellow"))
             continue
         value, sigma = 1e3 * movement.movement[i], 1e3 * movement.sigma[i]
         cells.append(Text(value_and_sigma(value, sigma)))
@@ -157,7 +159,7 @@ def _cells(movement: Movement) -> list[Text]:
 
 def _verdict(movement: Movement) -> list[Text]:
     if not movement.dof:
-        return [Text(_UNTOLD), Text(_UNTOLD), Text("cannot\nbe said", style="yellow")]
+        return [Text(UNKNOWN), Text(UNKNOWN), Text("not\ntested", style="yellow")]
     moved = Text("yes", style="bold red") if movement.moved else Text("no")
     return [
         Text(f"{movement.chi2:.1f}\n{movement.dof}"),

@@ -7,23 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from caliv_graph.common.json_text import without_infinities
 from caliv_graph.common.progress import StageRecord
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
 from caliv_graph.fusion.archive import calibration_graph, write_archive
-from caliv_graph.products import (
-    Calibration,
-    Solution,
-)
-
-if TYPE_CHECKING:
-    from caliv_graph.results.run import RunRecord
-from caliv_graph.common.json_text import without_infinities
+from caliv_graph.products import Calibration, Solution
 from caliv_graph.report.html import render_report
 from caliv_graph.report.log import log_documents
 from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.results.names import CALIBRATION_FILE, GRAPH_FILE, REPORT_FILE
 from caliv_graph.results.target_file import write_target
+
+if TYPE_CHECKING:
+    from caliv_graph.results.run import RunRecord
 
 
 def write_result(
@@ -39,18 +36,17 @@ def write_result(
 
     Args:
         folder: an empty folder.
-        calibration: goes to calibration.yaml and, as priors that GTSAM reads, to graph.gtsam and
+        calibration: for calibration.yaml and, as priors for GTSAM, graph.gtsam and
             graph.values.gtsam.
-        solution: its reconstructed targets go to target.ply, target_2.ply and so on, its course to
-            log.jsonl.
-        config: the effective one, goes to config.yaml.
-        stages: what was done and how long it took, goes to log.jsonl.
-        warnings: go to log.jsonl.
-        record: for report.html, which is not written without it; its numbers go to log.jsonl.
+        solution: for target.ply, target_2.ply, ... (the reconstructed targets) and log.jsonl.
+        config: the effective config, for config.yaml.
+        stages: with their durations, for log.jsonl.
+        warnings: for log.jsonl.
+        record: for report.html and log.jsonl; None: no report.html.
 
     Raises:
-        OSError: something cannot be written.
-        OutputError: likewise.
+        OSError: a file cannot be written.
+        OutputError: a file cannot be written.
     """
     write_calibration(calibration, folder / CALIBRATION_FILE)
     write_archive(*calibration_graph(calibration), folder / GRAPH_FILE)

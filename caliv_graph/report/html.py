@@ -1,7 +1,7 @@
-"""report.html: one self-contained page that says what a calibration is worth, and shows why.
+"""report.html: one self-contained page about the quality of a calibration.
 
-Nothing is loaded from anywhere: style, plotly.js and data are inside. Names come from users and
-are escaped wherever they go.
+The page loads nothing: style, plotly.js and data are inside. Names come from users and are escaped
+wherever they appear.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ import importlib.metadata
 import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gtsam
 import numpy as np
 from markupsafe import Markup
 
@@ -24,53 +22,27 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array, Calibration, Direction, LidarResult, Solution
-from caliv_graph.report.layout import SHOWN_AXES, decimals_of, fixed
+from caliv_graph.products import Calibration, Direction, LidarResult, Solution
+from caliv_graph.report.numbers import SHOWN_AXES, fixed, pair_cells, pose_cells, two_digits
 from caliv_graph.report.page import environment, script_data
-from caliv_graph.report.residuals import (
-    CloudVerdict,
-    all_residuals,
-    down_weighted,
-    figures_of,
-)
+from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weighted
 from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
-
-if TYPE_CHECKING:
-    from caliv_graph.report.figures import Figure
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
 
 MOST_LISTED = 40
-"""Down-weighted clouds in the table; the figure has all."""
-
-MOST_SOLID = 2
-"""Placements, and drives, with a 3-D view: a browser draws about a dozen of them at once."""
+"""Down-weighted clouds in the table; the figure shows all."""
 
 FAR_SIGMAS = 3.0
-"""From which a mounting counts as far from its guess."""
+"""An extrinsic that moved by more than this many sigmas of its guess is highlighted."""
 
 _HEADLINES = {
-    "ok": "Calibrated: the drive determined every axis of every LiDAR.",
-    "partial": "Calibrated in part: some axes were not determined by the drive.",
-    "inconsistent": "Do not use this result: what went into it contradicts itself.",
+    "ok": "Calibrated: this drive determined every axis of every LiDAR.",
+    "partial": "Calibrated in part: this drive did not determine some axes.",
+    "inconsistent": "Do not use this result: its inputs contradict each other.",
 }
 
 _VERSIONS_OF = ("gtsam", "numpy", "scipy", "open3d", "rosbags", "plotly")
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number of a table.
-
-    Attributes:
-        value: with its unit's decimals; in brackets if it was not determined.
-        below: its sigma, or what stands in for it.
-        determined: whether the drive told it.
-    """
-
-    value: str
-    below: str
-    determined: bool
 
 
 def render_report(
@@ -79,53 +51,50 @@ def render_report(
     config: Config,
     stages: Sequence[StageRecord],
     warnings: Sequence[str],
-    evidence: RunRecord,
+    record: RunRecord,
 ) -> str:
     """The page.
 
     Args:
         calibration: the result.
         solution: the solved graph.
-        config: the effective one.
-        stages: what was done, and how long it took.
-        warnings: what a person should know, a line each.
-        evidence: what the result was made from.
+        config: the effective config.
+        stages: stages of the run, with their durations.
+        warnings: one line each.
+        record: drives, trajectories, ground and scans of the run.
 
     Returns:
-        A whole HTML document of a few megabytes, most of them plotly.js.
+        An HTML document of a few megabytes, most of them plotly.js.
     """
-    # Here, for a run that writes no report has no use for them.
+    # Imported here: a run that writes no report does not need plotly.
     from plotly.offline import get_plotlyjs
 
-    pages = environment()
-    pages.globals["figures_of"] = figures_of
-    pages.globals["median"] = lambda values: float(np.median(np.abs(values)))
-    from caliv_graph.report.figures import without_template
+    from caliv_graph.report.figures.sections import report_figures
 
-    with without_template():
-        sections = _sections(calibration, solution, evidence)
-    figures = {f.name: f for figures in sections.values() for f in figures}
+    sections = report_figures(calibration, solution, record)
     clouds = down_weighted(solution, config.robust)
-    template = pages.get_template("report.html.j2")
-    return template.render(
+    pages = environment()
+    pages.globals["two_digits"] = two_digits
+    pages.globals["median"] = lambda values: float(np.median(np.abs(values)))
+    return pages.get_template("report.html.j2").render(
         calibration=calibration,
         headline=_HEADLINES.get(calibration.status, calibration.status),
         verdicts=verdicts(calibration),
-        conflicts=_conflicts(calibration, warnings),
+        contradictions=_contradictions(calibration, warnings),
         directions=_direction_rows(calibration),
         axes=SHOWN_AXES,
-        extrinsics={n: mounting_row(r) for n, r in calibration.lidars.items()},
-        pairs=_pair_rows(calibration),
+        extrinsics={n: extrinsic_row(r) for n, r in calibration.lidars.items()},
+        pairs=pair_cells(calibration),
         moves=_move_rows(calibration),
-        residuals=all_residuals(solution, evidence),
-        clouds=[_cloud_row(c, evidence) for c in clouds[:MOST_LISTED]],
+        residuals=all_residuals(solution, record),
+        clouds=[_cloud_row(c, record) for c in clouds[:MOST_LISTED]],
         more_clouds=max(len(clouds) - MOST_LISTED, 0),
         weights=_weight_rows(solution),
         registrations=solution.registrations,
         solution=solution,
-        noise=_noise_rows(solution, evidence),
+        noise=_noise_rows(solution, record),
         sections=sections,
-        data={name: script_data(f) for name, f in figures.items()},
+        data={f.name: script_data(f) for figures in sections.values() for f in figures},
         warnings=list(dict.fromkeys(warnings)),
         stages=[(s.depth, s.name, s.seconds, count_text(s)) for s in stages],
         config=dump_config(config),
@@ -137,32 +106,34 @@ def render_report(
 
 
 def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Per LiDAR and pair: its name, what was determined, what was not; in words."""
+    """Per LiDAR and pair: its name, the determined axes, the undetermined axes, as text."""
     out = []
     for name, lidar in calibration.lidars.items():
         if lidar.guess is not None and lidar.guess.fixed:
-            out.append((name, "", "not estimated: the config says to trust its mounting (fixed)"))
+            out.append((name, "", "not estimated: 'fixed' in the config"))
         elif not lidar.saw_target:
-            out.append((name, "", "everything: it never saw a target, its mounting is the guess"))
+            out.append((name, "", "all six axes: no target seen, the extrinsic is the guess"))
         else:
-            out.append((f"{name} to the vehicle", *_told(lidar.determined)))
+            out.append((f"{name} to the vehicle", *_axes_texts(lidar.determined)))
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):
         if all(calibration.lidars[n].saw_target for n in (source, to)):
-            told = _told(pair_determined(calibration, source, to))
-            out.append((f"{source} to {to}", *told))
+            axes = _axes_texts(pair_determined(calibration, source, to))
+            out.append((f"{source} to {to}", *axes))
     return out
 
 
-def _told(determined: Mapping[str, bool]) -> tuple[str, str]:
-    told = [axis for axis in SHOWN_AXES if determined[axis]]
-    lost = [axis for axis in SHOWN_AXES if not determined[axis]]
-    return ("all six axes" if not lost else ", ".join(told)), (
-        "all six axes" if not told else ", ".join(lost)
+def _axes_texts(determined: Mapping[str, bool]) -> tuple[str, str]:
+    """The determined and the undetermined axes."""
+    known = [axis for axis in SHOWN_AXES if determined[axis]]
+    unknown = [axis for axis in SHOWN_AXES if not determined[axis]]
+    return (
+        "all six axes" if not unknown else ", ".join(known),
+        "all six axes" if not known else ", ".join(unknown),
     )
 
 
-def _conflicts(calibration: Calibration, warnings: Sequence[str]) -> list[str]:
-    """What contradicts what; of a result that does not say so itself, all that was noticed."""
+def _contradictions(calibration: Calibration, warnings: Sequence[str]) -> list[str]:
+    """The contradictions; of an inconsistent result that names none, all warnings."""
     if calibration.contradictions or calibration.status != "inconsistent":
         return list(calibration.contradictions)
     return list(dict.fromkeys([*calibration.unmet, *warnings]))
@@ -186,9 +157,9 @@ def _direction_rows(calibration: Calibration) -> list[dict[str, str]]:
 
 
 def _sigma_text(direction: Direction, sigma: float) -> str:
-    """A sigma along a direction, as that of the axis it moves most."""
+    """A sigma along a direction, stated for the axis that changes most along it."""
     if not math.isfinite(sigma):
-        return "nothing known"
+        return "no information"
     best, size = ("", 0), 0.0
     for name, vector in direction.vector.items():
         # 1 mrad counts as 10 mm.
@@ -198,54 +169,23 @@ def _sigma_text(direction: Direction, sigma: float) -> str:
     name, axis = best
     value = 1e3 * sigma * abs(float(direction.vector[name][axis]))
     if value >= 1e4:
-        return "next to nothing"
-    return f"{figures_of(value)} {'mrad' if axis < 3 else 'mm'} in {AXES[axis]} of {name}"
+        return "almost no information"
+    return f"{two_digits(value)} {'mrad' if axis < 3 else 'mm'} in {AXES[axis]} of {name}"
 
 
-def mounting_row(result: LidarResult) -> dict[str, Any]:
-    """One LiDAR's line in a table of extrinsics: per axis the value and its sigma."""
-    estimated = not (result.guess is not None and result.guess.fixed)
+def extrinsic_row(result: LidarResult) -> dict[str, Any]:
+    """The row of one LiDAR in a table of extrinsics: a cell per axis, scans, time offset."""
+    offset = result.time_offset
     return {
-        "cells": _cells(result.T_vehicle_lidar, result.cov, result.determined),
+        "cells": pose_cells(result.T_vehicle_lidar, result.cov, result.determined),
         "scans": str(result.scans_used) if result.saw_target else "no target",
-        "offset": None
-        if result.time_offset is None
-        else f"{1e3 * result.time_offset[0]:+.2f} ± {1e3 * result.time_offset[1]:.2f} ms",
-        "estimated": estimated,
+        "offset": None if offset is None else f"{1e3 * offset[0]:+.2f} ± {1e3 * offset[1]:.2f} ms",
+        "estimated": not (result.guess is not None and result.guess.fixed),
     }
 
 
-def _pair_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    rows = []
-    for source, to in sensor_pairs(calibration.lidars, calibration.reference):
-        T_vehicle_from = calibration.lidars[source].T_vehicle_lidar
-        T_to_from = calibration.lidars[to].T_vehicle_lidar.between(T_vehicle_from)
-        cov = pair_covariance(calibration, source, to)
-        cells = _cells(T_to_from, cov, pair_determined(calibration, source, to))
-        rows.append({"from": source, "to": to, "cells": cells})
-    return rows
-
-
-def _cells(T_parent_child: gtsam.Pose3, cov: Array, determined: Mapping[str, bool]) -> list[Cell]:
-    """A cell per shown axis: metres and degrees, sigma in the parent's axes."""
-    sigma = np.sqrt(np.diag(parent_axes_covariance(T_parent_child, cov)))
-    values = np.concatenate([T_parent_child.rotation().rpy(), T_parent_child.translation()])
-    values[:3], sigma[:3] = np.degrees(values[:3]), np.degrees(sigma[:3])
-    out = []
-    for axis in SHOWN_AXES:
-        i = AXES.index(axis)
-        if determined[axis]:
-            decimals = decimals_of(float(sigma[i]), 2)
-            value = fixed(float(values[i]), decimals)
-            out.append(Cell(value, f"± {sigma[i]:.{decimals}f}", True))
-        else:
-            decimals = decimals_of(float(sigma[i]), 1)
-            out.append(Cell(f"({fixed(float(values[i]), decimals)})", "not determined", False))
-    return out
-
-
 def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """From the guess to the result, mm and mrad in vehicle axes."""
+    """Differences between guess and result; mm and mrad in vehicle axes."""
     rows = []
     for name, lidar in calibration.lidars.items():
         if lidar.guess is None or lidar.guess.fixed or not lidar.saw_target:
@@ -255,38 +195,38 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
         cells = []
         for axis in SHOWN_AXES:
             i = AXES.index(axis)
-            told, prior = lidar.determined[axis], lidar.guess.sigmas[i]
+            determined, prior = lidar.determined[axis], lidar.guess.sigmas[i]
             cells.append(
                 {
-                    "moved": f"{1e3 * moved[i]:.3g}" if told else "not determined",
+                    "moved": f"{1e3 * moved[i]:.3g}" if determined else "not determined",
                     "prior": f"{1e3 * prior:.3g}",
-                    "after": figures_of(1e3 * after[i]) if told else "the guess's",
-                    "sigmas": fixed(float(moved[i] / prior), 1) if told else "",
-                    "far": bool(told and abs(moved[i]) > FAR_SIGMAS * prior),
-                    "determined": told,
+                    "after": two_digits(1e3 * after[i]),
+                    "sigmas": fixed(float(moved[i] / prior), 1) if determined else "",
+                    "far": bool(determined and abs(moved[i]) > FAR_SIGMAS * prior),
+                    "determined": determined,
                 }
             )
         rows.append({"name": name, "cells": cells})
     return rows
 
 
-def _cloud_row(cloud: CloudVerdict, evidence: RunRecord) -> dict[str, str]:
-    begin, _ = evidence.trajectories[cloud.drive].span_ns
+def _cloud_row(cloud: CloudVerdict, record: RunRecord) -> dict[str, str]:
+    begin, _ = record.trajectories[cloud.drive].span_ns
     return {
         "lidar": cloud.lidar,
         "target": cloud.target,
-        "drive": evidence.drives[cloud.drive],
+        "drive": record.drives[cloud.drive],
         "at": f"{(cloud.stamp_ns - begin) / NANOSECONDS_PER_SECOND:.2f}",
         "source": _short_source(cloud.source),
         "weight": f"{cloud.weight:.2f}",
-        "turn": f"{1e3 * cloud.turn_rad:.3g}",
-        "shift": f"{1e3 * cloud.shift_m:.3g}",
+        "rotation": f"{1e3 * cloud.rotation_rad:.3g}",
+        "position": f"{1e3 * cloud.position_m:.3g}",
         "reason": cloud.reason,
     }
 
 
 def _short_source(source: str) -> str:
-    """A file by its last folder and name, a scan of a topic as it is."""
+    """Folder and name of a file; the name of a scan from a topic is returned unchanged."""
     return "/".join(source.split("/")[-2:]) if source.endswith(".pcd") else source
 
 
@@ -314,35 +254,35 @@ def _weight_rows(solution: Solution) -> list[dict[str, Any]]:
     return rows
 
 
-def _noise_rows(solution: Solution, evidence: RunRecord) -> list[tuple[str, str]]:
-    """Noise levels, and where they are from."""
+def _noise_rows(solution: Solution, record: RunRecord) -> list[tuple[str, str]]:
+    """Noise levels and their sources."""
     rows = []
     noise = solution.pose_noise
     if noise is not None:
         rows += [
             (
-                "given poses, white part (from the data where the config states none)",
+                "given poses, white error (estimated from the data unless the config states it)",
                 f"{1e3 * noise.white_rotation_rad:.2g} mrad, "
                 f"{1e3 * noise.white_position_m:.2g} mm per axis",
             ),
             (
-                "given poses, slow part",
+                "given poses, Gauss-Markov error",
                 f"{1e3 * noise.drift_rotation_rad:.2g} mrad, "
                 f"{1e3 * noise.drift_position_m:.2g} mm per axis, "
-                f"over {noise.drift_time_s:g} s",
+                f"correlation time {noise.drift_time_s:g} s",
             ),
         ]
     rows.append(
         ("registration of the target, factor on its sigmas", f"{solution.registration_scale:.2f}")
     )
-    for name, trajectory in zip(evidence.drives, evidence.trajectories, strict=True):
+    for name, trajectory in zip(record.drives, record.trajectories, strict=True):
         if isinstance(trajectory, SmoothedTrajectory):
             rows += [(f"{name}: {what}", by) for what, by in trajectory.noise_sources.items()]
     return rows
 
 
 def _inputs(calibration: Calibration) -> list[tuple[str, str]]:
-    """The provenance as lines: digests whole, for they are to be compared."""
+    """The provenance, one row per value; digests in full, so that they can be compared."""
     rows = []
     for key, value in calibration.provenance.items():
         shown = value if isinstance(value, list) else [value]
@@ -358,39 +298,3 @@ def _versions() -> list[tuple[str, str]]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return rows
-
-
-def _sections(
-    calibration: Calibration, solution: Solution, evidence: RunRecord
-) -> dict[str, list[Figure]]:
-    """The figures of each section of the page."""
-    from caliv_graph.report import figures as draw
-
-    lidars = list(calibration.lidars)
-    drives = list(zip(range(len(evidence.drives)), evidence.drives, strict=True))
-    targets: list[Figure | None] = []
-    scenes: list[Figure | None] = []
-    motions: list[Figure | None] = []
-    for m in range(len(solution.registrations)):
-        solid, flat = draw.target_figures(m, solution, calibration)
-        targets += [solid, flat] if m < MOST_SOLID else [flat]
-    for drive, name in drives:
-        trajectory = evidence.trajectories[drive]
-        if drive < MOST_SOLID:
-            scans = evidence.scene.get(drive, ())
-            scenes.append(draw.scene_figure(drive, trajectory, scans, calibration, name))
-        motions.append(draw.path_figure(drive, trajectory, solution, name, lidars))
-        if isinstance(trajectory, SmoothedTrajectory):
-            motions.append(draw.motion_figure(drive, trajectory, name))
-        motions.append(draw.correction_figure(drive, trajectory, solution, name))
-    kinds = all_residuals(solution, evidence)
-    sections: dict[str, list[Figure | None]] = {
-        "extrinsics": [draw.sigma_figure(calibration)],
-        "observability": [draw.spectrum_figure(solution), draw.correlation_figure(calibration)],
-        "alignment": [*targets, *scenes],
-        "residuals": [*map(draw.residual_figure, kinds, range(1, len(kinds) + 1))],
-        "weights": [draw.weight_figure(solution, lidars)],
-        "trajectory": motions,
-        "convergence": [draw.course_figure(solution)],
-    }
-    return {name: [f for f in found if f is not None] for name, found in sections.items()}

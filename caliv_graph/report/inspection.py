@@ -1,10 +1,13 @@
-"""What a recording holds: clouds, frames, gaps, the drive, and which LiDAR sees the target when."""
+"""The content of a recording: clouds, frames, gaps, the drive, and when each LiDAR sees the target.
+
+This file serves CaLiV folders and what bags have in common with them; `bag_inspection` serves bags.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -18,17 +21,17 @@ from caliv_graph.products import Array, GivenPoses, Recording, TargetObservation
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 
 Run = tuple[int, int]
-"""First and last frame number, or the frames before and after a gap."""
+"""First and last frame number of a run, or the frames before and after a gap."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """Points per cloud, without NaN and zero returns and those outside the ranges of the config.
+    """Points per cloud, without NaN, zero returns and points outside the ranges of the config.
 
     Attributes:
-        min: of the emptiest cloud.
-        median: over the clouds.
-        max: of the fullest cloud.
+        min: minimum over the clouds.
+        median: median over the clouds.
+        max: maximum over the clouds.
     """
 
     min: int
@@ -41,11 +44,11 @@ class LidarSummary:
     """The clouds of one LiDAR.
 
     Attributes:
-        clouds: how many there are.
+        clouds: number of clouds.
         frames: first and last frame number.
-        step: frame numbers from one cloud to the next, mostly.
-        gaps: frames before and after each place where clouds are missing from that rhythm.
-        rate_hz: nominal, for the files carry no time; None if there is but one cloud.
+        step: usual difference of frame numbers between clouds.
+        gaps: frames before and after each larger difference.
+        rate_hz: nominal, since the files have no stamps; None with one cloud.
         points: points per cloud.
     """
 
@@ -59,15 +62,15 @@ class LidarSummary:
 
 @dataclass(frozen=True)
 class DriveSummary:
-    """The vehicle's motion by the given poses.
+    """The vehicle's motion according to the given poses.
 
     Attributes:
-        poses: how many there are.
-        duration_s: nominal, from the first to the last.
+        poses: number of poses.
+        duration_s: nominal, from the first pose to the last.
         path_length_m: sum of the distances between poses.
-        climb_m: from the lowest to the highest.
-        heading_change_deg: sum of all turns, positive to the left.
-        turned_deg: the same without regard to the sign.
+        climb_m: height of the highest pose above the lowest.
+        heading_change_deg: sum of all heading changes, positive to the left.
+        turned_deg: sum of their absolute values.
     """
 
     poses: int
@@ -80,16 +83,16 @@ class DriveSummary:
 
 @dataclass(frozen=True)
 class Sighting:
-    """How one LiDAR sees one target.
+    """The scans of one LiDAR that see one target.
 
     Attributes:
-        scans: scans with enough points on the target.
-        frames: runs of frames, in the LiDAR's rhythm, from first to last; none of a bag.
+        scans: number of scans with enough points on the target.
+        frames: first and last frame of each run without a gap; empty for a bag.
         points: points on the target per scan, of the clouds that a calibration would use; None if
-            it is never seen.
-        range_m: nearest and farthest distance of the target from the LiDAR, of the same; None if
-            never seen.
-        times_s: of a bag the same runs, in seconds from its first record time.
+            no scan sees the target.
+        range_m: minimum and maximum distance of the target from the LiDAR, of the same clouds; None
+            if no scan sees the target.
+        times_s: for a bag, the runs in seconds from its first record time.
     """
 
     scans: int
@@ -104,9 +107,9 @@ class TargetSummary:
     """One target placement.
 
     Attributes:
-        name: what to call it.
-        centre_map_m: rough centre in the map.
-        lidars: sightings per LiDAR, also of those that never see it.
+        name: of the placement.
+        centre_map_m: approximate centre in the map.
+        lidars: sightings per LiDAR, including LiDARs that never see the target.
     """
 
     name: str
@@ -116,13 +119,13 @@ class TargetSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a recording holds.
+    """The content of a recording.
 
     Attributes:
         data: the recording.
         lidars: per LiDAR.
         drive: the vehicle's motion.
-        targets: who sees what when; None if nobody was asked to look.
+        targets: sightings per target; None if no target was searched.
     """
 
     data: str
@@ -131,15 +134,16 @@ class Inspection:
     targets: tuple[TargetSummary, ...] | None = None
 
     def document(self) -> dict[str, Any]:
-        """The same as plain values, for JSON."""
+        """Plain values for JSON."""
         return asdict(self)
 
 
 def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
-    """Reads all of a recording once, a cloud at a time.
+    """Reads a whole recording once, one cloud at a time.
 
     Raises:
-        RecordingError: a cloud is missing, empty, cut off or damaged.
+        RecordingError: a cloud is missing, empty, truncated or damaged.
+        TrajectoryError: the recording has no vehicle poses.
     """
     lidars = {}
     total = sum(len(recording.scan_stamps_ns(lidar)) for lidar in recording.lidars)
@@ -157,24 +161,39 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
 
 
 def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
-    """Adds which LiDAR sees the target when.
+    """Adds when each LiDAR sees each target.
 
     Args:
         inspection: of the recording.
         observations: the targets found in it.
     """
-    targets = tuple(
-        TargetSummary(
-            name=observation.name,
-            centre_map_m=centre_of(observation),
-            lidars={
-                lidar: _summarise_sighting(observation, lidar, summary.step)
-                for lidar, summary in inspection.lidars.items()
-            },
-        )
-        for observation in observations
+    targets = summarise_targets(
+        observations,
+        inspection.lidars,
+        lambda seen, lidar: _summarise_sighting(seen, lidar, inspection.lidars[lidar].step),
     )
     return replace(inspection, targets=targets)
+
+
+def summarise_targets(
+    observations: Iterable[TargetObservation],
+    lidars: Iterable[str],
+    sighting: Callable[[TargetObservation, str], Sighting],
+) -> tuple[TargetSummary, ...]:
+    """Sightings of every target by every LiDAR.
+
+    Args:
+        observations: the targets found.
+        lidars: names.
+        sighting: summarises the scans of one LiDAR that see one target.
+    """
+    names = list(lidars)
+    out = []
+    for observation in observations:
+        x, y, z = (float(v) for v in observation.centre_map)
+        seen = {lidar: sighting(observation, lidar) for lidar in names}
+        out.append(TargetSummary(observation.name, (x, y, z), seen))
+    return tuple(out)
 
 
 def _frames(recording: Recording, lidar: str) -> list[int]:
@@ -183,7 +202,7 @@ def _frames(recording: Recording, lidar: str) -> list[int]:
 
 def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSummary:
     steps = np.diff(frames)
-    # The lower median: a step that occurs, where the mean of two would not.
+    # The lower median: it is one of the steps, which the mean of two need not be.
     step = int(np.sort(steps)[(len(steps) - 1) // 2]) if len(steps) else 1
     gaps = [
         (before, after) for before, after in itertools.pairwise(frames) if after - before > step
@@ -200,7 +219,7 @@ def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSumma
 
 
 def summarise_drive(given: GivenPoses) -> DriveSummary:
-    """The vehicle's motion by given poses, at least one of them."""
+    """The vehicle's motion according to at least one given pose."""
     poses = given.T_map_vehicle
     positions_map = np.array([pose.translation() for pose in poses])
     turns = [
@@ -233,19 +252,19 @@ def _summarise_sighting(observation: TargetObservation, lidar: str, step: int) -
 
 
 def stamps_seen(observation: TargetObservation, lidar: str) -> list[int]:
-    """Stamps of the scans of a LiDAR that see a target; at least those of the clouds."""
+    """Stamps of the scans of a LiDAR that see a target, including those of the clouds."""
     of_clouds = {cloud.stamp_ns for cloud in observation.clouds if cloud.lidar == lidar}
     return sorted(of_clouds.union(observation.seen_ns.get(lidar, ())))
 
 
 def nearest_and_farthest(clouds_lidar: Sequence[Array]) -> tuple[float, float]:
-    """Least and greatest distance of the centres of clouds (N, 3) from the LiDAR, metres."""
+    """Minimum and maximum distance of the centres of clouds (N, 3) from the LiDAR, metres."""
     ranges_m = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds_lidar]
     return min(ranges_m), max(ranges_m)
 
 
 def runs_of(values: Sequence[int], step: int) -> tuple[Run, ...]:
-    """First and last of each run of ascending values that are no more than `step` apart."""
+    """First and last value of each run of ascending values with steps of at most `step`."""
     runs: list[Run] = []
     for value in values:
         if runs and value - runs[-1][1] <= step:
@@ -256,11 +275,5 @@ def runs_of(values: Sequence[int], step: int) -> tuple[Run, ...]:
 
 
 def summarise_points(counts: Sequence[int]) -> Points:
-    """Least, median and greatest number of points."""
+    """Minimum, median and maximum number of points."""
     return Points(min=min(counts), median=int(np.median(counts)), max=max(counts))
-
-
-def centre_of(observation: TargetObservation) -> tuple[float, float, float]:
-    """Rough centre of a target in the map, metres."""
-    x, y, z = (float(v) for v in observation.centre_map)
-    return x, y, z

@@ -1,6 +1,6 @@
-"""log.jsonl: what a run did and found, a JSON object per line, for programs.
+"""log.jsonl: the course and the results of a run, one JSON object per line, for programs.
 
-Every line has one key that says what it is about: `stage`, `recording`, `trajectory`, `ground`,
+The first key of a line names its subject: `stage`, `recording`, `trajectory`, `ground`,
 `clouds`, `registration`, `iteration`, `solution`, `residuals`, `down_weighted`, `result` or
 `warning`.
 """
@@ -17,17 +17,14 @@ from caliv_graph.common.progress import StageRecord
 from caliv_graph.config.model import RobustConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Solution
-from caliv_graph.report.residuals import (
-    Residuals,
-    all_residuals,
-    down_weighted,
-)
+from caliv_graph.report.numbers import rounded
+from caliv_graph.report.residuals import Residuals, all_residuals, down_weighted
 from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 
 def stage_documents(stages: Sequence[StageRecord]) -> list[dict[str, Any]]:
-    """What was done and how long it took, plain values only."""
+    """Stages with their durations, as plain values."""
     return [
         {
             "stage": stage.name,
@@ -48,21 +45,21 @@ def log_documents(
     robust: RobustConfig,
     stages: Sequence[StageRecord],
     warnings: Sequence[str],
-    evidence: RunRecord | None,
+    record: RunRecord | None,
 ) -> Iterator[dict[str, Any]]:
-    """The lines, plain values only. SI units; the names of the keys say which.
+    """The lines as plain values. SI units, named in the keys.
 
     Args:
         calibration: the result.
         solution: the solved graph.
-        robust: the kernel, which tells why clouds were weighed down.
-        stages: what was done.
-        warnings: a line each.
-        evidence: what it was made from; None: its lines are left out.
+        robust: the robust kernel, for the reasons of down-weighted clouds.
+        stages: of the run.
+        warnings: one line each.
+        record: drives, trajectories and ground of the run; None: without their lines.
     """
     yield from stage_documents(stages)
-    if evidence is not None:
-        yield from _evidence(evidence)
+    if record is not None:
+        yield from _trajectories(record)
     for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
         clouds = registration.observation.clouds
         for name in dict.fromkeys(cloud.lidar for cloud in clouds):
@@ -73,27 +70,27 @@ def log_documents(
                 "scans": int(mine.sum()),
                 "points": sum(len(c.points_lidar) for c in clouds if c.lidar == name),
                 "cut": sum(c.cut for c in clouds if c.lidar == name),
-                "median_inlier_ratio": _short(np.median(registration.inlier_ratio[mine])),
-                "weights": [_short(w) for w in weights[mine]],
+                "median_inlier_ratio": rounded(np.median(registration.inlier_ratio[mine])),
+                "weights": [rounded(w) for w in weights[mine]],
                 "stamps_ns": [c.stamp_ns for c in clouds if c.lidar == name],
             }
-        turn, shift = registration.last_step
+        rotation, position = registration.last_step
         yield {
             "registration": registration.observation.name,
             "clouds": len(registration.T_target_lidar),
             "components": len(registration.mixture.means_target),
             "iterations": registration.iterations,
             "converged": bool(registration.converged),
-            "last_step_rad": _short(turn),
-            "last_step_m": _short(shift),
+            "last_step_rad": rounded(rotation),
+            "last_step_m": rounded(position),
         }
     for number, iteration in enumerate(solution.course, start=1):
         yield {
             "iteration": number,
-            "step_rad": _short(iteration.turn_rad),
-            "step_m": _short(iteration.shift_m),
-            "step_sigmas": _short(iteration.sigmas),
-            "weight_change": _short(iteration.weight_change),
+            "step_rad": rounded(iteration.turn_rad),
+            "step_m": rounded(iteration.shift_m),
+            "step_sigmas": rounded(iteration.sigmas),
+            "weight_change": rounded(iteration.weight_change),
             "undetermined": iteration.undetermined,
         }
     yield {
@@ -105,8 +102,8 @@ def log_documents(
         "held": list(solution.held),
         "seconds": {name: round(s, 4) for name, s in solution.stage_times_s.items()},
     }
-    if evidence is not None:
-        for residuals in all_residuals(solution, evidence):
+    if record is not None:
+        for residuals in all_residuals(solution, record):
             yield _residuals(residuals)
     for cloud in down_weighted(solution, robust):
         yield {
@@ -115,9 +112,9 @@ def log_documents(
             "target": cloud.target,
             "drive": cloud.drive,
             "stamp_ns": cloud.stamp_ns,
-            "weight": _short(cloud.weight),
-            "residual_rad": _short(cloud.turn_rad),
-            "residual_m": _short(cloud.shift_m),
+            "weight": rounded(cloud.weight),
+            "residual_rad": rounded(cloud.rotation_rad),
+            "residual_m": rounded(cloud.position_m),
             "reason": cloud.reason,
         }
     yield {
@@ -135,9 +132,9 @@ def log_documents(
         yield {"warning": warning}
 
 
-def _evidence(evidence: RunRecord) -> Iterator[dict[str, Any]]:
+def _trajectories(record: RunRecord) -> Iterator[dict[str, Any]]:
     for drive, (name, trajectory) in enumerate(
-        zip(evidence.drives, evidence.trajectories, strict=True)
+        zip(record.drives, record.trajectories, strict=True)
     ):
         begin, end = trajectory.span_ns
         line: dict[str, Any] = {
@@ -158,12 +155,12 @@ def _evidence(evidence: RunRecord) -> Iterator[dict[str, Any]]:
                 "gnss_dropped": len(trajectory.gnss_rejected),
                 "yaw_bias_rad": None
                 if trajectory.yaw_bias is None
-                else [_short(v) for v in trajectory.yaw_bias],
+                else [rounded(v) for v in trajectory.yaw_bias],
             }
         else:
             line["poses"] = len(trajectory.trajectory.stamps_ns)
         yield line
-        of_drive = [ground for ground in evidence.grounds if ground.drive == drive]
+        of_drive = [ground for ground in record.grounds if ground.drive == drive]
         for lidar in dict.fromkeys(ground.lidar for ground in of_drive):
             mine = [ground for ground in of_drive if ground.lidar == lidar]
             yield {
@@ -179,14 +176,10 @@ def _residuals(residuals: Residuals) -> dict[str, Any]:
     return {
         "residuals": residuals.kind,
         "count": len(residuals.whitened),
-        "whitened_rms": _short(residuals.rms),
-        "beyond_3_sigma": _short(residuals.beyond_three),
+        "whitened_rms": rounded(residuals.rms),
+        "beyond_3_sigma": rounded(residuals.beyond_three),
         "median_abs": {
-            f"{quantity}_{unit.replace('/', '_')}": _short(np.median(np.abs(values)))
+            f"{quantity}_{unit.replace('/', '_')}": rounded(np.median(np.abs(values)))
             for quantity, (unit, values) in residuals.physical.items()
         },
     }
-
-
-def _short(value: Any) -> float:
-    return float(f"{float(value):.6g}")

@@ -1,4 +1,4 @@
-"""What pages of a report are made of: templates, and figures as data for their scripts."""
+"""Shared by all HTML pages: the templates, and figures as data for draw.js."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import jinja2
 from markupsafe import Markup
 
 if TYPE_CHECKING:
-    from caliv_graph.report.figures import Figure
+    from caliv_graph.report.figures.drawing import Figure
 
 
 def environment() -> jinja2.Environment:
-    """Of the report's templates: a name that is missing in one is an error, no empty text."""
+    """The template environment; a name that is missing in a template raises an error."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("caliv_graph.report"),
         autoescape=True,
@@ -23,8 +23,8 @@ def environment() -> jinja2.Environment:
 
 
 def script_data(figure: Figure) -> Markup:
-    """A figure's data for a script element: no text in it can end the element."""
-    from caliv_graph.report.figures import figure_json
+    """The JSON of a figure for a script element, escaped so that no text can end the element."""
+    from caliv_graph.report.figures.drawing import figure_json
 
     text = figure_json(figure)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -1,9 +1,9 @@
-"""What drives will tell, as tables and as JSON: of a recorded drive, and of a planned one."""
+"""The predicted covariance of recorded and planned drives, as tables and as plain values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from rich.text import Text
 from caliv_graph.common.json_text import without_infinities
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
-from caliv_graph.report.layout import SHOWN_AXES, axis_headings, new_table, sentences, titled
+from caliv_graph.report.layout import axis_headings, new_table, sentences, titled
+from caliv_graph.report.numbers import SHOWN_AXES, rounded
 from caliv_graph.report.tables import direction_texts
 from caliv_graph.results.calibration_file import calibration_document
 
@@ -26,33 +27,30 @@ if TYPE_CHECKING:
     from caliv_graph.workflows.survey import Survey
 
 LONGEST_PAUSE = 3.5
-"""Periods of a LiDAR after which seeing the target again counts as another time."""
-
-
-# ------------------------------------------------------------------ recorded
+"""Periods of a LiDAR without a view of the target that end an interval of view."""
 
 
 def survey_table(survey: Survey) -> RenderableType:
-    """The closing words of `observability`."""
-    outlook = survey.outlook
+    """The result of `observability` as tables."""
+    predicted = survey.outlook
     parts: list[RenderableType] = [
-        Text.assemble(("What the drive will tell", "bold"), f": {', '.join(survey.names)}"),
-        *_sigma_parts(outlook, "Expected"),
+        Text.assemble(("Expected accuracy", "bold"), f": {', '.join(survey.names)}"),
+        *_sigma_parts(predicted, "Expected"),
     ]
-    seen = new_table("target", "LiDAR", "scans\nthat count")
+    seen = new_table("target", "LiDAR", "scans\nused")
     for (target, lidar), count in survey.scans.items():
         seen.add_row(Text(target), Text(lidar), str(count))
-    parts += titled("Who sees the target", seen)
-    parts += _direction_parts(outlook)
-    parts += sentences("Asked for in the config, but not to be had:", survey.unmet)
+    parts += titled("Scans that see the target", seen)
+    parts += _direction_parts(predicted)
+    parts += sentences("Required by the config, but not expected to be reached:", survey.unmet)
     return Group(*parts)
 
 
 def survey_document(survey: Survey) -> dict[str, Any]:
-    """The same as plain values: metres, degrees, seconds."""
+    """The result as plain values: metres, degrees, seconds."""
     return {
         "drives": list(survey.names),
-        **_outlook_document(survey.outlook),
+        **_covariance_document(survey.outlook),
         "scans": [
             {"target": target, "lidar": lidar, "scans": count}
             for (target, lidar), count in survey.scans.items()
@@ -62,35 +60,33 @@ def survey_document(survey: Survey) -> dict[str, Any]:
     }
 
 
-# ------------------------------------------------------------------ planned
-
-
 def plan_table(
     prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> RenderableType:
-    """The closing words of `plan`.
+    """The result of `plan` as tables.
 
     Args:
         prediction: of the planned drive.
-        goals: largest sigmas that were asked for, by limit.
-        met: whether it keeps them.
-        suggestion: the drive that does in the least space, or comes nearest; None: there is none.
+        goals: per limit, the largest sigma allowed.
+        met: whether the planned drive keeps all limits.
+        suggestion: the drive that keeps them in the least space, or comes nearest; None: no drive
+            was found.
     """
-    outlook = prediction.outlook
+    predicted = prediction.outlook
     x, y = prediction.space_m
     parts: list[RenderableType] = [
         Text.assemble(
-            ("What this drive will tell", "bold"),
+            ("Predicted accuracy", "bold"),
             f": {', '.join(prediction.names)}, {prediction.duration_s:.0f} s, {x:.0f} x {y:.0f} m",
         ),
-        *_sigma_parts(outlook, "Predicted"),
-        *titled("Who sees the target when", _sightings(prediction)),
-        *_direction_parts(outlook),
+        *_sigma_parts(predicted, "Predicted"),
+        *titled("When each LiDAR sees the target", _sightings(prediction)),
+        *_direction_parts(predicted),
     ]
     if goals:
         kept = "keeps" if met else "does not keep"
-        asked = ", ".join(f"{key} {value:g}" for key, value in goals.items())
-        parts += ["", Text(f"It {kept} what was asked for: {asked}.")]
+        limits = ", ".join(f"{key} {value:g}" for key, value in goals.items())
+        parts += ["", Text(f"The drive {kept} the limits: {limits}.")]
     parts += _suggestion_parts(prediction, goals, met, suggestion)
     return Group(*parts)
 
@@ -98,7 +94,7 @@ def plan_table(
 def plan_document(
     prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> dict[str, Any]:
-    """The same as plain values: metres, degrees, seconds."""
+    """The result as plain values: metres, degrees, seconds."""
     return {
         **_prediction_document(prediction),
         "asked": dict(goals),
@@ -113,7 +109,7 @@ def _prediction_document(prediction: Prediction) -> dict[str, Any]:
         "drives": list(prediction.names),
         "duration_s": round(prediction.duration_s, 3),
         "space_m": [round(side, 2) for side in prediction.space_m],
-        **_outlook_document(prediction.outlook),
+        **_covariance_document(prediction.outlook),
         "sightings": [
             {"drive": drive, **_sighting_document(sighting)}
             for drive, sightings in zip(prediction.names, prediction.sightings, strict=True)
@@ -183,7 +179,7 @@ def _sightings(prediction: Prediction) -> Table:
 
 
 def _times(sighting: Sighting) -> list[tuple[float, float]]:
-    """First and last second of each time that the target is in view."""
+    """First and last second of each interval in which the target is in view."""
     stamps: IntArray = sighting.stamps_ns
     if not len(stamps):
         return []
@@ -210,11 +206,12 @@ def _suggestion_parts(
     smaller = x * y < 0.95 * prediction.space_m[0] * prediction.space_m[1]
     if met and not (suggestion.met and smaller):
         return []
-    wanted = "what was asked for" if goals else "everything"
+    wanted = "all limits" if goals else "all axes"
     if suggestion.met:
-        heading = f"In the least space{'' if met else ','} {wanted} is told by:"
+        heading = f"Smallest drive that {'keeps' if goals else 'determines'} {wanted}:"
     else:
-        heading = f"None of the manoeuvres tried tells {wanted}. The nearest:"
+        verb = "keeps" if goals else "determines"
+        heading = f"None of the manoeuvres tried {verb} {wanted}. The nearest:"
     lines: list[RenderableType] = [
         "",
         Text(heading, style="bold"),
@@ -229,31 +226,28 @@ def _worst(prediction: Prediction, key: str) -> str:
 
     found = sigma_of(prediction, key)
     if not found:
-        return "there is no pair of LiDARs"
+        return "no pair of LiDARs"
     return ", ".join(f"{value:.3g} of {what}" for what, value in found.items())
 
 
-# ------------------------------------------------------------------ both
-
-
-def _sigma_parts(outlook: PredictedCovariance, word: str) -> list[RenderableType]:
-    """Tables of sigmas; what is held by the guess in brackets."""
+def _sigma_parts(predicted: PredictedCovariance, word: str) -> list[RenderableType]:
+    """Tables of sigmas; those of undetermined axes in brackets."""
     extrinsics = new_table("LiDAR", *axis_headings("mm", "mrad"))
-    verdicts = {name: r.determined for name, r in outlook.calibration.lidars.items()}
-    for name, sigma in outlook.sigma_s2v.items():
+    verdicts = {name: r.determined for name, r in predicted.calibration.lidars.items()}
+    for name, sigma in predicted.sigma_s2v.items():
         extrinsics.add_row(Text(name), *_sigma_cells(sigma, verdicts[name]))
-    parts = titled(f"{word} 1 sigma of each mounting, vehicle axes", extrinsics)
-    if outlook.sigma_s2s:
+    parts = titled(f"{word} 1 sigma of each extrinsic, vehicle axes", extrinsics)
+    if predicted.sigma_s2s:
         pairs = new_table("from\nto", *axis_headings("mm", "mrad"))
-        for (a, b), sigma in outlook.sigma_s2s.items():
-            cells = _sigma_cells(sigma, outlook.determined_s2s[a, b])
+        for (a, b), sigma in predicted.sigma_s2s.items():
+            cells = _sigma_cells(sigma, predicted.determined_s2s[a, b])
             pairs.add_row(Text(f"{a}\n{b}"), *cells)
         parts += titled(f"{word} 1 sigma of one LiDAR against another, vehicle axes", pairs)
     held = any(not known for verdict in verdicts.values() for known in verdict.values())
     if held:
-        note = "In brackets: the drive does not determine it; it will be the initial guess's."
+        note = "In brackets: not determined by the drive; the sigma of the initial guess."
         parts.append(Text(note, style="yellow"))
-    offsets = [f"LiDAR '{n}': {1e3 * s:.2f} ms" for n, s in outlook.offsets_s.items()]
+    offsets = [f"LiDAR '{n}': {1e3 * s:.2f} ms" for n, s in predicted.offsets_s.items()]
     parts += sentences(f"{word} 1 sigma of the clocks:", offsets)
     return parts
 
@@ -268,55 +262,55 @@ def _sigma_cells(sigma: Array, determined: Mapping[str, bool]) -> list[Text]:
 
 
 def _three_digits(value: float) -> str:
-    """A number above zero to two or three digits, without an exponent."""
+    """A positive number to two or three digits, without an exponent."""
     decimals = min(max(1 - math.floor(math.log10(max(value, 1e-6))), 0), 3)
     return f"{value:.{decimals}f}"
 
 
-def _direction_parts(outlook: PredictedCovariance) -> list[RenderableType]:
+def _direction_parts(predicted: PredictedCovariance) -> list[RenderableType]:
     lost: Sequence[str] = [
-        *direction_texts(outlook.undetermined),
+        *direction_texts(predicted.undetermined),
         *(
-            f"LiDAR '{name}' never sees a target: nothing of it is told"
-            for name in outlook.unseeing
+            f"LiDAR '{name}' never sees a target: its extrinsic is not determined"
+            for name in predicted.unseeing
         ),
     ]
-    parts = sentences("What the drive cannot tell:", lost)
-    parts += sentences("What it tells only weakly:", direction_texts(outlook.weak))
+    parts = sentences("Not determined by the drive:", lost)
+    parts += sentences("Weakly determined:", direction_texts(predicted.weak))
     if not lost:
-        parts += ["", Text("It leaves nothing undetermined.", style="bold green")]
-    scaled = ", ".join(_three_digits(s) if s < 1e4 else "none" for s in _finite(outlook))
-    parts += ["", Text(f"Spectrum (1 sigma of the data, where 1 mrad counts as 10 mm): {scaled}")]
+        parts += ["", Text("The drive determines all directions.", style="bold green")]
+    scaled = ", ".join(_three_digits(s) if s < 1e4 else "none" for s in _spectrum(predicted))
+    parts += ["", Text(f"Spectrum (1 sigma of the data, 1 mrad counted as 10 mm): {scaled}")]
     return parts
 
 
-def _finite(outlook: PredictedCovariance) -> Iterable[float]:
-    return (float(s) for s in outlook.uncertainty.spectrum)
+def _spectrum(predicted: PredictedCovariance) -> list[float]:
+    return [float(s) for s in predicted.uncertainty.spectrum]
 
 
-def _outlook_document(outlook: PredictedCovariance) -> dict[str, Any]:
-    content = calibration_document(outlook.calibration)
+def _covariance_document(predicted: PredictedCovariance) -> dict[str, Any]:
+    content = calibration_document(predicted.calibration)
     lidars = {
         name: {
             "sigma_vehicle_axes": _sigma_document(sigma),
             "determined": content["lidars"][name]["determined"],
-            "sees_target": name not in outlook.unseeing,
+            "sees_target": name not in predicted.unseeing,
             **(
-                {"time_offset": {"sigma": outlook.offsets_s[name]}}
-                if name in outlook.offsets_s
+                {"time_offset": {"sigma": predicted.offsets_s[name]}}
+                if name in predicted.offsets_s
                 else {}
             ),
         }
-        for name, sigma in outlook.sigma_s2v.items()
+        for name, sigma in predicted.sigma_s2v.items()
     }
     pairs = [
         {
             "from": a,
             "to": b,
             "sigma_vehicle_axes": _sigma_document(sigma),
-            "determined": dict(outlook.determined_s2s[a, b]),
+            "determined": dict(predicted.determined_s2s[a, b]),
         }
-        for (a, b), sigma in outlook.sigma_s2s.items()
+        for (a, b), sigma in predicted.sigma_s2s.items()
     ]
     document = {
         "status": content["status"],
@@ -325,7 +319,7 @@ def _outlook_document(outlook: PredictedCovariance) -> dict[str, Any]:
         "sensor_to_sensor": pairs,
         "observability": {
             **content["observability"],
-            "spectrum": [float(f"{s:.6g}") for s in _finite(outlook)],
+            "spectrum": [rounded(s) for s in _spectrum(predicted)],
         },
     }
     plain: dict[str, Any] = without_infinities(document)
@@ -334,6 +328,6 @@ def _outlook_document(outlook: PredictedCovariance) -> dict[str, Any]:
 
 def _sigma_document(sigma: Array) -> dict[str, list[float]]:
     return {
-        "rpy_deg": [float(f"{v:.6g}") for v in np.degrees(sigma[:3])],
-        "xyz": [float(f"{v:.6g}") for v in sigma[3:]],
+        "rpy_deg": [rounded(v) for v in np.degrees(sigma[:3])],
+        "xyz": [rounded(v) for v in sigma[3:]],
     }

@@ -1,4 +1,4 @@
-"""What did not fit, by kind of measurement, and which clouds were believed less, and why."""
+"""Residuals by kind of measurement, and the down-weighted clouds with the reason."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 NOTABLE_WEIGHT = 0.9
-"""Clouds below this weight are listed."""
+"""Clouds with a lower weight are listed."""
 
 _MRAD, _MM, _MM_S = ("mrad", 1e3), ("mm", 1e3), ("mm/s", 1e3)
 
 _SOLUTION_KINDS = {
-    "given_pose": ("given poses, white part", {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)}),
+    "given_pose": (
+        "given poses, white error",
+        {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)},
+    ),
     "pose_error_step": (
-        "given poses, change of the slow part",
+        "given poses, change of the Gauss-Markov error",
         {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)},
     ),
     "ground_plane": (
@@ -35,7 +38,7 @@ _SOLUTION_KINDS = {
     "standing": ("ground, height of the vehicle above it", {"height": (_MM, 0, 1)}),
     "parallel": ("ground, vehicle parallel to it", {"tilt": (_MRAD, 0, 2)}),
 }
-"""Kind of factor -> what it is called, and where its residual holds what."""
+"""Per kind of factor, its name and the parts of its residual."""
 
 _TRAJECTORY_KINDS = {
     "gnss": ("GNSS fixes", {"position": (_MM, 0, 3)}),
@@ -54,8 +57,8 @@ class Residuals:
 
     Attributes:
         kind: what was measured.
-        whitened: (n, k), by the noise that was assumed: N(0, 1) if it was right, and the narrower
-            the more of the measurements the fit used up.
+        whitened: (n, k), divided by the assumed noise. N(0, 1) if that noise is right and the fit
+            has few parameters; narrower with more parameters.
         physical: quantity -> (unit, (m,) values in it).
     """
 
@@ -76,18 +79,18 @@ class Residuals:
 
 @dataclass(frozen=True)
 class CloudVerdict:
-    """A cloud of a target that was believed less than the others.
+    """A down-weighted cloud of a target.
 
     Attributes:
         lidar: name.
         target: name of the placement.
         drive: index of the drive.
         stamp_ns: stamp of the scan.
-        source: what to call the scan.
-        weight: its robust weight, 1 full and 0 dropped.
-        turn_rad: length of its rotation residual.
-        shift_m: length of its position residual, at the target.
-        reason: why, as a person says it.
+        source: name of the scan.
+        weight: robust weight: 1 is full weight, 0 is dropped.
+        rotation_rad: norm of the rotation residual.
+        position_m: norm of the position residual, at the target.
+        reason: why the weight is low, as text.
     """
 
     lidar: str
@@ -96,23 +99,15 @@ class CloudVerdict:
     stamp_ns: int
     source: str
     weight: float
-    turn_rad: float
-    shift_m: float
+    rotation_rad: float
+    position_m: float
     reason: str
-
-
-def figures_of(value: float) -> str:
-    """A number to two significant figures, never with an exponent unless it is very small."""
-    value = float(value)
-    if abs(value) >= 100.0:
-        return f"{value:.0f}"
-    return f"{value:.2g}"
 
 
 def solution_residuals(solution: Solution) -> tuple[Residuals, ...]:
     """Residuals of the calibration's graph, by kind: clouds, given poses, ground.
 
-    Clouds that were dropped are left out; those that were weighed down are there, unweighed.
+    Dropped clouds are left out. The residuals of down-weighted clouds do not include the weight.
     """
     found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
     for index, kind in enumerate(solution.factor_kinds):
@@ -128,7 +123,7 @@ def solution_residuals(solution: Solution) -> tuple[Residuals, ...]:
 
 
 def trajectory_residuals(trajectory: SmoothedTrajectory) -> tuple[Residuals, ...]:
-    """Residuals of a smoothed trajectory, by sensor. Dropped GNSS fixes are not among them."""
+    """Residuals of a smoothed trajectory, by sensor, without dropped GNSS fixes."""
     found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
     for index, kind in enumerate(trajectory.factor_kinds):
         found[kind].append(trajectory.graph.at(index))
@@ -139,19 +134,19 @@ def trajectory_residuals(trajectory: SmoothedTrajectory) -> tuple[Residuals, ...
     )
 
 
-def all_residuals(solution: Solution, evidence: RunRecord) -> tuple[Residuals, ...]:
-    """Of the calibration's graph and of every smoothed trajectory."""
+def all_residuals(solution: Solution, record: RunRecord) -> tuple[Residuals, ...]:
+    """Residuals of the calibration's graph and of every smoothed trajectory, by kind."""
     out = list(solution_residuals(solution))
-    for name, trajectory in zip(evidence.drives, evidence.trajectories, strict=True):
+    for name, trajectory in zip(record.drives, record.trajectories, strict=True):
         if isinstance(trajectory, SmoothedTrajectory):
             for r in trajectory_residuals(trajectory):
-                kind = f"{r.kind} (recording '{name}')" if len(evidence.drives) > 1 else r.kind
+                kind = f"{r.kind} (recording '{name}')" if len(record.drives) > 1 else r.kind
                 out.append(replace(r, kind=kind))
     return tuple(out)
 
 
 def gnss_residuals(trajectory: SmoothedTrajectory) -> tuple[IntArray, Array]:
-    """Stamps (k,) of the nodes that fixes belong to, and residuals (k, 3) in metres, map axes."""
+    """Stamps (k,) of the nodes with GNSS fixes, and residuals (k, 3) in metres, map axes."""
     nodes, residuals = [], []
     for index, kind in enumerate(trajectory.factor_kinds):
         if kind == "gnss":
@@ -163,7 +158,7 @@ def gnss_residuals(trajectory: SmoothedTrajectory) -> tuple[IntArray, Array]:
 
 
 def cloud_residuals(solution: Solution, placement: int) -> Array:
-    """(J, 6) residuals of a placement's clouds, rad and m, target frame: the whitening undone."""
+    """(J, 6) residuals of a placement's clouds, not whitened; rad and m, target frame."""
     information = solution.registrations[placement].information
     root = np.linalg.cholesky(information / solution.registration_scale**2)
     white = solution.residuals[placement]
@@ -171,7 +166,7 @@ def cloud_residuals(solution: Solution, placement: int) -> Array:
 
 
 def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdict, ...]:
-    """The clouds whose weight is below `NOTABLE_WEIGHT`, the least believed first."""
+    """The clouds with a weight below `NOTABLE_WEIGHT`, lowest weight first."""
     out = []
     for m, registration in enumerate(solution.registrations):
         r = cloud_residuals(solution, m)
@@ -188,8 +183,8 @@ def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdic
             reasons = []
             if explained[j] < 1.0:
                 reasons.append(
-                    f"only {registration.inlier_ratio[j]:.0%} of its points lie on the target, "
-                    f"{typical:.0%} of a typical cloud's"
+                    f"only {registration.inlier_ratio[j]:.0%} of its points lie on the target "
+                    f"(median of all clouds: {typical:.0%})"
                 )
             reasons += _misfit(weight / max(float(explained[j]), 1e-9), robust)
             out.append(
@@ -209,21 +204,21 @@ def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdic
 
 
 def _misfit(part: float, robust: RobustConfig) -> list[str]:
-    """Why the kernel took a cloud's weight down to `part`, if it did."""
+    """The reason why the kernel reduced a cloud's weight to `part`; empty if it did not."""
     if part > 0.99:
         return []
     if robust.kernel == "huber":
         bend = robust.huber_k * math.sqrt(DOF)
         return [
-            f"its pose is off by {bend / part:.1f} sigma ({DOF} degrees of freedom; full weight up "
-            f"to {bend:.1f})"
+            f"its pose residual is {bend / part:.1f} sigma ({DOF} degrees of freedom; full weight "
+            f"up to {bend:.1f})"
         ]
     if robust.kernel == "tls":
         return [
-            "its pose is off by more than chance explains (robust.tls_p_value "
+            "its pose residual is larger than noise explains (robust.tls_p_value "
             f"{robust.tls_p_value:g})"
         ]
-    return [f"among the {robust.trim_percent:g} percent whose pose fits worst"]
+    return [f"its pose residual is among the largest {robust.trim_percent:g} percent"]
 
 
 def _of_clouds(solution: Solution) -> Residuals:
@@ -259,10 +254,10 @@ def _of_factors(
 
 
 def _errors(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> tuple[Array, Array]:
-    """Residual of a factor, whitened and as it is."""
+    """Residual of a factor, whitened and not whitened."""
     if isinstance(factor, gtsam.NoiseModelFactor):
         return factor.whitenedError(values), factor.unwhitenedError(values)
-    # Linear ones know no errors of their own; the right-hand side is what is left to do.
+    # A linear factor has no error function; its residual is minus the right-hand side.
     linear = factor.linearize(values)
     assert isinstance(linear, gtsam.JacobianFactor)
     return -linear.jacobian()[1], -linear.jacobianUnweighted()[1]

@@ -1,4 +1,4 @@
-"""A validation as tables and as plain values. Millimetres exist in the tables only."""
+"""A validation as tables in millimetres, and as plain values in metres."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from rich.text import Text
 
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
-from caliv_graph.report.layout import new_table, sentences, titled
+from caliv_graph.report.layout import UNKNOWN, new_table, sentences, titled
+from caliv_graph.report.tables import STATUS_STYLES
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
 from caliv_graph.validation.validate import (
     AFTER,
@@ -23,10 +24,8 @@ from caliv_graph.validation.validate import (
 )
 from caliv_graph.workflows.repeatability import Repeatability
 
-_UNTOLD = "-"
-
 MOST_SHOWN = 12
-"""Surfaces in the table; the JSON document has all."""
+"""Surfaces in the table; the JSON document lists all."""
 
 
 def validation_table(found: Validation, repeated: Repeatability | None, p_value: float) -> Group:
@@ -34,8 +33,8 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
 
     Args:
         found: the validation.
-        repeated: split-half repeatability, if it was asked for.
-        p_value: limit of the tests in it.
+        repeated: split-half repeatability; None: not tested.
+        p_value: limit of its tests.
     """
     parts: list[RenderableType] = []
     for title, headings, rows in tables(found):
@@ -45,18 +44,27 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
         parts += titled(title, table)
     if repeated is not None:
         parts += sentences("Split-half repeatability:", repeatability_sentences(repeated, p_value))
-    style = "bold green"
-    if not found.has_structure:
-        style = "bold yellow"
-    elif found.verdict.contradicts or (found.verdict.better or 1.0) < 1.0:
-        style = "bold red"
     parts.append("")
+    style = STATUS_STYLES[validation_status(found)]
     parts += [Text(sentence, style=style) for sentence in found.verdict.sentences]
     return Group(*parts)
 
 
+def validation_status(found: Validation) -> str:
+    """The status of a validation, in the words of a calibration's status.
+
+    Returns:
+        `partial` without structure, `inconsistent` if the calibration contradicts the structure or
+        fits it worse than the initial guesses, else `ok`.
+    """
+    if not found.has_structure:
+        return "partial"
+    bad = found.verdict.contradicts or (found.verdict.better or 1.0) < 1.0
+    return "inconsistent" if bad else "ok"
+
+
 def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The tables, as title, headings and rows of text."""
+    """Per table its title, headings and rows of text."""
     out: list[tuple[str, list[str], list[list[str]]]] = []
     if found.pairs:
         rows = []
@@ -103,47 +111,47 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
 
 
 def repeatability_sentences(repeated: Repeatability, p_value: float) -> list[str]:
-    """What the halves of the drive say of each other."""
+    """The comparison of the two halves of the drive, in sentences."""
     comparison = repeated.comparison
     if comparison is None:
-        return [f"not done: {repeated.reason}"]
+        return [f"not tested: {repeated.reason}"]
     first, second = repeated.halves
     out = [f"{first} against {second}, largest differences along determined axes:"]
     for movement in comparison.movements:
         name = " to ".join(movement.lidars)
         if not movement.dof:
-            out.append(f"{name}: no direction that both halves determine")
+            out.append(f"{name}: no direction is determined by both halves")
             continue
         kinds = []
         for axes, unit in ((slice(3, 6), "mm"), (slice(0, 3), "mrad")):
-            told = [
+            known = [
                 (abs(d), s)
                 for d, s, t in zip(
                     movement.movement[axes], movement.sigma[axes], movement.told[axes], strict=True
                 )
                 if t
             ]
-            if told:
-                d, s = max(told)
+            if known:
+                d, s = max(known)
                 kinds.append(f"{1e3 * d:.2f} {unit} (sigma {1e3 * s:.2f})")
         kind = "S2S" if len(movement.lidars) == 2 else "S2V"
         out.append(
-            f"{kind} {name}: {', '.join(kinds) or 'only mixed directions'}; chi2 "
-            f"{movement.chi2:.1f} of {movement.dof} dof, p {movement.p_value:.2g}"
+            f"{kind} {name}: {', '.join(kinds) or 'no single axis is determined'}; chi2 "
+            f"{movement.chi2:.1f} with {movement.dof} dof, p {movement.p_value:.2g}"
         )
     out.append(_repeats(comparison, p_value))
     if not repeated.by_passes:
         out.append(
-            "such halves share the errors of the trajectory: two drives would agree less; a drive "
-            "that passes the target twice would tell more"
+            "these halves share the errors of the trajectory, so two drives would differ more; for "
+            "a better test, drive past the target twice"
         )
     return out
 
 
 def _repeats(comparison: Comparison, p_value: float) -> str:
     if not any(m.dof for m in comparison.movements):
-        return "the halves have no direction in common that both determine"
-    together = f"all at once: chi2 {comparison.chi2:.1f} of {comparison.dof} dof"
+        return "no direction is determined by both halves"
+    together = f"joint test: chi2 {comparison.chi2:.1f} with {comparison.dof} dof"
     if comparison.moved:
         return (
             f"the halves differ by more than their sigmas explain ({together}; limit p {p_value:g} "
@@ -155,7 +163,7 @@ def _repeats(comparison: Comparison, p_value: float) -> str:
 def validation_document(
     found: Validation, repeated: Repeatability | None, p_value: float
 ) -> dict[str, Any]:
-    """A validation in plain values: metres; null where nothing can be said."""
+    """A validation as plain values: metres; null where a value cannot be computed."""
     verdict = found.verdict
     document: dict[str, Any] = {
         "drive": found.drive,
@@ -260,9 +268,9 @@ def _place_document(
 
 
 def place_of(surface: Wall | Pole | Thing) -> tuple[float, float, tuple[float, ...]]:
-    """Where something is in the map, x and y in metres, and its sizes.
+    """Position in the map, x and y in metres, and sizes in metres.
 
-    Length and width of a wall; diameter and height of a pole; width of an object.
+    The sizes are the two lengths of a wall, diameter and height of a pole, width of an object.
     """
     if isinstance(surface, Wall):
         return float(surface.centre[0]), float(surface.centre[1]), surface.extent_m
@@ -313,8 +321,8 @@ def _stages(values: Mapping[str, float]) -> list[str]:
 
 def _lines(texts: Any) -> str:
     shown: Sequence[str] = list(texts)
-    return "\n".join(shown) or _UNTOLD
+    return "\n".join(shown) or UNKNOWN
 
 
 def _mm(value: float | None) -> str:
-    return _UNTOLD if value is None else f"{1e3 * value:.1f}"
+    return UNKNOWN if value is None else f"{1e3 * value:.1f}"

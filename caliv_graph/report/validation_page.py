@@ -1,37 +1,20 @@
-"""validation.html: one self-contained page with pictures before and after, coloured by LiDAR.
+"""validation.html: one self-contained page with figures before and after, coloured by LiDAR.
 
-Interactive figures rather than image files: one zooms in on the two millimetres that matter, and
-nothing but what the report needs anyway has to be installed.
+The figures are interactive, so that a reader can zoom in on two millimetres. They need no packages
+beyond those of report.html.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 from markupsafe import Markup
 
 import caliv_graph
-from caliv_graph.products import Array, IntArray
-from caliv_graph.report.figures import (
-    SYMBOLS,
-    Figure,
-    colours,
-    finish,
-    label,
-    small,
-    without_template,
-)
+from caliv_graph.report.figures.drawing import without_template
+from caliv_graph.report.figures.structure import validation_figures
 from caliv_graph.report.page import environment, script_data
-from caliv_graph.report.validation import repeatability_sentences, tables
-from caliv_graph.validation.validate import AFTER, BEFORE, Validation
+from caliv_graph.report.validation import repeatability_sentences, tables, validation_status
+from caliv_graph.validation.validate import Validation
 from caliv_graph.workflows.repeatability import Repeatability
-
-MOST_POINTS = 2500
-"""Of one LiDAR in one picture."""
-
-WALLS, POLES, THINGS = 2, 2, 2
-"""The largest ones are shown."""
 
 
 def render_validation(found: Validation, repeated: Repeatability | None, p_value: float) -> str:
@@ -39,11 +22,11 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
 
     Args:
         found: the validation.
-        repeated: split-half repeatability, if it was asked for.
-        p_value: limit of the tests in it.
+        repeated: split-half repeatability; None: not tested.
+        p_value: limit of its tests.
 
     Returns:
-        A whole HTML document of a few megabytes, most of them plotly.js.
+        An HTML document of a few megabytes, most of them plotly.js.
     """
     from plotly.offline import get_plotlyjs
 
@@ -54,7 +37,7 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
         .get_template("validation.html.j2")
         .render(
             found=found,
-            status=_status(found),
+            status=validation_status(found),
             tables=tables(found),
             repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
             figures=figures,
@@ -63,139 +46,3 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
             version=caliv_graph.__version__,
         )
     )
-
-
-def _status(found: Validation) -> str:
-    """A class of the page's style."""
-    if not found.has_structure:
-        return "partial"
-    bad = found.verdict.contradicts or (found.verdict.better or 1.0) < 1.0
-    return "inconsistent" if bad else "ok"
-
-
-def validation_figures(found: Validation) -> list[Figure]:
-    """Pictures: from above, along walls, of poles and of objects."""
-    if not len(found.clouds.lidar):
-        return []
-    out = [_top_view(found)]
-    walls = [s for s in found.surfaces if s.name.startswith(("wall", "ground"))][:WALLS]
-    poles = [s for s in found.surfaces if s.name.startswith("pole")][:POLES]
-    points = {stage: found.points_map(stage) for stage in (BEFORE, AFTER)}
-    for number, surface in enumerate(walls, start=1):
-        wall: Any = surface.surface
-        views = {
-            stage: np.column_stack(
-                [
-                    (p[wall.members] - wall.centre) @ wall.axes[0],
-                    1e3 * (p[wall.members] - wall.centre) @ wall.normal,
-                ]
-            )
-            for stage, p in points.items()
-        }
-        figure = _two(
-            found, wall.members, views, ("along (m)", "across (mm)"), equal=False, height=330
-        )
-        out.append(
-            Figure(
-                f"wall-{number}",
-                f"{surface.name}: its points from above, across it a hundredfold and more. Where "
-                "colours part, the LiDARs disagree; where one colour is thick, its mounting on the "
-                "vehicle is off.",
-                figure,
-            )
-        )
-    for number, surface in enumerate(poles, start=1):
-        pole: Any = surface.surface
-        views = {stage: p[pole.members, :2] - pole.foot for stage, p in points.items()}
-        figure = _two(found, pole.members, views, ("x (m)", "y (m)"), equal=True, height=480)
-        out.append(
-            Figure(
-                f"pole-{number}",
-                f"{surface.name} from above, {2e3 * pole.radius_m:.0f} mm thick: a ring if all is "
-                "right.",
-                figure,
-            )
-        )
-    for number, result in enumerate(found.things[:THINGS], start=1):
-        thing = result.thing
-        for kind, axes, heads in (
-            ("above", [0, 1], ("x (m)", "y (m)")),
-            ("the side", [0, 2], ("x (m)", "z (m)")),
-        ):
-            views = {s: (p[thing.members] - thing.centre)[:, axes] for s, p in points.items()}
-            out.append(
-                Figure(
-                    f"object-{number}-{'top' if kind == 'above' else 'side'}",
-                    f"{result.name} from {kind}.",
-                    _two(found, thing.members, views, heads, equal=True, height=480),
-                )
-            )
-    return out
-
-
-def _top_view(found: Validation) -> Figure:
-    members = np.arange(len(found.clouds.lidar), dtype=np.int64)
-    views = {stage: found.points_map(stage)[:, :2] for stage in (BEFORE, AFTER)}
-    figure = _two(found, members, views, ("x (m)", "y (m)"), equal=True, height=560, closer=False)
-    return Figure(
-        "top",
-        "What stands around the drive from above, in the map; ground and target are left out. Zoom "
-        "in: both pictures move together.",
-        figure,
-    )
-
-
-def _two(
-    found: Validation,
-    members: IntArray,
-    views: dict[str, Array],
-    heads: tuple[str, str],
-    *,
-    equal: bool,
-    height: int,
-    closer: bool = True,
-) -> Any:
-    """Before and after side by side to the same scale; closer: after to its own, too."""
-    from plotly.subplots import make_subplots
-
-    stages = {"before": BEFORE, "after": AFTER, **({"after, closer": AFTER} if closer else {})}
-    figure = make_subplots(1, len(stages), subplot_titles=tuple(stages))
-    lidar = found.clouds.lidar[members]
-    colour = colours(found.lidars)
-    for i, name in enumerate(found.lidars):
-        own = np.flatnonzero(lidar == i)
-        if not len(own):
-            continue
-        if len(own) > MOST_POINTS:
-            rng = np.random.default_rng(0)
-            own = own[np.sort(rng.choice(len(own), MOST_POINTS, replace=False))]
-        for column, stage in enumerate(stages.values(), start=1):
-            figure.add_scatter(
-                x=small(views[stage][own, 0]),
-                y=small(views[stage][own, 1]),
-                mode="markers",
-                marker={
-                    "color": colour[name],
-                    "symbol": f"{SYMBOLS[i % len(SYMBOLS)]}-open",
-                    "size": 4,
-                    "line": {"width": 0.7},
-                },
-                name=label(name),
-                legendgroup=name,
-                showlegend=column == 1,
-                hovertemplate="%{x:.3f}, %{y:.3f}",
-                row=1,
-                col=column,
-            )
-    figure.update_xaxes(title=heads[0])
-    figure.update_yaxes(title=heads[1], col=1)
-    figure.update_layout(xaxis2_matches="x", yaxis2_matches="y")
-    if equal:
-        # The second follows the first anyway.
-        figure.update_layout(yaxis_scaleanchor="x")
-        if closer:
-            figure.update_layout(yaxis3_scaleanchor="x3")
-        figure.update_xaxes(constrain="domain")
-        figure.update_yaxes(constrain="domain")
-    finish(figure, height)
-    return figure

@@ -83,7 +83,7 @@ def test_two_batches_do_not_share_a_folder(out: Path) -> None:
     with BatchFolder(out), pytest.raises(OutputError) as caught, BatchFolder(out):
         pass
 
-    assert str(caught.value).startswith(f"{out}: another batch is at work there (process ")
+    assert str(caught.value).startswith(f"{out}: another batch uses this folder (process ")
     with BatchFolder(out) as folder:
         assert folder.record("mon") is not None, "the one that was refused took nothing away"
 
@@ -110,7 +110,7 @@ def test_what_a_killed_batch_left_is_removed(out: Path) -> None:
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
 
-    with pytest.raises(OutputError, match="holds no batch"), BatchFolder(tmp_path):
+    with pytest.raises(OutputError, match="is not the folder of a batch"), BatchFolder(tmp_path):
         pass
 
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]

@@ -131,7 +131,7 @@ def test_a_drive_that_differs_is_named_with_its_sigmas() -> None:
     assert worst.job == "day3"
     assert worst.sigmas > 5.0
     page = render_index(summary(*drives(4, shift=0.02)))
-    assert "Disagree with the vehicle" in page
+    assert "disagree with the other drives of the vehicle" in page
     assert "number  far" in page
 
 
@@ -151,10 +151,10 @@ def test_results_that_cannot_be_compared_are_left_out_with_the_reason() -> None:
 
     failed = replace(second, state="failed", calibration=None)
     (spread,) = summary(first, failed).spreads()
-    assert spread.reason == "takes two drives with a result"
+    assert spread.reason == "two drives with a result are needed"
     assert spread.left_out == {"day1": "failed"}
     (spread,) = summary(replace(first, calibration=bad), second).spreads()
-    assert spread.left_out == {"day0": "contradicts itself"}
+    assert spread.left_out == {"day0": "inconsistent"}
     (spread,) = summary(first, replace(first, job="again")).spreads()
     assert "stems from the same drive as day0" in spread.reason
     assert summary(replace(first, vehicle=None), replace(second, vehicle=None)).spreads() == []

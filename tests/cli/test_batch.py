@@ -221,7 +221,7 @@ def test_what_is_done_is_not_done_again_and_what_has_changed_is(
     assert (mon["exit"], mon["reused"]) == (3, False)
     assert "s2v_yaw_deg" in mon["unmet"][0]
     assert (tue["state"], tue["folder"]) == ("failed", None)
-    assert tue["message"].endswith("(its folder still holds an older result)")
+    assert tue["message"].endswith("(its folder still contains an older result)")
     assert records(out)["tue"] == before["tue"]
     assert records(out)["mon"] != before["mon"]
 
@@ -324,7 +324,7 @@ def test_on_an_existing_scheduler(
     ("address", "said"),
     [
         ("tcp://127.0.0.1:9", "no Dask scheduler answers there within 10 s (Connection refused)"),
-        ("somewhere", "is no address of a scheduler: expected tcp://host:port"),
+        ("somewhere", "is not an address of a scheduler: expected tcp://host:port"),
     ],
 )
 def test_a_scheduler_that_is_not_there(
@@ -359,8 +359,7 @@ def test_without_dask_it_says_how_to_get_it(fleet: Path, tmp_path: Path) -> None
 
     assert result.returncode == 2
     assert result.stderr == (
-        "error: batch: needs Dask, which is not installed. Install it with "
-        "pip install 'caliv-graph[batch]'\n"
+        "error: batch: Dask is not installed. Install it with pip install 'caliv-graph[batch]'\n"
     )
     assert not (tmp_path / "out").exists()
 
@@ -393,7 +392,7 @@ def test_a_folder_of_something_else_is_refused(fleet: Path, tmp_path: Path) -> N
     result = run("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
 
     assert result.returncode == 2
-    assert "holds no batch (summary.json). Give another --out" in result.stderr
+    assert "is not the folder of a batch (no summary.json). Give another --out" in result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 
 

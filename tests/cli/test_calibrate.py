@@ -233,8 +233,8 @@ def test_the_folder_of_the_drive_is_not_replaced(pipeline: Pipeline, config: Pat
         (
             {"topics": {"imu": "/imu/data"}, "gnss": {"lever_arm": [0, 0, 1]}, "imu": {}},
             [
-                "topics: has no effect on a CaLiV folder, which brings its poses",
-                "gnss: has no effect on a CaLiV folder, which brings its poses",
+                "topics: has no effect, since a CaLiV folder contains the vehicle poses",
+                "gnss: has no effect, since a CaLiV folder contains the vehicle poses",
             ],
         ),
     ],

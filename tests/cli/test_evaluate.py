@@ -88,6 +88,6 @@ def test_no_lidar_in_common(calibration: Path, truth: Path) -> None:
 
     assert isinstance(result.exception, ConfigError)
     assert str(result.exception) == (
-        f"{truth}: has none of the LiDARs of {calibration} (front, rear), but L1, L2. Give them "
-        "the same names"
+        f"{truth}: has none of the LiDARs of {calibration} (front, rear), but L1, L2. Use "
+        "the same names in both files"
     )

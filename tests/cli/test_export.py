@@ -10,22 +10,13 @@ import pytest
 import yaml
 
 from caliv_graph.cli.main import run as run_program
+from caliv_graph.export.consumers import consumer_names
 from caliv_graph.results.calibration_file import write_calibration
 from tests.cli.commands import write_config
 from tests.export.requests import T_VEHICLE_LIDAR, calibration_of, quaternion_xyzw
 
-CONSUMERS = {
-    "urdf": "a.urdf",
-    "tf": "a.mcap",
-    "autoware": "a.yaml",
-    "glim": "a.json",
-    "lio-sam": "a.yaml",
-    "fast-lio": "a.yaml",
-    "mola": "a.yaml",
-    "npz": "a.npz",
-    "json": "a.json",
-    "gtsam": "a.gtsam",
-}
+FILES = {"tf": "a.mcap", "gtsam": "a.gtsam"}
+"""Outputs of consumers that do not take any name."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +50,9 @@ def result(tmp_path: Path) -> Path:
     return folder / "calibration.yaml"
 
 
-@pytest.mark.parametrize("consumer", CONSUMERS)
+@pytest.mark.parametrize("consumer", consumer_names())
 def test_every_consumer(run: Run, consumer: str, result: Path, tmp_path: Path) -> None:
-    out = tmp_path / CONSUMERS[consumer]
+    out = tmp_path / FILES.get(consumer, "a.out")
 
     done = run("export", result, "--to", consumer, "--out", out, "--json")
 
@@ -126,7 +117,7 @@ def test_contradictions_are_warned_about(run: Run, result: Path, tmp_path: Path)
     ("arguments", "message"),
     [
         (["--to", "ply"], "Invalid value for '--to'"),
-        (["--to", "tf", "--form", "xml"], "not by 'xml'. Give --form lines, launch or mcap"),
+        (["--to", "tf", "--form", "xml"], "no form for 'xml': "),
         (["--to", "tf", "--letter", "l"], "--letter: is not for --to tf, but for gtsam"),
         (["--to", "urdf", "--base", "none"], "none: no such file"),
         (["--to", "glim", "--config", "none"], "none: no such file"),
@@ -160,7 +151,7 @@ def test_the_imu_is_never_made_up(run: Run, result: Path, tmp_path: Path) -> Non
     done = run("export", result, "--to", "fast-lio", "--out", tmp_path / "a.yaml")
 
     assert done.returncode == 2
-    assert "needs where the IMU is" in done.stderr
+    assert "needs the pose of the IMU" in done.stderr
     told = run("export", result, "--to", "fast-lio", "--out", tmp_path / "a.yaml", "--imu", "0,0,1")
     assert told.returncode == 0
 

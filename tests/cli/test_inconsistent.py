@@ -28,7 +28,7 @@ def test_a_contradiction_is_exit_4_even_if_something_was_not_reached(tmp_path: P
     done = run("calibrate", config, "--out", tmp_path / "out", pipeline=INCONSISTENT)
     assert done.returncode == 4, done.stderr
     assert SENTENCE in done.stderr
-    assert "What contradicts what" in done.stdout
+    assert "Contradictions:" in done.stdout
     written = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())
     assert written["status"] == "inconsistent"
     assert written["contradictions"] == [SENTENCE]

@@ -201,7 +201,7 @@ def test_every_key_of_a_config_of_a_bag_is_commented(tmp_path: Path) -> None:
     assert names == ["data", "path: drive", "imu", "front", "rear", "solve", "robust"]
 
 
-def test_mountings_from_a_urdf(tmp_path: Path) -> None:
+def test_extrinsics_from_a_urdf(tmp_path: Path) -> None:
     urdf = tmp_path / "car.urdf"
     urdf.write_text(
         """<robot name="car">
@@ -239,7 +239,7 @@ def test_a_urdf_has_the_last_word(tmp_path: Path) -> None:
     assert config.lidars["rear"].initial.xyz == (3.0, 0.0, 1.5)
 
 
-def test_a_bag_that_tells_no_mountings(tmp_path: Path) -> None:
+def test_a_bag_without_extrinsics(tmp_path: Path) -> None:
     out = tmp_path / "config.yaml"
 
     result = init(write_sensors(tmp_path / "drive", static=None), "--out", out)
@@ -251,7 +251,7 @@ def test_a_bag_that_tells_no_mountings(tmp_path: Path) -> None:
     assert "(the bag, which has no /tf_static, has no frame base_link)" in out.read_text()
 
 
-def test_mountings_that_are_repeated_on_tf(tmp_path: Path) -> None:
+def test_extrinsics_repeated_on_tf(tmp_path: Path) -> None:
     moving = [
         ("/tf", START + k, tf(("odom", "base_link", (k, 0, 0), NONE), *links))
         for k, links in enumerate([[("base_link", "lidar", (1, 0, 2), NONE)]] * 5)

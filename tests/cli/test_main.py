@@ -1,4 +1,4 @@
-"""Exit codes and streams of SPEC 5, as a shell sees them."""
+"""Exit codes and streams, as a shell sees them."""
 
 from __future__ import annotations
 

@@ -91,11 +91,11 @@ def test_sigmas_asked_for_and_not_kept_are_exit_3() -> None:
     result = plan(ARC, "--sigma", "s2v_yaw_deg=0.05", "--sigma", "s2s_x_m=0.01")
 
     assert result.exit_code == 3
-    assert "It does not keep what was asked for: s2v_yaw_deg 0.05, s2s_x_m 0.01." in result.stdout
-    assert "In the least space" in result.stdout
+    assert "The drive does not keep the limits: s2v_yaw_deg 0.05, s2s_x_m 0.01." in result.stdout
+    assert "Smallest drive that keeps all limits" in result.stdout
     kept = plan(SCENARIOS / "figure_eight.yaml", "--sigma", "s2v_yaw_deg=0.05")
     assert kept.exit_code == 0
-    assert "It keeps what was asked for" in kept.stdout
+    assert "The drive keeps the limits" in kept.stdout
 
 
 def test_what_is_made_of_the_ground() -> None:

@@ -6,7 +6,9 @@ import json
 import gtsam
 import numpy as np
 
-from caliv_graph.export.covariance import export_json, export_npz, ros_covariance
+from caliv_graph.export.consumers.json import export as export_json
+from caliv_graph.export.consumers.npz import export as export_npz
+from caliv_graph.export.covariance import ros_covariance
 from tests.export.requests import T_VEHICLE_LIDAR, calibration_of, request
 
 

@@ -64,5 +64,5 @@ def test_named_values() -> None:
     for wrong in ("a", "a=", "=1"):
         with pytest.raises(ExportError, match=f"--frame: '{wrong}' is not NAME=VALUE"):
             parse_named([wrong], "--frame")
-    with pytest.raises(ExportError, match="'a' stands twice"):
+    with pytest.raises(ExportError, match="'a' is given twice"):
         parse_named(["a=1", "a=2"], "--frame")

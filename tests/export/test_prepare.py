@@ -10,9 +10,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.autoware import export as export_autoware
-from caliv_graph.export.prepare import Wishes, prepare
-from caliv_graph.export.tf import export as export_tf
+from caliv_graph.export.consumers.autoware import export as export_autoware
+from caliv_graph.export.consumers.tf import export as export_tf
+from caliv_graph.export.prepare import Options, prepare
 from caliv_graph.results.calibration_file import write_calibration
 from tests.cli.commands import write_config
 from tests.export.requests import (
@@ -94,7 +94,7 @@ def test_frames_housings_and_the_kit_from_a_recording(calibration: Path, tmp_pat
     old.write_text(f"sensor_kit_base_link: {{velodyne_front_base_link: {zeros}}}\n")
 
     asked = prepare(
-        calibration, Wishes("autoware", tmp_path / "new.yaml", base=old, bag=bag, lidars=["front"])
+        calibration, Options("autoware", tmp_path / "new.yaml", base=old, bag=bag, lidars=["front"])
     )
     made = export_autoware(asked)
 
@@ -103,58 +103,58 @@ def test_frames_housings_and_the_kit_from_a_recording(calibration: Path, tmp_pat
     assert made.warnings == ()
     # The other LiDAR is in another file: that the recording knows its frame does not change this.
     both = export_autoware(
-        prepare(calibration, Wishes("autoware", tmp_path / "new.yaml", base=old, bag=bag))
+        prepare(calibration, Options("autoware", tmp_path / "new.yaml", base=old, bag=bag))
     )
-    assert "has no frame of LiDAR 'rear': it is not written" in both.warnings[0]
+    assert "has no frame of LiDAR 'rear', which is not written" in both.warnings[0]
     # To tf2, the frame of the cloud is what matters, and a housing only if it was asked for.
-    lines = export_tf(prepare(calibration, Wishes("tf", OUT, bag=bag)))
+    lines = export_tf(prepare(calibration, Options("tf", OUT, bag=bag)))
     assert [t.child for t in lines.transforms] == ["velodyne_front", "velodyne_rear"]
     assert lines.transforms[0].T_parent_child.equals(T_VEHICLE_LIDAR["front"], 1e-9)
-    assert prepare(calibration, Wishes("tf", OUT, bag=bag)).recorded_ns == 5_000_000_000
+    assert prepare(calibration, Options("tf", OUT, bag=bag)).recorded_ns == 5_000_000_000
 
 
 def test_the_imu_is_where_the_config_or_the_option_says(calibration: Path, tmp_path: Path) -> None:
-    assert prepare(calibration, Wishes("glim", OUT)).imu is None
+    assert prepare(calibration, Options("glim", OUT)).imu is None
 
-    mounting = {"xyz": [0.412, -0.153, 0.608], "rpy_deg": [3.3, 5.1, -31.7]}
-    write_config(tmp_path / "config.yaml", imu={"T_vehicle_imu": mounting})
-    imu = prepare(calibration, Wishes("glim", OUT)).imu
+    extrinsic = {"xyz": [0.412, -0.153, 0.608], "rpy_deg": [3.3, 5.1, -31.7]}
+    write_config(tmp_path / "config.yaml", imu={"T_vehicle_imu": extrinsic})
+    imu = prepare(calibration, Options("glim", OUT)).imu
     assert imu is not None
     assert imu.stated
     assert imu.T_vehicle_imu.equals(T_VEHICLE_IMU, 1e-12)
 
-    imu = prepare(calibration, Wishes("glim", OUT, imu="1,2,3,0,0,0.5")).imu
+    imu = prepare(calibration, Options("glim", OUT, imu="1,2,3,0,0,0.5")).imu
     assert imu is not None
     assert imu.T_vehicle_imu.equals(gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([1, 2, 3.0])), 1e-12)
 
     other = write_config(tmp_path / "other.yaml", topics={"pose": "/pose"})
-    imu = prepare(calibration, Wishes("glim", OUT, config=other)).imu
+    imu = prepare(calibration, Options("glim", OUT, config=other)).imu
     assert imu is not None
     assert not imu.stated
     other = write_config(tmp_path / "other.yaml", topics={"imu": "/imu"})
-    imu = prepare(calibration, Wishes("glim", OUT, config=other)).imu
+    imu = prepare(calibration, Options("glim", OUT, config=other)).imu
     assert imu is not None
     assert imu.stated
 
 
 @pytest.mark.parametrize(
-    ("wishes", "message"),
+    ("options", "message"),
     [
         (
-            Wishes("npz", OUT, base=Path("x")),
-            "--base: is not for --to npz, but for urdf, autoware,",
+            Options("npz", OUT, base=Path("x")),
+            "--base: is not for --to npz, but for .*autoware,",
         ),
-        (Wishes("urdf", OUT, letter="l"), "--letter: is not for --to urdf, but for gtsam"),
-        (Wishes("urdf", OUT, lidars=["top"]), "--lidar: .* has no LiDAR 'top', but front, rear"),
-        (Wishes("tf", OUT, frames=["top=x"]), "--frame: .* has no LiDAR 'top', but front, rear"),
-        (Wishes("urdf", OUT, housings=["front=1"]), "--housing front: '1' is not x,y,z,roll"),
-        (Wishes("urdf", OUT, parents=["a"]), "--parent: 'a' is not NAME=VALUE"),
-        (Wishes("urdf", OUT, base=Path("none.urdf")), "none.urdf: no such file. Give --base an"),
+        (Options("urdf", OUT, letter="l"), "--letter: is not for --to urdf, but for gtsam"),
+        (Options("urdf", OUT, lidars=["top"]), "--lidar: .* has no LiDAR 'top', but front, rear"),
+        (Options("tf", OUT, frames=["top=x"]), "--frame: .* has no LiDAR 'top', but front, rear"),
+        (Options("urdf", OUT, housings=["front=1"]), "--housing front: '1' is not x,y,z,roll"),
+        (Options("urdf", OUT, parents=["a"]), "--parent: 'a' is not NAME=VALUE"),
+        (Options("urdf", OUT, base=Path("none.urdf")), "none.urdf: no such file. Give --base an"),
     ],
 )
-def test_what_cannot_be_asked_for(calibration: Path, wishes: Wishes, message: str) -> None:
+def test_what_cannot_be_asked_for(calibration: Path, options: Options, message: str) -> None:
     with pytest.raises(ExportError, match=message) as caught:
-        prepare(calibration, wishes)
+        prepare(calibration, options)
 
     assert "\n" not in str(caught.value)
 
@@ -164,11 +164,11 @@ def test_a_base_that_is_no_text(calibration: Path, tmp_path: Path) -> None:
     old.write_bytes(b"<robot name='\xff'/>")
 
     with pytest.raises(ExportError, match=r"old\.urdf: is not text in UTF-8"):
-        prepare(calibration, Wishes("urdf", OUT, base=old))
+        prepare(calibration, Options("urdf", OUT, base=old))
 
 
 def test_a_recording_that_says_nothing(calibration: Path, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", {}, {})
 
     with pytest.raises(ExportError, match="has neither /tf_static nor one of the LiDARs' topics"):
-        prepare(calibration, Wishes("tf", OUT, bag=bag))
+        prepare(calibration, Options("tf", OUT, bag=bag))

@@ -230,14 +230,14 @@ def test_kinds_of_the_solved_graph(bag: Ran, staged: Ran) -> None:
     ]
     assert list(given) == [
         "target clouds, pose of each",
-        "given poses, white part",
-        "given poses, change of the slow part",
+        "given poses, white error",
+        "given poses, change of the Gauss-Markov error",
     ]
     # White errors of 5 mm and 1 mrad were drawn, of which the fit follows a part.
-    unit, error = given["given poses, white part"].physical["position"]
+    unit, error = given["given poses, white error"].physical["position"]
     assert unit == "mm"
     assert 1.0 < np.std(error) < 6.0
-    # Slow errors are a linear factor, whose residual GTSAM does not tell: worked out by hand.
+    # Gauss-Markov errors are a linear factor, whose residual is computed by hand here.
     solution, noise = staged.run.solution, staged.run.solution.pose_noise
     assert noise is not None
     poses = sorted(solution.T_map_vehicle)
@@ -245,7 +245,7 @@ def test_kinds_of_the_solved_graph(bag: Ran, staged: Ran) -> None:
     decay = np.exp(-(poses[1][1] - poses[0][1]) * 1e-9 / noise.drift_time_s)
     stationary = np.array([noise.drift_rotation_rad] * 3 + [noise.drift_position_m] * 3)
     whitened = (second - decay * first) / (stationary * np.sqrt(1.0 - decay**2))
-    found = given["given poses, change of the slow part"]
+    found = given["given poses, change of the Gauss-Markov error"]
     assert found.whitened[0] == pytest.approx(whitened, abs=1e-6)
     assert found.physical["position"][1][:3] == pytest.approx(
         1e3 * (second - decay * first)[3:], abs=1e-6
@@ -272,12 +272,12 @@ def test_why_a_cloud_is_believed_less(bag: Ran) -> None:
     )
 
     # Huber bends at 1.5 sqrt(6) = 3.67 sigma: half the weight at twice that.
-    assert "off by 7.3 sigma" in first.reason
+    assert "its pose residual is 7.3 sigma" in first.reason
     assert "points" not in first.reason
     assert second.weight == 0.25
-    assert "only 54% of its points lie on the target, 90% of a typical cloud's" in second.reason
-    assert "off by 7.3 sigma" in second.reason
-    assert "10 percent whose pose fits worst" in trimmed.reason
+    assert "only 54% of its points lie on the target (median of all clouds: 90%)" in second.reason
+    assert "its pose residual is 7.3 sigma" in second.reason
+    assert "among the largest 10 percent" in trimmed.reason
     cloud = registration.observation.clouds[3]
     assert (first.lidar, first.stamp_ns) == (cloud.lidar, cloud.stamp_ns)
 
@@ -317,7 +317,7 @@ def test_names_do_not_run(bag: Ran) -> None:
 
 
 def test_long_names_are_short_in_figures_only_while_they_differ() -> None:
-    from caliv_graph.report.figures import labels
+    from caliv_graph.report.figures.drawing import labels
 
     long = "velodyne_front_left_upper"
 
@@ -342,17 +342,17 @@ def test_a_contradiction_comes_before_all_else(bag: Ran) -> None:
     silent = Page(bag.page(status="inconsistent"))
 
     assert "Do not use this result" in page.text
-    assert page.text.index(what) < page.text.index("determined by the drive")
-    # A result that does not say so itself: what was noticed is what there is to go by.
-    assert silent.text.index("never saw the target") < silent.text.index("determined by the drive")
+    assert page.text.index(what) < page.text.index("determined by this drive")
+    # A result without contradictions of its own: the warnings are shown.
+    assert silent.text.index("never saw the target") < silent.text.index("determined by this drive")
 
 
 def test_staged_on_given_poses(staged: Ran) -> None:
     page = Page(staged.page())
 
     assert "Mode staged" in page.text
-    assert "biases of the IMU" not in page.text
-    assert "given poses, slow part" in page.text
+    assert "IMU biases" not in page.text
+    assert "given poses, Gauss-Markov error" in page.text
     # The translation is the guess's: held by the mode.
     assert "front to the vehicle roll, pitch x, y, z, yaw" in page.text
 
@@ -360,7 +360,7 @@ def test_staged_on_given_poses(staged: Ran) -> None:
 def test_several_recordings_and_targets_are_told_apart(bag: Ran) -> None:
     run = bag.run
     assert run.record is not None
-    solution, evidence = run.solution, run.record
+    solution, record = run.solution, run.record
     twice = replace(
         solution,
         registrations=solution.registrations * 3,
@@ -368,7 +368,7 @@ def test_several_recordings_and_targets_are_told_apart(bag: Ran) -> None:
         residuals=solution.residuals * 3,
         T_target_map=solution.T_target_map * 3,
     )
-    more = replace(evidence, drives=("first", "second"), trajectories=evidence.trajectories * 2)
+    more = replace(record, drives=("first", "second"), trajectories=record.trajectories * 2)
 
     html = render_report(run.calibration, twice, bag.config, bag.stages, (), more)
 
@@ -382,7 +382,7 @@ def test_several_recordings_and_targets_are_told_apart(bag: Ran) -> None:
 
 
 def test_a_target_is_shown_upright_where_it_stands(bag: Ran) -> None:
-    from caliv_graph.report.figures import target_figures
+    from caliv_graph.report.figures.alignment import target_figures
 
     solution, calibration = bag.run.solution, bag.run.calibration
     solid, flat = target_figures(0, solution, calibration)
@@ -615,7 +615,7 @@ def test_every_figure_is_drawn_without_network_or_complaint(bag: Ran, tmp_path: 
         "path_0",
         "motion_0",
         "correction_0",
-        "course",
+        "convergence",
     } <= figures
     drawn = re.findall(r'<div class="([^"]*)" data-figure="(\w+)" data-drawn="yes"', told.dom)
     assert {name for _, name in drawn} == figures

@@ -17,7 +17,8 @@ from caliv_graph.report.inspection import (
     Sighting,
     TargetSummary,
 )
-from caliv_graph.report.tables import calibration_table, evaluation_table, inspection_table
+from caliv_graph.report.inspection_table import inspection_table
+from caliv_graph.report.tables import calibration_table, evaluation_table
 from caliv_graph.uncertainty.evaluation import evaluate
 from tests.samples import make_calibration, unseen
 
@@ -64,7 +65,7 @@ def test_values_are_shown_to_two_digits_of_their_sigma_in_metres_and_degrees() -
         "1.2346", "0.0000", "-2.5000", "-1.235", "10.000", "91.000", "60"
     ]  # fmt: skip
     assert cells_below(lines, "rear") == ["±0.0093"] * 3 + ["±0.031"] * 3
-    assert not any("held" in line or "could not tell" in line for line in lines)
+    assert not any("held" in line or "Not determined" in line for line in lines)
 
 
 def test_an_undetermined_axis_is_held_and_says_why() -> None:
@@ -77,8 +78,8 @@ def test_an_undetermined_axis_is_held_and_says_why() -> None:
     below = cells_below(lines, "front")
     assert (below[0], below[5]) == ("held", "held")
     assert below[1].startswith("±")
-    assert any(line.startswith("held: the drive does not determine") for line in lines)
-    index = lines.index("What the drive could not tell:")
+    assert any(line.startswith("held: this drive does not determine") for line in lines)
+    index = lines.index("Not determined by this drive:")
     assert lines[index + 1] == "  - rotation of all LiDARs about the turn centre"
 
 
@@ -100,7 +101,7 @@ def test_a_lidar_that_never_saw_the_target_pretends_nothing() -> None:
     assert all(cell.startswith("(") for cell in row[:6])
     assert row[6:] == ["no"]
     assert below == ["held"] * 6 + ["target"]
-    assert "  - LiDAR 'left' never saw a target: its mounting is the initial guess" in lines
+    assert "  - LiDAR 'left' never saw a target: its extrinsic is the initial guess" in lines
     assert all(cell.startswith("(") for cell in cells(lines, "front", after="Sensor to sensor")[:6])
 
 
@@ -109,7 +110,7 @@ def test_what_was_asked_for_and_not_reached_is_said() -> None:
 
     lines = rendered(calibration_table(calibration, [], 1.0))
 
-    index = lines.index("Asked for in the config, but not reached:")
+    index = lines.index("Required by the config, but not reached:")
     assert lines[index + 1] == "  - s2v: yaw of front is not determined"
 
 
@@ -170,7 +171,7 @@ def test_errors_in_millimetres_and_milliradians() -> None:
         "(12.35)", "-1.00", "0.00", "1.00", "-0.50", "(4.30)", "5.43"
     ]  # fmt: skip
     assert cells(lines, "S2S front to rear") == ["0.00"] * 6 + ["-"]
-    assert lines[-2].startswith("In brackets: the drive did not determine this axis")
+    assert lines[-1].startswith("In brackets: not determined by the drive")
 
 
 def test_what_a_recording_holds() -> None:

@@ -1,7 +1,7 @@
 "use strict";
 (function () {
   const options = { displaylogo: false, responsive: false, showSendToCloud: false, modeBarButtonsToRemove: ["sendDataToCloud"] };
-  // A print of a 3-D view is a picture of it: browsers leave canvases of WebGL empty there.
+  // Browsers print WebGL canvases empty, so a picture of each 3-D view replaces it in print.
   function keepStill(plot) {
     return Plotly.toImage(plot, { format: "png", width: plot.offsetWidth, height: plot.offsetHeight, scale: 1.5 }).then(function (url) {
       let still = plot.parentNode.querySelector("img.still");
@@ -29,7 +29,7 @@
     const why = plot.parentNode.classList.contains("solid") ? " (3-D views need WebGL)" : "";
     plot.textContent = "This figure could not be drawn" + why + ": " + error;
   }
-  // One after the other, flat ones first: the page can be read while 3-D views are prepared.
+  // One after the other, flat figures first: the page is readable while 3-D views are prepared.
   const plots = Array.from(document.querySelectorAll(".plot"));
   const solid = function (plot) { return plot.parentNode.classList.contains("solid") ? 1 : 0; };
   plots.sort(function (a, b) { return solid(a) - solid(b); });

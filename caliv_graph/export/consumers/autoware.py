@@ -1,16 +1,15 @@
 """Autoware: `sensors_calibration.yaml` and `sensor_kit_calibration.yaml`.
 
-A file has parent frames, below each its child frames, below each x, y, z, roll, pitch, yaw in
-metres and radians: the pose of the child in the parent, as the `<origin>` of a fixed joint. The
-child of a LiDAR is its housing `<sensor>_base_link`; where the cloud's frame is in it is said by
-the xacro of the sensor. So
+A file has parent frames, below each its child frames, and below each x, y, z, roll, pitch, yaw in
+metres and radians: the pose of the child in the parent, like the `<origin>` of a fixed joint. The
+child of a LiDAR is its housing `<sensor>_base_link`. The xacro of the sensor has the pose of the
+cloud's frame in the housing. Therefore
 `T_parent_housing = T_vehicle_parent^-1 T_vehicle_lidar T_housing_lidar^-1`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -19,35 +18,34 @@ import yaml
 from caliv_graph.errors import ExportError
 from caliv_graph.export.edit import Entry, YamlFile, read_base, with_comment
 from caliv_graph.export.frames import match_frame
-from caliv_graph.export.request import DEFAULT_VEHICLE_FRAME, Base, Export, Request, Transform
-from caliv_graph.export.wording import notice, number, rpy, with_hash, without_notice
+from caliv_graph.export.request import FRAME_OPTIONS, Base, Consumer, Export, Request, Transform
+from caliv_graph.export.text import notice, number, rpy, with_hash
 from caliv_graph.readers.frames import VEHICLE_FRAMES, FrameTransform, FrameTree
 
 _KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 _SENSORS = "sensors_calibration.yaml"
-"""File beside `sensor_kit_calibration.yaml` that says where the sensor kit is."""
+"""File beside `sensor_kit_calibration.yaml` with the pose of the sensor kit."""
 
 
 def export(request: Request) -> Export:
     """A calibration file of Autoware: a new `sensors_calibration.yaml`, or `--base` changed.
 
     Raises:
-        ExportError: `--base` is not such a file, has none of the LiDARs, or where a parent frame is
-            is not known.
+        ExportError: `--base` is not such a file or has none of the LiDARs, or the pose of a parent
+            frame is unknown.
     """
     if request.base is None:
         return _new(request)
-    return _changed(request, replace(request.base, text=without_notice(request.base.text)))
+    return _changed(request, request.base)
 
 
 def _new(request: Request) -> Export:
-    parent = request.vehicle_frame or DEFAULT_VEHICLE_FRAME
     transforms = tuple(
-        _transform(request, name, parent, request.frame(name) or f"{name}_base_link")
+        _transform(request, name, request.parent, request.frame(name) or f"{name}_base_link")
         for name in request.lidars
     )
-    lines = [f"{_quoted(parent)}:"]
+    lines = [f"{_quoted(request.parent)}:"]
     for transform in transforms:
         lines.append(f"  {_quoted(transform.child)}:")
         values = _values(transform.T_parent_child)
@@ -61,8 +59,8 @@ def _changed(request: Request, base: Base) -> Export:
     children = _children(file)
     if not children:
         raise ExportError(
-            f"{base.path}: has no frame with x, y, z, roll, pitch, yaw below a parent frame, as "
-            "Autoware's calibration files have. Give another --base"
+            f"{base.path}: is not a calibration file of Autoware: it has no frame with x, y, z, "
+            "roll, pitch, yaw below a parent frame. Give another --base"
         )
     tree = FrameTree([*_tree(file), *_tree_beside(base)])
     transforms: list[Transform] = []
@@ -95,7 +93,7 @@ def _changed(request: Request, base: Base) -> Export:
         )
     text = with_comment(with_hash(notice(request, transforms)), file.edited())
     warnings = [
-        *(f"{base.path}: has no frame of LiDAR '{name}': it is not written" for name in missing),
+        *(f"{base.path}: has no frame of LiDAR '{name}', which is not written" for name in missing),
         *_without_housing(request, [transform.lidar for transform in transforms]),
     ]
     return Export(text.encode(), tuple(transforms), tuple(warnings))
@@ -115,19 +113,18 @@ def _transform(
     T = request.T_vehicle_child(lidar)
     if T_vehicle_parent is not None:
         T = T_vehicle_parent.between(T)
-    told = lidar in request.housings
     remark = (
         f"The child is the housing; the LiDAR's frame in it is {_text(request.housings[lidar])}."
-        if told
-        else "The LiDAR's frame is taken to be that of its housing."
+        if lidar in request.housings
+        else "The LiDAR's frame is assumed to be the frame of its housing."
     )
     return Transform(lidar, parent, child, T, remark)
 
 
 def _without_housing(request: Request, lidars: list[str] | tuple[str, ...]) -> tuple[str, ...]:
     return tuple(
-        f"LiDAR '{name}': Autoware's frame is the housing, and where the cloud's frame is in it is "
-        f"not told: taken as the same. Give --housing {name}=x,y,z,roll,pitch,yaw or --bag"
+        f"LiDAR '{name}': Autoware places the housing, and the pose of the cloud's frame in it is "
+        f"unknown: assumed the same. Give --housing {name}=x,y,z,roll,pitch,yaw or --bag"
         for name in lidars
         if name not in request.housings
     )
@@ -148,7 +145,7 @@ def _quoted(name: str) -> str:
 
 
 def _children(file: YamlFile) -> dict[str, Entry]:
-    """The frames of a file with their entries: mappings of the six keys, below a parent frame."""
+    """The frames of a file with their entries: mappings of the six keys below a parent frame."""
     found = {}
     for entry in file.entries:
         below = file.below(entry)
@@ -171,7 +168,7 @@ def _tree(file: YamlFile) -> list[FrameTransform]:
 
 
 def _tree_beside(base: Base) -> list[FrameTransform]:
-    """What `sensors_calibration.yaml` says, if it lies beside `sensor_kit_calibration.yaml`."""
+    """The links of `sensors_calibration.yaml` in the folder of `sensor_kit_calibration.yaml`."""
     beside = base.path.parent / _SENSORS
     if base.path.name == _SENSORS or not beside.is_file():
         return []
@@ -192,6 +189,9 @@ def _parent_pose(request: Request, base: Base, tree: FrameTree, parent: str) -> 
             if T is not None:
                 return T
     raise ExportError(
-        f"{base.path}: where is '{parent}' in '{names[0]}'? Give --parent "
-        f"{parent}=x,y,z,roll,pitch,yaw, or put {_SENSORS} beside --base"
+        f"{base.path}: the pose of '{parent}' in '{names[0]}' is unknown. Give --parent "
+        f"{parent}=x,y,z,roll,pitch,yaw, or put {_SENSORS} in the folder of --base"
     )
+
+
+CONSUMER = Consumer(export, FRAME_OPTIONS | {"--base", "--parent"}, places_housings=True)

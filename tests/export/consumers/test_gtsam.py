@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.gtsam_archive import export
+from caliv_graph.export.consumers.gtsam import export
 from tests.export.requests import T_VEHICLE_LIDAR, calibration_of, request
 
 CONSUMER = """
@@ -108,5 +108,5 @@ def test_letters_and_names_that_cannot_be() -> None:
     for letter in ("", "xy", "1", "é"):
         with pytest.raises(ExportError, match="expected one letter"):
             export(request(letter=letter))
-    with pytest.raises(ExportError, match="is the name of the YAML that is written beside"):
+    with pytest.raises(ExportError, match="would be the name of the archive and of its YAML"):
         export(request(out=Path("prior.yaml")))

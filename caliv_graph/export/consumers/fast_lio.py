@@ -6,17 +6,17 @@ The LiDAR's pose in the IMU's frame (hku-mars/FAST_LIO, README): `p_imu = R p_li
 from __future__ import annotations
 
 from caliv_graph.export.parameters import Parameters, parameter_export
-from caliv_graph.export.request import Export, Request
+from caliv_graph.export.request import IMU_OPTIONS, Consumer, Export, Request
 
 
 def export(request: Request) -> Export:
-    """Parameters of FAST-LIO for ROS 2 (or, by `form`, ROS 1), or `--base` with them changed.
+    """Parameters of FAST-LIO for ROS 2 (or, by `form`, ROS 1), or `--base` with new values.
 
     Raises:
-        ExportError: the IMU's mounting is not known, or `--base` lacks the parameters.
+        ExportError: the pose of the IMU is unknown, or `--base` lacks the parameters.
     """
-    lidar, chosen = request.one_lidar("fast-lio")
-    T_lidar_imu, unsaid = request.T_lidar_imu(lidar, "fast-lio")
+    lidar, several = request.one_lidar("fast-lio")
+    T_lidar_imu, assumed = request.T_lidar_imu(lidar, "fast-lio")
     T_imu_lidar = T_lidar_imu.inverse()
     values = {
         "extrinsic_T": T_imu_lidar.translation().tolist(),
@@ -36,5 +36,8 @@ def export(request: Request) -> Export:
             above_ros1=("mapping",),
             above_ros2=("/**", "ros__parameters", "mapping"),
         ),
-        (*chosen, *unsaid),
+        (*several, *assumed),
     )
+
+
+CONSUMER = Consumer(export, IMU_OPTIONS | {"--form"})

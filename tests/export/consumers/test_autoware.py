@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.autoware import export
+from caliv_graph.export.consumers.autoware import export
 from caliv_graph.export.edit import read_base
 from caliv_graph.export.request import Export
 from caliv_graph.products import Array
@@ -101,8 +101,8 @@ def test_both_files_of_a_vehicle(tmp_path: Path) -> None:
     rear = pose(vehicle, "base_link", "velodyne_rear_base_link") @ HOUSINGS["rear"].matrix()
     np.testing.assert_allclose(rear, T_VEHICLE_LIDAR["rear"].matrix(), atol=1e-9)
     # Each has one of the two LiDARs, and says which it has not.
-    assert "has no frame of LiDAR 'rear': it is not written" in in_kit.warnings[0]
-    assert "has no frame of LiDAR 'front': it is not written" in in_sensors.warnings[0]
+    assert "has no frame of LiDAR 'rear', which is not written" in in_kit.warnings[0]
+    assert "has no frame of LiDAR 'front', which is not written" in in_sensors.warnings[0]
 
 
 @pytest.mark.parametrize("ends", ["\n", "\r\n"])
@@ -135,7 +135,9 @@ def test_all_else_in_a_base_stays_byte_for_byte(ends: str) -> None:
 
 
 def test_where_the_sensor_kit_is_can_be_told_or_recorded() -> None:
-    with pytest.raises(ExportError, match="where is 'sensor_kit_base_link' in 'base_link'"):
+    with pytest.raises(
+        ExportError, match="the pose of 'sensor_kit_base_link' in 'base_link' is unknown"
+    ):
         export(request(base=base(KIT), lidars=("front",)))
     link = FrameTransform("base_link", "sensor_kit_base_link", T_VEHICLE_KIT)
 
@@ -150,8 +152,8 @@ def test_where_the_sensor_kit_is_can_be_told_or_recorded() -> None:
 def test_a_housing_that_nobody_told_is_warned_about_and_commented() -> None:
     made = export(request(lidars=("front",)))
 
-    assert "where the cloud's frame is in it is not told: taken as the same" in made.warnings[0]
-    assert b"The LiDAR's frame is taken to be that of its housing." in made.content
+    assert "the pose of the cloud's frame in it is unknown: assumed the same" in made.warnings[0]
+    assert b"The LiDAR's frame is assumed to be the frame of its housing." in made.content
     assert b"yaw, x (vehicle axes) not determined" in made.content
     assert b"p_parent = T p_child" in made.content
     assert "--housing" not in " ".join(export(request(housings=HOUSINGS)).warnings)
@@ -177,8 +179,8 @@ def test_left_is_the_lidar_not_the_camera() -> None:
     ("text", "message"),
     [
         ("a: [", "old: not valid YAML in line 1"),
-        ("- 1", "old: holds no keys with values"),
-        ("a: {b: {x: 1}}", "old: has no frame with x, y, z, roll, pitch, yaw below a parent"),
+        ("- 1", "old: has no keys with values"),
+        ("a: {b: {x: 1}}", "old: is not a calibration file of Autoware"),
         (KIT.replace("velodyne_front", "velodyne_top"), "old: has none of the LiDARs front, but"),
         (
             KIT.replace("1.575\n", "[1]\n", 1),

@@ -10,22 +10,22 @@ import re
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export.edit import Edit, line_end, spliced, with_comment
-from caliv_graph.export.request import Base, Export, Request, Transform
-from caliv_graph.export.wording import notice, numbers, quaternion_xyzw, with_c, without_notice
+from caliv_graph.export.request import IMU_OPTIONS, Base, Consumer, Export, Request, Transform
+from caliv_graph.export.text import notice, numbers, quaternion_xyzw, with_c, without_notice
 
 _KEY = "T_lidar_imu"
 _NOTE = "_caliv_graph"
-"""Key of the comment where a file has none of JSON's unofficial ones; GLIM reads over it."""
+"""Key of the comment in a file without /* */ or // comments; GLIM ignores unknown keys."""
 
 
 def export(request: Request) -> Export:
-    """A `config_sensors.json` with `T_lidar_imu` alone, or `--base` with it changed.
+    """A `config_sensors.json` with `T_lidar_imu` alone, or `--base` with a new value.
 
     Raises:
-        ExportError: the IMU's mounting is not known, or `--base` has not one `T_lidar_imu`.
+        ExportError: the pose of the IMU is unknown, or `--base` has not exactly one `T_lidar_imu`.
     """
-    lidar, chosen = request.one_lidar("glim")
-    T_lidar_imu, unsaid = request.T_lidar_imu(lidar, "glim")
+    lidar, several = request.one_lidar("glim")
+    T_lidar_imu, assumed = request.T_lidar_imu(lidar, "glim")
     assert request.imu is not None
     transform = Transform(
         lidar,
@@ -46,14 +46,14 @@ def export(request: Request) -> Export:
         )
     else:
         text = _changed(request.base, value, note)
-    return Export(text.encode(), (transform,), (*chosen, *unsaid))
+    return Export(text.encode(), (transform,), (*several, *assumed))
 
 
 def _changed(base: Base, value: str, note: str) -> str:
     text = without_notice(base.text)
     ends = line_end(text)
     code = _without_comments(text)
-    # A comment of an earlier export goes with its comma and its line.
+    # The comment of an earlier export is removed with its comma and its line.
     own = re.search(rf'"{_NOTE}"\s*:\s*\[[^\]]*\]\s*,\s*', code)
     found = list(re.finditer(rf'"{_KEY}"\s*:\s*(\[[^\]]*\])', code))
     if len(found) != 1:
@@ -82,14 +82,14 @@ def _changed(base: Base, value: str, note: str) -> str:
 
 
 def _json_lines(note: str, indent: str) -> str:
-    # A bracket would end the list for the next export that looks for its end.
+    # A bracket would end the list for the search of the next export.
     lines = [json.dumps(line.replace("[", "(").replace("]", ")")) for line in note.splitlines()]
     inner = f",\n{indent}  ".join(lines)
     return f"[\n{indent}  {inner}\n{indent}]"
 
 
 def _without_comments(text: str) -> str:
-    """The text with blanks in place of /* */ and // comments, so that indices stay."""
+    """The text with blanks instead of /* */ and // comments; indices stay valid."""
     pattern = re.compile(r'"(?:\\.|[^"\\])*"|/\*.*?\*/|//[^\r\n]*', re.DOTALL)
 
     def blank(found: re.Match[str]) -> str:
@@ -97,3 +97,6 @@ def _without_comments(text: str) -> str:
         return piece if piece.startswith('"') else re.sub(r"[^\r\n]", " ", piece)
 
     return pattern.sub(blank, text)
+
+
+CONSUMER = Consumer(export, IMU_OPTIONS)

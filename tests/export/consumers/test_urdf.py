@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.urdf import export
+from caliv_graph.export.consumers.urdf import export
 from tests.export.requests import (
     T_HOUSING_LIDAR,
     T_VEHICLE_LIDAR,
@@ -237,11 +237,11 @@ def test_looking_straight_up_or_down(tmp_path: Path, pitch: float) -> None:
     ("text", "message"),
     [
         ("<robot", "old: is not valid XML"),
-        ("<sdf/>", r"old: its root is <sdf>, that of a URDF is <robot>"),
+        ("<sdf/>", r"old: its root is <sdf>, but a URDF has <robot>"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><robot name="r"/>', "old: has a DOCTYPE"),
         (
             one_joint("camera_front"),
-            r"old: LiDAR 'front': no joint leads to a link that is named like it. Joints lead to "
+            r"old: LiDAR 'front': no joint leads to a link with a similar name. Joints lead to "
             r"'camera_front'. Give --frame front=LINK",
         ),
         (
@@ -294,13 +294,13 @@ def test_the_root_stands_in_for_a_vehicle_frame_and_it_is_said() -> None:
 
     assert made.transforms[0].parent == "chassis"
     assert made.transforms[0].T_parent_child.equals(T_VEHICLE_LIDAR["front"], 1e-12)
-    assert "its root 'chassis' is taken for the vehicle frame" in made.warnings[0]
+    assert "its root 'chassis' is used as the vehicle frame" in made.warnings[0]
     with pytest.raises(ExportError, match="has no link 'body'"):
         front(one_joint("front"), vehicle_frame="body")
 
 
 def test_two_lidars_are_not_one_link() -> None:
-    with pytest.raises(ExportError, match="link 'x' is that of LiDARs front, rear"):
+    with pytest.raises(ExportError, match="link 'x' belongs to LiDARs front, rear"):
         export(request(base=base(one_joint("x")), frames={"front": "x", "rear": "x"}))
-    with pytest.raises(ExportError, match="'x' would be the name of two links"):
+    with pytest.raises(ExportError, match="'x' would be the name of two frames"):
         export(request(frames={"front": "x", "rear": "x"}))

@@ -1,11 +1,11 @@
-"""URDF: a new file, or an existing URDF or xacro with the origins of its joints changed."""
+"""URDF: a new file, or an existing URDF or xacro with new origins of its joints."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -17,47 +17,34 @@ from caliv_graph.export.edit import Edit, line_end, spliced
 from caliv_graph.export.frames import match_frame
 from caliv_graph.export.request import (
     DEFAULT_VEHICLE_FRAME,
+    FRAME_OPTIONS,
     Base,
+    Consumer,
     Export,
     Request,
     Transform,
+    check_names,
 )
-from caliv_graph.export.wording import notice, numbers, rpy, with_xml, without_notice
+from caliv_graph.export.text import notice, numbers, rpy, with_xml, without_notice
 from caliv_graph.readers.frames import VEHICLE_FRAMES, FrameTransform, FrameTree
 
 
 def export(request: Request) -> Export:
-    """A URDF with a fixed joint from the vehicle frame, or from where it is in `--base`, per LiDAR.
+    """A URDF with a fixed joint per LiDAR: from the vehicle frame, or as in `--base`.
 
     Raises:
-        ExportError: `--base` is no URDF, or a LiDAR's joint is not in it or cannot be changed.
+        ExportError: `--base` is not a URDF, or has no joint of a LiDAR that can be changed.
     """
     if request.base is None:
         return _new(request)
-    base = replace(request.base, text=without_notice(request.base.text))
-    return _Robot(base).with_extrinsics(request)
+    return _Robot(request.base).with_extrinsics(request)
 
 
 def _new(request: Request) -> Export:
-    parent = request.vehicle_frame or DEFAULT_VEHICLE_FRAME
-    transforms = [
-        Transform(
-            name,
-            parent,
-            request.frame(name) or name,
-            request.T_vehicle_child(name),
-            "URDF joint.",
-        )
-        for name in request.lidars
-    ]
-    children = [transform.child for transform in transforms]
-    for child in children:
-        if child == parent or children.count(child) > 1:
-            raise ExportError(
-                f"urdf: '{child}' would be the name of two links. Give other names by --frame "
-                "NAME=LINK or --vehicle-frame LINK"
-            )
-    lines = [f"  <link name={quoteattr(name)}/>" for name in (parent, *children)]
+    transforms = request.vehicle_transforms("URDF joint.")
+    check_names("urdf", transforms)
+    names = (request.parent, *(transform.child for transform in transforms))
+    lines = [f"  <link name={quoteattr(name)}/>" for name in names]
     for transform in transforms:
         lines += [
             f'  <joint name={quoteattr(f"{transform.child}_joint")} type="fixed">',
@@ -71,7 +58,7 @@ def _new(request: Request) -> Export:
         f"{with_xml(notice(request, transforms))}"
         '<robot name="vehicle">\n' + "\n".join(lines) + "\n</robot>\n"
     )
-    return Export(text.encode(), tuple(transforms))
+    return Export(text.encode(), transforms)
 
 
 def _xyz(transform: Transform) -> str:
@@ -84,7 +71,7 @@ def _rpy(transform: Transform) -> str:
 
 @dataclass
 class _Joint:
-    """A joint of the file, and where its origin stands in the bytes."""
+    """A joint of the file, with the positions of its tags in the text."""
 
     name: str
     kind: str
@@ -98,7 +85,7 @@ class _Joint:
     from_block: bool = False
 
     def pose(self) -> gtsam.Pose3 | None:
-        """`T_parent_child`, or None if the origin is no number, as in a xacro."""
+        """`T_parent_child`; None if the origin has expressions of xacro instead of numbers."""
         try:
             x, y, z = (float(value) for value in self.xyz.split())
             roll, pitch, yaw = (float(value) for value in self.rpy.split())
@@ -110,16 +97,17 @@ class _Joint:
 
 
 class _Robot:
-    """The joints of a URDF or xacro, found by a parser that knows where they stand."""
+    """The joints of a URDF or xacro, with their positions in the text."""
 
     def __init__(self, base: Base) -> None:
-        self._path, self._text, self._bytes = base.path, base.text, base.text.encode()
-        self._is_ascii = base.text.isascii()
+        self._path, self._text = base.path, without_notice(base.text)
+        self._bytes = self._text.encode()
+        self._is_ascii = self._text.isascii()
         self._joints: list[_Joint] = []
         self._links: list[str] = []
         self._stack: list[_Joint | None] = []
         self._root: tuple[str, int] | None = None
-        # What the file says of its encoding is not what it was read with.
+        # The file was read as UTF-8, whatever encoding it declares.
         self._parser = expat.ParserCreate("utf-8")
         self._parser.StartElementHandler = self._start
         self._parser.EndElementHandler = self._end
@@ -130,13 +118,13 @@ class _Robot:
             raise ExportError(f"{self._path}: is not valid XML: {e}") from None
         if self._root is None or self._root[0] != "robot":
             found = self._root[0] if self._root else ""
-            raise ExportError(f"{self._path}: its root is <{found}>, that of a URDF is <robot>")
-        # Transmissions and ros2_control name joints too, without saying where they are.
+            raise ExportError(f"{self._path}: its root is <{found}>, but a URDF has <robot>")
+        # Transmissions and ros2_control have joint elements, too, without parent and child.
         self._joints = [joint for joint in self._joints if joint.parent and joint.child]
 
     def _doctype(self, *_: object) -> None:
-        # Entities can unfold to gigabytes, and no URDF has them.
-        raise ExportError(f"{self._path}: has a DOCTYPE, which no URDF needs. Remove it")
+        # Entities can expand to gigabytes, and a URDF has none.
+        raise ExportError(f"{self._path}: has a DOCTYPE, which a URDF does not need. Remove it")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         at = self._index()
@@ -159,15 +147,14 @@ class _Robot:
                 joint.from_block = True
 
     def _index(self) -> int:
-        """Index of the character that the parser, which counts bytes, is at."""
+        """Index of the current character; the parser counts bytes."""
         at = self._parser.CurrentByteIndex
         return at if self._is_ascii else len(self._bytes[:at].decode())
 
     def _joint(self, name: str, attributes: dict[str, str], at: int) -> _Joint | None:
-        """The joint that begins here, if one does: itself, or the call of a sensor's macro.
+        """The joint that begins here: a joint element, or the call of a sensor's macro; else None.
 
-        Macros of sensors take a parent, a name and an origin, which is that of the housing,
-        `<name>_base_link`.
+        Macros of sensors take a parent, a name and the origin of the housing `<name>_base_link`.
         """
         joint = None
         line = self._parser.CurrentLineNumber
@@ -184,19 +171,19 @@ class _Robot:
         self._stack.pop()
 
     def with_extrinsics(self, request: Request) -> Export:
-        """The file with the extrinsics of all LiDARs in their joints."""
+        """The file with the new extrinsics in the joints of the LiDARs."""
         vehicle, warnings = self._vehicle_frame(request)
         joints = {name: self._joint_of(name, request) for name in request.lidars}
         shared = [name for name in joints if list(joints.values()).count(joints[name]) > 1]
         if shared:
             child = joints[shared[0]].child
             raise ExportError(
-                f"{self._path}: link '{child}' is that of LiDARs {', '.join(shared)}. Give --frame "
+                f"{self._path}: link '{child}' belongs to LiDARs {', '.join(shared)}. Give --frame "
                 "NAME=LINK for each"
             )
         tree = {joint.child: self._link(joint) for joint in self._joints if joint.pose()}
         transforms, edits = [], []
-        # A LiDAR that hangs on another one comes after it, for its joint begins where that one is.
+        # A joint below that of another LiDAR comes later, since its parent moves.
         for name in sorted(joints, key=lambda name: self._depth(joints[name])):
             joint = joints[name]
             T_vehicle_parent = self._parent_pose(joint, vehicle, tree, request)
@@ -231,12 +218,12 @@ class _Robot:
         roots = list(dict.fromkeys(frame for frame in frames if frame not in children))
         if len(roots) != 1:
             raise ExportError(
-                f"{self._path}: which is the vehicle frame? None is '{DEFAULT_VEHICLE_FRAME}'. "
-                f"Give --vehicle-frame one of {_listed(frames)}"
+                f"{self._path}: the vehicle frame is unknown: no link is named "
+                f"'{DEFAULT_VEHICLE_FRAME}'. Give --vehicle-frame one of {_listed(frames)}"
             )
         return roots[0], (
-            f"{self._path}: has no link '{DEFAULT_VEHICLE_FRAME}': its root '{roots[0]}' is taken "
-            "for the vehicle frame. Give --vehicle-frame LINK if it is another",
+            f"{self._path}: has no link '{DEFAULT_VEHICLE_FRAME}': its root '{roots[0]}' is used "
+            "as the vehicle frame. Give --vehicle-frame LINK if it is another",
         )
 
     def _joint_of(self, lidar: str, request: Request) -> _Joint:
@@ -246,13 +233,14 @@ class _Robot:
             frame = match_frame(lidar, children, housing=lidar in request.housings)
         found = [joint for joint in self._joints if joint.child == frame]
         if not found:
-            missing = f"link '{frame}'" if frame else "link that is named like it"
+            missing = f"link '{frame}'" if frame else "link with a similar name"
             if frame is None and lidar not in request.housings:
                 housing = match_frame(lidar, children, housing=True)
                 if housing:
                     raise ExportError(
                         f"{self._path}: LiDAR '{lidar}': '{housing}' is the frame of a housing. "
-                        f"Give --housing {lidar}=x,y,z,roll,pitch,yaw, the LiDAR's frame in it"
+                        f"Give --housing {lidar}=x,y,z,roll,pitch,yaw, the LiDAR's frame in the "
+                        "housing"
                     )
             raise ExportError(
                 f"{self._path}: LiDAR '{lidar}': no joint leads to a {missing}. Joints lead to "
@@ -262,19 +250,19 @@ class _Robot:
         where = f"{self._path}: joint '{joint.name}' in line {joint.line}"
         if len(found) > 1:
             raise ExportError(
-                f"{where}: another one, in line {found[1].line}, leads to link '{frame}' too. "
-                "Leave one"
+                f"{where}: another joint, in line {found[1].line}, also leads to link '{frame}'. "
+                "Remove one"
             )
         if joint.kind != "fixed":
             raise ExportError(
-                f"{where}: is of type '{joint.kind}', and a mounting is fixed. Give --frame "
+                f"{where}: is of type '{joint.kind}', but an extrinsic is fixed. Give --frame "
                 f"{lidar}=LINK of a fixed joint"
             )
         is_call_without_origin = joint.name.startswith("xacro:") and joint.origin is None
         if joint.from_block or is_call_without_origin:
             raise ExportError(
                 f"{where}: its origin comes from a block of the xacro. Write an <origin> there, or "
-                "expand it first: 'xacro FILE > vehicle.urdf'"
+                "expand the xacro first: 'xacro FILE > vehicle.urdf'"
             )
         return joint
 
@@ -304,7 +292,7 @@ class _Robot:
 
     def _link(self, joint: _Joint) -> FrameTransform:
         pose = joint.pose()
-        # A joint that moves fixes nothing: it leads nowhere.
+        # A movable joint does not connect frames.
         if pose is None or joint.kind != "fixed":
             return FrameTransform(joint.child, joint.child, gtsam.Pose3())
         return FrameTransform(joint.parent, joint.child, pose)
@@ -312,7 +300,7 @@ class _Robot:
     def _edit(self, joint: _Joint, transform: Transform) -> Edit:
         xyz, angles = _xyz(transform), _rpy(transform)
         if joint.origin is None:
-            # Right behind the joint's own tag, in a line of its own, indented as what follows.
+            # After the joint's own tag, on a separate line, indented like the next line.
             at = joint.tag + len(_tag(self._text, joint.tag))
             blank = self._text[at : len(self._text) - len(self._text[at:].lstrip())]
             return Edit(at, at, f'{blank}<origin xyz="{xyz}" rpy="{angles}"/>')
@@ -322,9 +310,9 @@ class _Robot:
 
 
 def _tag(text: str, start: int) -> str:
-    """A tag from its first to its last bracket; a bracket in quotes ends nothing."""
+    """A tag from its first to its last bracket; brackets in quotes do not count."""
     found = re.compile(r"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(text, start)
-    assert found is not None  # The parser has seen it.
+    assert found is not None  # The parser has accepted it.
     return found.group()
 
 
@@ -338,7 +326,10 @@ def _with_attribute(tag: str, name: str, value: str) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names for a message, not too many of them."""
+    """At most twelve names, for a message."""
     unique = list(dict.fromkeys(names))
     rest = f" and {len(unique) - 12} more" if len(unique) > 12 else ""
     return ", ".join(f"'{name}'" for name in unique[:12]) + rest if unique else "nothing"
+
+
+CONSUMER = Consumer(export, FRAME_OPTIONS | {"--base", "--parent"})

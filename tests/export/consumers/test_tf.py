@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.tf import export
+from caliv_graph.export.consumers.tf import export
 from caliv_graph.products import Array
 from tests.export.requests import (
     T_HOUSING_LIDAR,
@@ -140,7 +140,9 @@ def test_a_name_cannot_break_out_of_the_comment() -> None:
 
 @pytest.mark.parametrize(("out", "form"), [("tf.xml", ""), ("tf.sh", "bag")])
 def test_an_unknown_form(out: str, form: str) -> None:
-    with pytest.raises(ExportError, match=f"not by '{form or '.xml'}'. Give --form lines"):
+    with pytest.raises(
+        ExportError, match=f"no form for '{form or '.xml'}': the suffix of --out must be"
+    ):
         export(request(out=Path(out), form=form))
 
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.mola import export
+from caliv_graph.export.consumers.mola import export
 from caliv_graph.products import Array
 from tests.export.requests import T_VEHICLE_LIDAR, base, matrix_of, request
 
@@ -67,7 +67,7 @@ def test_onto_a_base() -> None:
 
 
 def test_a_topic_that_is_not_known() -> None:
-    with pytest.raises(ExportError, match="that of LiDAR 'front' is not known"):
+    with pytest.raises(ExportError, match="needs the topic of LiDAR 'front'"):
         export(request())
     with pytest.raises(ExportError, match="0 sensors with fixed_sensor_pose have topic /other of"):
         export(request(base=base(SYSTEM), topics={**TOPICS, "front": "/other"}))

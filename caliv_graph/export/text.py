@@ -1,4 +1,4 @@
-"""What every export says of itself, and how numbers are written."""
+"""Text of exported files: numbers, the comment at the top, caveats."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import LidarResult
 
 _DECIMALS = 12
-"""A picometre or picoradian: as many as calibration.yaml has of a pose."""
+"""A picometre or picoradian, as in calibration.yaml."""
 
 _FIRST = "caliv-graph export"
 _LAST = "end of caliv-graph export"
 
 
 def number(value: float) -> str:
-    """A number that every YAML, XML and ROS parser takes for a double: 1e-05 is text to YAML 1.1.
+    """A number that every YAML, XML and ROS parser reads as a double.
 
-    ROS 2 refuses an integer where a parameter is a double.
+    YAML 1.1 reads 1e-05 as text, and ROS 2 refuses an integer for a double parameter.
     """
     text = f"{value:.{_DECIMALS}f}".rstrip("0")
     text = f"{text}0" if text.endswith(".") else text
@@ -50,27 +50,27 @@ def quaternion_xyzw(pose: gtsam.Pose3) -> tuple[float, float, float, float]:
 
 
 def undetermined_axes(result: LidarResult) -> list[str]:
-    """Axes of the vehicle along which the drive did not determine a mounting."""
+    """Vehicle axes along which the drive did not determine an extrinsic."""
     return [axis for axis in AXES if not result.determined[axis]]
 
 
 def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
-    """What is not as it looks: what the drive did not determine, or what contradicts itself."""
+    """Warnings about undetermined axes and contradictions of a calibration."""
     lines = []
     if request.calibration.status == "inconsistent":
         lines.append(
             f"{request.source}: status inconsistent: the data contradict each other or the initial "
-            "guess. Find out why before you use this"
+            "guess. Find the cause before you use this file"
         )
     for name in lidars:
         result = request.calibration.lidars[name]
         axes = undetermined_axes(result)
         if not result.saw_target:
-            lines.append(f"LiDAR '{name}' never saw a target: its mounting is the initial guess")
+            lines.append(f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess")
         elif axes:
             lines.append(
                 f"LiDAR '{name}': {', '.join(axes)} (vehicle axes) not determined by the drive: "
-                "decided by the initial guesses"
+                "values of the initial guesses"
             )
     return lines
 
@@ -79,15 +79,15 @@ def notice(request: Request, transforms: Sequence[Transform], extra: Sequence[st
     """The comment of a file, several lines.
 
     Args:
-        request: what is exported.
-        transforms: what is in the file.
-        extra: what else there is to say, a line each.
+        request: the request.
+        transforms: in the file.
+        extra: further lines.
 
     Returns:
-        Lines without a mark of a comment, the first and the last of which `without_notice` knows.
+        Lines without comment marks; `without_notice` finds the first and the last.
     """
     lines = [f"{_FIRST} {__version__} of {request.source}, status {request.calibration.status}"]
-    lines.append("Metres and radians unless said otherwise; R = Rz(yaw) Ry(pitch) Rx(roll).")
+    lines.append("Metres and radians unless stated otherwise; R = Rz(yaw) Ry(pitch) Rx(roll).")
     for transform in transforms:
         remark = f" {transform.remark}" if transform.remark else ""
         lines.append(
@@ -98,28 +98,28 @@ def notice(request: Request, transforms: Sequence[Transform], extra: Sequence[st
     for name in lidars:
         lines += _lines_of(name, request.calibration.lidars[name])
     lines += [*extra, *(f"ATTENTION: {caveat}" for caveat in caveats(request, lidars)), _LAST]
-    # Names of frames and LiDARs are the user's: none of them may break a line.
+    # Names of frames and LiDARs are user input and must not break a line.
     return "\n".join(" ".join(line.split()) for line in lines)
 
 
 def with_hash(text: str) -> str:
-    """A comment of YAML, Python and the shell."""
+    """Text as a comment of YAML, Python and the shell."""
     return "".join(f"# {line}\n" for line in text.splitlines())
 
 
 def with_xml(text: str) -> str:
-    """A comment of XML, in which two hyphens must not stand together."""
+    """Text as a comment of XML, which must not contain two hyphens in a row."""
     inner = re.sub(r"-(?=-)", "- ", text)
     return f"<!-- {inner} -->\n"
 
 
 def with_c(text: str) -> str:
-    """A comment of C, as GLIM's reader of JSON takes it."""
+    """Text as a comment of C, which GLIM's JSON reader accepts."""
     return f"/* {text.replace('*/', '* /')} */\n"
 
 
 def without_notice(text: str) -> str:
-    """A file without the comment of an earlier export, so that comments do not pile up."""
+    """A text without the comment of an earlier export."""
     marks = (
         rf"^# {_FIRST} \d.*?^# {_LAST}\r?\n",
         rf"<!-- {_FIRST} \d.*?{_LAST} -->\r?\n",
@@ -137,7 +137,7 @@ def _lines_of(name: str, result: LidarResult) -> list[str]:
         f"{axis} {value:.3g} {unit}" + ("" if result.determined[axis] else " (guess)")
         for axis, value, unit in zip(AXES, sigma, ["mrad"] * 3 + ["mm"] * 3, strict=True)
     ]
-    lines = [f"{name}: 1 sigma of the mounting, vehicle axes: {', '.join(parts)}."]
+    lines = [f"{name}: 1 sigma of the extrinsic, vehicle axes: {', '.join(parts)}."]
     if result.time_offset is not None:
         late_s, sigma_s = result.time_offset
         lines.append(f"{name}: its stamps are late by {late_s:.6f} s, 1 sigma {sigma_s:.1g} s.")

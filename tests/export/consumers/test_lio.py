@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export import fast_lio, glim, lio_sam
+from caliv_graph.export.consumers import fast_lio, glim, lio_sam
 from caliv_graph.export.request import Export, ImuExtrinsic
 from caliv_graph.products import Array
 from tests.export.requests import (
@@ -241,7 +241,7 @@ NO_VALUE = "lio_sam:\n  extrinsicTrans: # [0, 0, 0]\n  extrinsicRot: [1, 0, 0, 0
         (
             lio_sam,
             PARAMS.replace("imuRate: 500", "extrinsicRot: []"),
-            "old: 'extrinsicRot' stands in lines 6, 12",
+            "old: 'extrinsicRot' is ambiguous: it is in lines 6, 12",
         ),
         (fast_lio, VELODYNE.replace("    - 0\n", "", 1), "mapping.extrinsic_R in line 6: expected"),
         (lio_sam, NO_VALUE, "old: a value is missing in or above line 2. Write one there"),
@@ -267,6 +267,6 @@ def test_which_lidar_and_whose_imu(consumer: Any) -> None:
     unsaid = ImuExtrinsic(gtsam.Pose3(), "config.yaml", stated=False)
     assert "names no IMU" in consumer.export(replace(request(), imu=unsaid)).warnings[-1]
 
-    with pytest.raises(ExportError, match="needs where the IMU is") as caught:
+    with pytest.raises(ExportError, match="needs the pose of the IMU") as caught:
         consumer.export(request(imu=None))
     assert "--imu x,y,z,roll,pitch,yaw" in str(caught.value)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caliv_graph.export.request import Transform
-from caliv_graph.export.wording import (
+from caliv_graph.export.text import (
     caveats,
     notice,
     number,
@@ -52,13 +52,13 @@ def test_caveats() -> None:
     calibration = calibration_of()
     lines = caveats(request(calibration), calibration.lidars)
     assert lines == [
-        f"LiDAR '{name}': yaw, x (vehicle axes) not determined by the drive: decided by the "
+        f"LiDAR '{name}': yaw, x (vehicle axes) not determined by the drive: values of the "
         "initial guesses"
         for name in calibration.lidars
     ]
     never = unseen(calibration, "rear")
     assert caveats(request(never), ["rear"]) == [
-        "LiDAR 'rear' never saw a target: its mounting is the initial guess"
+        "LiDAR 'rear' never saw a target: its extrinsic is the initial guess"
     ]
     wrong = replace(calibration, status="inconsistent")
     assert "status inconsistent" in caveats(request(wrong), [])[0]

@@ -8,48 +8,36 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import gtsam
 import yaml
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export.edit import YamlFile, with_comment
-from caliv_graph.export.request import DEFAULT_VEHICLE_FRAME, Base, Export, Request, Transform
-from caliv_graph.export.wording import notice, numbers, rpy, with_hash, without_notice
+from caliv_graph.export.request import Base, Consumer, Export, Request, Transform
+from caliv_graph.export.text import notice, numbers, rpy, with_hash
 
 _KEY = "fixed_sensor_pose"
 
 
 def export(request: Request) -> Export:
-    """The `sensors` of a MOLA data source, or `--base` with the poses of its sensors changed.
+    """The `sensors` of a MOLA data source, or `--base` with new poses of its sensors.
 
     Raises:
-        ExportError: no topic is known to tell the sensors by, or `--base` has none of them.
+        ExportError: the topic of a LiDAR is unknown or not in `--base`.
     """
-    parent = request.vehicle_frame or DEFAULT_VEHICLE_FRAME
-    transforms = tuple(
-        Transform(
-            name,
-            parent,
-            request.frame(name) or name,
-            request.T_vehicle_lidar(name),
-            f"{_KEY}: x y z in metres, yaw pitch roll in degrees.",
-        )
-        for name in request.lidars
-    )
+    transforms = request.vehicle_transforms(f"{_KEY}: x y z in metres, yaw pitch roll in degrees.")
     unknown = [name for name in request.lidars if name not in request.topics]
     if unknown:
         raise ExportError(
-            f"mola: tells sensors by their topics, and that of LiDAR '{unknown[0]}' is not known: "
-            f"there is no config.yaml beside {request.source}. Give --config CONFIG.yaml"
+            f"mola: needs the topic of LiDAR '{unknown[0]}', and there is no config.yaml beside "
+            f"{request.source}. Give --config CONFIG.yaml"
         )
     comment = with_hash(notice(request, transforms))
     if request.base is None:
         text = _new(request, transforms)
     else:
-        base = replace(request.base, text=without_notice(request.base.text))
-        text = _changed(base, request, transforms)
+        text = _changed(request.base, request, transforms)
     return Export(with_comment(comment, text).encode(), transforms)
 
 
@@ -62,7 +50,7 @@ def _new(request: Request, transforms: tuple[Transform, ...]) -> str:
     lines = ["sensors:"]
     for transform in transforms:
         lines += [
-            # What JSON quotes is quoted for YAML too.
+            # A JSON string is a valid YAML string.
             f"  - topic: {json.dumps(request.topics[transform.lidar])}",
             "    type: CObservationPointCloud",
             f'    {_KEY}: "{_pose(transform.T_parent_child)}"',
@@ -80,14 +68,14 @@ def _changed(base: Base, request: Request, transforms: tuple[Transform, ...]) ->
         sensors += [(entry.value.value, pose.value) for pose in beside]
     for transform in transforms:
         topic = request.topics[transform.lidar]
-        # A topic may be the default of a variable of the environment: ${TOPIC|'/points'}.
+        # A topic may be the default of an environment variable: ${TOPIC|'/points'}.
         found = [pose for text, pose in sensors if topic in (text, _default(text))]
         if len(found) != 1:
             listed = ", ".join(text for text, _ in sensors) or "none"
             raise ExportError(
                 f"{base.path}: {len(found)} sensors with {_KEY} have topic {topic} of LiDAR "
-                f"'{transform.lidar}', expected one; topics: {listed}. Mend --base, or give "
-                "--lidar to leave the LiDAR out"
+                f"'{transform.lidar}', expected one; topics: {listed}. Correct --base, or leave "
+                "the LiDAR out by --lidar"
             )
         file.set_text(found[0], _pose(transform.T_parent_child))
     return file.edited()
@@ -96,3 +84,6 @@ def _changed(base: Base, request: Request, transforms: tuple[Transform, ...]) ->
 def _default(text: str) -> str:
     inner = text.strip().removeprefix("${").removesuffix("}")
     return inner.partition("|")[2].strip("'\"") if text.strip().startswith("${") else text
+
+
+CONSUMER = Consumer(export, frozenset(("--base", "--frame", "--vehicle-frame")), needs_topics=True)

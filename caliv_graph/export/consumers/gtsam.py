@@ -1,7 +1,7 @@
-"""GTSAM: a joint prior on the extrinsics as an archive, and as a YAML that needs no version.
+"""GTSAM: a joint prior on the extrinsics as an archive, and as a YAML for any version of GTSAM.
 
-Three files (`fusion.archive`): the factors, their values beside them, and the YAML, which has the
-comment: an archive has no place for one.
+Three files (`fusion.archive`): the factors, their values, and the YAML, which has the comment,
+since an archive cannot have one.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import yaml
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export.covariance import joint_covariance
-from caliv_graph.export.request import DEFAULT_VEHICLE_FRAME, Export, Request, Transform
-from caliv_graph.export.wording import notice, with_hash
+from caliv_graph.export.request import Consumer, Export, Request, Transform
+from caliv_graph.export.text import notice, with_hash
 from caliv_graph.fusion.archive import (
     archive_document,
     archive_paths,
@@ -25,16 +25,16 @@ from caliv_graph.fusion.priors import lettered_keys
 
 
 def export(request: Request) -> Export:
-    """A graph of one factor over the extrinsics, and values, as GTSAM serialises them.
+    """A graph of one factor over the extrinsics and its values, serialised by GTSAM.
 
     Raises:
-        ExportError: the letter is none, the covariance has no inverse, or the YAML would have the
-            name of the archive.
+        ExportError: the letter is invalid, the covariance is singular, or archive and YAML would
+            have the same name.
     """
     factors, values_path, document_path = archive_paths(request.out)
     if document_path == factors:
         raise ExportError(
-            f"{request.out}: is the name of the YAML that is written beside the archive. Give "
+            f"{request.out}: would be the name of the archive and of its YAML. Give "
             f"--out {request.out.with_suffix('.gtsam')}"
         )
     calibration = replace(
@@ -47,7 +47,7 @@ def export(request: Request) -> Export:
     transforms = tuple(
         Transform(
             name,
-            request.vehicle_frame or DEFAULT_VEHICLE_FRAME,
+            request.parent,
             name,
             request.T_vehicle_lidar(name),
             f"Variable {request.letter}{i}.",
@@ -69,3 +69,6 @@ def export(request: Request) -> Export:
         transforms,
         beside={values_path: str(values.serialize()).encode(), document_path: text.encode()},
     )
+
+
+CONSUMER = Consumer(export, frozenset(("--letter",)))

@@ -8,8 +8,15 @@ import tempfile
 from pathlib import Path
 
 from caliv_graph.errors import ExportError
-from caliv_graph.export.request import DEFAULT_VEHICLE_FRAME, Export, Request, Transform
-from caliv_graph.export.wording import notice, numbers, quaternion_xyzw, with_hash
+from caliv_graph.export.request import (
+    FRAME_OPTIONS,
+    Consumer,
+    Export,
+    Request,
+    Transform,
+    check_names,
+)
+from caliv_graph.export.text import notice, numbers, quaternion_xyzw, with_hash
 
 FORMS = {".mcap": "mcap", ".py": "launch", ".sh": "lines", ".txt": "lines", "": "lines"}
 """Form by the suffix of the output."""
@@ -21,26 +28,17 @@ def export(request: Request) -> Export:
     """The extrinsics as static transforms from the vehicle frame to the frames of the clouds.
 
     Raises:
-        ExportError: the form follows neither from `form` nor from the name of the output.
+        ExportError: neither `form` nor the name of the output gives the form.
     """
     suffix = request.out.suffix
     form = request.form or FORMS.get(suffix)
     if form not in FORMS.values():
         raise ExportError(
-            f"tf: the form is told by the suffix of --out, .sh, .py or .mcap, and not by "
-            f"'{request.form or suffix}'. Give --form lines, launch or mcap"
+            f"tf: no form for '{request.form or suffix}': the suffix of --out must be .sh, .py or "
+            ".mcap. Give --form lines, launch or mcap"
         )
-    parent = request.vehicle_frame or DEFAULT_VEHICLE_FRAME
-    transforms = tuple(
-        Transform(name, parent, request.frame(name) or name, request.T_vehicle_child(name), "tf2.")
-        for name in request.lidars
-    )
-    for transform in transforms:
-        if [parent, *(other.child for other in transforms)].count(transform.child) > 1:
-            raise ExportError(
-                f"tf: '{transform.child}' would be the name of two frames. Give other names by "
-                "--frame NAME=FRAME or --vehicle-frame FRAME"
-            )
+    transforms = request.vehicle_transforms("tf2.")
+    check_names("tf", transforms)
     if form == "mcap":
         content = _mcap(request, transforms)
     elif form == "launch":
@@ -51,7 +49,7 @@ def export(request: Request) -> Export:
 
 
 def _arguments(transform: Transform) -> list[str]:
-    """What static_transform_publisher takes since ROS 2 Humble: child in parent."""
+    """Arguments of static_transform_publisher since ROS 2 Humble: pose of child in parent."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     pose = transform.T_parent_child
     values = numbers((*pose.translation(), *quaternion_xyzw(pose))).split()
@@ -61,7 +59,7 @@ def _arguments(transform: Transform) -> list[str]:
 
 
 def _lines(request: Request, transforms: tuple[Transform, ...]) -> str:
-    extra = ["Each line is a process of its own that goes on running."]
+    extra = ["Each line starts a process that does not end."]
     lines = [
         shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(transform)])
         for transform in transforms
@@ -97,7 +95,7 @@ def _launch(request: Request, transforms: tuple[Transform, ...]) -> str:
 
 
 def _mcap(request: Request, transforms: tuple[Transform, ...]) -> bytes:
-    """A bare MCAP with one latched message; the comment is in its rosbag2 metadata."""
+    """A single MCAP file with one latched message; the comment is in its rosbag2 metadata."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,
@@ -153,3 +151,6 @@ def _mcap(request: Request, transforms: tuple[Transform, ...]) -> bytes:
             writer.write(connection, request.recorded_ns, data)
         (file,) = folder.glob("*.mcap")
         return file.read_bytes()
+
+
+CONSUMER = Consumer(export, FRAME_OPTIONS | {"--form"})

@@ -1,0 +1,1 @@
+"""The figures of report.html and validation.html, one file per subject."""

@@ -1,0 +1,263 @@
+"""Figures of the trajectory: the drive from above, biases and GNSS residuals, corrections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+from scipy.spatial.transform import Rotation
+
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, Solution
+from caliv_graph.report.figures.drawing import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    PURPLE,
+    SYMBOLS,
+    VERMILLION,
+    Figure,
+    colours,
+    evenly,
+    finish,
+    first_stamp,
+    label,
+    labels,
+    small,
+    stamps_along,
+    to_seconds,
+)
+from caliv_graph.report.residuals import gnss_residuals
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+MOST_SAMPLES = 3000
+"""Points of a line over time."""
+
+
+def path_figure(
+    drive: int,
+    trajectory: VehicleTrajectory,
+    solution: Solution,
+    name: str,
+    lidars: Sequence[str],
+) -> Figure:
+    """The drive from above: path, scans that see the target, the target, GNSS fixes."""
+    stamps = stamps_along(trajectory, 1500)
+    _, t = trajectory.poses_at(stamps)
+    origin = t[0]
+    figure = go.Figure()
+    _line(figure, t[:, 0] - origin[0], t[:, 1] - origin[1], "vehicle", BLACK)
+    if isinstance(trajectory, SmoothedTrajectory):
+        fixes, residuals = gnss_residuals(trajectory)
+        if len(fixes):
+            # The residual is the predicted position minus the fix.
+            _, at = trajectory.poses_at(np.clip(fixes, *trajectory.span_ns))
+            place = at - residuals - origin
+            _dots(
+                figure,
+                place[:, 0],
+                place[:, 1],
+                "GNSS fixes",
+                GREY,
+                "circle-open",
+                5,
+            )
+        rejected = trajectory.gnss_rejected
+        rejected = rejected[
+            (rejected >= trajectory.span_ns[0]) & (rejected <= trajectory.span_ns[1])
+        ]
+        if len(rejected):
+            _, at = trajectory.poses_at(rejected)
+            place = at - origin
+            _dots(
+                figure,
+                place[:, 0],
+                place[:, 1],
+                "dropped GNSS fixes",
+                VERMILLION,
+                "x",
+                10,
+            )
+    colour, shown = colours(lidars), labels(lidars)
+    for i, lidar in enumerate(lidars):
+        seen = np.unique(
+            [
+                c.stamp_ns
+                for r in solution.registrations
+                for c in r.observation.clouds
+                if c.lidar == lidar and c.drive == drive
+            ]
+        ).astype(np.int64)
+        if len(seen):
+            _, at = trajectory.poses_at(np.clip(seen, *trajectory.span_ns))
+            side = 0.12 * i
+            _dots(
+                figure,
+                at[:, 0] - origin[0],
+                at[:, 1] - origin[1] + side,
+                f"{shown[lidar]} sees a target ({len(seen)} scans)",
+                colour[lidar],
+                SYMBOLS[i % len(SYMBOLS)],
+                6,
+            )
+    for r in solution.registrations:
+        if any(c.drive == drive for c in r.observation.clouds):
+            x, y, _ = r.observation.centre_map - origin
+            _dots(
+                figure,
+                np.array([x]),
+                np.array([y]),
+                label(r.observation.name),
+                PURPLE,
+                "star",
+                15,
+            )
+    figure.update_yaxes(scaleanchor="x", title="m")
+    figure.update_xaxes(title="m, from the first pose, map axes", constrain="domain")
+    finish(figure, 480)
+    return Figure(
+        f"path_{drive}",
+        f"Recording '{name}' from above. Scans of further LiDARs are drawn beside the path.",
+        figure,
+    )
+
+
+def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figure:
+    """IMU biases and GNSS residuals over time."""
+    nodes = trajectory.nodes_ns
+    begin = int(nodes[0])
+    some = evenly(len(nodes), MOST_SAMPLES // 6)
+    seconds = to_seconds(nodes[some] - begin)
+    fixes, r = gnss_residuals(trajectory)
+    titles = ["accelerometer bias (mm/s²)", "gyroscope bias (mrad/s)"]
+    if len(fixes):
+        titles.append("GNSS residual (mm)")
+    figure = make_subplots(
+        len(titles), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.09
+    )
+    force_sigma, gyro_sigma = trajectory.bias_sigmas()
+    dashes, axes = ("solid", "dash", "dot"), "xyz"
+    states = trajectory.states
+    for row, (values, sigma) in enumerate(
+        ((states.force_bias, force_sigma), (states.gyro_bias, gyro_sigma)), start=1
+    ):
+        for axis, colour in enumerate((BLUE, VERMILLION, GREEN)):
+            value, spread = 1e3 * values[some, axis], 1e3 * sigma[some, axis]
+            figure.add_scatter(
+                x=np.concatenate([seconds, seconds[::-1]]),
+                y=small(np.concatenate([value + spread, (value - spread)[::-1]])),
+                fill="toself",
+                fillcolor=f"{colour}22",
+                line={"width": 0},
+                mode="lines",
+                hoverinfo="skip",
+                showlegend=False,
+                row=row,
+                col=1,
+            )
+            figure.add_scatter(
+                x=seconds,
+                y=small(value),
+                mode="lines",
+                line={"color": colour, "dash": dashes[axis]},
+                name=f"{axes[axis]} of the IMU",
+                legendgroup=f"bias {axis}",
+                showlegend=row == 1,
+                row=row,
+                col=1,
+            )
+    if len(fixes):
+        few = evenly(len(fixes), MOST_SAMPLES // 3)
+        for axis, (colour, symbol) in enumerate(
+            ((BLUE, "circle"), (VERMILLION, "square"), (GREEN, "diamond"))
+        ):
+            figure.add_scatter(
+                x=to_seconds(fixes[few] - begin),
+                y=small(1e3 * r[few, axis]),
+                mode="markers",
+                marker={"color": colour, "symbol": symbol, "size": 4},
+                name=("east", "north", "up")[axis],
+                row=3,
+                col=1,
+            )
+    figure.update_xaxes(title="seconds", row=len(titles), col=1)
+    finish(figure, 200 * len(titles) + 60)
+    dropped = len(trajectory.gnss_rejected)
+    return Figure(
+        f"motion_{drive}",
+        f"Recording '{name}': IMU biases (bands: 1 sigma)"
+        + (" and residuals of the GNSS fixes used" if len(fixes) else "")
+        + (f"; {dropped} fixes were dropped" if dropped else "")
+        + ". No GNSS was recorded." * (not len(fixes)),
+        figure,
+    )
+
+
+def correction_figure(
+    drive: int, trajectory: VehicleTrajectory, solution: Solution, name: str
+) -> Figure | None:
+    """Change of the vehicle poses by the calibration; None if no pose of this drive was used."""
+    used = [(stamp, T) for (d, stamp), T in solution.T_map_vehicle.items() if d == drive]
+    if not used:
+        return None
+    stamps = np.array([stamp for stamp, _ in used], dtype=np.int64)
+    R, t = trajectory.poses_at(stamps)
+    R_new, t_new = stack([T for _, T in used])
+    back = np.swapaxes(R, 1, 2)
+    rotation = Rotation.from_matrix(back @ R_new).as_rotvec()
+    translation = np.einsum("nij,nj->ni", back, t_new - t)
+    figure = make_subplots(
+        2,
+        1,
+        shared_xaxes=True,
+        vertical_spacing=0.14,
+        subplot_titles=("rotation (mrad)", "position (mm)"),
+    )
+    seconds = to_seconds(stamps - first_stamp(stamps))
+    for row, values in enumerate((rotation, translation), start=1):
+        for axis, (colour, symbol) in enumerate(
+            ((BLUE, "circle"), (VERMILLION, "square"), (GREEN, "diamond"))
+        ):
+            figure.add_scatter(
+                x=seconds,
+                y=small(1e3 * values[:, axis]),
+                mode="markers",
+                marker={"color": colour, "symbol": symbol, "size": 5},
+                name=f"{'xyz'[axis]} (vehicle axes)",
+                legendgroup=f"correction {axis}",
+                showlegend=row == 1,
+                row=row,
+                col=1,
+            )
+    figure.update_xaxes(title="seconds from the first scan used", row=2, col=1)
+    finish(figure, 420)
+    before = "smoothed" if isinstance(trajectory, SmoothedTrajectory) else "given"
+    return Figure(
+        f"correction_{drive}",
+        f"Recording '{name}': vehicle poses of the solved graph minus the {before} input poses.",
+        figure,
+    )
+
+
+def _line(figure: go.Figure, x: Array, y: Array, name: str, colour: str) -> None:
+    figure.add_scatter(
+        x=small(x), y=small(y), mode="lines", line={"color": colour, "width": 1}, name=name
+    )
+
+
+def _dots(
+    figure: go.Figure, x: Array, y: Array, name: str, colour: str, symbol: str, size: int
+) -> None:
+    some = evenly(len(x), MOST_SAMPLES)
+    figure.add_scatter(
+        x=small(x[some]),
+        y=small(y[some]),
+        mode="markers",
+        marker={"color": colour, "symbol": symbol, "size": size},
+        name=name,
+        hovertemplate="%{x:.2f}, %{y:.2f} m",
+    )

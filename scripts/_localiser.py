@@ -30,7 +30,7 @@ from caliv_graph.fusion.monitor import MountAlarm, MountMonitor, extrinsic_innov
 from caliv_graph.fusion.priors import prior_factors
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
 from caliv_graph.scenario.model import Scenario
-from caliv_graph.scenario.shapes import GROUND, World
+from caliv_graph.scenario.world import GROUND, World
 from caliv_graph.trajectory.imu import clean_inertial, preintegrate
 from caliv_graph.trajectory.noise import ImuNoise
 

@@ -22,8 +22,9 @@ from caliv_graph.geometry.se3 import (
 )
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
 from caliv_graph.results.files import read_calibration
-from caliv_graph.scenario.model import Scenario, StandstillDrive, dump_scenario
-from caliv_graph.scenario.shapes import World
+from caliv_graph.scenario.drive_models import StandstillDrive
+from caliv_graph.scenario.model import Scenario, dump_scenario
+from caliv_graph.scenario.world import World
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive
 from scripts import _localiser
 from scripts._localiser import Extrinsics, Localiser, Track, make_map

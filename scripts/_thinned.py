@@ -24,14 +24,9 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray, LidarScan
 from caliv_graph.scenario.drives import VehicleStates
-from caliv_graph.scenario.model import (
-    CropModel,
-    LidarModel,
-    Scenario,
-    SuspensionModel,
-    dump_scenario,
-)
-from caliv_graph.scenario.shapes import GROUND
+from caliv_graph.scenario.model import CropModel, Scenario, SuspensionModel, dump_scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import GROUND
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar, beam_directions
 from caliv_graph.simulation.noise import Stream, random_stream
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedScan

@@ -38,12 +38,7 @@ import caliv_graph
 from caliv_graph.common.progress import PlainProgress
 from caliv_graph.config.load import dump_config
 from caliv_graph.errors import CalivError
-from caliv_graph.scenario.model import (
-    InitialGuessModel,
-    Scenario,
-    dump_scenario,
-    load_scenario,
-)
+from caliv_graph.scenario.model import InitialGuessModel, Scenario, dump_scenario, load_scenario
 from caliv_graph.simulation.recording import simulate_drive
 from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row
 from scripts._tables_statistics import (

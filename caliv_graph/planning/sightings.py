@@ -15,9 +15,11 @@ from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.scenario.drives import Drive, sample_stamps
-from caliv_graph.scenario.model import LidarModel, ObjectModel, Scenario, WorldModel
-from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.scenario.world import make_world
+from caliv_graph.scenario.world_models import ObjectModel, WorldModel
 from caliv_graph.targets.cloud.extract import TOTAL_PER_LIDARS
 from caliv_graph.targets.cloud.views import evenly_spread
 

@@ -18,15 +18,10 @@ from caliv_graph.config.model import LIMIT_KEY
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.planning.predict import Assumptions, Prediction, predict, sigma_of, space
+from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
 from caliv_graph.scenario.drives import Drive, make_drive
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    DriveModel,
-    FigureEightDrive,
-    RampModel,
-    Scenario,
-    SCurveDrive,
-)
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.world_models import RampModel
 
 USUAL_RADIUS_M = 9.16
 USUAL_SPEED_M_S = 2.0

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
     FigureEightDrive,

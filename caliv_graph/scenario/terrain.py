@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import GroundModel, RampModel
+from caliv_graph.scenario.world_models import GroundModel, RampModel
 
 MESH_STEP_M = 0.1
 """Grid of a ramp's mesh: within 0.3 mm of it where it bends by 0.1 per metre."""

@@ -26,7 +26,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, LidarScan
-from caliv_graph.scenario.model import LidarModel, Scenario
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import TOPIC_GNSS, TOPIC_IMU, TOPIC_TWIST, topic_of_lidar
 

@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.scenario.model import CropModel, EdgeModel, LidarModel
-from caliv_graph.scenario.shapes import GROUND, World
+from caliv_graph.scenario.model import CropModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel
+from caliv_graph.scenario.world import GROUND, World
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SingleArray = npt.NDArray[np.float32]

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, TwistSamples
 from caliv_graph.scenario.drives import Drive, VehicleStates, sample_stamps
-from caliv_graph.scenario.model import GnssModel, ImuModel, Scenario
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import GnssModel, ImuModel
 from caliv_graph.simulation.noise import Stream, random_stream
 
 ANGULAR_ACCELERATION_STEP_NS = 50_000

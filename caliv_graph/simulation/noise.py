@@ -17,7 +17,8 @@ from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import PoseNoiseModel
 
 
 class Stream(enum.IntEnum):

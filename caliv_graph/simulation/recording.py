@@ -13,9 +13,10 @@ from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray, LidarScan, MotionData
 from caliv_graph.scenario.drives import Drive, VehicleStates, make_drive, sample_stamps
-from caliv_graph.scenario.model import LidarModel, Scenario
-from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.terrain import make_terrain
+from caliv_graph.scenario.world import World, make_world
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
 from caliv_graph.simulation.motion import (
     SimulatedGnss,

@@ -24,15 +24,10 @@ from caliv_graph.planning.predict import (
 )
 from caliv_graph.planning.sightings import Sighting, placements, sight
 from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, SCurveDrive, StraightDrive
 from caliv_graph.scenario.drives import Drive, make_drive
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    DriveModel,
-    OutageModel,
-    Scenario,
-    SCurveDrive,
-    StraightDrive,
-)
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import OutageModel
 from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD

@@ -15,21 +15,22 @@ from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.predict import Ground, Prediction, predict_drives, sigma_of
-from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
-    ChairModel,
     DriveModel,
     FigureEightDrive,
-    GroundModel,
-    PoleModel,
-    RampModel,
-    Scenario,
     SCurveDrive,
     StandstillDrive,
     StraightDrive,
+)
+from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile
+from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.scenario.world_models import (
+    ChairModel,
+    GroundModel,
+    PoleModel,
+    RampModel,
     WorldModel,
-    load_scenario,
 )
 from tests.drives_with_chair import paper_lidar, paper_scenario
 

@@ -16,7 +16,8 @@ import pytest
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import SolveError
 from caliv_graph.products import GroundObservation
-from caliv_graph.scenario.model import ArcDrive, SuspensionModel, load_scenario
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import SuspensionModel, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 from scripts import _tables_rows as rows

@@ -14,16 +14,13 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, LidarScan, Recording, TargetObservation
-from caliv_graph.scenario.model import (
-    ArcDrive,
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel
+from caliv_graph.scenario.world_models import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
-    EdgeModel,
-    InitialGuessModel,
-    LidarModel,
-    SuspensionModel,
-    SweepModel,
     WalkerModel,
     WorldModel,
 )

@@ -9,7 +9,8 @@ import pytest
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import PoseNoiseModel
 from caliv_graph.simulation.noise import (
     Stream,
     noisy_poses,

@@ -16,7 +16,7 @@ Turn = Literal["left", "right"]
 
 
 class _DriveSection(Section):
-    """What all drives have. The vehicle frame is on the ground at the rear axle."""
+    """Common to all drives. The vehicle frame is on the ground at the rear axle."""
 
     start_xy_m: Pair = Field((0.0, 0.0), description="metres, start in the map")
     start_yaw_deg: Finite = Field(0.0, description="degrees, heading at the start, from map +x")
@@ -49,7 +49,7 @@ class _TimedSection(_MovingSection):
 
 class _TransitionSection(Section):
     transition_m: Positive = Field(
-        3.0, description="metres of path over which one curvature goes over into the other"
+        3.0, description="metres of path over which the curvature changes"
     )
 
 
@@ -62,7 +62,7 @@ class ArcDrive(_TimedSection):
 
 
 class SCurveDrive(_TimedSection, _TransitionSection):
-    """An arc, and from half of the way on the opposite one."""
+    """An arc to one side for half of the path, then one to the other side."""
 
     kind: Literal["s_curve"] = "s_curve"
     radius_m: Positive = Field(9.16, description="metres, turning radius of the rear axle")

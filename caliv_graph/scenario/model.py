@@ -7,6 +7,7 @@ them what a drive determines, and `simulation` draws measurements.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,9 +28,9 @@ from caliv_graph.scenario.world_models import BodyBoxModel, WorldModel
 
 
 class CropModel(Section):
-    """Which beams are cast and written, so that a scan is cheap and small.
+    """Which beams are cast and written. Cropping makes a scan cheap and small.
 
-    A beam that is kept returns what it returns without cropping, noise included.
+    A beam that is kept returns the same as without cropping, noise included.
     """
 
     margin_m: NonNegative = Field(
@@ -42,7 +43,7 @@ class CropModel(Section):
 
 
 class BagModel(Section):
-    """How the bag is written."""
+    """Options of the bag."""
 
     start_time_s: Annotated[int, Field(ge=0)] = Field(
         1_750_000_000, description="seconds since 1970, stamp of the drive's start"
@@ -56,10 +57,10 @@ class BagModel(Section):
 
 
 class SuspensionModel(Section):
-    """What the vehicle frame's height above the ground, nominally zero, does.
+    """Error of the vehicle frame's height above the ground, whose nominal value is zero.
 
-    Heave lifts vehicle and LiDARs while a cloud is taken. It is white from scan to scan and
-    therefore no motion that an IMU could feel: IMU, GNSS and velocity know nothing of it.
+    Heave lifts vehicle and LiDARs while a cloud is taken. It is white from scan to scan. A physical
+    motion cannot be white, so IMU, GNSS and velocity do not measure it.
     """
 
     height_sigma_m: NonNegative = Field(
@@ -70,8 +71,12 @@ class SuspensionModel(Section):
     )
 
 
+UNIFORM_TO_SIGMA = 1.0 / math.sqrt(3.0)
+"""Standard deviation of a uniform draw from -1 to 1."""
+
+
 class InitialGuessModel(Section):
-    """How far the written config's initial guess is off, drawn uniformly per LiDAR and axis."""
+    """Error of the initial guess in the written config, drawn uniformly per LiDAR and axis."""
 
     translation_m: NonNegative = Field(0.1, description="metres, largest error per vehicle axis")
     rotation_deg: NonNegative = Field(3.0, description="degrees, largest roll, pitch, yaw error")
@@ -81,7 +86,7 @@ class Scenario(Section):
     """A simulated drive past one or more targets."""
 
     name: str = Field(
-        pattern=r"^[\w. -]+$", description="what to call it: letters, digits, dots, dashes, spaces"
+        pattern=r"^[\w. -]+$", description="its name: letters, digits, dots, dashes, spaces"
     )
     drive: DriveModel
     lidars: dict[str, LidarModel] = Field(min_length=1, description="by the user's name")
@@ -96,7 +101,7 @@ class Scenario(Section):
     velocity: VelocityModel = VelocityModel()
     gravity_m_s2: Positive = Field(9.80665, description="m/s^2, towards map -z")
     vehicle_body: tuple[BodyBoxModel, ...] = Field(
-        (), description="what the LiDARs see of the vehicle; absent: nothing"
+        (), description="parts of the vehicle that the LiDARs see; absent: none"
     )
     bag: BagModel = BagModel()
     config_target: Literal["region", "search"] = Field(
@@ -140,6 +145,6 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def dump_scenario(scenario: Scenario) -> str:
-    """The effective scenario as YAML that `load_scenario` reads back to the same values."""
+    """The effective scenario as YAML. `load_scenario` reads the same values from it."""
     data = scenario.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

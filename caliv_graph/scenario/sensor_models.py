@@ -33,7 +33,7 @@ class SweepModel(Section):
         "clockwise", description="which way the columns follow one another, seen from above"
     )
     stamp_at: Literal["start", "end"] = Field(
-        "start", description="end of the sweep that the stamp of the cloud tells"
+        "start", description="which end of the sweep the stamp of the cloud marks"
     )
     time_field: TimeField = Field(
         "t",
@@ -53,33 +53,34 @@ class SweepModel(Section):
 
 
 class EdgeModel(Section):
-    """What a beam of finite width returns at an edge, and beams that return nothing."""
+    """Returns of a beam of finite width at an edge, and beams without a return."""
 
     divergence_mrad: Positive = Field(
         3.0, description="milliradians, full width of a beam (2 sigma to either side)"
     )
     gap_m: Positive = Field(
-        0.05, description="metres of range between two parts of a beam that make it an edge"
+        0.05,
+        description="smallest difference of range between two parts of a beam at an edge, metres",
     )
     mixing_m: NonNegative = Field(
-        1.5, description="metres of range up to which the two parts melt into one return"
+        1.5,
+        description="metres, difference of range up to which the two parts merge into one return",
     )
     mixed_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        0.7, description="part of these that come from between the two surfaces"
+        0.7, description="fraction of these returns that lie between the two surfaces"
     )
     lost_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        0.3, description="part of all edge beams that return nothing"
+        0.3, description="fraction of the beams at an edge that return nothing"
     )
     dropout_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        0.0, description="part of all beams that return nothing"
+        0.0, description="fraction of all beams that return nothing"
     )
 
 
 class LidarModel(Section):
-    """A LiDAR. Without `sweep` it takes its whole cloud at one instant, as in CARLA.
+    """A LiDAR. Without `sweep` it takes the whole cloud at one instant, as in CARLA.
 
-    A beam is given by its elevation over the LiDAR's xy plane and its azimuth about the
-    LiDAR's z axis.
+    A beam has an elevation over the LiDAR's xy plane and an azimuth about the LiDAR's z axis.
     """
 
     mounting: PoseConfig = Field(description="true T_vehicle_lidar")
@@ -91,8 +92,8 @@ class LidarModel(Section):
     elevations_deg: tuple[Finite, ...] | None = Field(
         None,
         min_length=2,
-        description="degrees of elevation per channel, ascending, where they are uneven; takes "
-        "the place of vertical_fov_deg and channels",
+        description="degrees of elevation per channel, ascending, for uneven spacing; replaces "
+        "vertical_fov_deg and channels",
     )
     horizontal_resolution_deg: Positive = Field(
         0.18237, description="degrees between two beams of a channel"
@@ -113,8 +114,13 @@ class LidarModel(Section):
 
     @property
     def sweep_s(self) -> float:
-        """Seconds that a cloud takes; 0 if it is taken at one instant."""
+        """Duration of a cloud in seconds; 0 if it is taken at one instant."""
         return 0.0 if self.sweep is None else self.sweep.duration_s or 1.0 / self.rate_hz
+
+    @property
+    def stamps_at_start(self) -> bool:
+        """Whether a cloud's stamp marks the start of its sweep, or its only instant."""
+        return self.sweep is None or self.sweep.stamp_at == "start"
 
     @model_validator(mode="after")
     def _sweep_within_the_period(self) -> LidarModel:
@@ -174,14 +180,14 @@ class PoseNoiseModel(Section):
 
 
 class _SampledSection(Section):
-    """What is published at a rate."""
+    """A sensor that publishes at a rate."""
 
     enabled: bool = Field(True, description="false: the vehicle has none")
     phase_s: NonNegative = Field(0.0, description="seconds, stamp of the first sample")
 
 
 class OrientationModel(Section):
-    """The orientation that the IMU reports: of the IMU in ENU axes."""
+    """The orientation that the IMU reports: its own attitude in ENU axes."""
 
     enabled: bool = Field(True, description="false: messages say that there is none")
     sigma_rad: NonNegative = Field(
@@ -193,7 +199,7 @@ class OrientationModel(Section):
 
 
 class ImuModel(_SampledSection):
-    """An IMU, sampled at instants; the earth does not turn."""
+    """An IMU, sampled at instants. Earth rotation is not modelled."""
 
     mounting: PoseConfig = Field(
         PoseConfig(xyz=(0.0, 0.0, 0.0)), description="true and known T_vehicle_imu"
@@ -228,7 +234,7 @@ class OutageModel(Section):
 
 
 class JumpModel(Section):
-    """A time during which all fixes are off by the same, as by a reflected signal."""
+    """A time during which all fixes have the same offset, as with a reflected signal."""
 
     start_s: NonNegative = Field(description="seconds since the start of the drive")
     duration_s: Positive = Field(description="seconds")
@@ -247,10 +253,10 @@ class GnssModel(_SampledSection):
     )
     vertical_sigma_m: NonNegative = Field(0.02, description="metres, 1 sigma of white noise")
     outlier_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
-        0.0, description="part of the fixes that are outliers"
+        0.0, description="fraction of the fixes that are outliers"
     )
     outlier_sigma_m: NonNegative = Field(
-        2.0, description="metres, 1 sigma of an outlier per axis; no covariance tells of it"
+        2.0, description="metres, 1 sigma of an outlier per axis; the stated covariances exclude it"
     )
     outages: tuple[OutageModel, ...] = Field((), description="absent: always a fix")
     jumps: tuple[JumpModel, ...] = Field((), description="absent: none")

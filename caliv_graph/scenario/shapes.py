@@ -44,18 +44,18 @@ class Mesh:
     triangles: IntArray
 
     def moved(self, T_a_b: gtsam.Pose3) -> Mesh:
-        """The mesh with its vertices taken from frame b into frame a."""
+        """The mesh with its vertices transformed from frame b into frame a."""
         vertices = self.vertices @ T_a_b.rotation().matrix().T + T_a_b.translation()
         return Mesh(vertices, self.triangles)
 
     def signed_volume(self) -> float:
-        """Volume in cubic metres; positive if the mesh is closed and its faces look outwards."""
+        """Volume in cubic metres of a closed mesh; positive if its faces point outwards."""
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one. Solids may overlap: a ray from outside meets the outer skin first."""
+    """Several meshes as one. Solids may overlap: a ray from outside hits the outer skin first."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return Mesh(
         np.vstack([mesh.vertices for mesh in meshes]),
@@ -94,7 +94,7 @@ def solid_between(one: Array, other: Array) -> Mesh:
         ]
     )
     mesh = Mesh(np.vstack([one.reshape(-1, 3), other.reshape(-1, 3)]), triangles)
-    # Which way the faces look depends on which side of `one` the other lies.
+    # The orientation of the faces depends on the side of `one` on which `other` lies.
     return mesh if mesh.signed_volume() > 0.0 else Mesh(mesh.vertices, triangles[:, ::-1])
 
 
@@ -120,13 +120,13 @@ def bar(
         end: centre of the other end.
         begin_size: sides of the rectangle at `begin` along the two axes.
         end_size: sides at `end`.
-        axes: the two of x, y, z (0, 1, 2) that the rectangles span.
+        axes: the two axes of x, y, z (0, 1, 2) that the rectangles span.
     """
     return solid_between(_rectangle(begin, begin_size, axes), _rectangle(end, end_size, axes))
 
 
 def box(size_m: Point) -> Mesh:
-    """A box of this size, its origin in the middle of its bottom face."""
+    """A box of this size; the origin is in the middle of its bottom face."""
     x, y, z = size_m
     return bar((0.0, 0.0, 0.0), (0.0, 0.0, z), (x, y), (x, y))
 
@@ -172,8 +172,8 @@ def _side(side: float) -> list[Mesh]:
 def chair() -> Mesh:
     """A plastic armchair like the CaLiV authors': 0.71 m wide, 0.77 m deep, 1.25 m high.
 
-    Front is +x, origin on the ground below the middle of the seat. Left and right mirror each
-    other; no turn maps it onto itself.
+    Front is +x, the origin is on the ground below the middle of the seat. It has mirror symmetry
+    between left and right and no rotational symmetry.
     """
     return join([_seat(), _backrest(), *_side(1.0), *_side(-1.0)])
 
@@ -181,7 +181,7 @@ def chair() -> Mesh:
 def cylinder(
     begin: Point, end: Point, begin_radius_m: float, end_radius_m: float, sides: int = 24
 ) -> Mesh:
-    """An upright round solid of so many sides between two levels, tapered if the radii differ."""
+    """An upright round solid between two levels, tapered if the radii differ."""
     angle = np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False)
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     low = np.array(begin) + begin_radius_m * rim
@@ -201,7 +201,7 @@ def cylinder(
 
 
 def table(size_m: Point, top_m: float, leg_m: float) -> Mesh:
-    """A table: a top and four square legs at its corners, its origin on the ground below it."""
+    """A table: a top and four square legs at its corners; the origin is on the ground below it."""
     x, y, z = size_m
     top = bar((0.0, 0.0, z - top_m), (0.0, 0.0, z), (x, y), (x, y))
     half_x, half_y = 0.5 * (x - leg_m), 0.5 * (y - leg_m)
@@ -228,9 +228,9 @@ def person() -> Mesh:
 
 
 def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
-    """Ground about the origin, a square at z = 0 with ramps on it, looking up.
+    """Ground around the origin, a square at z = 0 with ramps on it, facing up.
 
-    It alone has no thickness.
+    It is the only mesh without thickness.
     """
     if terrain is None:
         side_m = 2.0 * half_size_m

@@ -1,4 +1,4 @@
-"""The world of a scenario: what a beam can hit, and where it stands at any time."""
+"""The world of a scenario: everything that a beam can hit, and its pose at any time."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ GROUND = "ground"
 VEHICLE = "vehicle"
 
 CARRIER_M = 0.45
-"""Distance of the person who carries an object behind it."""
+"""Distance from an object back to the person who carries it."""
 
 
 @dataclass(frozen=True)
 class Walker:
-    """Somebody who walks to and fro.
+    """A person who walks back and forth.
 
     Attributes:
-        mesh: in a frame that walks along: origin on the ground, x axis in the direction of going.
-        model: where and how fast.
+        mesh: in the walker's frame: origin on the ground, x axis in the direction of walking.
+        model: path and speed.
         ground_z_map: height of the level ground in metres.
         terrain: the ramps on it.
     """
@@ -47,22 +47,20 @@ class Walker:
         if self.terrain is not None:
             z += self.terrain.heights(xy)[0]
         cos, sin = np.where(way < 1.0, 1.0, -1.0) * ((end - begin) / length_m)[:, None]
-        zeros, ones = np.zeros_like(z), np.ones_like(z)
-        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
-        return R.reshape(-1, 3, 3), np.column_stack([xy, z])
+        return _yaw_matrices(cos, sin), np.column_stack([xy, z])
 
 
 @dataclass(frozen=True)
 class Carried:
-    """Something that is carried from place to place, or the person who carries it.
+    """An object that is carried from place to place, or the person who carries it.
 
     Attributes:
-        mesh: origin on the ground; of a person, facing the way.
-        begins_s: (m,) seconds since the start of the drive, picked up.
-        ends_s: (m,) put down again.
-        places_map: (m + 1, 3) metres, where it stands before, between and after.
-        yaws_rad: (m + 1,) its headings there.
-        carrier: whether this is the person: behind what is carried, and elsewhere in between.
+        mesh: origin on the ground; a person faces the direction of walking.
+        begins_s: (m,) start of each move, seconds since the start of the drive.
+        ends_s: (m,) end of each move.
+        places_map: (m + 1, 3) metres, its place before, between and after the moves.
+        yaws_rad: (m + 1,) its heading at each place.
+        carrier: whether this is the person, who is behind the object and absent between moves.
     """
 
     mesh: Mesh
@@ -87,23 +85,28 @@ class Carried:
             yaw = np.arctan2(way[:, 1], way[:, 0])
             behind = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
             place = place - CARRIER_M * behind
-            # Where no ray gets to: below the ground.
+            # Below the ground no ray reaches the person.
             place[~carried, 2] -= 1000.0
-        cos, sin, zeros, ones = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
-        return R.reshape(-1, 3, 3), place
+        return _yaw_matrices(np.cos(yaw), np.sin(yaw)), place
+
+
+def _yaw_matrices(cos: Array, sin: Array) -> Array:
+    """(n, 3, 3) rotations about z, from cosine and sine of the yaw (n,)."""
+    zeros, ones = np.zeros_like(cos), np.ones_like(cos)
+    R: Array = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
+    return R.reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True)
 class World:
-    """What there is to be hit, by name.
+    """Everything that a beam can hit, by name.
 
     Attributes:
-        meshes: what stands, in the map: the ground first, then the objects.
+        meshes: static meshes in the map: the ground first, then the objects.
         targets: names of the objects that serve as targets.
         ground_z_map: height of the level ground in metres.
-        walkers: who walks, and what is carried about.
-        vehicle: the vehicle's body in its own frame; None: it has none.
+        walkers: people who walk, and objects that are carried.
+        vehicle: the vehicle's body in the vehicle frame; None: it has none.
     """
 
     meshes: dict[str, Mesh]
@@ -114,23 +117,23 @@ class World:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in the order that `RayCaster` counts objects in: what stands, walks, drives."""
+        """Names in the order of object indices: static meshes, walkers, vehicle."""
         vehicle = () if self.vehicle is None else (VEHICLE,)
         return (*self.meshes, *self.walkers, *vehicle)
 
     def bounds(self, name: str) -> tuple[Array, Array]:
-        """(3,) lower and (3,) upper corner of an object in the map, wherever it stands."""
+        """(3,) lower and (3,) upper corner of an object in the map, over all its places."""
         vertices = self._vertices(name)
         return vertices.min(axis=0), vertices.max(axis=0)
 
     def bounding_sphere(self, name: str) -> tuple[Array, float]:
-        """(3,) centre in the map and radius in metres of a sphere that holds an object always."""
+        """(3,) centre in the map and radius in metres of a sphere around an object, all places."""
         low, high = self.bounds(name)
         centre = 0.5 * (low + high)
         return centre, float(np.linalg.norm(self._vertices(name) - centre, axis=1).max())
 
     def _vertices(self, name: str) -> Array:
-        """(n, 3) metres, map; of what is carried about at all its places."""
+        """(n, 3) metres, map; of a carried object at all its places."""
         moving = self.walkers.get(name)
         if not isinstance(moving, Carried):
             return self.meshes[name].vertices
@@ -146,8 +149,8 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
     """The world that a scenario describes.
 
     Args:
-        model: what stands and walks.
-        vehicle_body: the boxes that the vehicle consists of.
+        model: ground, objects and walkers.
+        vehicle_body: the boxes that make up the vehicle.
     """
     z = model.ground.height_m
     terrain = make_terrain(model.ground)

@@ -25,10 +25,10 @@ class RampModel(Section):
     xy_m: Pair = Field(description="metres, middle of its top in the map")
     yaw_deg: Finite = Field(0.0, description="degrees, direction of its flanks, from map +x")
     height_m: Positive = Field(description="metres from the ground to the top")
-    flank_m: Positive = Field(description="metres of ground that each flank takes")
+    flank_m: Positive = Field(description="metres, horizontal length of each flank")
     top_m: NonNegative = Field(0.0, description="metres, length of the level top")
     width_m: Positive = Field(
-        6.0, description="metres, width of the level top, beside which flanks come down as well"
+        6.0, description="metres, width of the level top; it has flanks on these two sides too"
     )
 
 
@@ -41,7 +41,7 @@ class GroundModel(Section):
 
 
 class MoveModel(Section):
-    """Somebody carries an object to another place. In between nobody is there."""
+    """A person carries an object to another place. The person is absent between moves."""
 
     begin_s: NonNegative = Field(description="seconds since the start of the drive, picked up")
     end_s: Positive = Field(description="seconds since the start of the drive, put down")
@@ -80,7 +80,7 @@ class ChairModel(_ObjectSection):
 
 
 class BoxModel(_ObjectSection):
-    """A box; flat and long, a wall."""
+    """A box. A long flat one is a wall."""
 
     shape: Literal["box"] = "box"
     size_m: PositiveTriple = Field(description="metres along its x, y, z")
@@ -95,7 +95,7 @@ class PoleModel(_ObjectSection):
 
 
 class CylinderModel(_ObjectSection):
-    """A drum. It looks the same after any turn about its axis: smooth, unlike a pole's 24 sides."""
+    """A drum. It is symmetric about its axis: its mesh has 360 sides, a pole's has 24."""
 
     shape: Literal["cylinder"] = "cylinder"
     radius_m: Positive = Field(0.3, description="metres")
@@ -103,11 +103,11 @@ class CylinderModel(_ObjectSection):
 
 
 class TableModel(_ObjectSection):
-    """A table on four legs: it looks the same after half a turn, and only then."""
+    """A table on four legs. It is symmetric under half a turn only."""
 
     shape: Literal["table"] = "table"
     size_m: PositiveTriple = Field((1.1, 0.7, 0.72), description="metres along its x, y, z")
-    top_m: Positive = Field(0.04, description="metres, how thick its top is")
+    top_m: Positive = Field(0.04, description="metres, thickness of its top")
     leg_m: Positive = Field(0.07, description="metres, side of its square legs")
 
     @model_validator(mode="after")
@@ -126,7 +126,7 @@ ObjectModel = Annotated[
 
 
 class WalkerModel(Section):
-    """A person, 1.75 m tall, who walks to and fro along a line."""
+    """A person, 1.75 m tall, who walks back and forth along a line."""
 
     from_xy_m: Pair = Field(description="metres, one end of the line in the map")
     to_xy_m: Pair = Field(description="metres, the other end")
@@ -140,17 +140,17 @@ class WalkerModel(Section):
 
 
 class WorldModel(Section):
-    """What stands around the drive."""
+    """Everything around the drive."""
 
     ground: GroundModel = GroundModel()
-    objects: dict[str, ObjectModel] = Field({}, description="what stands, by name")
-    walkers: dict[str, WalkerModel] = Field({}, description="who walks, by name")
+    objects: dict[str, ObjectModel] = Field({}, description="objects, by name")
+    walkers: dict[str, WalkerModel] = Field({}, description="people who walk, by name")
     targets: tuple[str, ...] = Field(
         (), description="names of the objects that serve as calibration targets"
     )
     region_margin_m: Positive = Field(
         5.0,
-        description="metres around each target that the written config calls its region",
+        description="metres around each target that the region in the written config includes",
     )
 
     @model_validator(mode="after")

@@ -75,7 +75,7 @@ def plan_table(
         met: whether it keeps them.
         suggestion: the drive that does in the least space, or comes nearest; None: there is none.
     """
-    outlook = prediction.outlook
+    outlook = prediction.covariance
     x, y = prediction.space_m
     parts: list[RenderableType] = [
         Text.assemble(
@@ -112,7 +112,7 @@ def _prediction_document(prediction: Prediction) -> dict[str, Any]:
         "drives": list(prediction.names),
         "duration_s": round(prediction.duration_s, 3),
         "space_m": [round(side, 2) for side in prediction.space_m],
-        **_outlook_document(prediction.outlook),
+        **_outlook_document(prediction.covariance),
         "sightings": [
             {"drive": drive, **_sighting_document(sighting)}
             for drive, sightings in zip(prediction.names, prediction.sightings, strict=True)

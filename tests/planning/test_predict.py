@@ -14,7 +14,8 @@ from caliv_graph.config.model import ExtractionConfig, PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict
-from caliv_graph.planning.predict import Ground, Prediction, predict_drives, sigma_of
+from caliv_graph.planning.assumptions import Ground
+from caliv_graph.planning.predict import Prediction, predict_drives, sigma_of
 from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
@@ -193,7 +194,7 @@ def test_the_table_of_what_drives_leave_open(name: str, ground: Ground) -> None:
     assert len(prediction.undetermined) == COUNTS.get(name, (len(lost),) * 3)[column]
     # S2S is told in all of these.
     assert all(d.together for d in prediction.undetermined)
-    assert all(all(axes.values()) for axes in prediction.outlook.determined_s2s.values())
+    assert all(all(axes.values()) for axes in prediction.covariance.determined_s2s.values())
     assert all(d.remedy for d in prediction.undetermined)
 
 
@@ -210,7 +211,7 @@ def test_null_directions_are_null_without_any_threshold(name: str) -> None:
             first, others, replace(Assumptions(ground=ground, heave_sigma_m=0.0), **exact)
         )
 
-        sigma = prediction.outlook.uncertainty.spectrum
+        sigma = prediction.covariance.uncertainty.spectrum
         lost = COUNTS.get(name, tuple(len(t) for t in TABLE[name]))[column]
         assert (sigma > 50.0).sum() == lost
         if name != "standstill":
@@ -237,11 +238,11 @@ def test_without_a_shared_view_standing_still_tells_nothing_of_the_pair() -> Non
 
     prediction = predict(scenario)
 
-    assert prediction.outlook.lidars == ("front",)
-    assert prediction.outlook.unseeing == ("rear",)
+    assert prediction.covariance.lidars == ("front",)
+    assert prediction.covariance.unseeing == ("rear",)
     guess = np.array([math.radians(3.0)] * 3 + [0.1] * 3) / math.sqrt(3.0)
     assert prediction.sigma_s2v["rear"] == pytest.approx(guess)
-    assert not any(prediction.outlook.calibration.lidars["rear"].determined.values())
+    assert not any(prediction.covariance.calibration.lidars["rear"].determined.values())
     assert "'rear' never sees a target" in " ".join(prediction.warnings)
 
 
@@ -335,7 +336,7 @@ def test_two_drives_tell_more_than_either() -> None:
     both = planned("left arc, right arc", "height")
     for single in DRIVES["left arc, right arc"]:
         alone = predict(single)
-        information = both.outlook.information_data - alone.outlook.information_data
+        information = both.covariance.information_data - alone.covariance.information_data
         assert np.linalg.eigvalsh(information).min() > -1e-3 * np.trace(information)
     assert both.duration_s == pytest.approx(34.0)
 
@@ -381,11 +382,11 @@ def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
     )
     eight = planned("figure-eight", "height", time_offset=True)
 
-    assert min(freed.outlook.offsets_s.values()) > 0.03
+    assert min(freed.covariance.offsets_s.values()) > 0.03
     assert sum("does not tell its time offset" in line for line in freed.warnings) == 2
     # So it is not freed.
     assert freed.sigma_s2s["front", "rear"] == pytest.approx(without.sigma_s2s["front", "rear"])
-    assert max(eight.outlook.offsets_s.values()) < 0.0015
+    assert max(eight.covariance.offsets_s.values()) < 0.0015
     assert eight.undetermined == ()
     assert (
         eight.sigma_s2s["front", "rear"]
@@ -419,14 +420,14 @@ def test_given_poses_average_out_if_white_and_do_not_if_they_wander() -> None:
 # ------------------------------------------------------------------ what is wrong
 
 
-def test_a_round_target_tells_no_heading_by_itself() -> None:
+def test_the_yaw_of_a_round_target_is_unobservable() -> None:
     scenario = DRIVES["figure-eight"][0]
     world = WorldModel(objects={"pole": PoleModel(xy_m=(12.08, 0.0))}, targets=("pole",))
 
     prediction = predict(scenario.model_copy(update={"world": world}))
     chair = predict(scenario)
 
-    assert any("'pole' looks the same after any turn" in line for line in prediction.warnings)
+    assert any("'pole' is symmetric about its axis" in line for line in prediction.warnings)
     # Its place at many distances still does.
     assert prediction.sigma_s2v["front"][2] > chair.sigma_s2v["front"][2]
 

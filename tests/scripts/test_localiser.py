@@ -13,6 +13,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_differe
 from caliv_graph.products import Array, Calibration, LidarResult, LidarScan
 from caliv_graph.results.files import write_calibration
 from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from scripts import _localiser_runs, localiser_example
 from scripts._localiser import Extrinsics, Localiser, Track, WallMap, make_map, register

@@ -15,7 +15,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, GroundConfig, RegistrationConfig
 from caliv_graph.pipeline import Prepared, prepare
 from caliv_graph.planning import Assumptions, predict
-from caliv_graph.planning.predict import Ground
+from caliv_graph.planning.assumptions import Ground
 from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,

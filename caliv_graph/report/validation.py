@@ -119,7 +119,10 @@ def repeatability_sentences(repeated: Repeatability, p_value: float) -> list[str
             told = [
                 (abs(d), s)
                 for d, s, t in zip(
-                    movement.movement[axes], movement.sigma[axes], movement.told[axes], strict=True
+                    movement.movement[axes],
+                    movement.sigma[axes],
+                    movement.determined[axes],
+                    strict=True,
                 )
                 if t
             ]

@@ -11,8 +11,7 @@ from rich.text import Text
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
 from caliv_graph.report.layout import new_table, sentences, titled
-from caliv_graph.validation.surfaces import Pole, Thing, Wall
-from caliv_graph.validation.validate import (
+from caliv_graph.validation.findings import (
     AFTER,
     BEFORE,
     STAGES,
@@ -21,6 +20,7 @@ from caliv_graph.validation.validate import (
     ThingResult,
     Validation,
 )
+from caliv_graph.validation.surfaces import Pole, Thing, Wall
 from caliv_graph.workflows.repeatability import Repeatability
 
 _UNTOLD = "-"

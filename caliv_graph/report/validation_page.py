@@ -24,7 +24,7 @@ from caliv_graph.report.figures import (
 )
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.validation import repeatability_sentences, tables
-from caliv_graph.validation.validate import AFTER, BEFORE, Validation
+from caliv_graph.validation.findings import AFTER, BEFORE, Validation
 from caliv_graph.workflows.repeatability import Repeatability
 
 MOST_POINTS = 2500

@@ -1,4 +1,4 @@
-"""Predicted sigmas against SPEC 8's lower bounds, and verdicts against the table of SPEC 4."""
+"""Predicted sigmas against lower bounds of an ideal estimator, and verdicts against null spaces."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 
 RADIUS_M = 9.16
 
-# ------------------------------------------------------------------ SPEC 8, "Lower bound"
+# ------------------------------------------------------------------ lower bounds
 
 BOUND = Assumptions(
     heave_sigma_m=0.0,
@@ -112,7 +112,7 @@ def test_lower_bounds_of_an_ideal_estimator(name: str, ground: Ground) -> None:
             assert value == pytest.approx(float(text), abs=part * float(text) + half_digit(text))
 
 
-# ------------------------------------------------------------------ SPEC 4, the table
+# ------------------------------------------------------------------ null directions of drives
 
 HEIGHT = "height of all LiDARs together"
 TURN = "rotation of all LiDARs about the turn centre: x and yaw together, 9.16 m per rad"
@@ -363,7 +363,7 @@ def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:
 
 
 def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
-    # SPEC 4: at constant speed on an arc an offset is the same direction; freeing it loses S2S.
+    # At constant speed on an arc an offset has the direction of x/yaw; freeing it loses S2S.
     # Its start and its end, where the speed does change, are not seen.
     scenario = DRIVES["arc"][0]
     rolling = scenario.model_copy(

@@ -187,7 +187,7 @@ def test_with_noise_it_is_the_same_kind_of_cloud() -> None:
 
 
 def test_the_ground_is_told_as_well_as_its_floors() -> None:
-    """SPEC 8: the normal to 0.5 mrad, the distance to 2 mm; the noise adds next to nothing."""
+    """The normal to 0.5 mrad, the distance to 2 mm; the noise adds almost nothing."""
     scenario = scenario_of()
     recording = ThinnedRecording(scenario, selected(), 5)
     found = []

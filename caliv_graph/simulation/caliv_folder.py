@@ -49,7 +49,7 @@ def check_frames(scenario: Scenario) -> None:
             )
         if model.sweep is not None:
             raise ConfigError(
-                f"lidars.{name}.sweep: a CaLiV folder does not tell when each point was taken. "
+                f"lidars.{name}.sweep: a CaLiV folder has no time per point. "
                 "Write a bag (--format bag), or leave 'sweep' out"
             )
 

@@ -102,7 +102,7 @@ def noisy_poses(
 
 
 def perturbed_extrinsic(
-    mounting: PoseConfig, model: InitialGuessModel, rng: np.random.Generator
+    extrinsic: PoseConfig, model: InitialGuessModel, rng: np.random.Generator
 ) -> PoseConfig:
     """An initial guess with uniform errors of position per vehicle axis, and of rotation.
 
@@ -114,7 +114,7 @@ def perturbed_extrinsic(
     """
     shift_m = rng.uniform(-1.0, 1.0, 3) * model.translation_m
     turn_rad = rng.uniform(-1.0, 1.0, 3) * math.radians(model.rotation_deg)
-    T_vehicle_lidar = mounting.pose()
+    T_vehicle_lidar = extrinsic.pose()
     rotation = T_vehicle_lidar.rotation().compose(gtsam.Rot3.RzRyRx(*turn_rad))
     return PoseConfig(
         xyz=_rounded(T_vehicle_lidar.translation() + shift_m),

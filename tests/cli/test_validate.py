@@ -127,7 +127,7 @@ def test_nothing_to_validate_on(tmp_path: Path) -> None:
     assert document["structure"] is False
     assert document["verdict"]["better"] is document["verdict"]["p_value"] is None
     assert document["thickness_m"]["merged"]["after"] is None
-    assert result.stderr.startswith("warning: Nothing can be said: no wall")
+    assert result.stderr.startswith("warning: Nothing can be said: there is no wall")
     assert (tmp_path / "out" / "validation.html").exists()
 
 

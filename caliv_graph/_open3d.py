@@ -1,8 +1,8 @@
-"""The one place that imports open3d: late, for it costs a second, and with its libraries.
+"""The only import of open3d: late, because it takes a second, and with its shared libraries.
 
 open3d 0.20 is linked against libusb-1.0.so.0, which slim images lack. PyPI's `libusb-package`
-carries that library under another file name but with the same SONAME, so that loading it first
-satisfies the linker without apt. libGL, libEGL and libX11 have no such package.
+contains this library under another file name but with the same SONAME. Loading it first satisfies
+the linker without apt. libGL, libEGL and libX11 have no such package.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
     "libgomp.so.1": "libgomp1",
 }
-"""Shared libraries that open3d wants from the system, and the Debian package of each."""
+"""Shared libraries that open3d needs from the system, and the Debian package of each."""
 
 
 def _loads(library: str) -> bool:
@@ -34,7 +34,7 @@ def _loads(library: str) -> bool:
 
 
 def _preload_libusb() -> bool:
-    """Makes libusb available to the linker: the system's, else that of `libusb-package`."""
+    """Loads libusb: the system's, or else that of `libusb-package`."""
     if _loads(LIBUSB):
         return True
     try:
@@ -67,7 +67,7 @@ def import_open3d() -> Any:
 
     Raises:
         CalivError: it is not installed, or a shared library that it needs is missing; names the
-            packages that bring it.
+            packages that contain it.
     """
     have_libusb = _preload_libusb() if sys.platform == "linux" else True
     try:

@@ -15,9 +15,9 @@ Tangent space
     GTSAM's `Pose3`: rotation (3) before translation (3), right perturbation
     `T.retract(d) = T * Exp(d)`. A covariance names its pose, its order and its side:
     `cov_*` is a covariance, `info_*` its inverse, `sigma_*` a standard deviation.
-    *Vehicle axes*: the perturbation of `T_vehicle_lidar` by a small rotation about, and a shift
-    along, the vehicle's axes with the LiDAR's own origin as the centre:
-    `t' = t + dt`, `R' = Exp(dw) R`. It is the right perturbation rotated by `R_vehicle_lidar`.
+    *Vehicle axes*: the perturbation of `T_vehicle_lidar` by a small rotation about the vehicle's
+    axes at the LiDAR's origin and a translation along them: `t' = t + dt`, `R' = Exp(dw) R`.
+    It is the right perturbation rotated by `R_vehicle_lidar`.
 
 Units
     Metres, radians, seconds; stamps are `int` nanoseconds (`stamp_ns`), durations float seconds
@@ -40,7 +40,7 @@ def key_vehicle(index: int) -> int:
 
 
 def key_pose_error(index: int) -> int:
-    """Key of the slow error of the given pose at the i-th stamp used."""
+    """Key of the Gauss-Markov error of the given pose at the i-th stamp used."""
     return int(gtsam.symbol("d", index))
 
 
@@ -60,12 +60,12 @@ def key_bias(index: int) -> int:
 
 
 def key_yaw_bias() -> int:
-    """Key of the turn about the vertical of a trajectory's orientation source, (1,) rad."""
+    """Key of the yaw bias of a trajectory's orientation source, (1,) rad, about map z."""
     return int(gtsam.symbol("y", 0))
 
 
 def key_extrinsic() -> int:
-    """Key of E = T_vehicle_ref, the mounting of the reference LiDAR."""
+    """Key of E = T_vehicle_ref, the extrinsic of the reference LiDAR."""
     return int(gtsam.symbol("e", 0))
 
 
@@ -85,15 +85,15 @@ def key_offset(index: int) -> int:
 
 
 def key_ground(drive: int) -> int:
-    """Key of the ground's plane in a drive: slopes along map x and y, and height, (3,)."""
+    """Key of the ground plane of a drive: slopes along map x and y, and height, (3,)."""
     return int(gtsam.symbol("g", drive))
 
 
 def key_height(drive: int) -> int:
-    """Key of the error of the vehicle's height above ground in a drive, (1,) metres."""
+    """Key of the error of the vehicle's height above ground of a drive, (1,) metres."""
     return int(gtsam.symbol("h", drive))
 
 
 def key_parallel(drive: int) -> int:
-    """Key of the tilt of the ground in the vehicle frame in a drive: its normal's x and y, (2,)."""
+    """Key of the ground's tilt in the vehicle frame of a drive: x and y of its normal, (2,)."""
     return int(gtsam.symbol("p", drive))

@@ -6,11 +6,11 @@ escapes is a defect of the program (exit code 1).
 
 
 class CalivError(Exception):
-    """Base of everything a user can cause and mend."""
+    """Base of all errors that a user can cause and correct."""
 
 
 class ConfigError(CalivError):
-    """The configuration, or a result file given as input, is not what its schema says."""
+    """The configuration, or a result file given as input, violates its schema."""
 
 
 class RecordingError(CalivError):
@@ -18,7 +18,7 @@ class RecordingError(CalivError):
 
 
 class TrajectoryError(CalivError):
-    """The vehicle's motion cannot be had from what was recorded."""
+    """The recorded data do not determine the vehicle's motion."""
 
 
 class TargetError(CalivError):
@@ -34,12 +34,12 @@ class SolveError(CalivError):
 
 
 class ExportError(CalivError):
-    """A result could not be written in the form that was asked for."""
+    """A result could not be written in the requested format."""
 
 
 class OutputError(CalivError):
-    """A result could not be written where it was asked for."""
+    """A result could not be written to the requested place."""
 
 
 class BatchError(CalivError):
-    """A batch cannot run: Dask is missing, or its scheduler or workers are of no use."""
+    """A batch cannot run: Dask is missing, or its scheduler or workers are unusable."""

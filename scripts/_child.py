@@ -1,4 +1,4 @@
-"""One run of the command line in a process of its own: time, CPU and memory without our own."""
+"""Runs the command line in its own process, and measures its time, CPU and memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caliv_graph.errors import CalivError
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-# A process inherits the peak memory of the one that started it; this one is small.
+# A process inherits the peak memory of its parent. This parent is small.
 _LAUNCHER = """
 import json, os, resource, subprocess, sys
 cores, report = int(sys.argv[1]), sys.argv[2]
@@ -32,7 +32,7 @@ with open(report, "w") as file:
     }, file)
 """
 
-# Start-up is what a user waits for whatever the drive: the interpreter and the imports.
+# Start-up is the interpreter and the imports. It does not depend on the drive.
 _RUN = """
 import json, sys, time
 from caliv_graph.cli.main import run
@@ -49,7 +49,7 @@ sys.exit(code)
 
 @dataclass(frozen=True)
 class Usage:
-    """What one run took.
+    """Resources of one run.
 
     Attributes:
         code: its exit code.
@@ -68,7 +68,7 @@ class Usage:
     stages: Mapping[str, tuple[float, float]]
 
     def stage_s(self, *names: str) -> float:
-        """Wall time of some stages together; those that did not take place count nothing."""
+        """Wall time of some stages together; stages that did not run count 0."""
         return sum(self.stages[name][0] for name in names if name in self.stages)
 
 
@@ -78,8 +78,8 @@ def calibrate(config: Path, result: Path, cores: int, data: Sequence[Path] = ())
     Args:
         config: config file.
         result: folder to write to; replaced.
-        cores: that it may use.
-        data: drives instead of that of the config.
+        cores: number of cores that it may use.
+        data: drives that replace the drive of the config.
 
     Raises:
         CalivError: it wrote no result.
@@ -99,9 +99,9 @@ def middle(usages: Sequence[Usage]) -> Usage:
 
 
 def help_s(arguments: Sequence[str], runs: int) -> float:
-    """Wall time of a whole process that only prints its help, the quickest of some, seconds.
+    """Shortest wall time of a process that only prints its help, over several runs, seconds.
 
-    The quickest, for what others do on the machine can only slow it down.
+    The shortest, because other processes can only slow it down.
     """
     command = [sys.executable, "-m", "caliv_graph", *arguments, "--help"]
     times = []
@@ -116,13 +116,13 @@ def run(arguments: Sequence[str], cores: int) -> tuple[int, dict[str, float]]:
     """Runs `caliv-graph` with these arguments; its exit code, and times and memory.
 
     Raises:
-        CalivError: exit code 2, with what it said; or it did not come to an end.
+        CalivError: exit code 2, with its message; or it did not end.
     """
     with tempfile.TemporaryDirectory() as name:
         inner, outer = Path(name) / "inner.json", Path(name) / "outer.json"
         command = [sys.executable, "-c", _RUN, str(inner), *arguments]
         launch = [sys.executable, "-I", "-S", "-c", _LAUNCHER, str(cores), str(outer), *command]
-        # As a user starts it; scripts set this for themselves.
+        # Like a user's environment; the scripts set this variable for themselves.
         environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
         done = subprocess.run(
             launch,
@@ -143,7 +143,7 @@ def run(arguments: Sequence[str], cores: int) -> tuple[int, dict[str, float]]:
 
 
 def read_stages(log: Path) -> dict[str, tuple[float, float]]:
-    """Wall and processor seconds of each stage of a log.jsonl; NaN where it tells none."""
+    """Wall and processor seconds of each stage of a log.jsonl; NaN if the log has none."""
     stages: dict[str, tuple[float, float]] = {}
     for line in map(json.loads, log.read_text(encoding="utf-8").splitlines()):
         if "stage" in line and line["depth"] == 0 and line["seconds"] is not None:

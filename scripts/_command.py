@@ -1,4 +1,4 @@
-"""What the scripts have in common as commands: exit codes, numbers on the command line."""
+"""Common parts of the scripts' command lines: exit codes, numbers, options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Number = TypeVar("Number", int, float)
 
 COMMAND = Path(sys.executable).with_name("caliv-graph")
 
-# A process inherits the peak memory of the one that started it; this one is small.
+# A process inherits the peak memory of its parent. This parent is small.
 LAUNCHER = """
 import json, os, resource, subprocess, sys, time
 cores = int(sys.argv[1])
@@ -36,7 +36,7 @@ print(json.dumps({
 
 @dataclass(frozen=True)
 class Usage:
-    """What one calibration took.
+    """Resources of one calibration.
 
     Attributes:
         code: its exit code.
@@ -54,12 +54,12 @@ class Usage:
 
 
 def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
-    """Runs `caliv-graph calibrate` in a process of its own.
+    """Runs `caliv-graph calibrate` in its own process.
 
     Args:
-        config: to calibrate with.
+        config: config to calibrate with.
         result: folder for the result; an older one is replaced.
-        cores: that it may run on; 0: all.
+        cores: number of cores that it may use; 0: all.
 
     Raises:
         CalivError: it left no result.
@@ -79,11 +79,11 @@ def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
 
 
 def exit_code_of(work: Callable[[], int], interrupted: str = "interrupted") -> int:
-    """Does the work; what goes wrong with its input is one line on stderr and exit code 2.
+    """Runs the work. An error of its input becomes one line on stderr and exit code 2.
 
     Args:
-        work: returns its own exit code.
-        interrupted: what is said on an interrupt, whose exit code is 130.
+        work: function that returns the exit code.
+        interrupted: message on an interrupt, whose exit code is 130.
     """
     try:
         return work()
@@ -114,7 +114,7 @@ def positive(text: str) -> int:
 
 
 def between(kind: Callable[[str], Number], least: Number, most: Number) -> Callable[[str], Number]:
-    """Reads a number of the command line, int or float, that is in a range, ends included."""
+    """Reads a number of the command line, int or float, within a closed range."""
 
     def read(text: str) -> Number:
         value = kind(text)
@@ -122,5 +122,5 @@ def between(kind: Callable[[str], Number], least: Number, most: Number) -> Calla
             raise argparse.ArgumentTypeError(f"must be {least} to {most}")
         return value
 
-    read.__name__ = "integer" if kind is int else "number"  # what argparse says is invalid
+    read.__name__ = "integer" if kind is int else "number"  # the name in argparse's message
     return read

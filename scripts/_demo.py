@@ -1,4 +1,4 @@
-"""The main job with its result explained, by the commands that a user types: see scripts/demo."""
+"""The main job with an explained result, by the commands that a user types: see scripts/demo."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ WIDTH = 100
 SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 TURN_CENTRE = (
-    "On an arc the vehicle only ever turns about one point. Turn all LiDARs about that point, and "
-    "every cloud fits as well as before, to a target that is turned likewise. A drive whose "
-    "curvature changes (an S, a figure-eight) does tell."
+    "On an arc the vehicle turns about one point only. If all LiDARs turn about that point, every "
+    "cloud fits as well as before, to a target that turns with them. A drive with a change of "
+    "curvature (an S, a figure-eight) determines this direction."
 )
 HEIGHT = (
-    "On level ground the vehicle never moves up or down. Lift all LiDARs, and every cloud fits as "
-    "well as before, to a target that is lifted likewise. A tape measure does tell."
+    "On level ground the vehicle never moves up or down. If all LiDARs move up, every cloud fits "
+    "as well as before, to a target that moves up with them. A tape measure determines the height."
 )
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What there is to calibrate."""
+    """A drive to calibrate."""
 
     data: Path
     config: Path
@@ -68,7 +68,7 @@ def main() -> int:
         print(f"error: {e}", file=sys.stderr)
         return 2
     except subprocess.CalledProcessError as e:
-        return e.returncode  # the command has said why
+        return e.returncode  # the command has printed the reason
     except KeyboardInterrupt:
         return 130
 
@@ -119,9 +119,9 @@ def _released_drive(out: Path) -> Drive:
         )
     _say(
         "The drive that the CaLiV authors published: two LiDARs, one looking ahead and one back, "
-        "pass a chair on an arc. Their own config lies beside the clouds, and 'init' takes over "
-        f"what it says of the extrinsics. Here that is the truth; {_shown(RELEASED)} has guesses "
-        "such as a tape measure gives."
+        "pass a chair on an arc. Their own config lies beside the clouds, and 'init' copies its "
+        f"extrinsics. Here these are the truth; {_shown(RELEASED)} has guesses such as a tape "
+        "measure gives."
     )
     out.mkdir(parents=True, exist_ok=True)
     _run("init", data, "--out", out / "authors.yaml", "--force")
@@ -135,9 +135,9 @@ def _released_drive(out: Path) -> Drive:
 
 
 def _calibrate_and_explain(drive: Drive, result: Path, released: bool) -> int:
-    _say("What was recorded, and which LiDAR sees the target when:")
+    _say("The recording, and the scans in which each LiDAR sees the target:")
     _run("inspect", drive.data, "--config", drive.config)
-    _say("The main job, from what was recorded and the guesses to extrinsics:")
+    _say("The main job, from the recording and the guesses to extrinsics:")
     code = _run("calibrate", drive.config, "--out", result, "--force", may_fall_short=True)
     _say("Since the truth is known here, the errors:")
     _run("evaluate", result / "calibration.yaml", drive.truth)
@@ -145,8 +145,8 @@ def _calibrate_and_explain(drive: Drive, result: Path, released: bool) -> int:
     _explain(calibration, load_config(drive.config), read_truth(drive.truth))
     if released:
         _say(
-            "The authors' extrinsics serve as the truth. About 16 mm between the LiDARs, in x and "
-            "y, nobody has explained yet; in y the authors' own program finds the same."
+            "The authors' extrinsics serve as the truth. A difference of about 16 mm between "
+            "the LiDARs, in x and y, is not explained yet; in y the authors' program finds it too."
         )
     _say(f"All files are in {_shown(result)}.")
     return code
@@ -185,17 +185,16 @@ def _explain(calibration: Calibration, config: Config, truth: Mapping[str, gtsam
         )
     if not calibration.undetermined:
         _say(
-            "Every direction was determined by the drive itself: the curvature of its path "
-            "changes, which tells x, y and yaw, and the ground under the wheels tells roll, pitch "
-            "and z."
+            "The drive determines every direction: the change of curvature determines x, y and "
+            "yaw, and the ground under the wheels determines roll, pitch and z."
         )
     if calibration.undetermined:
-        print("\nWhat the drive could not tell, and why")
+        print("\nUndetermined directions, and the reason")
         for direction in calibration.undetermined:
             _say(f"- {direction.text}. {_reason(direction)}".rstrip(), indent="  ")
         _say(
-            "Along these the initial guesses of all LiDARs together decide, and the sigma in "
-            "calibration.yaml is that of the guesses: it says so instead of inventing a number."
+            "Along these the estimate is that of the initial guesses of all LiDARs together, and "
+            "the sigma in calibration.yaml is that of the guesses."
         )
     print("\nCan the sigmas be trusted?")
     nees = [f"{lidar['s2v']['nees']:.1f} ('{n}')" for n, lidar in errors["lidars"].items()]
@@ -208,7 +207,7 @@ def _explain(calibration: Calibration, config: Config, truth: Mapping[str, gtsam
 
 
 def _guessed(calibration: Calibration, config: Config) -> Calibration:
-    """The initial guesses in the place of the estimates, to be evaluated likewise."""
+    """A calibration whose estimates are the initial guesses, for their evaluation."""
     lidars = {
         name: replace(lidar, T_vehicle_lidar=config.lidars[name].initial.pose())
         for name, lidar in calibration.lidars.items()
@@ -229,27 +228,27 @@ def _compare(
         "result off by": _by_axis([*found["rotation_rad"], *found["translation_m"]]),
         "1 sigma": _by_axis(sigma),
     }
-    told = [axis for axis in SHOWN_AXES if determined[axis]]
+    known = [axis for axis in SHOWN_AXES if determined[axis]]
     print(f"\n  {title}")
     headings = [f"{axis} {'mm' if axis in 'xyz' else 'mrad'}" for axis in SHOWN_AXES]
     print(f"  {'':16}{''.join(f'{heading:>11}' for heading in headings)}")
     for label, values in rows.items():
-        sure = SHOWN_AXES if label.startswith("guess") else told
-        # Adding zero takes the sign off a negative zero.
+        sure = SHOWN_AXES if label.startswith("guess") else known
+        # Adding zero removes the sign of a negative zero.
         rounded = {axis: f"{round(value, 1) + 0.0:.1f}" for axis, value in values.items()}
         cells = [rounded[axis] if axis in sure else f"({rounded[axis]})" for axis in SHOWN_AXES]
         print(f"  {label:16}{''.join(f'{cell:>11}' for cell in cells)}")
-    _say(_verdict(told, rows["result off by"], rows["1 sigma"]), indent="  ")
+    _say(_verdict(known, rows["result off by"], rows["1 sigma"]), indent="  ")
 
 
-def _verdict(told: list[str], error: Mapping[str, float], sigma: Mapping[str, float]) -> str:
-    """Which axes are determined, and whether their errors are what their sigmas say."""
-    if not told:
+def _verdict(determined: list[str], error: Mapping[str, float], sigma: Mapping[str, float]) -> str:
+    """The determined axes, and their errors in units of their sigmas."""
+    if not determined:
         return "Determined: nothing."
-    off = {axis: abs(error[axis]) / sigma[axis] for axis in told}
-    worst = max(told, key=lambda axis: off[axis])
-    lost = [axis for axis in SHOWN_AXES if axis not in told]
-    verdict = f"Determined: {', '.join(told)}." if lost else "Determined: all six axes."
+    off = {axis: abs(error[axis]) / sigma[axis] for axis in determined}
+    worst = max(determined, key=lambda axis: off[axis])
+    lost = [axis for axis in SHOWN_AXES if axis not in determined]
+    verdict = f"Determined: {', '.join(determined)}." if lost else "Determined: all six axes."
     if lost:
         verdict += f" Not determined, in brackets: {', '.join(lost)}."
     return f"{verdict} The worst determined axis, {worst}, is {off[worst]:.1f} of its sigmas off."
@@ -267,7 +266,7 @@ def _reason(direction: Direction) -> str:
 
 
 def _shown(path: Path) -> str:
-    """A path as one would type it here."""
+    """A path relative to the current folder, if it is near."""
     near = path.is_relative_to(Path.cwd()) or path.is_relative_to(REPOSITORY.parent)
     return os.path.relpath(path) if near else str(path)
 

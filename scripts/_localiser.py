@@ -1,16 +1,16 @@
 """A sliding-window localiser: IMU, GNSS and LiDAR scans registered to a map, on GTSAM.
 
-It takes the extrinsics of the LiDARs as constants or as variables, and is otherwise the same; scans
-that fit badly have Huber's weight in all cases, or wrong constants would throw it off the map. Made
-to show what a calibration is worth to one; its parts are those of a localiser that drives.
+The extrinsics of the LiDARs are constants or variables; everything else is the same. Scans with
+large innovations have Huber's weight in all cases, because wrong constants would otherwise make it
+lose the map. It measures the effect of a calibration, and has the parts of a real localiser.
 
-How certain a registration is. Point-to-plane ICP minimises sum w_i e_i^2 over the pose, where
+The covariance of a registration. Point-to-plane ICP minimises sum w_i e_i^2 over the pose, where
 e_i = n_i . (T p_i - q_i) and w_i is Tukey's weight. With J_i = [p_i x n_i, n_i] (lidar axes), A =
-sum w_i J_i J_i^T is half its Hessian, and the noise of the points comes through as
-cov = A^-1 (sum w_i^2 s_i^2 J_i J_i^T) A^-1. A beam's noise is along the beam, so that s_i is the
-range noise times the cosine of the angle at which it meets the plane: a beam that grazes the ground
-10 m ahead measures its height to 2 mm, not 10. To this come what a map of samples leaves
-(`REGISTRATION_FLOOR`) and the heave of the vehicle on its springs, which no other sensor sees.
+sum w_i J_i J_i^T is half its Hessian, and the noise of the points propagates to
+cov = A^-1 (sum w_i^2 s_i^2 J_i J_i^T) A^-1. A beam's noise is along the beam, so s_i is the range
+noise times the cosine of the angle of incidence: a beam that grazes the ground 10 m ahead measures
+its height to 2 mm, not 10. The errors of a sampled map (`REGISTRATION_FLOOR`) and the heave of the
+vehicle, which no other sensor measures, are added.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from caliv_graph.fusion.monitor import MountAlarm, MountMonitor, extrinsic_innov
 from caliv_graph.fusion.priors import prior_factors
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
 from caliv_graph.scenario.model import Scenario
-from caliv_graph.scenario.shapes import GROUND, World
+from caliv_graph.scenario.world import GROUND, World
 from caliv_graph.trajectory.imu import clean_inertial, preintegrate
 from caliv_graph.trajectory.noise import ImuNoise
 
@@ -38,41 +38,41 @@ LAG_S = 4.0
 """The smoother's window."""
 
 WALK_SIGMAS = np.repeat([1e-5, 1e-5], 3)
-"""Of a mounting per square root of a second, rad and m: 0.6 mrad and 0.6 mm in an hour. It makes
-the localiser a little too modest about mounts that do not move (NEES 0.95 of a drive becomes 1.05
-with 3e-6). At 1e-6 the factors of Cholesky come out singular, and GTSAM throws."""
+"""Random walk of an extrinsic per square root of a second, rad and m: 0.6 mrad and 0.6 mm in an
+hour. The localiser is slightly conservative about unmoved mounts (NEES 0.95 of a drive; 1.05 with
+3e-6). At 1e-6 the Cholesky factors become singular, and GTSAM throws."""
 
 PRIOR_VELOCITY_M_S = 0.02
 """Sigma of the standing vehicle's velocity."""
 
 FALSE_ALARMS_PER_HOUR = 0.1
-"""Of the mount monitor, at most."""
+"""Upper bound of the mount monitor's false alarms."""
 
 MAP_SPACING_M = 0.2
-"""Between the map's points on walls."""
+"""Spacing of the map's points on walls."""
 
 POLE_SPACING_M = 0.05
 GROUND_SPACING_M = 0.4
 
 STAGES = ((2.5, 1.0), (0.35, 0.05))
-"""Of the registration: distance up to which points are paired, and Tukey's limit, metres."""
+"""Stages of the registration: largest distance of paired points, and Tukey's limit, metres."""
 
 GOOD_FITNESS = 0.9
-"""Part of the points that lie on the map at once, above which the last stage alone will do. Ground
-always fits: where no more does, walls were out of reach."""
+"""Fraction of points on the map above which the last stage alone is sufficient. Ground points are
+always on the map; a lower fraction means that walls were out of reach."""
 
 LEAST_FITNESS = 0.85
-"""Part of the points that lie on the map, below which a registration has failed. All that stands in
-this world is on its map; where cars park, ask for less."""
+"""Fraction of points on the map below which a registration has failed. This world is completely on
+its map; with parked cars, use a lower value."""
 
 HUBER = 4.7
-"""Sigmas beyond which a scan is doubted: one in a thousand of six degrees of freedom."""
+"""Sigmas beyond which a scan is down-weighted: probability 1e-3 with six degrees of freedom."""
 
 MOST_SIGMA_M = 0.05
-"""Of a registration along its least certain direction. A scan of one wall and the ground slides."""
+"""Largest sigma of a registration. A scan of one wall and the ground is undetermined along it."""
 
 REGISTRATION_FLOOR = np.repeat([1e-5, 1e-4], 3)
-"""rad and m, 1 sigma: pairs across an edge, poles of flat sides, iterations that stop."""
+"""rad and m, 1 sigma: pairs across an edge, flat sides of poles, stopping of the iterations."""
 
 
 # ------------------------------------------------------------------ the map
@@ -80,12 +80,12 @@ REGISTRATION_FLOOR = np.repeat([1e-5, 1e-4], 3)
 
 @dataclass(frozen=True)
 class WallMap:
-    """What stands around, as points with normals.
+    """The surroundings as points with normals.
 
     Attributes:
         points_map: (n, 3) metres.
         normals_map: (n, 3) of length 1.
-        cloud: the same as Open3D has it.
+        cloud: the same as a cloud of Open3D.
     """
 
     points_map: Array
@@ -97,8 +97,8 @@ def make_map(world: World, seed: int = 0) -> WallMap:
     """A surveyed map of a simulated world: exact, and sampled.
 
     Args:
-        world: what stands.
-        seed: of where samples lie.
+        world: the world.
+        seed: seed of the samples.
     """
     o3d = import_open3d()
     rng = np.random.default_rng(seed)
@@ -138,12 +138,12 @@ def _samples(corners: Array, spacing_m: float, rng: np.random.Generator) -> tupl
 
 @dataclass(frozen=True)
 class Registered:
-    """A scan on the map.
+    """A scan registered to the map.
 
     Attributes:
-        T_map_lidar: where the LiDAR was.
-        cov: (6, 6) of it, right perturbation, rotation then translation, rad and m.
-        fitness: part of the points that lie on the map.
+        T_map_lidar: the registered pose.
+        cov: (6, 6) its covariance, right perturbation, rotation then translation, rad and m.
+        fitness: fraction of the points on the map.
     """
 
     T_map_lidar: gtsam.Pose3
@@ -154,16 +154,16 @@ class Registered:
 def register(
     scan: LidarScan, T_map_lidar: gtsam.Pose3, walls: WallMap, range_sigma_m: float
 ) -> Registered | None:
-    """Point-to-plane ICP of a scan, by Open3D, with an honest covariance (see the module).
+    """Point-to-plane ICP of a scan by Open3D, with a covariance (see the module).
 
     Args:
         scan: the cloud.
-        T_map_lidar: where the LiDAR is thought to be.
+        T_map_lidar: the predicted pose.
         walls: the map.
         range_sigma_m: noise of the points along their beams.
 
     Returns:
-        None if the scan does not lie on the map.
+        None if the scan is not on the map.
     """
     o3d = import_open3d()
     registration = o3d.pipelines.registration
@@ -199,7 +199,7 @@ def _pairs(result: Any, scan: LidarScan, walls: WallMap) -> tuple[Array, Array, 
 
 
 def _on_map(result: Any, scan: LidarScan, walls: WallMap) -> float:
-    """Part of the points that lie on a surface of the map, as Tukey has it."""
+    """Fraction of the points on a surface of the map, by Tukey's weight."""
     if not len(result.correspondence_set):
         return 0.0
     distance_m = _pairs(result, scan, walls)[2]
@@ -207,14 +207,14 @@ def _on_map(result: Any, scan: LidarScan, walls: WallMap) -> float:
 
 
 def _covariance(result: Any, scan: LidarScan, walls: WallMap, range_sigma_m: float) -> Array | None:
-    """See the module; None where the map does not hold the scan in place."""
+    """See the module; None if the map does not determine the scan's pose."""
     points, normals, distance_m = _pairs(result, scan, walls)
     weight = np.maximum(1.0 - (distance_m / STAGES[-1][1]) ** 2, 0.0) ** 2
     J = np.hstack([np.cross(points, normals), normals])
     along = np.einsum("ni,ni->n", points, normals) / np.linalg.norm(points, axis=1)
     sigma = range_sigma_m * along
     hessian = (J * weight[:, None]).T @ J
-    # A guard for the inverse; the verdict is below.
+    # For the inverse only; the limit is checked below.
     if np.linalg.eigvalsh(hessian)[0] < (0.5 * range_sigma_m / MOST_SIGMA_M) ** 2:
         return None
     inverse = np.linalg.inv(hessian)
@@ -234,16 +234,16 @@ Extrinsics = Mapping[str, gtsam.Pose3] | Calibration
 
 @dataclass
 class Track:
-    """What a localiser said, one row per keyframe, each of the newest pose.
+    """Estimates of a localiser, one row per keyframe, each of the newest pose.
 
     Attributes:
         stamps_ns: nanoseconds.
         T_map_vehicle: estimates.
         cov: (6, 6) each, right perturbation, rotation then translation.
-        registered: each scan's LiDAR, registration and stamp.
-        innovations: chi-square of each of these scans against what was predicted.
-        alarms: of the monitor, every scan that called for one.
-        left_out: scans that the localiser did without.
+        registered: LiDAR, stamp and registration of each scan.
+        innovations: chi-square of each of these scans against the prediction.
+        alarms: alarms of the monitor.
+        left_out: number of scans that the localiser left out.
     """
 
     stamps_ns: list[int] = field(default_factory=list)
@@ -268,16 +268,16 @@ class Localiser:
         first_ns: int,
         keyframes_per_s: float,
     ) -> None:
-        """Starts where the vehicle stands.
+        """Starts at standstill.
 
         Args:
             motion: IMU with orientation, and GNSS.
-            scenario: noise of the sensors, as their data sheets state it.
+            scenario: noise of the sensors, as in their data sheets.
             datum: latitude, longitude (degrees) and altitude (m) of the map's origin.
             walls: the map.
             extrinsics: poses: constants; a calibration: variables with its joint prior, watched.
-            first_ns: stamp of the first keyframe; up to there the vehicle stands.
-            keyframes_per_s: scans per second that will be handed in.
+            first_ns: stamp of the first keyframe; the vehicle stands until then.
+            keyframes_per_s: scans per second.
         """
         assert motion.imu is not None
         assert motion.gnss is not None
@@ -307,7 +307,7 @@ class Localiser:
     # -------------------------------------------------------------- start
 
     def _start(self, motion: MotionData) -> None:
-        """Priors from what the sensors said while the vehicle stood."""
+        """Priors from the measurements at standstill."""
         imu, gnss, first_ns = motion.imu, self._scenario.gnss, self._first_ns
         assert imu is not None
         assert imu.orientation_xyzw is not None
@@ -322,7 +322,7 @@ class Localiser:
         turn = self._scenario.imu.orientation.sigma_rad / math.sqrt(len(xyzw))
         shift = self._gnss_sigmas() / math.sqrt(len(places))
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        # The position is the antenna's business, a lever arm away.
+        # The antenna measures the position, at a lever arm.
         known = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([turn, 1e3], 3))
         graph.add(gtsam.PriorFactorPose3(_x(0), pose, known))
         graph.add(
@@ -358,10 +358,10 @@ class Localiser:
     # -------------------------------------------------------------- each keyframe
 
     def step(self, scan: LidarScan) -> None:
-        """One keyframe: predict, register the scan, take it in.
+        """One keyframe: predict, register the scan, update.
 
         Args:
-            scan: later than all before it.
+            scan: later than all earlier scans.
         """
         predicted = self._predict(scan)
         T_vehicle_lidar = self._mounting(scan.lidar)
@@ -378,7 +378,7 @@ class Localiser:
         self.track.cov.append(np.asarray(self._smoother.marginalCovariance(_x(self._k))))
 
     def _predict(self, scan: LidarScan) -> gtsam.Pose3:
-        """Brings the smoother to a scan's stamp by IMU and GNSS."""
+        """Propagates the smoother to a scan's stamp with IMU and GNSS."""
         before, k, nodes = self._k, self._k + 1, np.array([self._stamp_ns, scan.stamp_ns])
         gravity = self._scenario.gravity_m_s2
         (measured,) = preintegrate(
@@ -424,7 +424,7 @@ class Localiser:
         T_vehicle_lidar: gtsam.Pose3,
         found: Registered,
     ) -> None:
-        """Adds a registered scan, unless the monitor finds it suspicious."""
+        """Adds a registered scan unless the monitor finds it suspicious."""
         up_lidar = found.T_map_lidar.rotation().matrix()[2]
         heave = self._scenario.suspension.heave_sigma_m * np.concatenate([np.zeros(3), up_lidar])
         cov = found.cov + np.outer(heave, heave)
@@ -439,8 +439,8 @@ class Localiser:
             if self._monitor.suspicious(innovation):
                 self.track.left_out += 1
                 return
-        # Huber's weight, of the innovation: a robust noise model would weigh the error before the
-        # update, which is as large as the prediction is uncertain.
+        # Huber's weight of the innovation. A robust noise model would use the error before the
+        # update, which is as large as the prediction's uncertainty.
         cov = cov * max(1.0, math.sqrt(innovation.chi2) / HUBER)
         graph = gtsam.NonlinearFactorGraph()
         if self._mounted:
@@ -456,7 +456,7 @@ class Localiser:
         self._update(graph, gtsam.Values(), [])
 
     def _cov_predicted(self, lidar: str) -> Array:
-        """(12, 12) of pose and mounting, before the scan; a constant is certain."""
+        """(12, 12) covariance of pose and extrinsic before the scan; that of a constant is zero."""
         isam, cov = self._smoother.getISAM2(), np.zeros((12, 12))
         if not self._mounted:
             cov[:6, :6] = isam.marginalCovariance(_x(self._k))
@@ -498,5 +498,5 @@ def _b(k: int) -> int:
 
 
 def _m(lidar: int, k: int) -> int:
-    """Key of a LiDAR's mounting as of a keyframe; a million keyframes each."""
+    """Key of a LiDAR's extrinsic at a keyframe, up to a million keyframes each."""
     return int(gtsam.symbol("m", 1_000_000 * lidar + k))

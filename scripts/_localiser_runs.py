@@ -1,4 +1,4 @@
-"""Drives of the localiser example: what is simulated, run, measured and kept of each."""
+"""Drives of the localiser example: simulation, runs, measures and cached results."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ from caliv_graph.geometry.se3 import (
 )
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
 from caliv_graph.results.calibration_file import read_calibration
-from caliv_graph.scenario.model import Scenario, StandstillDrive, dump_scenario
-from caliv_graph.scenario.shapes import World
+from caliv_graph.scenario.drive_models import StandstillDrive
+from caliv_graph.scenario.model import Scenario, dump_scenario
+from caliv_graph.scenario.world import World
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedTruth, simulate_drive
 from scripts import _localiser
 from scripts._localiser import Extrinsics, Localiser, Track, make_map
 
 KEYFRAME_S = 0.5
-"""Between keyframes. The LiDARs take turns: scans taken together would share the heave."""
+"""Time between keyframes. The LiDARs alternate, because simultaneous scans share the heave."""
 
 SEED_OF_DRIVES = 10_000
-"""Added to the seeds, so that no drive shares its noise with one that was calibrated on."""
+"""Added to the seeds, so that no drive shares its noise with a calibrated drive."""
 
 VARIANTS = {
     "initial": "initial guess, constants",
@@ -41,11 +42,11 @@ VARIANTS = {
 }
 
 Run = dict[str, Any]
-"""Of one localiser on one drive, plain values only."""
+"""Result of one localiser on one drive, plain values only."""
 
 
 class KnockedRecording:
-    """A drive in the middle of which a mount is knocked; otherwise the same, noise included."""
+    """A drive with a mount that is knocked; everything else, noise included, is unchanged."""
 
     def __init__(
         self, scenario: Scenario, seed: int, lidar: str, turn_rad: Array, after_s: float
@@ -54,8 +55,8 @@ class KnockedRecording:
 
         Args:
             scenario: the drive.
-            seed: of all that is drawn.
-            lidar: whose mount is knocked.
+            seed: seed of all draws.
+            lidar: LiDAR whose mount is knocked.
             turn_rad: (3,) rotation vector about the LiDAR's own origin, vehicle axes.
             after_s: seconds since the start of the drive.
         """
@@ -73,12 +74,12 @@ class KnockedRecording:
 
     @property
     def truth(self) -> SimulatedTruth:
-        """What is true up to the knock; of the vehicle's poses, throughout."""
+        """Truth before the knock. The vehicle's poses are true for the whole drive."""
         return self._before.truth
 
     @property
     def world(self) -> World:
-        """What stands around."""
+        """The world around the drive."""
         return self._before.world
 
     def motion(self) -> MotionData:
@@ -99,14 +100,13 @@ class KnockedRecording:
 
 @dataclass(frozen=True)
 class Task:
-    """What is run of a seed.
+    """The runs of a seed.
 
     Attributes:
         scenario: the drive.
-        calibration: of the vehicle; from whichever drives.
-        knock_deg: how far a mount is turned; 0: no such drive.
-        draw: whether the errors of the calibration are drawn anew, from what it says of them, or
-            stay those that it has.
+        calibration: file of a calibration of the vehicle, from any drives.
+        knock_deg: rotation of the knocked mount; 0: no drive with a knock.
+        draw: whether the errors of the calibration are drawn from its covariance, or stay its own.
     """
 
     scenario: Scenario
@@ -115,7 +115,7 @@ class Task:
     draw: bool
 
     def digest(self) -> str:
-        """Of all that the outcome depends on, this project's estimator aside."""
+        """Digest of everything that the result depends on, except this project's estimator."""
         text = hashlib.sha256(dump_scenario(self.scenario).encode())
         text.update(self.calibration.read_bytes())
         text.update(repr((self.knock_deg, self.draw)).encode())
@@ -126,7 +126,7 @@ class Task:
 
 
 def cached_runs(task: Task, seed: int, folder: Path) -> dict[str, Run]:
-    """The runs of a seed: those kept in `folder`, or made now."""
+    """The runs of a seed: cached in `folder`, or made now."""
     path = folder / f"seed-{seed}-{task.digest()}.json"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ def runs(task: Task, seed: int) -> dict[str, Run]:
 
 
 def knocked_run(task: Task, seed: int, calibration: Calibration) -> Run:
-    """The localiser with priors, in mid-drive of which one mount is turned about a random axis."""
+    """The localiser with priors on a drive with one mount rotated about a random axis."""
     names = list(task.scenario.lidars)
     lidar = names[seed % len(names)]
     axis = np.random.default_rng([seed, 1]).normal(size=3)
@@ -166,7 +166,7 @@ def knocked_run(task: Task, seed: int, calibration: Calibration) -> Run:
 
 
 def drawn(calibration: Calibration, truth: Mapping[str, gtsam.Pose3], seed: int) -> Calibration:
-    """A calibration that errs as this one says of itself: drawn about the truth."""
+    """A calibration with errors drawn from this one's covariance about the truth."""
     values, vectors = np.linalg.eigh(calibration.cov_joint)
     normal = np.random.default_rng([seed, 0]).normal(size=len(values))
     error = vectors @ (np.sqrt(np.maximum(values, 0.0)) * normal)
@@ -220,7 +220,7 @@ def keyframes(
 
 
 def measured(track: Track, truth: SimulatedTruth) -> Run:
-    """What a track is worth, against the truth."""
+    """Errors and consistency of a track against the truth."""
     true = truth.T_map_vehicle(np.array(track.stamps_ns))
     errors = np.array(
         [vehicle_axes_difference(a, b) for a, b in zip(track.T_map_vehicle, true, strict=True)]
@@ -261,7 +261,7 @@ def _nees(errors: Array, cov: Array, axes: slice) -> list[float]:
 
 
 def _registration_nees(track: Track, truth: SimulatedTruth) -> list[float]:
-    """Of the registrations alone, against where the LiDARs truly were; not of a knocked mount."""
+    """NEES of the registrations against the true LiDAR poses, without a knocked mount."""
     out = []
     for name, stamp_ns, found in track.registered:
         (pose,) = truth.T_map_vehicle(np.array([stamp_ns]))

@@ -1,10 +1,10 @@
-"""The paper's own estimator, written anew: the baseline that benchmarks compare with.
+"""The paper's own estimator, reimplemented: the baseline of the benchmarks.
 
 UKF poses, joint registration with isotropic components (`_paper_registration`), the error on the
 corners of the target's oriented bounding box, the percentile filter and Powell's method in two
-stages (the paper's section III). It is plain, and favoured where the paper leaves a choice: the
-target is cut out by this project's extraction, components start at the target, and numbers are
-worked out in arrays, so that its time is the method's and not the interpreter's.
+stages (the paper's section III). Where the paper leaves a choice, the better one is taken: the
+target is extracted by this project, components start at the target, and all computations are on
+arrays, so that its time is that of the method and not of the interpreter.
 """
 
 from __future__ import annotations
@@ -45,23 +45,23 @@ from scripts._paper_registration import (
 from scripts._ukf import filter_trajectory
 
 PERCENTILE = 10.0
-"""The paper's k."""
+"""Percentile k of the paper's filter."""
 
 
 @dataclass(frozen=True)
 class PaperResult:
-    """What the paper's estimator finds.
+    """Result of the paper's estimator.
 
     Attributes:
-        T_vehicle_lidar: of every LiDAR that saw the target: stage 2, with the S2S of stage 1.
+        T_vehicle_lidar: of every LiDAR that saw the target, from stage 2 and the S2S of stage 1.
         T_lidar_pairs: per (from, to) `T_to_from` of stage 1, `to` being the reference.
         T_target_lidar: of every cloud, as registered.
         means_target: (K, 3) metres, the reconstructed target.
         corners_target: (8, 3) metres, corners of its oriented bounding box.
         seconds: wall time of `registration`, `optimisation` and `total`; from a recording also of
             `ukf` (nearly none if poses were given) and `extraction` (reading included).
-        iterations: of the registration.
-        evaluations: of the cost, in stage 1 and stage 2.
+        iterations: iterations of the registration.
+        evaluations: evaluations of the cost in stage 1 and stage 2.
     """
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
@@ -83,14 +83,14 @@ def paper_from_recording(
     iterations: int = ITERATIONS,
     percentile: float = PERCENTILE,
 ) -> PaperResult:
-    """Calibrates a drive as the paper does.
+    """Calibrates a drive with the paper's method.
 
     Args:
         recording: with IMU, orientation, GNSS and velocity, or with poses.
         config: topics, guesses, region, noise.
-        seed: of where the components start.
-        components: of the mixture.
-        iterations: of the registration.
+        seed: seed of the components' start.
+        components: number of components of the mixture.
+        iterations: iterations of the registration.
         percentile: k of the filter.
 
     Raises:
@@ -143,15 +143,15 @@ def paper_estimator(
     """Calibrates from the target's points.
 
     Args:
-        clouds: of one target.
-        T_map_vehicle: per LiDAR and stamp of a cloud.
-        guesses: `T_vehicle_lidar` that clouds are pre-aligned with; stage 2 keeps the translation
-            of the reference's.
+        clouds: clouds of one target.
+        T_map_vehicle: pose per LiDAR and stamp of a cloud.
+        guesses: `T_vehicle_lidar` for the pre-alignment; stage 2 keeps the translation of the
+            reference.
         reference: the paper's L2.
-        components: of the mixture.
-        iterations: of the registration.
+        components: number of components of the mixture.
+        iterations: iterations of the registration.
         percentile: k of the filter.
-        seed: of where the components start.
+        seed: seed of the components' start.
 
     Raises:
         TargetError: the reference has no cloud.
@@ -172,14 +172,14 @@ def paper_estimator(
         T.transformFrom(cloud.points_lidar.T).T
         for T, cloud in zip(pre_aligned, clouds, strict=True)
     ]
-    # GMMCalib is told where the target is; here it is where the guesses have it.
+    # GMMCalib needs the target's position; here it follows from the guesses.
     centre = np.mean([p.mean(axis=0) for p in points], axis=0)
     mixture = register_clouds(
         [p - centre for p in points],
         cube_components(components, np.random.default_rng(seed)),
         iterations,
     )
-    # The registration moves clouds that the pre-alignment has put into the map, less the centre.
+    # The registration moves clouds in the map, relative to the centre.
     T_target_map = unstack(mixture.R, mixture.t - mixture.R @ centre)
     T_target_lidar = tuple(T.compose(pre) for T, pre in zip(T_target_map, pre_aligned, strict=True))
     registered = time.perf_counter()
@@ -216,7 +216,7 @@ def paper_estimator(
 
 
 def oriented_box(points: Array) -> Array:
-    """Corners (8, 3) of the oriented bounding box of points (n, 3), as open3d makes it.
+    """Corners (8, 3) of open3d's oriented bounding box of points (n, 3).
 
     Raises:
         RegistrationError: the points are flat.
@@ -238,7 +238,7 @@ def pairwise_errors(corners_map: Array) -> Array:
     """The paper's e for every pair of clouds.
 
     Args:
-        corners_map: (n, 8, 3) metres, the box's corners as each cloud has them in the map.
+        corners_map: (n, 8, 3) metres, the box's corners in the map according to each cloud.
 
     Returns:
         (n (n - 1) / 2,) m^2, sums over the corners of their squared distances.
@@ -247,17 +247,17 @@ def pairwise_errors(corners_map: Array) -> Array:
 
 
 def within_percentiles(errors: Array, percentile: float) -> Array:
-    """The errors but those below the k-th or above the (100 - k)-th percentile."""
+    """The errors from the k-th to the (100 - k)-th percentile."""
     low, high = np.percentile(errors, [percentile, 100.0 - percentile])
     return np.asarray(errors[(errors >= low) & (errors <= high)])
 
 
 @dataclass(frozen=True)
 class Minimisation:
-    """The paper's equation 5: which extrinsics let all clouds agree where the target is.
+    """The paper's equation 5: the extrinsics with which all clouds agree on the target's place.
 
-    Unknowns are in metres and degrees, as in the authors' program: Powell's method looks along one
-    at a time, and begins with steps of one.
+    Unknowns are in metres and degrees, as in the authors' program: Powell's method searches along
+    one unknown at a time and starts with unit steps.
 
     Attributes:
         corners_lidar: (n, 8, 3) metres, the box's corners, in the frame of each cloud's LiDAR by
@@ -316,14 +316,14 @@ class Minimisation:
         return pairwise_errors(corners + t_map_lidar[:, None])
 
     def cost(self, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> float:
-        """The sum of the errors that the filter leaves, m^2."""
+        """The sum of the errors after the filter, m^2."""
         return float(within_percentiles(self.errors(T_vehicle_lidar), self.percentile).sum())
 
     def stage_1(self) -> tuple[dict[str, gtsam.Pose3], int]:
-        """S2S of every other LiDAR, the reference's mounting being free as well.
+        """S2S of every other LiDAR, with the reference's extrinsic free as well.
 
         Returns:
-            Per LiDAR its pose in the frame of the reference, and how often the cost was evaluated.
+            Per LiDAR its pose in the frame of the reference, and the number of evaluations.
         """
         others = self.lidars[:-1]
         if not others:
@@ -346,13 +346,14 @@ class Minimisation:
         return pairs_of(np.asarray(found.x)), int(found.nfev)
 
     def stage_2(self, pairs: Mapping[str, gtsam.Pose3]) -> tuple[gtsam.Pose3, int]:
-        """Rotation of the reference, S2S as found.
+        """Rotation of the reference, with S2S fixed.
 
-        The authors' program turns the LiDAR about the vehicle's origin, which moves it; "errors of
-        the translation are fixed to zero" is taken at its word: it stays where the guess has it.
+        The authors' program rotates the LiDAR about the vehicle's origin, which moves it. Here the
+        translation stays at the guess, as the paper says: "errors of the translation are fixed to
+        zero".
 
         Returns:
-            Its mounting, and how often the cost was evaluated.
+            Its extrinsic, and the number of evaluations of the cost.
         """
         held = np.zeros(3)
 
@@ -374,7 +375,7 @@ class Minimisation:
 
 
 def perturbed(T_vehicle_lidar: gtsam.Pose3, x: Array) -> gtsam.Pose3:
-    """A mounting moved by x, y, z (m) and turned by roll, pitch, yaw (degrees), vehicle axes."""
+    """An extrinsic moved by x, y, z (m) and rotated by roll, pitch, yaw (degrees), vehicle axes."""
     roll, pitch, yaw = np.radians(x[3:])
     turn = gtsam.Rot3.RzRyRx(roll, pitch, yaw)
     return gtsam.Pose3(
@@ -383,22 +384,22 @@ def perturbed(T_vehicle_lidar: gtsam.Pose3, x: Array) -> gtsam.Pose3:
 
 
 def _powell(cost: Any, unknowns: int) -> Any:
-    """Powell's method from zero, scipy's tolerances as they are: the paper names none."""
+    """Powell's method from zero with scipy's default tolerances: the paper names none."""
     return minimize(cost, np.zeros(unknowns), method="Powell")
 
 
 def vehicle_poses(motion: MotionData, config: Config, stamps_ns: IntArray) -> GivenTrajectory:
-    """Filtered poses at the clouds and at the IMU's samples, or the poses that were given."""
+    """Filtered poses at the clouds and at the IMU's samples, or the given poses."""
     if takes_given_poses(motion, config):
         return GivenTrajectory(given_trajectory(motion))
     if motion.imu is None or motion.imu.orientation_xyzw is None:
         raise TrajectoryError(f"{motion.name}: the paper's filter needs an IMU with orientation")
     if motion.gnss is None or motion.twist is None:
         raise TrajectoryError(f"{motion.name}: the paper's filter needs GNSS and velocity")
-    # A cloud that takes time is put together between the IMU's samples.
+    # The clouds of a sweep are deskewed with poses at the IMU's samples.
     wanted = np.union1d(stamps_ns, motion.imu.stamps_ns)
     R, t, _ = filter_trajectory(motion, config, wanted)
-    # The filter has no pose before it starts, nor after the IMU ends.
+    # The filter has no pose before its start and after the end of the IMU data.
     wanted = wanted[wanted <= motion.imu.stamps_ns[-1]]
     if len(R) < 2:
         raise TrajectoryError(f"{motion.name}: the paper's filter has {len(R)} pose(s), needs 2")
@@ -406,7 +407,7 @@ def vehicle_poses(motion: MotionData, config: Config, stamps_ns: IntArray) -> Gi
 
 
 def _best_seen(observations: Sequence[TargetObservation], config: Config) -> TargetObservation:
-    """The target that the LiDAR which sees it least has most clouds of: the paper knows one."""
+    """One target, as in the paper: that with the largest minimum number of clouds per LiDAR."""
     names = config.lidar_order()
 
     def rank(observation: TargetObservation) -> tuple[int, int]:

@@ -1,9 +1,9 @@
-"""Joint registration as GMMCalib does it: the first half of the paper's estimator, see `_paper`.
+"""Joint registration of GMMCalib, the first half of the paper's estimator, see `_paper`.
 
-Isotropic Gaussian components and one uniform outlier class explain the points of all clouds
-(Evangelidis & Horaud 2018; SPEC 3). What the paper leaves open is as in GMMCalib's published
-settings: components that start on the faces of a cube about the target, with the squared diagonal
-of all points' bounding box as variance, and a fixed number of iterations.
+The points of all clouds follow a mixture of isotropic Gaussian components and one uniform outlier
+class (JRMPC; Evangelidis & Horaud 2018). What the paper leaves open follows GMMCalib's published
+settings: components start on the faces of a cube around the target, their first variance is the
+squared diagonal of all points' bounding box, and the number of iterations is fixed.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from caliv_graph.errors import RegistrationError
 from caliv_graph.products import Array
 
 COMPONENTS = 400
-"""Components that GMMCalib and CaLiV ask for."""
+"""Number of components in GMMCalib and CaLiV."""
 
 ITERATIONS = 100
-"""Iterations that they do; there is no other end."""
+"""Their number of iterations; they have no other stopping rule."""
 
 OUTLIER_RATIO = 0.1
-"""Their gamma, outliers to inliers."""
+"""Their gamma, the ratio of outliers to inliers."""
 
 VARIANCE_ADDED_M2 = 1e-9
-"""What they add to every variance, so that a component on a single point stays one."""
+"""The constant they add to every variance, so that a component on a single point stays regular."""
 
 CUBE_SIDE_M = 0.5
-"""Of the cube on which the components start."""
+"""Side of the cube on which the components start."""
 
 ABANDONED = 1e-9
-"""Points' worth below which a component, or a cloud, stays where it was: their ratio is 0 / 0."""
+"""Number of points below which a component, or a cloud, is not updated, to avoid 0 / 0."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class GmmRegistration:
         t: (J, 3) translation likewise, metres.
         means: (K, 3) metres: the reconstructed target.
         variances: (K,) m^2.
-        priors: (K,) of the components; they and the outliers' add up to one.
-        log_likelihood: of all points before each iteration; expectation-maximisation never lets it
-            fall.
+        priors: (K,) of the components; their sum and the outliers' prior add up to one.
+        log_likelihood: of all points before each iteration; expectation-maximisation never lowers
+            it.
     """
 
     R: Array
@@ -58,7 +58,7 @@ class GmmRegistration:
 
 
 def cube_components(count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) points in metres on the faces of a cube about the origin."""
+    """(count, 3) points in metres on the faces of a cube around the origin."""
     points = rng.uniform(-0.5, 0.5, (count, 3))
     face = np.arange(count) % 6
     points[np.arange(count), face // 2] = np.where(face % 2, 0.5, -0.5)
@@ -68,15 +68,15 @@ def cube_components(count: int, rng: np.random.Generator) -> Array:
 def register_clouds(
     clouds: Sequence[Array], means: Array, iterations: int, outlier_ratio: float = OUTLIER_RATIO
 ) -> GmmRegistration:
-    """Registers clouds, pre-aligned but for small motions, to one mixture.
+    """Registers clouds, pre-aligned except for small motions, to one mixture.
 
     Every iteration is an E-step, a weighted rigid fit per cloud, then means, variances and priors,
-    each given what comes before it.
+    each with the results before it.
 
     Args:
-        clouds: (n, 3) points of each in metres, the target near the origin (for the numbers' sake).
-        means: (K, 3) metres, where the components start.
-        iterations: how many.
+        clouds: (n, 3) points of each in metres, with the target near the origin.
+        means: (K, 3) metres, start of the components.
+        iterations: their number.
         outlier_ratio: gamma.
 
     Raises:
@@ -93,7 +93,7 @@ def register_clouds(
     means = means.copy()
     variances = np.full(len(means), float(extent @ extent))
     priors = np.full(len(means), 1.0 / (len(means) * (1.0 + outlier_ratio)))
-    # gamma / (h (gamma + 1)), the volume h being that of all points' bounding box.
+    # gamma / (h (gamma + 1)), with h the volume of all points' bounding box.
     outlier_density = outlier_ratio / ((1.0 + outlier_ratio) * max(float(np.prod(extent)), 1e-9))
     R = np.tile(np.eye(3), (len(clouds), 1, 1))
     t = np.zeros((len(clouds), 3))
@@ -115,13 +115,13 @@ def register_clouds(
 
 
 def _features(points: Array) -> Array:
-    """(n, 5) of 1, v, |v|^2: what the exponent is linear in, and all that the M-step sums up."""
+    """(n, 5) features 1, v, |v|^2, in which the exponent is linear; the M-step needs their sums."""
     square = np.einsum("ni,ni->n", points, points)
     return np.column_stack([np.ones(len(points)), points, square])
 
 
 def _log_density(means: Array, variances: Array, priors: Array) -> Array:
-    """(5, K) by which features times this is the log of p_k N(y; x_k, s2_k)."""
+    """(5, K) coefficients: features times these are the log of p_k N(y; x_k, s2_k)."""
     scale = np.log(np.maximum(priors, 1e-300)) - 1.5 * np.log(2.0 * np.pi * variances)
     square = np.einsum("ki,ki->k", means, means)
     return np.vstack(
@@ -130,7 +130,7 @@ def _log_density(means: Array, variances: Array, priors: Array) -> Array:
 
 
 def _moved(quadratic: Array, R: Array, t: Array) -> Array:
-    """The same as a function of points before they are moved, y = R v + t."""
+    """The same coefficients for points v before the motion y = R v + t."""
     constant, linear, square = quadratic[0], quadratic[1:4], quadratic[4]
     return np.vstack(
         [
@@ -156,14 +156,14 @@ def _expect(features: Array, quadratic: Array, outlier_density: float) -> tuple[
 def _rigid_fits(
     mass: Array, first: Array, means: Array, variances: Array, R: Array, t: Array
 ) -> tuple[Array, Array]:
-    """M-step of the poses: what minimises the sum of alpha / s2_k |R v + t - x_k|^2 per cloud.
+    """M-step of the poses: minimises the sum of alpha / s2_k |R v + t - x_k|^2 per cloud.
 
     Args:
         mass: (J, K) sums of alpha.
         first: (J, K, 3) sums of alpha v.
         means: (K, 3) x_k.
         variances: (K,) s2_k.
-        R: (J, 3, 3) of clouds that no component explains: they stay.
+        R: (J, 3, 3) current rotations, kept for clouds that no component explains.
         t: (J, 3) likewise.
     """
     weight = mass / variances

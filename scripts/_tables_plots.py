@@ -1,4 +1,4 @@
-"""The distributions of benchmark_tables, as the paper shows them."""
+"""Plots of the distributions of benchmark_tables, as in the paper."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def write_plot(path: Path, title: str, lines: Sequence[Line]) -> bool:
     Errors on axes that a run did not determine are left out.
 
     Args:
-        path: the file; a new one takes the place of an old one at once.
-        title: what to write above.
+        path: the file; it is replaced atomically.
+        title: title of the plot.
         lines: the runs of a row.
 
     Returns:
-        Whether there was anything to show.
+        Whether there was any error to show.
     """
     done = [line for line in lines if line.quantities]
     names = list(dict.fromkeys(name for line in done for name in line.quantities))
@@ -41,17 +41,17 @@ def write_plot(path: Path, title: str, lines: Sequence[Line]) -> bool:
         for plot, axes, unit in zip(
             row, (("x", "y", "z"), ("roll", "pitch", "yaw")), ("mm", "mrad"), strict=True
         ):
-            told = [axis for axis in axes if errors[axis]]
+            determined = [axis for axis in axes if errors[axis]]
             plot.set_title(f"{name}, error in {unit}", fontsize="medium")
             plot.axhline(0.0, color="0.7", linewidth=0.8)
-            if not told:
+            if not determined:
                 plot.set_yticks([])
                 plot.set_xticks([])
                 plot.text(0.5, 0.5, "not determined", ha="center", transform=plot.transAxes)
                 continue
             plot.boxplot(
-                [errors[axis] for axis in told],
-                tick_labels=[f"{axis}\nn = {len(errors[axis])}" for axis in told],
+                [errors[axis] for axis in determined],
+                tick_labels=[f"{axis}\nn = {len(errors[axis])}" for axis in determined],
                 flierprops={"markersize": 3},
             )
     fresh = path.with_name(f".{path.name}.part")
@@ -68,7 +68,7 @@ def _errors(lines: Sequence[Line], quantity: str) -> Mapping[str, list[float]]:
         found = line.quantities.get(quantity)
         if found is None:
             continue
-        for axis, error, told in zip(AXES, found.error, found.determined, strict=True):
-            if told:
+        for axis, error, determined in zip(AXES, found.error, found.determined, strict=True):
+            if determined:
                 out[axis].append(1e3 * error)
     return out

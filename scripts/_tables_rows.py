@@ -1,4 +1,4 @@
-"""What the rows of benchmark_tables are: how a simulated drive is calibrated in each."""
+"""The rows of benchmark_tables: how a simulated drive is calibrated in each."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs, sigmas_s2s, sigmas_s2v
 
 PERCENTILE = 10.0
-"""The paper's k."""
+"""Percentile k of the paper's filter."""
 
 PARALLEL_SIGMA_DEG = 0.001
-"""Role (c) of the ground: the simulated vehicle does stand parallel to it."""
+"""Sigma of the vehicle's tilt against the ground. The simulated vehicle is parallel to it."""
 
 TRUE_POSES_NOISE = {
     "pose_position_m": 1e-4,
@@ -49,24 +49,24 @@ TRUE_POSES_NOISE = {
     "pose_drift_position_m": 1e-4,
     "pose_drift_rotation_deg": 1e-3,
 }
-"""As good as none, for a sigma cannot be zero."""
+"""A negligible sigma, because a sigma cannot be zero."""
 
 _NOWHERE = Path()
-"""No path of a config is used."""
+"""The folder of a config whose paths are not used."""
 
 GROUND_AXES = ("roll", "pitch", "z")
-"""What the ground alone tells."""
+"""Axes that the ground alone determines."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of one mounting or pair; vehicle axes, in the order of `conventions.AXES`, rad and m.
+    """Errors of one extrinsic or pair; vehicle axes, in the order of `conventions.AXES`, rad and m.
 
     Attributes:
         error: (6,).
-        sigma: (6,) as stated; None: none is.
+        sigma: (6,) stated sigmas; None: none stated.
         determined: per axis.
-        nees: of all six axes, priors included; None without a covariance.
+        nees: NEES of all six axes, priors included; None without a covariance.
     """
 
     error: tuple[float, ...]
@@ -77,13 +77,13 @@ class Errors:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a row made of one drive.
+    """Result of a row on one drive.
 
     Attributes:
         quantities: 'S2V front', 'S2S front to rear', ...
         status: of the calibration; empty if there is none.
         undetermined: directions, as they are named.
-        seconds: of CPU per part, and of all ('total', with the simulation of the clouds).
+        seconds: CPU time per part, and in total ('total', with the simulation of the clouds).
     """
 
     quantities: Mapping[str, Errors]
@@ -94,12 +94,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class View(ForwardingRecording):
-    """A recording of which some is hidden, or that knows the true poses (products.Recording).
+    """A recording with hidden parts, or with the true poses (products.Recording).
 
     Attributes:
-        left: LiDARs that are there.
-        hidden: (lidar, stamp) of clouds that are not there.
-        poses: instead of all other motion data; None: those of the recording.
+        left: LiDARs that are visible.
+        hidden: (lidar, stamp) of hidden clouds.
+        poses: replace all other motion data; None: the motion data of the recording.
     """
 
     left: tuple[str, ...]
@@ -127,9 +127,9 @@ class View(ForwardingRecording):
 
 
 def true_poses(truth: SimulatedTruth, stamps_ns: Sequence[int]) -> GivenPoses:
-    """Where the vehicle was, lifted by its heave as the clouds saw it.
+    """True poses of the vehicle at the clouds, heave included.
 
-    The heave is held from one of its periods to the next; there is a pose at each stamp.
+    The heave is constant within each of its periods. There is a pose at each stamp.
     """
     stamps = np.unique(np.asarray(stamps_ns, np.int64))
     heave_m = truth.heave_m[(stamps - truth.start_ns) // HEAVE_PERIOD_NS]
@@ -143,12 +143,12 @@ def true_poses(truth: SimulatedTruth, stamps_ns: Sequence[int]) -> GivenPoses:
 def config_for(
     recording: SimulatedRecording, changes: Mapping[str, Mapping[str, Any]], *, poses: bool = False
 ) -> Config:
-    """What `simulate` would write, with changes.
+    """The config that `simulate` writes, with changes.
 
     Args:
         recording: the drive.
-        changes: keys that a section has besides, or instead.
-        poses: the true poses are given instead of IMU, GNSS and velocity.
+        changes: keys to add to a section, or to replace.
+        poses: whether the true poses replace IMU, GNSS and velocity.
     """
     raw = config_of(recording, has_bag=not poses)
     del raw["data"]
@@ -178,10 +178,10 @@ class Row:
     """A row of the tables.
 
     Attributes:
-        text: what it is.
-        runs: how many there are unless the caller says.
-        run: makes one; given the drive and its seed.
-        changes: of the config, part of what a result depends on.
+        text: its description.
+        runs: default number of runs.
+        run: function of the drive and its seed that makes one run.
+        changes: changes of the config, on which a result depends.
     """
 
     text: str
@@ -210,7 +210,7 @@ def _seen(recording: SimulatedRecording, poses: bool) -> Recording:
 def _for_scenario(
     recording: SimulatedRecording, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Mapping[str, Any]]:
-    """Time offsets are estimated where there are some: a user of such a vehicle would ask so."""
+    """Estimates time offsets if the scenario has some, as a user of such a vehicle would."""
     out: dict[str, Mapping[str, Any]] = dict(changes)
     if any(recording.truth.time_offset_s.values()):
         out["solve"] = {"time_offset": True, **out.get("solve", {})}
@@ -241,11 +241,11 @@ def compared(
     }
     for errors in found["pairs"]:
         a, b = errors["from"], errors["to"]
-        told = pair_determined(calibration, a, b)
+        determined = pair_determined(calibration, a, b)
         quantities[f"S2S {a} to {b}"] = Errors(
             _six(errors),
             tuple(sigmas_s2s(calibration, a, b).tolist()),
-            tuple(told[axis] for axis in AXES),
+            tuple(determined[axis] for axis in AXES),
             errors["nees"],
         )
     texts = tuple(direction.text for direction in calibration.undetermined)
@@ -257,7 +257,7 @@ def _six(errors: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def _one_by_one(recording: SimulatedRecording, seed: int) -> Outcome:
-    """The paper's S2V stage for each LiDAR by itself; what it makes of S2S is what is left."""
+    """The paper's S2V stage for each LiDAR by itself; S2S follows from the two results."""
     config = config_for(recording, _for_scenario(recording, _STAGED))
     lidars: dict[str, LidarResult] = {}
     for name in recording.lidars:
@@ -271,12 +271,12 @@ def _one_by_one(recording: SimulatedRecording, seed: int) -> Outcome:
     outcome = compared(
         _calibration(lidars, cov, config.reference), recording.truth.T_vehicle_lidar, {}
     )
-    # What neither of the two knows of itself, the difference does not know either.
+    # An axis of the difference is determined only if both LiDARs determine it.
     for name in outcome.quantities:
         if name.startswith("S2S"):
             a, b = name.removeprefix("S2S ").split(" to ")
-            told = tuple(lidars[a].determined[x] and lidars[b].determined[x] for x in AXES)
-            errors = replace(outcome.quantities[name], determined=told)
+            determined = tuple(lidars[a].determined[x] and lidars[b].determined[x] for x in AXES)
+            errors = replace(outcome.quantities[name], determined=determined)
             outcome = replace(outcome, quantities={**outcome.quantities, name: errors})
     return outcome
 
@@ -298,10 +298,11 @@ def _calibration(lidars: Mapping[str, LidarResult], cov: Array, reference: str) 
 def _ground_alone(recording: SimulatedRecording, seed: int) -> Outcome:
     """Roll, pitch and z from the ground under a vehicle that stands parallel to it.
 
-    What SensorX2Car and Multi-LiCa do, with all scans of the drive. Yaw, x and y stay as guessed.
+    SensorX2Car and Multi-LiCa do the same. All scans of the drive are used. Yaw, x and y stay at
+    the guess.
     """
     config = config_for(recording, _PARALLEL)
-    # Up, to 10 degrees, is all that the poses are needed for.
+    # The poses are only needed for the vertical direction, to 10 degrees.
     trajectory = smooth_trajectories([recording], config, [[]])[0]
     begin, end = trajectory.span_ns
     poses: dict[str, gtsam.Pose3] = {}
@@ -323,7 +324,7 @@ def _ground_alone(recording: SimulatedRecording, seed: int) -> Outcome:
     nowhere = np.full((size, size), math.nan)
     calibration = _calibration(lidars, nowhere, config.reference)
     found = compared(calibration, recording.truth.T_vehicle_lidar, {})
-    told = tuple(axis in GROUND_AXES for axis in AXES)
+    determined = tuple(axis in GROUND_AXES for axis in AXES)
     common = np.array([math.radians(PARALLEL_SIGMA_DEG)] * 2 + [config.ground.sigma])
     quantities = {}
     for name in poses:
@@ -333,7 +334,7 @@ def _ground_alone(recording: SimulatedRecording, seed: int) -> Outcome:
         sigma = np.hypot(own[a], own[b])
         quantities[f"S2S {a} to {b}"] = (sigma, found.quantities[f"S2S {a} to {b}"])
     stated = {
-        name: replace(errors, sigma=_on_ground_axes(sigma), determined=told, nees=None)
+        name: replace(errors, sigma=_on_ground_axes(sigma), determined=determined, nees=None)
         for name, (sigma, errors) in quantities.items()
     }
     return Outcome(stated, "", ("x, y and yaw: the ground does not tell them",), {})
@@ -347,10 +348,10 @@ def _on_ground_axes(sigma: Array) -> tuple[float, ...]:
 def stood_on(
     planes: Sequence[GroundObservation], guess: gtsam.Pose3, vehicle_height_m: float
 ) -> tuple[gtsam.Pose3, Array]:
-    """A mounting whose roll, pitch and z are those at which the vehicle stands on the ground.
+    """An extrinsic with the roll, pitch and z at which the vehicle stands on the ground.
 
     Args:
-        planes: of one LiDAR.
+        planes: ground planes of one LiDAR.
         guess: T_vehicle_lidar, whose x, y and yaw are kept.
         vehicle_height_m: of the vehicle frame above the ground.
 
@@ -362,7 +363,7 @@ def stood_on(
     distances = np.array([plane.distance_m for plane in planes])
     up_lidar = normals.mean(axis=0)
     up_lidar /= np.linalg.norm(up_lidar)
-    # The smallest turn that stands the mean normal upright leaves the heading alone.
+    # The smallest rotation that makes the mean normal vertical does not change the heading.
     up = guess.rotation().rotate(up_lidar)
     axis = np.cross(up, [0.0, 0.0, 1.0])
     length = float(np.linalg.norm(axis))
@@ -377,10 +378,10 @@ def stood_on(
 
 
 def _percentile(recording: SimulatedRecording, seed: int) -> Outcome:
-    """No kernel; then again, without what the paper's filter drops.
+    """Without a robust kernel, then again without the clouds that the paper's filter drops.
 
-    It drops the errors below the k-th and above the (100 - k)-th percentile: here those of the
-    clouds, as the paper's pairwise ones have no place in a graph.
+    It drops the errors below the k-th and above the (100 - k)-th percentile. Here these are the
+    errors of the clouds, because the graph has no pairwise errors.
     """
     config = config_for(recording, _for_scenario(recording, _NO_KERNEL))
     first = calibrate([recording], config, SilentProgress())
@@ -391,7 +392,7 @@ def _percentile(recording: SimulatedRecording, seed: int) -> Outcome:
         for cloud, size in zip(registration.observation.clouds, error.tolist(), strict=True):
             if not low <= size <= high:
                 hidden.add((cloud.lidar, cloud.stamp_ns))
-    # Only these clouds again: others would else come in their place.
+    # Only these clouds again; otherwise other clouds would replace the dropped ones.
     used = {
         (cloud.lidar, cloud.stamp_ns)
         for registration in first.solution.registrations
@@ -403,10 +404,10 @@ def _percentile(recording: SimulatedRecording, seed: int) -> Outcome:
 
 @dataclass(frozen=True)
 class _OnlyTargets(View):
-    """A view whose clouds, but for some, keep their ground and lose the rest.
+    """A view in which only some clouds keep all points; the others keep only the ground.
 
     Attributes:
-        used: (lidar, stamp) of the clouds that were used.
+        used: (lidar, stamp) of the clouds that are used.
     """
 
     used: frozenset[tuple[str, int]] = frozenset()
@@ -432,7 +433,7 @@ class _OnlyTargets(View):
 
 
 def _paper(recording: SimulatedRecording, seed: int) -> Outcome:
-    """The paper's own estimator, written anew: it states no sigma, and holds every translation."""
+    """The paper's own estimator, reimplemented. It states no sigma and fixes every translation."""
     from scripts._paper import paper_from_recording
 
     config = config_for(recording, {})
@@ -473,7 +474,7 @@ ROWS: Mapping[str, Row] = {
     "none": _calibrated(_NO_KERNEL, "auto, no kernel"),
     "percentile": Row("auto, the paper's percentile filter", 20, _percentile, _NO_KERNEL),
 }
-"""By name, in the order in which they are run and printed."""
+"""Rows by name, in the order in which they run and are printed."""
 
 _TABLES = ("auto", "auto_true", "staged", "staged_true", "staged_no_s2s", "auto_parallel", "ground")
 
@@ -484,7 +485,7 @@ ROWS_OF: Mapping[str, tuple[str, ...]] = {
     "tri_lidar": _TABLES,
     "noisy": ("auto", "tls", "trimmed", "none", "percentile"),
 }
-"""The rows of each scenario, unless the caller says which."""
+"""Default rows of each scenario."""
 
 RUNS_OF: Mapping[tuple[str, str], int] = {("noisy", "auto"): 20}
-"""Where a scenario has another number of runs than the row."""
+"""Numbers of runs of a scenario that differ from those of the row."""

@@ -1,4 +1,4 @@
-"""What benchmark_tables makes of its runs: statistics, the figures to beat, and tables as text."""
+"""Statistics of the runs of benchmark_tables, limits, published figures, and tables as text."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _ORDER = [AXES.index(axis) for axis in SHOWN]
 NONE = math.nan
 
 RATIO_LIMIT = 1.25
-"""RMSE over the predicted sigma, to which three standard errors are added."""
+"""Limit of RMSE over predicted sigma, before three standard errors are added."""
 
 CONSERVATIVE = 0.8
-"""NEES may be smaller by so much."""
+"""Smallest ratio of the mean NEES to its expected value."""
 
 SECONDS_LIMIT = 15.0
 
@@ -34,11 +34,11 @@ DEGREES_OF_FREEDOM = 6
 
 @dataclass(frozen=True)
 class Line:
-    """One run, as it is written down.
+    """One run as a line of a file.
 
     Attributes:
-        seed: of all that was drawn.
-        failure: why there is no result, or empty.
+        seed: seed of all draws.
+        failure: reason for a missing result, or empty.
         status: of the calibration.
         undetermined: directions, as they are named.
         seconds: of CPU.
@@ -57,24 +57,24 @@ class Line:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of one quantity over the runs of a row; (6,) in the order of `SHOWN`, mm and mrad.
+    """Statistics of one quantity over the runs of a row; (6,) in the order of `SHOWN`, mm and mrad.
 
-    What a run did not determine on an axis is no part of that axis; NaN where nothing is left.
+    Runs that did not determine an axis are left out of that axis; NaN if no run is left.
 
     Attributes:
-        runs: how many.
-        told: (6,) how many of them determined an axis.
+        runs: number of runs.
+        determined: (6,) number of runs that determined an axis.
         mean_abs: mean absolute error.
         rmse: root mean square error.
         largest: largest absolute error.
         sigma: root mean square of the stated sigmas; NaN without.
-        held: mean absolute error of the runs that did *not* determine the axis: that of the guess.
-        nees: mean, all six axes; NaN without a covariance.
-        nees_runs: how many it is the mean of.
+        held: mean absolute error of the runs that did *not* determine the axis: the guess's error.
+        nees: mean NEES of all six axes; NaN without a covariance.
+        nees_runs: number of runs in this mean.
     """
 
     runs: int
-    told: Array
+    determined: Array
     mean_abs: Array
     rmse: Array
     largest: Array
@@ -89,39 +89,39 @@ class Statistics:
         return np.asarray(self.rmse / self.sigma)
 
     def ratio_limits(self) -> Array:
-        """(6,) what `ratio` may be: that of n normal draws scatters by 1 / sqrt(2 n)."""
-        return np.asarray(RATIO_LIMIT + 3.0 / np.sqrt(2.0 * np.maximum(self.told, 1.0)))
+        """(6,) limits of `ratio`: that of n normal draws has a standard error of 1 / sqrt(2 n)."""
+        return np.asarray(RATIO_LIMIT + 3.0 / np.sqrt(2.0 * np.maximum(self.determined, 1.0)))
 
 
 def nees_interval(runs: int) -> tuple[float, float]:
-    """95% interval of the mean of so many NEES, each chi-square with 6 degrees of freedom."""
+    """95% interval of the mean NEES of n runs, each chi-square with 6 degrees of freedom."""
     dof = DEGREES_OF_FREEDOM * runs
     return float(chi2.ppf(0.025, dof)) / runs, float(chi2.ppf(0.975, dof)) / runs
 
 
 def nees_is_right(mean: float, runs: int) -> bool:
-    """Within three standard errors of 6, or smaller by 20% at most."""
+    """Whether it is within three standard errors of 6, or at most 20% smaller."""
     error = 3.0 * math.sqrt(2.0 * DEGREES_OF_FREEDOM / runs)
     low = min(DEGREES_OF_FREEDOM - error, CONSERVATIVE * DEGREES_OF_FREEDOM)
     return low <= mean <= DEGREES_OF_FREEDOM + error
 
 
 def statistics(runs: Sequence[Errors]) -> Statistics:
-    """Of one quantity."""
+    """Statistics of one quantity."""
     scale = np.array([1e3] * 6)
     error = np.abs(np.array([run.error for run in runs]))[:, _ORDER] * scale
-    told = np.array([run.determined for run in runs], bool)[:, _ORDER]
+    determined = np.array([run.determined for run in runs], bool)[:, _ORDER]
     stated = [run.sigma or (NONE,) * 6 for run in runs]
     sigma = np.array(stated)[:, _ORDER] * scale
     nees = [run.nees for run in runs if run.nees is not None]
     return Statistics(
         runs=len(runs),
-        told=told.sum(axis=0).astype(np.float64),
-        mean_abs=_per_axis(np.mean, error, told),
-        rmse=_per_axis(_rms, error, told),
-        largest=_per_axis(np.max, error, told),
-        sigma=_per_axis(_rms, sigma, told),
-        held=_per_axis(np.mean, error, ~told),
+        determined=determined.sum(axis=0).astype(np.float64),
+        mean_abs=_per_axis(np.mean, error, determined),
+        rmse=_per_axis(_rms, error, determined),
+        largest=_per_axis(np.max, error, determined),
+        sigma=_per_axis(_rms, sigma, determined),
+        held=_per_axis(np.mean, error, ~determined),
         nees=float(np.mean(nees)) if nees else NONE,
         nees_runs=len(nees),
     )
@@ -141,7 +141,7 @@ def _per_axis(of: Callable[[Array], float], values: Array, taken: Array) -> Arra
 
 
 def by_quantity(lines: Sequence[Line]) -> dict[str, Statistics]:
-    """Statistics of every quantity of a row; what failed has none."""
+    """Statistics of every quantity of a row; failed runs are left out."""
     names = list(dict.fromkeys(name for line in lines for name in line.quantities))
     return {
         name: statistics([line.quantities[name] for line in lines if name in line.quantities])
@@ -153,7 +153,7 @@ def by_quantity(lines: Sequence[Line]) -> dict[str, Statistics]:
 
 
 def limits(scenario: str, quantity: str) -> tuple[float, ...] | None:
-    """Largest mean absolute errors that are good enough, mm and mrad, `SHOWN`; NaN: none."""
+    """Limits of the mean absolute errors, mm and mrad, `SHOWN`; NaN: no limit."""
     return _LIMITS.get(scenario, {}).get(quantity[:3])
 
 
@@ -197,20 +197,21 @@ PUBLISHED: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     },
 }
 """Tables I to III of the paper: mean absolute errors over 100 runs on its arc, mm and mrad. It does
-not say of which LiDAR table III is."""
+not name the LiDAR of table III."""
 
 
 @dataclass(frozen=True)
 class OtherSystem:
-    """One figure of SPEC 8's table of other systems.
+    """One run of another system on a simulated drive, measured with its own program.
 
     Attributes:
-        name: of the system.
-        scenario: that it is compared on.
-        row: ours that it is compared with.
-        quantity: that it estimated.
-        errors: mm and mrad in the order of `SHOWN`, NaN where it tells nothing.
-        target: False if it was given the true mount, or started from the truth.
+        name: name of the system.
+        scenario: scenario of the comparison.
+        row: our row in the comparison.
+        quantity: the quantity it estimated.
+        errors: mm and mrad in the order of `SHOWN`, NaN for axes it does not estimate.
+        target: whether our errors have to be smaller. False if it had the true mount of a LiDAR or
+            started from the truth.
     """
 
     name: str
@@ -258,16 +259,16 @@ OTHERS: tuple[OtherSystem, ...] = (
 
 
 def root_sum_square(errors: Sequence[float], axes: slice, like: Sequence[float]) -> float:
-    """Over some of the six axes, where `like` has a number; NaN if it has none."""
+    """Root sum square over those of the axes in which `like` has a number; NaN if it has none."""
     values = np.array(errors)[axes][np.isfinite(np.array(like)[axes])]
     return float(np.sqrt((values**2).sum())) if len(values) else NONE
 
 
 def other_systems(lines_of: Callable[[str, str], Sequence[Line]], seeds: int = 20) -> str:
-    """SPEC 8's other systems beside ours, mean of so many seeds; empty if there is no run yet.
+    """Other systems and ours, mean over the seeds; empty if there is no run yet.
 
-    A drive's own error of the vehicle's height is in the z of all that go by the ground, theirs and
-    ours: what the ground alone makes of our drives is printed beside.
+    The z of all systems that use the ground includes the drive's error of the vehicle's height. The
+    result of the ground alone on our drives is printed too.
     """
     rows = []
     for other in OTHERS:
@@ -300,8 +301,8 @@ def other_systems(lines_of: Callable[[str, str], Sequence[Line]], seeds: int = 2
     return "\n".join(
         [
             "",
-            "Other systems (SPEC 8, one run each) and ours (mean over seeds): root sum square over",
-            "the axes that theirs has, translations in mm and rotations in mrad",
+            "Other systems (one run each) and ours (mean over seeds): root sum square over",
+            "the axes that theirs estimates, translations in mm and rotations in mrad",
             heading,
             *rows,
         ]
@@ -317,10 +318,10 @@ def _runs(lines: Sequence[Line], quantity: str, seeds: int) -> list[Errors]:
 
 
 def _mean_of_ours(runs: Sequence[Errors], axes: slice, like: Sequence[float]) -> float:
-    """Mean root sum square, mm and mrad; NaN if an axis was not determined or none is asked for."""
+    """Mean root sum square, mm and mrad; NaN if an axis was undetermined or none is compared."""
     usable = np.isfinite(np.array(like)[axes])
-    told = np.array([run.determined for run in runs], bool)[:, _ORDER][:, axes]
-    if not usable.any() or not told[:, usable].all():
+    determined = np.array([run.determined for run in runs], bool)[:, _ORDER][:, axes]
+    if not usable.any() or not determined[:, usable].all():
         return NONE
     return float(
         np.mean([root_sum_square([1e3 * run.error[i] for i in _ORDER], axes, like) for run in runs])
@@ -365,23 +366,23 @@ def row_table(
         text: what the row is.
         lines: its runs.
         predicted: the planner's sigmas per quantity, `AXES`, rad and m.
-        judged: whether `limits` are meant for it.
+        judged: whether `limits` apply to it.
     """
     done = [line for line in lines if not line.failure]
     out = [f"\n{scenario} · {text}: n = {len(done)} of {len(lines)}"]
     if done:
         statuses = Counter(line.status for line in done if line.status)
         seconds = np.array([line.seconds.get("total", NONE) for line in done])
-        told = ", ".join(f"{status} {n}" for status, n in statuses.most_common())
+        counted = ", ".join(f"{status} {n}" for status, n in statuses.most_common())
         verdict = _verdict(float(np.mean(seconds)) <= SECONDS_LIMIT) if judged else ""
         out[0] += (
-            f"{', ' + told if told else ''}; {np.mean(seconds):.1f} s of CPU each, "
+            f"{', ' + counted if counted else ''}; {np.mean(seconds):.1f} s of CPU each, "
             f"{np.max(seconds):.1f} s at most{verdict}"
         )
     out += [f"  seed {line.seed}: {line.failure}" for line in lines if line.failure]
     named: dict[str, list[str]] = {}
     for direction in (d for line in done for d in dict.fromkeys(line.undetermined)):
-        # What is named varies by a digit from run to run: 9.14 or 9.17 m per rad.
+        # Numbers in the names vary from run to run: 9.14 or 9.17 m per rad.
         named.setdefault(re.sub(r"\d+(\.\d+)?", "#", direction), []).append(direction)
     out += [f"  undetermined in {len(alike)}: {alike[0]}" for alike in named.values()]
     for name, s in by_quantity(done).items():
@@ -413,13 +414,13 @@ def _quantity(
     yield f"  {name + f', n = {s.runs}':26}{HEADING}"
     yield f"    {'mean absolute error':22}{_cells(s.mean_abs)}"
     if np.isfinite(s.held).any():
-        counts = [f"{round(s.runs - told)}x" if told < s.runs else "" for told in s.told]
+        counts = [f"{round(s.runs - n)}x" if n < s.runs else "" for n in s.determined]
         yield f"    {'  not determined':22}" + "".join(f"{c:>13}" for c in counts)
         brackets = [f"({_number(v, 2)})" if math.isfinite(v) else "" for v in s.held]
         yield f"    {'  of the guess there':22}" + "".join(f"{c:>13}" for c in brackets)
     limit = limits(scenario, name) if judged else None
     if limit is not None:
-        # What is held at the guess has a limit too: that of the guesses' own error.
+        # An axis held at the guess has a limit too: the guess's own error.
         values = np.where(np.isfinite(s.mean_abs), s.mean_abs, s.held)
         marks = [
             "" if math.isnan(m) else _verdict(v <= m) for v, m in zip(values, limit, strict=True)
@@ -436,7 +437,7 @@ def _quantity(
         yield f"    {'RMSE / sigma':22}{_cells(s.ratio, marks)}"
     if predicted is not None:
         planned = np.array(predicted)[_ORDER] * 1e3
-        planned = np.where(s.told > 0, planned, NONE)
+        planned = np.where(s.determined > 0, planned, NONE)
         yield f"    {'sigma as planned':22}{_cells(planned)}"
         yield f"    {'RMSE / planned':22}{_cells(s.rmse / planned)}"
     if s.nees_runs:
@@ -449,7 +450,7 @@ def _quantity(
 
 
 def comparison(scenario: str, rows: Mapping[str, tuple[str, Sequence[Line]]]) -> str:
-    """Mean absolute errors of all rows of a scenario, quantity by quantity; the paper's beside.
+    """Mean absolute errors of all rows of a scenario, quantity by quantity; and those of the paper.
 
     Args:
         scenario: its name.
@@ -469,11 +470,11 @@ def comparison(scenario: str, rows: Mapping[str, tuple[str, Sequence[Line]]]) ->
                 continue
             s = of_row[quantity]
             cells = ""
-            for i, told in enumerate(s.told):
+            for i, count in enumerate(s.determined):
                 digits = 2 if i < 3 else 3
                 text = f"({_number(s.held[i], digits)})"
-                if told:
-                    of = "" if told == s.runs else f" of {told:.0f}"
+                if count:
+                    of = "" if count == s.runs else f" of {count:.0f}"
                     text = _number(s.mean_abs[i], digits) + of
                 cells += f"{text:>13}"
             out.append(f"    {rows[name][0] + f', n = {s.runs}':42}{cells}")

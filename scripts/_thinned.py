@@ -1,9 +1,9 @@
-"""A drive simulated over and over with fresh noise: only the beams that matter are cast.
+"""A drive simulated many times with new noise, casting only the relevant beams.
 
-Which beams meet the target, or something beside it, depends on where the vehicle is, not on what is
-drawn: it is found once per scenario with whole clouds, and kept in a file. Every seed then casts
-those beams anew, with its own height, heave and noise, so that its returns are as true as those of
-a whole cloud; only there are a hundred times fewer of them.
+The beams that hit the target or its surroundings depend on the vehicle's path and hardly on the
+noise. They are selected once per scenario with whole clouds, and kept in a file. Every seed then
+casts these beams with its own height, heave and noise. The returns equal those of whole clouds, but
+their number is a hundred times smaller.
 """
 
 from __future__ import annotations
@@ -24,64 +24,58 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray, LidarScan
 from caliv_graph.scenario.drives import VehicleStates
-from caliv_graph.scenario.model import (
-    CropModel,
-    LidarModel,
-    Scenario,
-    SuspensionModel,
-    dump_scenario,
-)
-from caliv_graph.scenario.shapes import GROUND
+from caliv_graph.scenario.model import CropModel, Scenario, SuspensionModel, dump_scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import GROUND
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar, beam_directions
 from caliv_graph.simulation.noise import Stream, random_stream
 from caliv_graph.simulation.recording import SimulatedRecording, SimulatedScan
 
 SELECTION_VERSION = 1
-"""Part of the digest of a selection: another rule makes another one."""
+"""Version of the selection rule, part of the digest of a selection."""
 
 NEIGHBOURS = 2
-"""Beams to each side of what is met: 2 channels of the paper's LiDAR are 35 mm at 6 m, seven
-standard deviations of height and heave."""
+"""Beams added to each side of those that hit. 2 channels of the paper's LiDAR are 35 mm at 6 m,
+seven standard deviations of height and heave."""
 
 REACH = 3.0
-"""What the guess may be off moves things by as much as a region is widened for it: two to three
-times the largest error at their range."""
+"""Widening of a region for errors of the initial guess: two to three times the largest error at the
+region's range."""
 
 GROUND_NEAR_TARGET = 400
-"""Beams at the ground of a target's region, about."""
+"""Approximate number of beams at the ground of a target's region."""
 
 GROUND_RADIUS_M = 15.5
 GROUND_PER_M2 = 3
-"""Beams per square metre of the ground about the vehicle. Whole clouds have more, of which
-`targets.ground.planes` looks at ten; with three, what the noise leaves of a plane (0.02 mrad and
-0.2 mm) is still far below the floors that it adds (0.5 mrad and 2 mm)."""
+"""Beams per square metre of the ground around the vehicle. Whole clouds have more, of which
+`targets.ground.planes` uses ten. With three, the error of a plane by noise (0.02 mrad and 0.2 mm)
+is still far below the floors of its sigmas (0.5 mrad and 2 mm)."""
 
 SKY_STRIDE = 16
 EDGE_STRIDE = 4
-"""Of all other beams, and of those at the left and right edge of the field of view, every n-th
-channel and column: they show how far the field of view goes."""
+"""Every n-th channel and column of all other beams, and of those at the left and right edge of the
+field of view, is kept. They show the extent of the field of view."""
 
 PATCH_RAD = math.radians(11.0)
-"""A part of the field of view, as wide and as high, that shows how dense it is."""
+"""Size of a patch of the field of view that keeps all beams and so shows their density."""
 
 OTHERS = 10
-"""Of the clouds in which nothing that matters is in sight every so manieth is kept."""
+"""Every n-th cloud without anything relevant in view is kept."""
 
 NEIGHBOUR_NS = 110_000_000
-"""Clouds of the other LiDARs this near to one that matters are kept: the ground is read in them."""
+"""Clouds of other LiDARs that are nearer in time to a relevant one are kept, for the ground."""
 
 
 @dataclass(frozen=True)
 class GroundWaves:
-    """Unevenness of the ground longer than what a cloud shows of it, drawn anew for every cloud.
+    """Unevenness of the ground with a wavelength longer than a cloud, drawn for every cloud.
 
-    Worlds have smooth ground; asphalt is not. SPEC 8 counts on a plane that is right to these
-    figures in each cloud, and so does whoever weighs it: a stated sigma that nothing was drawn for
-    makes NEES too small.
+    The ground of a simulated world is smooth; asphalt is not. The weights of the ground planes
+    assume these sigmas (`targets.ground.planes`). Without a draw for them, NEES would be too small.
 
     Attributes:
-        normal_sigma_rad: of its slopes along map x and y.
-        height_sigma_m: of its height at the foot of the LiDAR.
+        normal_sigma_rad: sigma of its slopes along map x and y.
+        height_sigma_m: sigma of its height below the LiDAR.
     """
 
     normal_sigma_rad: float = 0.5e-3
@@ -90,14 +84,14 @@ class GroundWaves:
 
 @dataclass(frozen=True)
 class BeamSelection:
-    """Which clouds of a scenario are taken, and which beams of each.
+    """Clouds of a scenario that are simulated, and the beams of each.
 
     Attributes:
-        digest: of the scenario and of the rule.
+        digest: digest of the scenario and the rule.
         fixed: per LiDAR, the beams of every cloud, ascending.
-        idle: per LiDAR, those of every `OTHERS`th cloud if nothing that matters is in sight.
-        near: per LiDAR, by number of the cloud: beams at targets and at what is beside them.
-        frames: per LiDAR, the numbers of the clouds that are taken, ascending.
+        idle: per LiDAR, the beams of every `OTHERS`th cloud without anything relevant in view.
+        near: per LiDAR, by index of the cloud: beams at targets and their surroundings.
+        frames: per LiDAR, the indices of the clouds that are simulated, ascending.
     """
 
     digest: str
@@ -119,14 +113,14 @@ class BeamSelection:
 
 
 def scenario_digest(scenario: Scenario) -> str:
-    """What a selection of beams depends on, in 16 digits; noise is no part of it."""
+    """Digest of everything that a selection depends on; noise is not part of it."""
     silent = _without_noise(scenario)
     text = f"{SELECTION_VERSION}\n{dump_scenario(silent)}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _without_noise(scenario: Scenario) -> Scenario:
-    """The scenario with nothing drawn that moves a beam, its clouds whole."""
+    """The scenario with whole clouds and without any draw that moves a beam."""
     lidars = {
         name: model.model_copy(update={"range_sigma_m": 0.0, "edges": None})
         for name, model in scenario.lidars.items()
@@ -143,7 +137,7 @@ def _without_noise(scenario: Scenario) -> Scenario:
 
 
 class _Selector(SimulatedRecording):
-    """Finds the beams that matter, at the poses that nothing has been drawn for."""
+    """Finds the relevant beams, at the true poses without noise."""
 
     def __init__(self, scenario: Scenario, threads: int) -> None:
         super().__init__(_without_noise(scenario), 0, threads)
@@ -155,11 +149,11 @@ class _Selector(SimulatedRecording):
         self._ground_id = self.world.names.index(GROUND)
 
     def near(self, lidar: str, progress: Progress) -> dict[int, IntArray]:
-        """By number of the cloud, the beams at targets and at what is in their regions."""
+        """By index of the cloud, the beams at targets and in their regions."""
         model = self.scenario.lidars[lidar]
         reach_m = self._reach_m(model.max_range_m)
         half_m = max(0.5 * float(np.linalg.norm(high - low)) for low, high in self._regions)
-        # The widest sphere that a region, as widened, can have.
+        # The largest sphere around a widened region.
         crop = CropModel(margin_m=half_m + reach_m, elsewhere_stride=0)
         simulated = SimulatedLidar(
             model, self.world, self._caster, crop, random_stream(0, Stream.LIDAR)
@@ -179,7 +173,7 @@ class _Selector(SimulatedRecording):
 
     def _reach_m(self, range_m: float) -> float:
         guess = self.scenario.initial_guess
-        # Beyond 30 m no LiDAR has the points that a target needs.
+        # Beyond 30 m no LiDAR has enough points on a target.
         return REACH * (guess.translation_m + math.radians(guess.rotation_deg) * min(range_m, 30.0))
 
     def _chosen(
@@ -224,10 +218,10 @@ def _with_neighbours(beams: IntArray, columns: int, channels: int) -> IntArray:
 
 
 def fixed_beams(model: LidarModel) -> tuple[IntArray, IntArray]:
-    """The beams that every cloud of a LiDAR has, and those of a cloud with nothing else in it.
+    """Beams of every cloud of a LiDAR, and those of a cloud with nothing relevant in view.
 
     Args:
-        model: on level ground, its vehicle's frame on it.
+        model: the LiDAR; its vehicle frame is on level ground.
     """
     directions = beam_directions(model)
     channels, columns = directions.shape[:2]
@@ -238,7 +232,7 @@ def fixed_beams(model: LidarModel) -> tuple[IntArray, IntArray]:
     chosen[::SKY_STRIDE, ::SKY_STRIDE] = True
     chosen[::EDGE_STRIDE, [0, -1]] = True
     if height_m > 0.0:
-        # Level ground is where a beam that falls by one has gone these two ways.
+        # Horizontal offset of a beam per metre of descent to level ground.
         falls = np.minimum(beams_vehicle[:, 2], -1e-9)
         xy = beams_vehicle[:, :2] / -falls[:, None] * height_m
         near = np.flatnonzero((xy**2).sum(axis=1) < GROUND_RADIUS_M**2)
@@ -264,7 +258,7 @@ def _steps(model: LidarModel, channels: int, columns: int) -> tuple[float, float
 
 
 def _spread(xy: Array) -> IntArray:
-    """Indices of some of the places (n, 2), the same number of each square metre."""
+    """Indices of some of the places (n, 2), with the same number in each square metre."""
     rng = np.random.default_rng(0)
     order = rng.permutation(len(xy))
     cells = np.floor(xy[order]).astype(np.int64)
@@ -278,12 +272,12 @@ def _spread(xy: Array) -> IntArray:
 def select_beams(
     scenario: Scenario, threads: int = 1, progress: Progress | None = None
 ) -> BeamSelection:
-    """Finds the beams that matter, with whole clouds.
+    """Selects the relevant beams with whole clouds.
 
     Args:
-        scenario: the drive; it must name a target region, not have it searched for.
+        scenario: the drive; its config must name the target region.
         threads: threads that cast rays; the result does not depend on it.
-        progress: told of every cloud.
+        progress: advanced at every cloud.
 
     Raises:
         ConfigError: it has no target, or its config does not name the region.
@@ -295,8 +289,8 @@ def select_beams(
             "beam of it can be left out: give world.targets, and config_target: region"
         )
     selector = _Selector(scenario, threads)
-    told = progress or SilentProgress()
-    near = {name: selector.near(name, told) for name in scenario.lidars}
+    shown = progress or SilentProgress()
+    near = {name: selector.near(name, shown) for name in scenario.lidars}
     stamps = {name: np.asarray(selector.scan_stamps_ns(name), np.int64) for name in scenario.lidars}
     matter = np.unique(np.concatenate([stamps[name][list(near[name])] for name in near]))
     fixed, idle = {}, {}
@@ -312,7 +306,7 @@ def select_beams(
 
 
 def _frames(stamps_ns: IntArray, matter_ns: IntArray) -> IntArray:
-    """Numbers of the clouds that are taken: near one that matters, and some of the others."""
+    """Indices of the clouds to simulate: those near a relevant one, and some of the others."""
     chosen = np.zeros(len(stamps_ns), np.bool_)
     chosen[::OTHERS] = True
     chosen[-1:] = True
@@ -327,13 +321,13 @@ def _frames(stamps_ns: IntArray, matter_ns: IntArray) -> IntArray:
 def cached_selection(
     scenario: Scenario, folder: Path, threads: int = 1, progress: Progress | None = None
 ) -> BeamSelection:
-    """`select_beams`, or what it found the last time, from a file in a folder.
+    """`select_beams`, or its last result from a file in a folder.
 
     Args:
         scenario: the drive.
-        folder: where the files are; it is made.
+        folder: folder of the files; it is created.
         threads: threads that cast rays.
-        progress: told of every cloud.
+        progress: advanced at every cloud.
     """
     path = folder / f"beams-{scenario.name}-{scenario_digest(scenario)}.npz"
     if path.exists():
@@ -387,11 +381,11 @@ def _read(path: Path, lidars: Sequence[str]) -> BeamSelection:
 
 
 class ThinnedRecording(SimulatedRecording):
-    """A simulated drive with the beams that matter; for a config that names the target's region.
+    """A simulated drive with the relevant beams only, for a config that names the target's region.
 
-    Motion data and initial guesses are those of a `SimulatedRecording` of the same seed. The noise
-    of the clouds is of the same kind but drawn otherwise: every cloud has its own source, so that
-    none is drawn for beams and clouds that are left out. Clouds are kept once they have been cast.
+    Motion data and initial guesses equal those of a `SimulatedRecording` of the same seed. The
+    noise of the clouds has the same distribution but other draws: every cloud has its own stream,
+    so nothing is drawn for beams and clouds that are left out. Clouds are cached.
     """
 
     def __init__(
@@ -402,17 +396,17 @@ class ThinnedRecording(SimulatedRecording):
         threads: int = 1,
         waves: GroundWaves | None = None,
     ) -> None:
-        """Draws what concerns the whole drive.
+        """Draws the errors that hold for the whole drive.
 
         Args:
             scenario: the drive.
-            selection: of its beams.
-            seed: of all that is drawn.
+            selection: its beams.
+            seed: seed of all draws.
             threads: threads that cast rays; the result does not depend on it.
-            waves: of the ground; None: it is as the world has it.
+            waves: unevenness of the ground; None: the ground of the world.
 
         Raises:
-            ConfigError: the seed is negative, or the selection is another scenario's.
+            ConfigError: the seed is negative, or the selection is for another scenario.
         """
         if selection.digest != scenario_digest(scenario):
             raise ConfigError(
@@ -438,14 +432,14 @@ class ThinnedRecording(SimulatedRecording):
         }
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
-        """Stamps of the clouds that are taken."""
+        """Stamps of the clouds that are simulated."""
         stamps = np.asarray(super().scan_stamps_ns(lidar), np.int64)
         return [int(stamp) for stamp in stamps[self.selection.frames[lidar]]]
 
     def scans_with_truth(
         self, lidar: str, wanted: Container[int] | None = None
     ) -> Iterator[SimulatedScan]:
-        """Like `scans`, with what each point lies on."""
+        """Like `scans`, with the object of each point."""
         index = list(self.scenario.lidars).index(lidar)
         stamps = self._frame_stamps(lidar).tolist()
         for frame in self.selection.frames[lidar].tolist():

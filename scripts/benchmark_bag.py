@@ -1,14 +1,14 @@
-"""How fast a calibration from a long bag is, and how much memory it takes.
+"""Time and memory of a calibration from a long bag.
 
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_bag.py
 
 Writes a bag of 10 minutes (`--minutes`) with 4 LiDARs (`--lidars`) that look to all sides, at 10 Hz
 with 30,000 points per cloud (`--points`), each point with its time, 12 GB in all; IMU, GNSS and
 velocity as in the paper. The vehicle drives figure-eights past a chair in a walled yard, one lap a
-minute, so that it is back at the same pose after as many clouds: those of the first lap are
-simulated, later laps repeat them with new stamps. What moves is never repeated. Then
-`caliv-graph calibrate` runs in a process of its own on 2 cores (`--cores`), with the bag thrown out
-of the page cache first, as far as the file system lets it (`--warm`: it stays). The bag is deleted.
+minute. Only the clouds of the first lap are simulated; later laps repeat them with new stamps. IMU,
+GNSS and velocity are never repeated. Then `caliv-graph calibrate` runs in its own process on 2
+cores (`--cores`). The bag is first dropped from the page cache, if the file system allows it
+(`--warm`: it stays). The bag is deleted at the end.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import IO, Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: the matrices are small
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the module beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the module beside this script from any folder
 
 import numpy as np
 from rosbags.interfaces import Connection
@@ -52,7 +52,7 @@ from scripts._command import COMMAND, Usage, between, calibrate_measured, exit_c
 
 RATE_HZ = 10.0
 LAP_S = 60
-"""A whole number of clouds, so that a lap later the vehicle takes the same cloud again."""
+"""Clouds per lap, a whole number: after a lap the vehicle is at the same pose."""
 SPEED_M_S = 2.0
 LAP_M = SPEED_M_S * LAP_S
 STANDSTILL_S, RAMP_S = 1.0, 1.5
@@ -61,22 +61,22 @@ POINT_BYTES = 16
 """x, y, z and the time, 4 bytes each."""
 
 TURN_RAD = float(jn_zeros(0, 1)[0])
-"""Amplitude of the heading over a lap, the first zero of J0. A path whose heading goes like
-a sine of its length advances by J0(amplitude) per length: by nothing."""
+"""Amplitude of the heading over a lap, the first zero of the Bessel function J0. If the heading is
+a sine of path length, the path advances by J0(amplitude) per length: here not at all."""
 
 LEAST_SPEEDUP = 3.0
 MOST_MEMORY_MB = 2048.0
-"""A workstation shall be through several drives while one is driven, beside other work."""
+"""Smallest ratio of drive time to calibration time, and largest peak memory."""
 
 SPARE_DISK = 1.15
 
 
 @dataclass(frozen=True)
 class FigureEights(CurvatureProfile):
-    """Figure-eights without end, each of them closed: heading goes like a sine of path length.
+    """Endless closed figure-eights: the heading is a sine of path length.
 
     Attributes:
-        lap_m: path length of one.
+        lap_m: path length of a lap.
     """
 
     lap_m: float = LAP_M
@@ -92,18 +92,18 @@ class FigureEights(CurvatureProfile):
 
 
 class LapsRecording(SimulatedRecording):
-    """A simulated drive of figure-eights, whatever the scenario's own curvature."""
+    """A simulated drive of figure-eights, with the scenario's curvature replaced."""
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
-        """Draws what concerns the whole drive; see `SimulatedRecording`."""
+        """Draws the errors that hold for the whole drive; see `SimulatedRecording`."""
         super().__init__(scenario, seed, threads)
         drive = replace(self.truth.drive, curvature=FigureEights(0.0))
         self.truth = replace(self.truth, drive=drive)
 
     def original_ns(self, lidar: str, stamp_ns: int) -> int:
-        """Stamp of the cloud that a cloud repeats: of the first lap; its own if it is none."""
+        """Stamp of the cloud of the first lap that a cloud repeats, or its own stamp."""
         begin_ns = self.truth.start_ns + _nanoseconds(STANDSTILL_S + RAMP_S)
-        # While the vehicle slows down, it is not where it was a lap before.
+        # While the vehicle slows down, it is not at the pose of a lap before.
         end_ns = self.truth.end_ns - _nanoseconds(RAMP_S)
         after_ns = _nanoseconds(self.scenario.lidars[lidar].sweep_s)
         if not begin_ns <= stamp_ns <= end_ns - after_ns:
@@ -112,7 +112,7 @@ class LapsRecording(SimulatedRecording):
 
 
 class RepeatingWriter(BagWriter):
-    """Writes a bag in which clouds come again with other stamps, without making them again."""
+    """Writes a bag with clouds repeated under other stamps, without simulating them again."""
 
     _data: bytes | memoryview = b""
 
@@ -126,10 +126,10 @@ class RepeatingWriter(BagWriter):
         return bytes(self._data)
 
     def write_again(self, lidar: str, stamp_ns: int, data: bytes) -> None:
-        """Writes a serialised cloud with another stamp, and all else that came before it.
+        """Writes a serialised cloud with another stamp, after all other messages before it.
 
         Args:
-            lidar: whose.
+            lidar: name of its LiDAR.
             stamp_ns: new stamp.
             data: the message, as in `written`.
         """
@@ -137,14 +137,14 @@ class RepeatingWriter(BagWriter):
         record_ns = stamp_ns + _nanoseconds(sweep_s)
         self._write_others(record_ns)
         seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
-        # CDR: four bytes that tell the encoding, then the stamp with which the header begins.
+        # CDR: four bytes with the encoding, then the stamp at the start of the header.
         stamp = np.array([seconds, nanoseconds], "<u4").tobytes()
         self._writer.write(self._clouds[lidar], record_ns, data[:4] + stamp + data[12:])
 
 
 @dataclass(frozen=True)
 class WorstError:
-    """The axis between two LiDARs that is off by the largest part of its sigma; m or rad."""
+    """The axis between two LiDARs with the largest error in sigmas; m or rad."""
 
     what: str
     error: float
@@ -213,7 +213,7 @@ def benchmark(arguments: argparse.Namespace) -> int:
 
 
 def scenario_of(arguments: argparse.Namespace) -> Scenario:
-    """LiDARs that look evenly to all sides; a chair beside the crossing, in a walled yard."""
+    """LiDARs that look to all sides, and a chair beside the crossing in a walled yard."""
     width_deg, height_deg = FIELD_OF_VIEW_DEG
     channels = max(2, round(math.sqrt(arguments.points * height_deg / width_deg) * 1.26))
     columns = max(1, round(arguments.points / channels))
@@ -222,7 +222,7 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
         yaw_deg = 360.0 * i / arguments.lidars
         turn = math.radians(yaw_deg)
         lidars[f"lidar_{i + 1}"] = {
-            # All about the middle of the roof, nose down.
+            # All around the middle of the roof, nose down.
             "mounting": {
                 "xyz": [round(1.0 + math.cos(turn), 4), round(0.8 * math.sin(turn), 4), 2.0],
                 "rpy_deg": [0.0, 10.0, yaw_deg],
@@ -249,7 +249,7 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
     chair = {"shape": "chair", "xy_m": [10.0, middle_m], "yaw_deg": 160.0}
     raw = {
         "name": "laps",
-        # Figure-eights take the place of the straight line: see `LapsRecording`.
+        # Figure-eights replace the straight line: see `LapsRecording`.
         "drive": {
             "kind": "straight",
             "duration_s": 60.0 * arguments.minutes,
@@ -266,13 +266,13 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
 
 
 def lap_length_m() -> float:
-    """How far a figure-eight reaches from its start, in metres, perpendicular to the start."""
+    """Largest distance of a figure-eight from its start, perpendicular to the start, metres."""
     s = np.linspace(0.0, 0.5 * LAP_M, 2001)
     return float(np.trapezoid(np.sin(FigureEights(0.0).heading(s)), s))
 
 
 def check_disk(recording: SimulatedRecording, points: int, folder: Path) -> None:
-    """Raises before gigabytes are written to a disk that has no room for them."""
+    """Raises if the disk has no room for the bag."""
     clouds = {name: recording.scan_stamps_ns(name) for name in recording.lidars}
     total = sum(len(stamps) for stamps in clouds.values())
     first = min(total, round((LAP_S + 10.0) * RATE_HZ * len(clouds)))
@@ -291,7 +291,7 @@ def write_laps(recording: LapsRecording, folder: Path, progress: Progress) -> fl
     Args:
         recording: the drive.
         folder: an empty folder.
-        progress: told of every cloud.
+        progress: advanced at every cloud.
 
     Returns:
         Size of the bag in MB.
@@ -329,13 +329,13 @@ def write_laps(recording: LapsRecording, folder: Path, progress: Progress) -> fl
 
 
 def _keep(spool: IO[bytes], data: bytes) -> tuple[int, int]:
-    """Appends to a file; where it begins, and its size."""
+    """Appends to a file; returns its offset and size."""
     place = spool.seek(0, os.SEEK_END)
     return place, spool.write(data)
 
 
 def drop_from_cache(folder: Path) -> None:
-    """A bag that was recorded another day is on disk, not in memory."""
+    """Drops the bag from the page cache, like a bag of another day."""
     if not hasattr(os, "posix_fadvise"):
         return
     for file in folder.iterdir():
@@ -345,7 +345,7 @@ def drop_from_cache(folder: Path) -> None:
 
 
 def worst_error(folder: Path, reference: str) -> WorstError | None:
-    """What is off most between a LiDAR and the reference, in sigmas; None: there is only one."""
+    """The largest error in sigmas between a LiDAR and the reference; None: only one LiDAR."""
     calibration = read_calibration(folder / "result/calibration.yaml")
     return worst_error_of(calibration, read_truth(folder / "truth.yaml"), reference)
 
@@ -353,7 +353,7 @@ def worst_error(folder: Path, reference: str) -> WorstError | None:
 def worst_error_of(
     calibration: Calibration, truth: Mapping[str, Any], reference: str
 ) -> WorstError | None:
-    """As `worst_error`, of what was read."""
+    """Like `worst_error`, for a calibration that was read."""
     found = []
     for pair in evaluate(calibration, truth)["pairs"]:
         if pair["to"] != reference:

@@ -1,15 +1,14 @@
-"""How much faster a batch is on two workers than on one, and whether a killed one ends the same.
+"""Speed-up of a batch on two workers, and whether a killed batch ends with the same results.
 
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_batch.py
 
 Simulates 16 drives (`--drives`) of the demo's arc with different seeds, once: they stay in
-out/batch_drives. Then `caliv-graph batch` runs on them with 1 and with 2 workers (`--workers`), in
-turn, `--rounds` times each; what counts is the shortest time of each, for other programs can only
-make it longer. With `--kills N` a batch is killed (SIGKILL to all its processes) at a random moment
-and started again, N times; after each kill every result that was finished has to be there,
-untouched, and in the end all of them have to be those of the batch that was never killed, byte for
-byte, but for what says when and how long: job.json (times and sizes), log.jsonl (seconds) and the
-table of times in report.html.
+out/batch_drives. Then `caliv-graph batch` runs on them with 1 and with 2 workers (`--workers`),
+alternately, `--rounds` times each. The shortest time of each counts, because other programs can
+only make it longer. With `--kills N` a batch is killed (SIGKILL to all its processes) at a random
+moment and started again, N times. After each kill every finished result must be unchanged. In the
+end all results must equal those of a batch that was never killed, byte for byte, except times and
+durations: job.json (times and sizes), log.jsonl (seconds) and the table of times in report.html.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))  # for the module beside this one, run from anywhere
+sys.path.insert(0, str(ROOT))  # imports the module beside this one from any folder
 
 from caliv_graph.common.files import output_folder
 from caliv_graph.config.load import load_config
@@ -46,7 +45,7 @@ SCENARIO = ROOT / "configs/scenarios/demo_arc.yaml"
 DRIVES = ROOT / "out/batch_drives"
 
 LEAST_RATIO = 1.8
-"""Issue 7, of two workers against one."""
+"""Smallest speed-up of two workers."""
 
 _TIMES_IN_REPORT = re.compile(rb"<h3>Time</h3>.*?</table>", re.DOTALL)
 
@@ -56,10 +55,10 @@ class Run:
     """One batch.
 
     Attributes:
-        workers: how many.
+        workers: number of workers.
         wall_s: from start to end.
         cpu_s: processor time of all its processes.
-        load: of the machine, of the minute before.
+        load: load average of the machine in the minute before.
     """
 
     workers: int
@@ -70,13 +69,13 @@ class Run:
 
 @dataclass(frozen=True)
 class Kills:
-    """Kills, and what became of the results.
+    """Kills, and their effect on the results.
 
     Attributes:
-        kills: how often the batch was killed.
-        finished: results that were finished at each kill.
-        touched: finished results that a later run has made again, lost or changed.
-        different: files that are not those of the batch that was never killed.
+        kills: number of kills.
+        finished: number of finished results at each kill.
+        touched: finished results that a later run has repeated, lost or changed.
+        different: files that differ from those of the batch that was never killed.
     """
 
     kills: int
@@ -174,7 +173,7 @@ def make_drives(count: int, tell: Callable[[str], None]) -> list[Path]:
         drive = DRIVES / f"drive_{seed:03d}"
         if not (drive / "config.yaml").is_file():
             tell(f"simulating drive {seed} of {count}")
-            # A drive that was simulated by half would be one for ever.
+            # A partly simulated drive must not stay.
             with output_folder(drive, ("config.yaml",)) as fresh:
                 simulate_caliv(scenario, fresh / "drive", seed, threads=1)
                 for file in (fresh / "drive").iterdir():
@@ -201,7 +200,7 @@ def command(manifest: Path, out: Path, workers: int) -> list[str]:
 
 
 def time_batch(manifest: Path, out: Path, workers: int) -> Run:
-    """Runs a batch from nothing."""
+    """Runs a batch in an empty folder."""
     shutil.rmtree(out, ignore_errors=True)
     load = os.getloadavg()[0]
     used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
@@ -229,16 +228,16 @@ def kill_often(
     arguments: argparse.Namespace,
     tell: Callable[[str], None],
 ) -> Kills:
-    """Kills a batch again and again, lets it end, and compares.
+    """Kills a batch several times, lets it end, and compares the results.
 
-    A batch that has ended before the wanted number of kills begins anew.
+    A batch that ends before the requested number of kills starts again from nothing.
     """
     rng = random.Random(arguments.seed)
     before: dict[str, str] = {}
     counts: list[int] = []
     touched: list[str] = []
     different: set[str] = set()
-    # The moments are spread over about one job, from the first breath on.
+    # The moments are spread over about the duration of one job, from its start.
     longest_s = max(json.loads(text)["seconds"] for text in results(whole).values())
     while len(counts) < arguments.kills:
         process = subprocess.Popen(
@@ -275,7 +274,7 @@ def kill_often(
 
 
 def results(out: Path) -> dict[str, str]:
-    """Per finished job its record, which says when it was made."""
+    """Record of each finished job, which has the time at which it was made."""
     found = {}
     for file in sorted(out.glob("*/job.json")):
         record = file.read_text(encoding="utf-8")
@@ -287,7 +286,7 @@ def results(out: Path) -> dict[str, str]:
 
 
 def compare(whole: Path, out: Path) -> set[str]:
-    """Files that differ, but for what says when it was, and how long it took."""
+    """Files that differ in more than times and durations."""
     names = {
         str(file.relative_to(folder)) for folder in (whole, out) for file in folder.glob("[!.]*/*")
     }

@@ -1,13 +1,13 @@
-"""Is `compare` right? P-values where no mount has moved, and how often a moved one is found.
+"""Is `compare` right? P-values of unmoved mounts, and the detection rate of moved ones.
 
     .venv/bin/python scripts/benchmark_compare.py
     .venv/bin/python scripts/benchmark_compare.py --result result/calibration.yaml
     .venv/bin/python scripts/benchmark_compare.py --from-sensors 50
 
-Quick form: pairs of calibrations are drawn from what one calibration of the scenario says of its
-own errors. This tests the tests. With `--from-sensors N`, N pairs of drives are simulated from raw
-sensors and calibrated, which tests the covariance too; what has been calibrated is kept below
-out/compare and not done again. Mounts are moved by moving the second result.
+Quick form: pairs of calibrations are drawn from the stated covariance of one calibration of the
+scenario. This tests the tests. With `--from-sensors N`, N pairs of drives are simulated from raw
+sensors and calibrated, which tests the covariance too. These calibrations are kept below
+out/compare and not repeated. A mount is moved by changing the second result.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ Pair = tuple[Calibration, Calibration]
 
 @dataclass(frozen=True)
 class Move:
-    """Something to find.
+    """A movement to detect.
 
     Attributes:
         text: what it is.
-        lidars: which LiDARs are moved.
-        axis: which way, index of `conventions.AXES`.
-        size: how far, rad or m; None: five predicted sigmas of the difference.
+        lidars: LiDARs that are moved.
+        axis: index of `conventions.AXES`.
+        size: rad or m; None: five predicted sigmas of the difference.
     """
 
     text: str
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def drawn_pairs(calibration: Calibration, count: int, seed: int) -> Iterator[Pair]:
-    """Pairs of calibrations whose data err as those of `calibration` say they do."""
+    """Pairs of calibrations with errors drawn from the stated data covariance of one."""
     rng = np.random.default_rng(seed)
     root = data_root(calibration)
     for pair in range(count):
@@ -116,13 +116,15 @@ def data_root(calibration: Calibration) -> Array:
     information = own_term(calibration, "result").information
     guesses = [guess_of(calibration, name).sigmas for name in calibration.lidars]
     split = spectrum(information, np.diag(np.concatenate(guesses) ** -2.0))
-    told = ~split.undetermined
+    determined = ~split.undetermined
     unit = scaling(len(guesses))
-    return np.asarray(unit[:, None] * split.vectors[:, told] / np.sqrt(split.information[told]))
+    return np.asarray(
+        unit[:, None] * split.vectors[:, determined] / np.sqrt(split.information[determined])
+    )
 
 
 def at(calibration: Calibration, e: Array, source: str) -> Calibration:
-    """A calibration whose data are best met at a perturbation e (vehicle axes) of this one."""
+    """The calibration with its data's optimum moved by e (vehicle axes)."""
     return replace(
         moved(calibration, e),
         gradient_data=np.zeros(len(e)),
@@ -149,12 +151,12 @@ def measured_pairs(scenario: str, count: int, jobs: int) -> list[Pair]:
 
 
 def calibrated(scenario: str, seeds: Sequence[int], jobs: int) -> list[Path]:
-    """Calibrations of a simulated scenario, those that are not there yet made now."""
+    """Calibrations of a simulated scenario; missing ones are made."""
     cached_selection(load_scenario(SCENARIOS / f"{scenario}.yaml"), OUT / "beams")
     make = partial(calibrated_once, scenario)
     if jobs == 1:
         return [make(seed) for seed in seeds]
-    # Spawned: threads of open3d do not survive a fork.
+    # Spawned, because threads of open3d do not survive a fork.
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         return list(pool.map(make, seeds))
 
@@ -175,7 +177,7 @@ def calibrated_once(scenario: str, seed: int) -> Path:
 
 
 def null_table(pairs: Sequence[Pair]) -> str:
-    """P-values of pairs of which nothing has moved."""
+    """P-values of pairs without movement."""
     found = [compare(*pair, LABELS) for pair in pairs]
     lines = [
         f"\nNothing has moved: {len(pairs)} pairs. Uniform p-values give a large p of the "
@@ -211,7 +213,7 @@ def name_of(lidars: Sequence[str]) -> str:
 
 
 def power_table(pairs: Sequence[Pair]) -> str:
-    """How often a mount that has moved is found."""
+    """Detection rate of moved mounts."""
     lines = [
         "\nA mount has moved. Found: by a test of a LiDAR or pair that moved, p < 0.01; by the "
         "verdict, corrected for the number of tests",
@@ -239,7 +241,7 @@ def power_table(pairs: Sequence[Pair]) -> str:
 
 
 def moves(lidars: Sequence[str]) -> Iterator[Move]:
-    """A tenth of a degree, and five sigmas, of each LiDAR and of all together."""
+    """Movements by 0.1 degrees and by five sigmas, of each LiDAR and of all together."""
     groups: Mapping[str, tuple[str, ...]] = {
         **{f"'{name}'": (name,) for name in lidars},
         "all LiDARs": tuple(lidars),
@@ -252,7 +254,7 @@ def moves(lidars: Sequence[str]) -> Iterator[Move]:
 
 
 def perturbation(first: Calibration, second: Calibration, move: Move) -> tuple[Array, float]:
-    """(6n,) of the mounts, and its size: five sigmas are those of the first LiDAR moved."""
+    """(6n,) the movement, and its size. Five sigmas refer to the first LiDAR that is moved."""
     names = list(first.lidars)
     rows = [6 * names.index(name) + move.axis for name in move.lidars]
     size = move.size

@@ -1,4 +1,4 @@
-"""Is a wrong result called wrong, and a right one never? False alarms and faults, from raw sensors.
+"""False alarms and detected faults of the status `inconsistent`, from raw sensors.
 
 Needs the environment that scripts/demo makes:
 
@@ -6,12 +6,12 @@ Needs the environment that scripts/demo makes:
     .venv/bin/python scripts/benchmark_consistency.py --faults --seeds 3
     .venv/bin/python scripts/benchmark_consistency.py --summary
 
-Clean drives: seed n is one of the scenarios in turn. Every run draws all that a stated sigma
-covers; none may come out `inconsistent`. Faults, all on figure_eight: stamps of one LiDAR that are
-off, clouds of one LiDAR that lie elsewhere, swapped topics; each has to come out `inconsistent` or,
-where no target is found, as an error. A run is a line in out/consistency/runs.jsonl, written as it
-is done: a second start does what is missing. Runs of another version of the program's text do not
-count unless --any-version is given.
+Clean drives: seed n uses the scenarios in turn. Every run draws all errors that a stated sigma
+covers. No run may be `inconsistent`. Faults, all on figure_eight: wrong stamps of one LiDAR,
+displaced clouds of one LiDAR, swapped topics. Each must be `inconsistent` or, if no target is
+found, an error. A run is a line in out/consistency/runs.jsonl, written when it ends. A second start
+runs the missing ones. Runs of another version of the program do not count unless --any-version is
+given.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
 import numpy as np
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.errors import CalivError
@@ -53,10 +53,10 @@ SCENARIOS = ("figure_eight", "s_curve", "paper_arc", "tri_lidar")
 
 @dataclass(frozen=True)
 class Faulty(ForwardingRecording):
-    """A recording with something wrong (products.Recording).
+    """A recording with a fault (products.Recording).
 
     Attributes:
-        late_ns: per LiDAR, by how much its stamps are late.
+        late_ns: per LiDAR, delay of its stamps.
         displaced: per LiDAR, which clouds (number, of how many) lie elsewhere, and by what (metres,
             lidar frame).
         source: per LiDAR, whose clouds come under its name.
@@ -128,7 +128,7 @@ FAULTS: dict[str, Callable[[Recording], Recording]] = {
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a scenario, what is wrong with it (empty: nothing), a seed."""
+    """One run: a scenario, its fault (empty: none), a seed."""
 
     scenario: str
     fault: str
@@ -163,14 +163,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def tasks(seeds: int, *, faults: bool) -> list[Task]:
-    """What there shall be."""
+    """All runs that are requested."""
     if faults:
         return [Task("figure_eight", f, seed) for seed in range(1, seeds + 1) for f in FAULTS]
     return [Task(SCENARIOS[(n - 1) % len(SCENARIOS)], "", n) for n in range(1, seeds + 1)]
 
 
 def perform(task: Task, beams: Path) -> dict[str, Any]:
-    """Simulates and calibrates once; the line to write."""
+    """Simulates and calibrates once; returns the line to write."""
     model = load_scenario(REPOSITORY / "configs" / "scenarios" / f"{task.scenario}.yaml")
     selection = cached_selection(model, beams)
     drive = ThinnedRecording(model, selection, task.seed, waves=GroundWaves())
@@ -194,7 +194,7 @@ def perform(task: Task, beams: Path) -> dict[str, Any]:
 
 
 def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
-    """The runs of a file that count; half a line is none."""
+    """The runs of a file that count, without incomplete lines."""
     out = []
     for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
@@ -207,7 +207,7 @@ def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
 
 
 def summary(lines: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
-    """What came of the runs, and how many came out as they should not."""
+    """Summary of the runs, and the number of wrong ones."""
     clean = [line for line in lines if not line["fault"]]
     alarms = [line for line in clean if line["status"] not in ("ok", "partial")]
     out = [f"clean drives: {len(clean)}, of which {len(alarms)} are called wrong"]

@@ -1,12 +1,11 @@
-"""What carries no weight on `noisy`: fixes that are off, and what is not the chair.
+"""Weights on the scenario `noisy`: outlying fixes, and points that are not on the chair.
 
 Needs the environment that scripts/demo makes:
 
     .venv/bin/python scripts/benchmark_outliers.py --seeds 5
 
-A fix is off if it is farther than six of its sigmas from where the antenna truly is: in a jump, or
-an outlier of its own. What each point of a cloud lies on is known from the simulation; it carries
-the robust weight of its cloud.
+A fix is an outlier if it is more than six of its sigmas from the true antenna, in a jump or alone.
+The simulation gives the object of each point of a cloud. A point has its cloud's robust weight.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 import pymap3d
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config
@@ -40,15 +39,15 @@ from scripts._thinned import GroundWaves, ThinnedRecording, cached_selection
 SCENARIO = REPOSITORY / "configs" / "scenarios" / "noisy.yaml"
 
 OFF_SIGMAS = 6.0
-"""A sound fix is as far off once in a hundred million."""
+"""Error in sigmas above which a fix is an outlier: probability 1e-8 of a sound fix."""
 
 WALKED = 0.05
-"""Part of a cloud's points on the walker from which on it is one of his clouds."""
+"""Fraction of a cloud's points on the walker from which on it counts as a cloud of the walker."""
 
 
 @dataclass(frozen=True)
 class Fixes:
-    """How many fixes there are of a kind, and how many of them were dropped."""
+    """Number of fixes of a kind, and the number of dropped ones."""
 
     jump: tuple[int, int]
     outlier: tuple[int, int]
@@ -57,14 +56,14 @@ class Fixes:
 
 @dataclass(frozen=True)
 class Clouds:
-    """Of the clouds that were used.
+    """Weights of the clouds that were used.
 
     Attributes:
         count: all.
         walked: those with the walker in them.
         walked_weight: mean weight of these; NaN if there are none.
-        walker_share: part of the weight, over all clouds, that lies on the walker's points.
-        chair_share: the same of the chair's.
+        walker_share: fraction of the total weight on the walker's points.
+        chair_share: fraction of the total weight on the chair's points.
     """
 
     count: int
@@ -95,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def fixes_of(drive: ThinnedRecording, config: Config) -> Fixes:
-    """Which fixes the smoother drops."""
+    """The fixes that the smoother drops."""
     model = drive.scenario.gnss
     fixes = drive.motion().gnss
     assert fixes is not None
@@ -120,7 +119,7 @@ def fixes_of(drive: ThinnedRecording, config: Config) -> Fixes:
 
 
 def clouds_of(drive: ThinnedRecording, config: Config) -> Clouds:
-    """On whose points the weight lies."""
+    """Weights by the object of the points."""
     run = calibrate([drive], config, SilentProgress())
     names = drive.world.names
     walkers = np.array([names.index(name) for name in drive.scenario.world.walkers])
@@ -147,7 +146,7 @@ def clouds_of(drive: ThinnedRecording, config: Config) -> Clouds:
 
 
 def _objects(drive: ThinnedRecording, lidar: str, stamp_ns: int, points_lidar: Array) -> IntArray:
-    """(n,) what each point of an extracted cloud lies on."""
+    """(n,) object of each point of an extracted cloud."""
     (taken,) = drive.scans_with_truth(lidar, {stamp_ns})
     of = {p.tobytes(): k for p, k in zip(taken.scan.points_lidar, taken.objects, strict=True)}
     return np.array([of[p.tobytes()] for p in points_lidar], np.int64)

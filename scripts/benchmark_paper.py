@@ -1,13 +1,12 @@
-"""The paper's own estimator, written anew, beside ours: same clouds, same guesses, same machine.
+"""The paper's own estimator, reimplemented, and ours: same clouds, same guesses, same machine.
 
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_paper.py
 
 Simulates each scenario with seeds 1 to N (`--runs`), keeps its clouds in memory, and calibrates
-them from the guess that a simulated drive comes with (`--starts truth`: from the true extrinsics,
-which only shows how good the paper's estimator is at best). `--released` does the same on the drive
-that the CaLiV authors published, from drawn guesses. Errors are in vehicle axes, mean absolute over
-the runs, as the paper defines them. Each run is a line of `out/paper/NAME.jsonl`; lines that are
-there already are not run again.
+them from the initial guess of the simulated drive (`--starts truth`: from the true extrinsics, the
+best case of the paper's estimator). `--released` does the same on the drive that the CaLiV authors
+published, from drawn guesses. Errors are in vehicle axes, mean absolute over the runs, as the paper
+defines them. Each run is a line of `out/paper/NAME.jsonl`; existing lines are not run again.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one core for both
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the estimator beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the estimator beside this script from any folder
 
 import gtsam
 import numpy as np
@@ -61,12 +60,12 @@ TIMES: Mapping[str, str] = {
     "optimisation": "optimisation alone",
     "cpu": "end to end, of CPU",
 }
-"""Optimisation is Powell's method, or our graph solves; what goes round with those, to refine shape
-and graph together, counts as registration."""
+"""Optimisation is Powell's method, or our graph solves. The rest of the loop that refines shape and
+graph together counts as registration."""
 
 CROP = CropModel(margin_m=0.5, elsewhere_stride=8)
-"""Of a scenario without one: all beams near the target, few elsewhere, so that clouds fit into
-memory. As in figure_eight.yaml."""
+"""Crop of a scenario without one, as in figure_eight.yaml: all beams near the target and few
+elsewhere, so that clouds fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +75,12 @@ class Outcome:
     Attributes:
         drive: scenario, or RELEASED.
         run: seed of the drive, or number of the guess.
-        start: what the clouds were pre-aligned with: guess or truth.
+        start: extrinsics for the pre-alignment: guess or truth.
         estimator: PAPER or OURS.
-        failure: why there is no result, or empty.
-        errors: what was compared ('S2V front', 'S2S front to rear') -> axis -> rad or m; an axis
-            that the estimator holds, or names as not determined, is None.
-        seconds: TIMES; reading takes some only where there are files to read.
+        failure: reason for a missing result, or empty.
+        errors: quantity ('S2V front', 'S2S front to rear') -> axis -> rad or m; None for an axis
+            that the estimator fixes or names as undetermined.
+        seconds: TIMES; reading takes time only if there are files.
     """
 
     drive: str
@@ -94,7 +93,7 @@ class Outcome:
 
 
 class KeptRecording:
-    """A recording whose clouds are in memory: nobody waits for rays to be cast."""
+    """A recording with its clouds in memory, so that casting rays is not timed."""
 
     def __init__(self, recording: Recording) -> None:
         self.name = recording.name
@@ -122,7 +121,7 @@ class Job:
     Attributes:
         drive: scenario, or RELEASED.
         run: seed of the drive, or number of the guess.
-        open: gives the recording, the config with the guesses, and the true extrinsics.
+        open: returns the recording, the config with the guesses, and the true extrinsics.
     """
 
     drive: str
@@ -176,7 +175,7 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def benchmark(arguments: argparse.Namespace) -> list[Outcome]:
-    """Runs what is not finished yet."""
+    """Runs the missing ones."""
     jobs = [
         Job(name, run, simulated(name, run))
         for name in arguments.scenarios
@@ -184,7 +183,7 @@ def benchmark(arguments: argparse.Namespace) -> list[Outcome]:
     ]
     if arguments.released is not None:
         data = arguments.released.resolve()
-        released.authors_config(data)  # says at once if it is not there
+        released.authors_config(data)  # raises now if the drive is missing
         jobs += [Job(RELEASED, run, published(data, run)) for run in range(1, arguments.runs + 1)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     outcomes = []
@@ -224,11 +223,11 @@ def published(
 def run_job(
     job: Job, starts: Sequence[str], log: Path, tell: Callable[[str], None]
 ) -> list[Outcome]:
-    """The outcomes of a drive; those that the log has are not worked out again."""
+    """The outcomes of a drive; those in the log are not computed again."""
     done = read_log(log)
     wanted = [(job.drive, job.run, s, e) for s in starts for e in (PAPER, OURS)]
     if any(key not in done for key in wanted):
-        import_open3d()  # a second that belongs to neither
+        import_open3d()  # takes a second that is part of neither estimator
         recording, config, truth = job.open()
         for key in wanted:
             if key not in done:
@@ -261,7 +260,7 @@ def run_once(
     begun, cpu = time.perf_counter(), time.process_time()
     try:
         errors, stages = run(recording, config, true_poses, job.run)
-    except CalivError as e:  # one that fails is a result too
+    except CalivError as e:  # a failure is a result too
         return Outcome(job.drive, job.run, start, estimator, str(e), {}, {})
     seconds = {
         "total": time.perf_counter() - begun,
@@ -280,7 +279,7 @@ def run_paper(
 ) -> tuple[Errors, Mapping[str, float]]:
     result = paper_from_recording(recording, config, seed)
     found = mounting_errors(result.T_vehicle_lidar, truth, config.reference)
-    # S2V translations are the guess's, S2S moved them along: not an estimate.
+    # S2V translations are those of the guess, moved by S2S, and no estimates.
     held = dict.fromkeys("xyz")
     errors = {row: {**e, **held} if row.startswith("S2V") else e for row, e in found.items()}
     return errors, result.seconds
@@ -294,8 +293,8 @@ def run_ours(
     seen = {n: r.T_vehicle_lidar for n, r in calibration.lidars.items() if r.saw_target}
     errors = mounting_errors(seen, truth, calibration.reference)
     for name in seen:
-        told = calibration.lidars[name].determined
-        errors[f"S2V {name}"] = only(errors[f"S2V {name}"], told)
+        determined = calibration.lidars[name].determined
+        errors[f"S2V {name}"] = only(errors[f"S2V {name}"], determined)
     for source, to in sensor_pairs(seen, calibration.reference):
         row = f"S2S {source} to {to}"
         errors[row] = only(errors[row], pair_determined(calibration, source, to))
@@ -305,8 +304,10 @@ def run_ours(
     }
 
 
-def only(errors: Mapping[str, float | None], told: Mapping[str, bool]) -> dict[str, float | None]:
-    return {axis: error if told[axis] else None for axis, error in errors.items()}
+def only(
+    errors: Mapping[str, float | None], determined: Mapping[str, bool]
+) -> dict[str, float | None]:
+    return {axis: error if determined[axis] else None for axis, error in errors.items()}
 
 
 def mounting_errors(
@@ -335,7 +336,7 @@ Key = tuple[str, int, str, str]
 
 
 def settings() -> dict[str, Any]:
-    """What a line of the log was made with; one that was made otherwise does not count."""
+    """Settings of a line of the log; lines with other settings do not count."""
     return {
         "version": __version__,
         "components": COMPONENTS,
@@ -345,7 +346,7 @@ def settings() -> dict[str, Any]:
 
 
 def read_log(path: Path) -> dict[Key, Outcome]:
-    """Finished runs; half a line, which a killed run leaves, is none."""
+    """Finished runs, without the incomplete line of a killed run."""
     out: dict[Key, Outcome] = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         try:
@@ -360,7 +361,7 @@ def read_log(path: Path) -> dict[Key, Outcome]:
 
 
 def append(path: Path, outcome: Outcome) -> None:
-    """Adds a line; on a line of its own even after half of one."""
+    """Adds a line, on its own line even after an incomplete one."""
     torn = path.is_file() and path.stat().st_size and not path.read_bytes().endswith(b"\n")
     line = json.dumps({"settings": settings(), **vars(outcome)})
     with path.open("a", encoding="utf-8") as file:
@@ -404,11 +405,11 @@ def table(drive: str, start: str, outcomes: Sequence[Outcome]) -> str:
 
 AUTHORS_PROGRAM = (
     "The authors' own program: 15 s to preprocess 462 clouds, 38 minutes for the 158 that see the "
-    "target, 2 cores (SPEC 8)"
+    "target, 2 cores"
 )
 
 LARGEST_RATIO = 1000.0
-"""A larger one is the luck of a few runs."""
+"""Largest ratio that is shown; a larger one is chance in a few runs."""
 
 
 def mean_absolute(row: str, outcomes: Sequence[Outcome]) -> dict[str, float | None]:

@@ -1,9 +1,9 @@
-"""How good and how fast a calibration of the CaLiV authors' drive is, over many initial guesses.
+"""Accuracy and speed of calibrations of the CaLiV authors' drive, over many initial guesses.
 
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_released.py
 
-The guesses are drawn as in the paper: every translation off by up to 0.1 m per vehicle axis, every
-rotation by up to 3 degrees in roll, pitch and yaw. The truth is what the authors' config says.
+The guesses are drawn as in the paper, with errors of up to 0.1 m per vehicle axis and up to 3
+degrees in roll, pitch and yaw. The truth is the extrinsics of the authors' config.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the module beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the module beside this script from any folder
 
 import gtsam
 import numpy as np
@@ -74,8 +74,8 @@ STAGED_LIMITS: Mapping[str, Mapping[str, float]] = {
     "S2V L1": {"roll": 5.1, "pitch": 5.3, "yaw": 8.2},
     "S2V L2": {"roll": 1.5, "pitch": 2.4, "yaw": 8.2},
 }
-"""Largest mean absolute errors, mm and mrad: what the authors' program reaches, and for S2S x and
-y a little more than nobody has explained yet."""
+"""Limits of the mean absolute errors, mm and mrad: those of the authors' program, and for S2S x and
+y a little more than the unexplained offset of this drive."""
 
 AUTO_YAW_LIMIT_MRAD = 5.0
 AUTO_STD_LIMITS = {"x": 2.0, "y": 2.0, "z": 2.0, "roll": 0.5, "pitch": 0.5, "yaw": 0.5}
@@ -89,11 +89,11 @@ GROUND_STD_LIMITS = {"x": 1.0, "y": 1.0, "z": 1.0, "roll": 0.2, "pitch": 0.2, "y
 """With the ground, which the authors discard: mean absolute errors and spread, mm and mrad."""
 
 JOINT_PRIOR = {"x": 40.0, "z": 41.0, "yaw": 4.3}
-"""Sigmas (mm, mrad) of the two guesses together, 58 mm and 30 mrad each, along what this drive
-leaves open: height, and the rotation about a turn centre 9.14 m away."""
+"""Sigmas (mm, mrad) of the two guesses together, 58 mm and 30 mrad each, along the undetermined
+directions of this drive: height, and the rotation about a turn centre 9.14 m away."""
 
 SMALL_SIGMA = 0.5
-"""A sigma of what is not determined is small, a false claim, below this part of the prior's."""
+"""Smallest ratio of the sigma of an undetermined axis to the prior's. A smaller one is wrong."""
 
 TOTAL_LIMIT_S = 15.0
 GRAPH_LIMIT_S = 2.0
@@ -117,7 +117,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the guesses of one mode and kernel came to; (6,) in mm and mrad, `SHOWN_AXES`."""
+    """Statistics over the guesses of one mode and kernel; (6,) in mm and mrad, `SHOWN_AXES`."""
 
     mean_abs: Array
     std: Array
@@ -152,7 +152,7 @@ class Runs:
         )
 
     def smallest_sigma(self, axis: str) -> float:
-        """Of an axis of either LiDAR's mounting, over all guesses; mm or mrad."""
+        """Smallest sigma of an axis of both LiDARs' S2V, over all guesses; mm or mrad."""
         return min(
             value_of(axis, shown_units(o.sigmas[quantity]))
             for o in self.good
@@ -306,7 +306,7 @@ def calibrate_all(
         for guess, config in enumerate(guesses)
     ]
     outcomes: list[Outcome] = []
-    # Fork would copy the locks of whatever threads the libraries have started.
+    # Fork would copy the locks of threads that the libraries have started.
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(arguments.jobs, context) as pool,
@@ -332,7 +332,7 @@ def calibrate_once(config: Config, true_config: Config, guess: int) -> Outcome:
     outcome = Outcome(config.solve.mode, config.robust.kernel, guess)
     try:
         run = calibrate([open_recording(config)], config, SilentProgress())
-    except Exception as e:  # one that fails is a result too
+    except Exception as e:  # a failure is a result too
         return replace(outcome, failure=f"{type(e).__name__}: {e}")
     truth = {n: lidar.initial.pose() for n, lidar in true_config.lidars.items()}
     return measured(outcome, run.calibration, truth)
@@ -371,7 +371,7 @@ def measured(
 def time_command(
     config: Config, mode: SolveMode, kernel: RobustKernel, progress: Progress
 ) -> Timing:
-    """Times the installed command, one at a time, each in a process of its own."""
+    """Times the installed command, one run at a time, each in its own process."""
     found = []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -476,7 +476,7 @@ def accuracy_text(run: Runs) -> str:
     lost = frozenset.intersection(*(outcome.lost for outcome in run.good))
     for quantity in QUANTITIES:
         s = run.statistics(quantity)
-        # What moves all LiDARs together leaves S2S alone.
+        # A movement of all LiDARs together does not change S2S.
         held = frozenset() if quantity == "S2S" else lost
         lines += [
             row(f"{quantity:8}mean absolute error", s.mean_abs, held, f"{s.nees:9.2f}"),

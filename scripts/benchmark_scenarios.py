@@ -1,11 +1,11 @@
-"""How far off a calibration from raw sensors is, per scenario, with fresh noise for every seed.
+"""Errors of calibrations from raw sensors, per scenario, with new noise for every seed.
 
     .venv/bin/python scripts/benchmark_scenarios.py --scenarios figure_eight s_curve --seeds 3
 
 Every run simulates the drive in memory (the bag that `caliv-graph simulate` writes holds the same),
 calibrates it with the config that `simulate` writes, and compares with the truth. Errors are in
-vehicle axes, mm and mrad; of an axis that the drive does not determine the error is left out, and
-counted. NEES is 6 on average if the covariance is right.
+vehicle axes, mm and mrad. Errors of undetermined axes are left out, and their number is shown. NEES
+is 6 on average if the covariance is right.
 """
 
 from __future__ import annotations
@@ -49,13 +49,12 @@ class Outcome:
 
     Attributes:
         scenario: its name.
-        seed: of all that was drawn.
-        failure: why there is no result, or empty.
+        seed: seed of all draws.
+        failure: reason for a missing result, or empty.
         status: of the calibration.
-        seconds: of CPU, simulation left out.
-        rows: what was compared ('S2V front') -> error per axis (rad and m; None: not determined),
-            and NEES.
-        offsets_ms: per LiDAR, estimated time offset less the true one.
+        seconds: CPU time without the simulation.
+        rows: quantity ('S2V front') -> error per axis (rad and m; None: undetermined), and NEES.
+        offsets_ms: per LiDAR, estimated time offset minus the true one.
     """
 
     scenario: str
@@ -107,11 +106,11 @@ def run(task: tuple[str, int, bool, bool]) -> Outcome:
     errors = evaluate(calibration, recording.truth.T_vehicle_lidar)
     rows = {}
     for lidar, found in errors["lidars"].items():
-        told = calibration.lidars[lidar].determined
-        rows[f"S2V {lidar}"] = (by_axis(found["s2v"], told), found["s2v"]["nees"])
+        determined = calibration.lidars[lidar].determined
+        rows[f"S2V {lidar}"] = (by_axis(found["s2v"], determined), found["s2v"]["nees"])
     for pair in errors["pairs"]:
-        told = pair_determined(calibration, pair["from"], pair["to"])
-        rows[f"S2S {pair['from']} to {pair['to']}"] = (by_axis(pair, told), pair["nees"])
+        determined = pair_determined(calibration, pair["from"], pair["to"])
+        rows[f"S2S {pair['from']} to {pair['to']}"] = (by_axis(pair, determined), pair["nees"])
     found_offsets = {
         lidar: 1e3 * (result.time_offset[0] - recording.truth.time_offset_s[lidar])
         for lidar, result in calibration.lidars.items()
@@ -120,10 +119,10 @@ def run(task: tuple[str, int, bool, bool]) -> Outcome:
     return Outcome(name, seed, "", calibration.status, seconds, rows, found_offsets)
 
 
-def by_axis(found: Mapping[str, Any], told: Mapping[str, bool]) -> dict[str, float | None]:
-    """Errors by axis; None where the drive did not determine it."""
+def by_axis(found: Mapping[str, Any], determined: Mapping[str, bool]) -> dict[str, float | None]:
+    """Errors by axis; None for undetermined axes."""
     values = [*found["rotation_rad"], *found["translation_m"]]
-    return {a: float(v) if told[a] else None for a, v in zip(AXES, values, strict=True)}
+    return {a: float(v) if determined[a] else None for a, v in zip(AXES, values, strict=True)}
 
 
 def table(name: str, outcomes: Sequence[Outcome]) -> str:
@@ -145,8 +144,10 @@ def table(name: str, outcomes: Sequence[Outcome]) -> str:
     for row, contents in gathered.items():
         cells = []
         for axis in SHOWN:
-            told = [abs(e[axis] or 0.0) for e, _ in contents if e[axis] is not None]
-            cells.append(f"{1e3 * np.mean(told):.2f}" if len(told) == len(contents) else "-")
+            determined = [abs(e[axis] or 0.0) for e, _ in contents if e[axis] is not None]
+            cells.append(
+                f"{1e3 * np.mean(determined):.2f}" if len(determined) == len(contents) else "-"
+            )
         nees = np.mean([n for _, n in contents])
         lines.append(f"  {row:28}{''.join(f'{c:>12}' for c in cells)}{nees:8.1f}")
     for outcome in done:

@@ -1,20 +1,20 @@
-"""Where the time of a calibration goes, and how it grows.
+"""Time of a calibration by stage, and its growth with the data.
 
 Needs the environment that scripts/demo makes: .venv/bin/python scripts/benchmark_speed.py
 
-Every calibration is `caliv-graph calibrate` in a process of its own, report and files included, and
-is timed from the end of its imports (start-up is told apart); memory is that of the whole process.
-Bags are simulated with `--seed` into a temporary folder and deleted. Measured are
+Every calibration is `caliv-graph calibrate` in its own process, report and files included. It is
+timed from the end of its imports; start-up is measured separately. Memory is that of the whole
+process. Bags are simulated with `--seed` into a temporary folder and deleted. Measured are
 
 - the drive that the CaLiV authors published (`--data`) and simulated bags, on 2 cores and on 1:
   each stage, the rest (first pass over a bag, report, files), and peak memory;
 - how processor time grows with clouds, points per cloud, LiDARs and components of the mixture,
   each 1, 2 and 4 times;
-- the paper's own estimator, written anew (`benchmark_paper.py`), on the same clouds from the same
+- the paper's own estimator, reimplemented (`benchmark_paper.py`), on the same clouds from the same
   guesses in the same process as ours, one thread each: end to end, and the optimisation alone;
 - `--help` of the program and of every command.
 
-Growth and ratios are of processor time: wall time also measures what else the machine does.
+Growth and ratios use processor time, because wall time depends on other processes.
 `--quick` leaves out all repetitions, the larger bag and the paper's estimator on it.
 """
 
@@ -32,7 +32,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one thread for both estimators
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the scripts beside this one from any folder
 
 from caliv_graph._open3d import import_open3d
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
@@ -49,16 +49,16 @@ REPEATED = 3
 CORES = (2, 1)
 
 CLOUD_STEPS = (4, 2, 1)
-"""Every so manieth cloud of the authors' drive."""
+"""Subsampling of the clouds of the authors' drive: every n-th cloud."""
 
 POINTS = (12_000, 24_000, 48_000)
 LIDARS = (1, 2, 4)
 COMPONENTS = (300, 600, 1200)
 MOST_COMPONENTS = 1000
-"""Beside 300, the two that the limit is about."""
+"""Numbers of components to which the limit applies, besides 300."""
 
 MINUTES = 1.0
-"""Of the bags in which points and LiDARs vary: one figure-eight."""
+"""Duration of the bags with varying points and LiDARs: one figure-eight."""
 
 READING = ("reading clouds", "reading the ground")
 
@@ -78,9 +78,9 @@ class Case:
     """One drive, calibrated on some numbers of cores.
 
     Attributes:
-        name: what to call it.
-        clouds: in the recording.
-        usages: by number of cores.
+        name: its name.
+        clouds: number of clouds in the recording.
+        usages: resources by number of cores.
     """
 
     name: str
@@ -90,12 +90,12 @@ class Case:
 
 @dataclass(frozen=True)
 class Growth:
-    """How a calibration grows with one quantity.
+    """Growth of a calibration's time with one quantity.
 
     Attributes:
         what: the quantity.
-        sizes: it had.
-        usages: for each; on one core.
+        sizes: its values.
+        usages: resources for each value, on one core.
     """
 
     what: str
@@ -103,17 +103,17 @@ class Growth:
     usages: tuple[_child.Usage, ...]
 
     def ratios(self) -> tuple[float, ...]:
-        """Processor time over that of the first."""
+        """Processor times relative to the first."""
         return tuple(usage.cpu_s / self.usages[0].cpu_s for usage in self.usages)
 
     def doubled(self) -> float:
-        """Processor time of the last over that of the last but one."""
+        """Processor time of the last relative to the one before."""
         return self.usages[-1].cpu_s / self.usages[-2].cpu_s
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """The paper's estimator beside ours on the same clouds.
+    """The paper's estimator and ours on the same clouds.
 
     Attributes:
         name: of the drive.
@@ -142,15 +142,15 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Found:
-    """Everything that was measured.
+    """All measurements.
 
     Attributes:
         cases: drives, stage by stage.
         growths: by quantity.
-        more_components: processor time with 1,000 components over that with 300; None: not asked.
-        baselines: the paper's estimator beside ours.
+        more_components: processor time with 1,000 components relative to 300; None: not measured.
+        baselines: the paper's estimator and ours.
         helps_s: wall time of `--help` by command.
-        load: processes that wanted a core before this began: wall times are longer by them.
+        load: load average before the start. It makes wall times longer.
     """
 
     cases: tuple[Case, ...]
@@ -296,7 +296,7 @@ def with_clouds(data: Path, folder: Path, repeated: int, progress: Progress) -> 
 
 
 def part_of(data: Path, step: int, folder: Path) -> Path:
-    """A CaLiV folder with every so manieth cloud of another, as links."""
+    """A CaLiV folder with links to every n-th cloud of another one."""
     part = Path(tempfile.mkdtemp(dir=folder))
     (part / "input").mkdir()
     poses = data / "input/ego_poses.yaml"
@@ -359,7 +359,7 @@ def beside(job: benchmark_paper.Job, progress: Progress) -> Baseline:
     Raises:
         CalivError: one of them has no result.
     """
-    import_open3d()  # a second that belongs to neither
+    import_open3d()  # takes a second that is part of neither estimator
     recording, config, truth = job.open()
     outcomes = {}
     for estimator in (benchmark_paper.PAPER, benchmark_paper.OURS):
@@ -372,7 +372,7 @@ def beside(job: benchmark_paper.Job, progress: Progress) -> Baseline:
 
 
 def verdicts(found: Found) -> list[Verdict]:
-    """What the project promises, against what was measured."""
+    """The project's limits and the measured values."""
     out = []
     for case in found.cases:
         if case.name == "authors' drive":
@@ -442,7 +442,7 @@ def case_text(case: Case) -> str:
 
 
 def rest(usage: _child.Usage) -> tuple[float, float]:
-    """Wall and processor time that no stage has."""
+    """Wall and processor time outside all stages."""
     walls, cpus = zip(*usage.stages.values(), strict=True)
     return usage.wall_s - sum(walls), usage.cpu_s - sum(cpus)
 

@@ -6,13 +6,12 @@ Needs the environment that scripts/demo makes:
     .venv/bin/python scripts/benchmark_tables.py --scenarios figure_eight --rows auto --runs 5
     .venv/bin/python scripts/benchmark_tables.py --summary
 
-Every run draws all that a stated sigma covers: vehicle height, heave, waves of the ground, the
-noise of every sensor, and initial guesses that are off by up to 0.1 m and 3 degrees. Of a cloud
-only the beams that matter are cast (`scripts._thinned`). A run is a line in
-out/tables/<scenario>-<row>.jsonl, written as it is done: a second start does what is missing. Runs
+Every run draws all errors that a stated sigma covers: vehicle height, heave, waves of the ground,
+the noise of every sensor, and initial guesses with errors of up to 0.1 m and 3 degrees. Only the
+relevant beams of a cloud are cast (`scripts._thinned`). A run is a line in
+out/tables/<scenario>-<row>.jsonl, written when it ends. A second start runs the missing ones. Runs
 of another version of the program, another scenario or another config do not count. Errors are in
-vehicle axes, as `evaluate` has them; of an axis that a run did not determine the error is left out,
-and counted.
+vehicle axes, as in `evaluate`. Errors of undetermined axes are left out, and their number is shown.
 """
 
 from __future__ import annotations
@@ -32,18 +31,13 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per core
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 import caliv_graph
 from caliv_graph.common.progress import PlainProgress
 from caliv_graph.config.load import dump_config
 from caliv_graph.errors import CalivError
-from caliv_graph.scenario.model import (
-    InitialGuessModel,
-    Scenario,
-    dump_scenario,
-    load_scenario,
-)
+from caliv_graph.scenario.model import InitialGuessModel, Scenario, dump_scenario, load_scenario
 from caliv_graph.simulation.recording import simulate_drive
 from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row
 from scripts._tables_statistics import (
@@ -64,7 +58,7 @@ SCENARIOS = REPOSITORY / "configs" / "scenarios"
 OUT = REPOSITORY / "out" / "tables"
 
 WAVES = GroundWaves()
-"""The ground is as uneven as SPEC 8 has it: half a milliradian and 2 mm in each cloud."""
+"""Unevenness of the ground: 0.5 mrad and 2 mm in each cloud, the floors of a plane's sigmas."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ class Task:
     Attributes:
         scenario: its name.
         row: its name.
-        seed: of all that is drawn.
+        seed: seed of all draws.
         out: folder of the results.
     """
 
@@ -93,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     defects: list[str] = []
     if not asked.summary:
         for name in rows:
-            _selection(name, asked.out)  # once, before the processes ask for it
+            _selection(name, asked.out)  # once, before the processes start
         defects = run_missing(
             [
                 Task(name, row, seed, asked.out)
@@ -131,7 +125,7 @@ def _rows_help() -> str:
 
 
 def runs_of(scenario: str, row: str, asked: int | None) -> int:
-    """How many runs there shall be."""
+    """Requested number of runs."""
     return asked or RUNS_OF.get((scenario, row), ROWS[row].runs)
 
 
@@ -149,7 +143,7 @@ def _selection(name: str, out: Path) -> BeamSelection:
 
 
 def perform(task: Task) -> dict[str, Any]:
-    """Simulates, calibrates and compares once; the line to write."""
+    """Simulates, calibrates and compares once; returns the line to write."""
     scenario = _scenario(task.scenario)
     line: dict[str, Any] = {
         "digest": digest(task.scenario, task.row),
@@ -167,15 +161,15 @@ def perform(task: Task) -> dict[str, Any]:
 
 
 def run_missing(tasks: Sequence[Task], jobs: int, *, fresh: bool = False) -> list[str]:
-    """Does the tasks that no file has, each written down as it is done.
+    """Runs the tasks that no file has, and writes each when it ends.
 
     Args:
-        tasks: what there shall be.
-        jobs: processes.
-        fresh: discard what there is of these rows.
+        tasks: the requested runs.
+        jobs: number of processes.
+        fresh: whether existing runs of these rows are discarded.
 
     Returns:
-        A sentence for each task that ended in a defect of the program; they are not written.
+        A message for each task that ended with a defect of the program. These are not written.
     """
     missing = []
     for scenario, row, out in dict.fromkeys((t.scenario, t.row, t.out) for t in tasks):
@@ -207,7 +201,7 @@ def run_missing(tasks: Sequence[Task], jobs: int, *, fresh: bool = False) -> lis
 def _performed(
     tasks: Sequence[Task], jobs: int
 ) -> Iterator[tuple[Task, dict[str, Any] | Exception]]:
-    """Tasks and their lines, as they are done."""
+    """Tasks and their lines, in the order in which they end."""
     if jobs == 1:
         for task in tasks:
             try:
@@ -215,7 +209,7 @@ def _performed(
             except Exception as e:
                 yield task, e
         return
-    # Spawned: threads of open3d do not survive a fork.
+    # Spawned, because threads of open3d do not survive a fork.
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         futures = {pool.submit(perform, task): task for task in tasks}
         try:
@@ -239,7 +233,7 @@ def file_of(scenario: str, row: str, out: Path) -> Path:
 
 @functools.cache
 def digest(scenario: str, row: str) -> str:
-    """What a result depends on besides its seed: version, scenario, row and effective config."""
+    """Digest of version, scenario, row and effective config, on which a result depends."""
     model = _scenario(scenario)
     exact = model.model_copy(
         update={"initial_guess": InitialGuessModel(translation_m=0.0, rotation_deg=0.0)}
@@ -261,7 +255,7 @@ def digest(scenario: str, row: str) -> str:
 
 @functools.cache
 def code_digest() -> str:
-    """Of the program's text: runs before and after a change can be told apart."""
+    """Digest of the program's text, to distinguish runs before and after a change."""
     files = [*(REPOSITORY / "caliv_graph").rglob("*.py"), *(REPOSITORY / "scripts").glob("_*.py")]
     out = hashlib.sha256()
     for path in sorted(files):
@@ -270,7 +264,7 @@ def code_digest() -> str:
 
 
 def _usable(path: Path, scenario: str, row: str) -> list[dict[str, Any]]:
-    """The lines of a file that belong to what is asked now; half a line is none."""
+    """The lines of a file with the current digest, without incomplete lines."""
     if not path.exists():
         return []
     lines = []
@@ -318,7 +312,7 @@ def _line(raw: Mapping[str, Any]) -> Line:
 
 
 def planned(scenario: str) -> Mapping[str, Sequence[float]]:
-    """The planner's sigmas by quantity, `conventions.AXES`, rad and m; empty if there is none."""
+    """Sigmas of `plan` by quantity, `conventions.AXES`, rad and m; empty if there are none."""
     try:
         from caliv_graph.planning import predict
     except ImportError:
@@ -331,7 +325,7 @@ def planned(scenario: str) -> Mapping[str, Sequence[float]]:
 
 
 def summary(rows: Mapping[str, Sequence[str]], out: Path, runs: int | None = None) -> str:
-    """All tables of what is there, and the plots beside the files."""
+    """All tables of the existing runs; the plots are written beside the files."""
     texts = []
     for name, of_scenario in rows.items():
         found = {row: read_lines(name, row, out, runs) for row in of_scenario}

@@ -4,13 +4,12 @@ Needs the environment that scripts/demo makes: .venv/bin/python scripts/check_me
 
 Writes bags of 1, 4 and 16 minutes (`--laps`), 0.24 GB each minute: figure-eights past a chair, one
 a minute, two LiDARs (`--lidars`) at 10 Hz with 12,000 points per cloud (`--points`). The clouds of
-the first lap come again with later stamps; IMU, GNSS and velocity, which is all that tells the
-motion, are never repeated. `caliv-graph calibrate` runs in a process of its own on each, and its
-peak memory (ru_maxrss) is printed. The bags are deleted, each before the next is made.
+the first lap are repeated with later stamps; IMU, GNSS and velocity are never repeated.
+`caliv-graph calibrate` runs in its own process on each, and its peak memory (ru_maxrss) is printed.
+Each bag is deleted before the next one is written.
 
-What may grow is what the smoother is made of: the samples of the IMU and a pose every tenth of a
-second. `--limit` is how much that may be, in MB per minute of drive. A drive whose clouds stayed in
-memory would take 0.24 GB per minute and more.
+Only the smoother may grow: the samples of the IMU and a pose every 0.1 s. `--limit` is the limit of
+this growth in MB per minute of drive. Clouds kept in memory would need 0.24 GB per minute.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the scripts beside this one, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the scripts beside this one from any folder
 
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.errors import CalivError
@@ -41,9 +40,9 @@ class Length:
     """A bag of one length, and the calibration from it.
 
     Attributes:
-        minutes: of drive.
+        minutes: duration of the drive.
         bag_mb: size of the bag.
-        usage: of the calibration.
+        usage: resources of the calibration.
     """
 
     minutes: int

@@ -4,10 +4,10 @@ Needs the environment that scripts/demo makes: .venv/bin/python scripts/check_re
 
 Calibrates the drive that the CaLiV authors published (../shared/data/caliv_released, or `--config`
 with `--data`) in processes that differ in what must not matter: the number of cores, the number of
-threads that BLAS and OpenMP are told to use, the seed of Python's hashes, the current folder and a
-second run. Prints the digest of calibration.yaml and the time of each; the exit code is 1 if they
-differ. With `--scenario` the drive is simulated first, twice, and compared as well. What a
-calibration.yaml holds of the date, the stamp, is left out.
+threads of BLAS and OpenMP, the seed of Python's hashes, the current folder, and a second run.
+Prints the digest of calibration.yaml and the time of each. The exit code is 1 if they differ. With
+`--scenario` the drive is first simulated twice and compared as well. The date in a calibration.yaml
+is left out.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ STAMPS = ("stamp", "created", "date")
 
 @dataclass(frozen=True)
 class Setting:
-    """What must not matter.
+    """A setting that must not change the result.
 
     Attributes:
         name: for the table.
         cores: that the process may use.
-        threads: for `THREADS`; None: they are not set.
-        hash_seed: of Python.
+        threads: value of `THREADS`; None: not set.
+        hash_seed: seed of Python's hashes.
         elsewhere: whether the current folder is another one.
     """
 
@@ -64,7 +64,7 @@ SETTINGS = (
 
 @dataclass
 class Found:
-    """What came of a setting: digest per file, and seconds."""
+    """Result of a setting: digest per file, and seconds."""
 
     digests: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
@@ -131,7 +131,7 @@ def run(setting: Setting, place: Path, options: argparse.Namespace) -> Found:
 
 
 def command(setting: Setting, place: Path, arguments: Sequence[object]) -> None:
-    """Runs the program as the setting says.
+    """Runs the program with a setting.
 
     Raises:
         RuntimeError: it failed.
@@ -154,7 +154,7 @@ def command(setting: Setting, place: Path, arguments: Sequence[object]) -> None:
 
 
 def without_stamp(path: Path) -> str:
-    """Digest of a calibration.yaml but for when it was made."""
+    """Digest of a calibration.yaml without its date."""
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [text for text in lines if text.strip().partition(":")[0] not in STAMPS]
     return hashlib.sha256("\n".join(kept).encode()).hexdigest()

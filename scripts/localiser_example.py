@@ -1,4 +1,4 @@
-"""What is a calibration worth to a localiser? The same drives with three kinds of extrinsics.
+"""Effect of a calibration on a localiser: the same drives with three kinds of extrinsics.
 
     .venv/bin/python scripts/localiser_example.py
     .venv/bin/python scripts/localiser_example.py --seeds 20 --knock 0.5
@@ -8,19 +8,20 @@
 A sliding-window localiser (scripts/_localiser.py: `gtsam.IncrementalFixedLagSmoother`, IMU
 preintegration, GNSS with an outage of 20 s, scans registered to a map by Open3D) drives the
 scenario `localiser` with the extrinsics (a) as guessed, constants; (b) as calibrated, constants;
-(c) as calibrated, variables with the calibration's joint covariance for a prior. The LiDARs of (c)
-are watched by `caliv_graph.fusion.monitor`; it drives once more, with a mount knocked in
-mid-drive.
+(c) as calibrated, variables with the calibration's joint covariance as a prior.
+`caliv_graph.fusion.monitor` watches the LiDARs of (c), also in a second drive with a mount that is
+knocked in mid-drive.
 
 NEES is the squared error in units of the stated covariance, per degree of freedom: 1 if the
-localiser knows how good it is. Every seed draws the drive's noise, the initial guess and the error
-of the calibration; the latter from its own covariance, or, with --from-sensors, by calibrating a
-drive of figure_eight of that seed from raw sensors. Seeds that have been run are kept below
-out/localiser and not run again; one takes about 20 s.
+covariance is right. Every seed draws the drive's noise, the initial guess and the error of the
+calibration. The latter is drawn from its own covariance, or, with --from-sensors, results from
+calibrating a drive of figure_eight of that seed from raw sensors. Finished seeds are kept below
+out/localiser and not run again. One seed takes about 20 s.
 
 Measured with `--seeds 20` (seeds 1 to 20): position RMSE (a) 246, (b) 6.0, (c) 4.7 mm; heading RMSE
-25, 0.18, 0.12 mrad; NEES 45000, 16.4, 0.84: (c) lets the extrinsics drift by more than they do. A
-knock of 0.5 degrees is found within 1.8 s in all drives, without an alarm in any clean one.
+25, 0.18, 0.12 mrad; NEES 45000, 16.4, 0.84: the random walk of the extrinsics in (c) is larger than
+their true drift. A knock of 0.5 degrees is detected within 1.8 s in all drives, and no clean drive
+has an alarm.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per core
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def tasks_of(
     calibration: Path | None,
     from_sensors: bool,
 ) -> dict[int, Task]:
-    """What to run of each seed; calibrates where that has not been done."""
+    """The task of each seed; missing calibrations are made."""
     if from_sensors:
         paths = calibrated(CALIBRATION_SCENARIO, seeds, 1)
         return {
@@ -116,7 +117,7 @@ def tasks_of(
 
 
 def run_all(tasks: Mapping[int, Task], jobs: int) -> dict[int, dict[str, Run]]:
-    """The runs of all seeds, told of as they come in."""
+    """The runs of all seeds; each is printed when it ends."""
     work = partial(_run, OUT)
     found = {}
     if jobs == 1:
@@ -124,7 +125,7 @@ def run_all(tasks: Mapping[int, Task], jobs: int) -> dict[int, dict[str, Run]]:
             found[seed] = work(task, seed)
             print(line_of(seed, found[seed]), flush=True)
         return found
-    # Spawned: threads of open3d do not survive a fork.
+    # Spawned, because threads of open3d do not survive a fork.
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         for seed, runs in zip(tasks, pool.map(work, tasks.values(), tasks), strict=True):
             found[seed] = runs
@@ -189,7 +190,7 @@ def accuracy_table(found: Seeds, scenario: Scenario) -> str:
 
 
 def monitor_table(found: Seeds, knock_deg: float) -> str:
-    """False alarms where nothing moved, and how fast a knock is found."""
+    """False alarms without movement, and the time to detect a knock."""
     clean = [of_seed["priors"] for of_seed in found.values()]
     hours = sum(run["time_s"][-1] for run in clean) / 3600.0
     alarmed = sum(bool(run["alarms"]) for run in clean)
@@ -208,7 +209,7 @@ def monitor_table(found: Seeds, knock_deg: float) -> str:
 
 
 def knock_line(runs: Sequence[Run], knock_deg: float) -> str:
-    """Of drives in the middle of which a mount was knocked."""
+    """Table of the drives with a mount knocked in mid-drive."""
     early = sum(any(a["time_s"] < run["knock_s"] for a in run["alarms"]) for run in runs)
     first = [
         next((a for a in run["alarms"] if a["time_s"] >= run["knock_s"]), None) for run in runs

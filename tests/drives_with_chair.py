@@ -16,21 +16,18 @@ from caliv_graph.config.model import Config, GroundConfig, LidarConfig, PoseConf
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
 from caliv_graph.readers import open_recording
-from caliv_graph.scenario.drives import Drive, make_drive, smoothstep, smoothstep_rate
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
-    ChairModel,
-    CropModel,
     DriveModel,
     FigureEightDrive,
-    LidarModel,
-    PoseNoiseModel,
-    Scenario,
     SCurveDrive,
     StandstillDrive,
     StraightDrive,
-    WorldModel,
 )
+from caliv_graph.scenario.drives import Drive, make_drive, smoothstep, smoothstep_rate
+from caliv_graph.scenario.model import CropModel, Scenario
+from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel
+from caliv_graph.scenario.world_models import ChairModel, WorldModel
 from caliv_graph.simulation import simulate_caliv
 
 RADIUS_M = 9.16

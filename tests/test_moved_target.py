@@ -15,16 +15,10 @@ from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.scenario.model import (
-    ChairModel,
-    CropModel,
-    LidarModel,
-    MoveModel,
-    Scenario,
-    StandstillDrive,
-    WorldModel,
-    load_scenario,
-)
+from caliv_graph.scenario.drive_models import StandstillDrive
+from caliv_graph.scenario.model import CropModel, Scenario, load_scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world_models import ChairModel, MoveModel, WorldModel
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets

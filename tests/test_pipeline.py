@@ -28,7 +28,7 @@ from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.readers import open_recording
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.scenario.model import ChairModel, CylinderModel
+from caliv_graph.scenario.world_models import ChairModel, CylinderModel
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_covariance, sigmas_s2s, sigmas_s2v
 from tests.drives_with_chair import (

@@ -348,6 +348,6 @@ def _deviations(
 
 
 def _sigmas(movement: Movement, axis: int) -> float | None:
-    if not movement.told[axis]:
+    if not movement.determined[axis]:
         return None
     return float(abs(movement.movement[axis]) / movement.sigma[axis])

@@ -67,7 +67,8 @@ def plan(
     """
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.errors import OutputError
-    from caliv_graph.planning.predict import Assumptions, predict
+    from caliv_graph.planning.assumptions import Assumptions
+    from caliv_graph.planning.predict import predict
     from caliv_graph.planning.suggest import is_met, parse_goals, shortfall, suggest
     from caliv_graph.report.predicted import plan_document, plan_table
     from caliv_graph.scenario.model import dump_scenario, load_scenario
@@ -95,5 +96,5 @@ def plan(
         if out is not None:
             streams.say(f"Written to {out}")
     streams.warn(prediction.warnings)
-    if (goals and not met) or prediction.outlook.unseeing:
+    if (goals and not met) or prediction.covariance.unseeing:
         raise typer.Exit(UNMET)

@@ -1,5 +1,5 @@
-"""What calibrations are good for together: factors for localisers, comparing and merging them.
+"""Uses of calibrations: factors for localisers, comparison and merging. README.md explains them.
 
-`priors`, `factors` and `archive` hand a calibration to a GTSAM localiser; `terms`, `compare` and
-`merge` work on what the data of each drive say, so that a shared guess is never counted twice.
+`priors`, `factors` and `archive` pass a calibration to a GTSAM localiser. `terms`, `compare` and
+`merge` work on the information of each drive's data alone, so a shared guess never counts twice.
 """

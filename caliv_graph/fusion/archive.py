@@ -1,9 +1,9 @@
-"""A calibration as a GTSAM archive that a localiser loads, beside a YAML that needs no version.
+"""A calibration as a GTSAM archive for localisers, and as YAML independent of GTSAM's version.
 
-Three files: NAME.gtsam, a `NonlinearFactorGraph` as GTSAM serialises it (boost text archive);
-NAME.values.gtsam, the `Values` it is about; NAME.yaml, the same numbers for everybody else. A
-program of the same GTSAM version reads the first two with `gtsam::deserializeFromFile`, or from
-Python with `graph.deserialize(text)`.
+There are three files. NAME.gtsam is a serialised `NonlinearFactorGraph` (boost text archive).
+NAME.values.gtsam holds its `Values`. NAME.yaml has the same numbers. A program with the same GTSAM
+version reads the first two with `gtsam::deserializeFromFile`, or in Python with
+`graph.deserialize(text)`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from caliv_graph.fusion.priors import (
     lettered_keys,
     prior_factors,
 )
+from caliv_graph.geometry.se3 import quaternion_xyzw
 from caliv_graph.products import Calibration
 
 SCHEMA = "caliv-graph/gtsam/1"
@@ -41,7 +42,7 @@ def archive_paths(path: Path) -> tuple[Path, Path, Path]:
     """The files of an archive: factors, values, YAML.
 
     Args:
-        path: of the factors, such as graph.gtsam.
+        path: file of the factors, such as graph.gtsam.
     """
     return path, path.with_suffix(f".values{path.suffix}"), path.with_suffix(".yaml")
 
@@ -70,9 +71,9 @@ def write_archive(
     """Writes any graph of native factors, and its values.
 
     Args:
-        graph: without custom factors.
-        values: of its variables.
-        path: of the factors; the values go beside them (`archive_paths`).
+        graph: a graph without custom factors.
+        values: values of its variables.
+        path: file of the factors; the values are written beside it (`archive_paths`).
         force: replace older files.
 
     Returns:
@@ -86,7 +87,7 @@ def write_archive(
     paths = archive_paths(path)[:2]
     for file in paths:
         check_output_file(file, force)
-    # The file that was asked for comes last: if it is there, the other is.
+    # The file of the factors is last: if it exists, the values exist.
     atomic_write(paths[1], str(values.serialize()), force)
     atomic_write(paths[0], text, force)
     return paths
@@ -95,11 +96,11 @@ def write_archive(
 def calibration_graph(
     calibration: Calibration, letter: str = DEFAULT_LETTER, joint: bool = True
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The solution over the extrinsics, linearised: what `graph.gtsam` of a result holds.
+    """The solution over the extrinsics, linearised: the content of `graph.gtsam`.
 
     Args:
         calibration: the result.
-        letter: of the keys, numbered in the order of the calibration's LiDARs.
+        letter: letter of the keys, numbered in the order of the calibration's LiDARs.
         joint: see `prior_factors`.
 
     Raises:
@@ -120,8 +121,8 @@ def write_calibration_archive(
 
     Args:
         calibration: the result.
-        path: of the factors; values and YAML go beside them (`archive_paths`).
-        letter: of the keys.
+        path: file of the factors; values and YAML are written beside it (`archive_paths`).
+        letter: letter of the keys.
         joint: see `prior_factors`.
         force: replace older files.
 
@@ -148,20 +149,19 @@ def archive_document(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
 ) -> dict[str, Any]:
-    """What the archive says, plain values only.
+    """The content of the YAML file, plain values only.
 
     Args:
-        calibration: names the LiDARs.
-        key: of each.
+        calibration: the result.
+        key: key of each LiDAR.
         graph: its priors.
-        values: where they are linearised.
+        values: their linearisation point.
     """
     ordering = gtsam.Ordering()
     variables = []
     for name, lidar in calibration.lidars.items():
         ordering.push_back(key(name))
         T = lidar.T_vehicle_lidar
-        quaternion: Any = T.rotation().toQuaternion()
         symbol = gtsam.Symbol(key(name))
         variables.append(
             {
@@ -171,12 +171,9 @@ def archive_document(
                 "key": int(key(name)),
                 "T_vehicle_lidar": {
                     "translation": [float(v) for v in T.translation()],
-                    "quaternion_xyzw": [
-                        float(v)
-                        for v in (quaternion.x(), quaternion.y(), quaternion.z(), quaternion.w())
-                    ],
+                    "quaternion_xyzw": [float(v) for v in quaternion_xyzw(T.rotation())],
                 },
-                "determined": {axis: bool(told) for axis, told in lidar.determined.items()},
+                "determined": {axis: bool(yes) for axis, yes in lidar.determined.items()},
             }
         )
     information = np.asarray(graph.linearize(values).hessian(ordering)[0], dtype=np.float64)

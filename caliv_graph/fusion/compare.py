@@ -1,7 +1,8 @@
-"""Has a mount moved? What two drives say about the extrinsics, tested against each other.
+"""Has a mount moved? A test of the extrinsics of two drives against each other.
 
-Only what the data themselves say takes part: a guess that two calibrations share would make them
-agree. Along a direction that either drive did not determine (SPEC 4) nothing can be said.
+The test uses the information of the data alone, because a shared guess would make two calibrations
+agree. It has no power along directions that one of the drives does not determine
+(caliv_graph/uncertainty/README.md), and names them.
 """
 
 from __future__ import annotations
@@ -36,36 +37,38 @@ from caliv_graph.uncertainty.pairs import sensor_pairs
 from caliv_graph.wording.directions import named
 
 ALPHA = 0.01
-"""Chance of a false alarm when nothing has moved, over all tests of one comparison."""
+"""Probability of a false alarm if no mount has moved, over all tests of one comparison."""
 
-_LEAK_SHARE = 0.1
-"""Share of what is not determined in the variance of a direction, above which it is not tested. Up
-to it the test is a little too cautious."""
+_MAX_PRIOR_FRACTION = 0.1
+"""Largest fraction of a direction's variance that may come from undetermined directions. Directions
+with more are not tested. Below it, the test is slightly conservative."""
 
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a LiDAR, or one against another, is from where it was.
+    """Movement of a LiDAR against the vehicle or against another LiDAR.
 
     Attributes:
         lidars: one name: against the vehicle. Two, `from` and `to`: the first against the second.
-        movement: (6,) vehicle axes at the (first) LiDAR, rotation (rad) then translation (m), the
-            second calibration less the first.
-        sigma: (6,) of it.
-        told: (6,) whether both drives determine the axis; elsewhere the two numbers mean nothing.
-        chi2: of the movement along the directions that both drives determine.
-        dof: how many these are; 0: nothing can be said.
-        p_value: chance of a larger `chi2` if nothing has moved.
-        p_axes: (6,) the same of each axis that both determine, by itself: a mount that moved along
-            one axis alone shows there first. 1 for the others.
-        p_corrected: the smallest of all these, corrected for the number of tests (Holm 1979).
-        moved: whether that is below the limit.
+        movement: (6,) second calibration minus the first, vehicle axes at the (first) LiDAR,
+            rotation (rad) then translation (m).
+        sigma: (6,) standard deviation of the movement.
+        determined: (6,) whether both drives determine the axis. The movement and sigma of other
+            axes have no meaning.
+        chi2: chi-square of the movement along the directions that both drives determine.
+        dof: number of these directions; 0: no test is possible.
+        p_value: probability of a larger `chi2` if nothing has moved.
+        p_axes: (6,) p-value of each determined axis by itself, more sensitive to a movement along
+            a single axis; 1 for the others.
+        p_corrected: the smallest of all these p-values, corrected for the number of tests
+            (Holm 1979).
+        moved: whether `p_corrected` is below the limit.
     """
 
     lidars: tuple[str, ...]
     movement: Array
     sigma: Array
-    told: tuple[bool, ...]
+    determined: tuple[bool, ...]
     chi2: float
     dof: int
     p_value: float
@@ -75,10 +78,10 @@ class Movement:
 
     @property
     def tests(self) -> list[float]:
-        """P-values of all tests of it."""
+        """P-values of all tests of this movement."""
         if not self.dof:
             return []
-        return [self.p_value, *(float(p) for p in self.p_axes[list(self.told)])]
+        return [self.p_value, *(float(p) for p in self.p_axes[list(self.determined)])]
 
 
 @dataclass(frozen=True)
@@ -88,13 +91,13 @@ class Comparison:
     Attributes:
         lidars: LiDAR against vehicle.
         pairs: LiDAR against LiDAR.
-        chi2: of all LiDARs at once.
-        dof: of that.
-        p_value: of that.
-        moved: the verdict: whether any movement is one, after the correction.
-        conclusion: the verdict as a person says it.
-        not_compared: LiDARs left out, and why.
-        undetermined: what the first, and what the second, could not tell.
+        chi2: chi-square of all LiDARs together.
+        dof: its degrees of freedom.
+        p_value: its p-value.
+        moved: the verdict: whether any movement is significant after the correction.
+        conclusion: the verdict in words.
+        not_compared: LiDARs left out, with the reason.
+        undetermined: directions that the first and the second drive do not determine, in words.
     """
 
     lidars: Mapping[str, Movement]
@@ -109,27 +112,27 @@ class Comparison:
 
     @property
     def movements(self) -> tuple[Movement, ...]:
-        """All that was tested, or could have been."""
+        """Movements of all LiDARs and all pairs."""
         return (*self.lidars.values(), *self.pairs)
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What one drive determines, all matrices over the LiDARs of the comparison.
+class _Drive:
+    """Determined and undetermined directions of one drive, over the LiDARs of the comparison.
 
     Attributes:
-        poses: where its data, along the directions they determine, put the LiDARs.
-        data: (6n, k) root of their covariance along these, vehicle axes.
-        leak: (6n, m) root of the guesses' covariance along the others: how far off the poses may
-            be for what the data do not tell.
-        lost: (6n, m) these other directions, in scaled units, orthonormal.
-        undetermined: how a person says them.
+        poses: extrinsics that the data alone give along the determined directions.
+        root_data: (6n, k) root of the data's covariance along the determined directions, vehicle
+            axes.
+        root_prior: (6n, m) root of the guesses' covariance along the undetermined directions.
+        null: (6n, m) undetermined directions, in scaled units, orthonormal.
+        undetermined: the undetermined directions in words.
     """
 
     poses: Mapping[str, gtsam.Pose3]
-    data: Array
-    leak: Array
-    lost: Array
+    root_data: Array
+    root_prior: Array
+    null: Array
     undetermined: tuple[str, ...]
 
 
@@ -144,18 +147,18 @@ def compare(
     Args:
         first: the earlier one.
         second: the later one.
-        labels: what to call them in messages (their files).
-        p_value: chance of a false alarm over all tests.
+        labels: their names in messages (their files).
+        p_value: probability of a false alarm over all tests.
 
     Raises:
-        ConfigError: they stem from the same drive, or have no LiDAR in common.
+        ConfigError: they come from the same drive, or have no LiDAR in common.
     """
     terms = own_term(first, labels[0]), own_term(second, labels[1])
     shared = set(terms[0].sources) & set(terms[1].sources)
     if shared:
         raise ConfigError(
-            f"{labels[1]}: stems from the same drive as {labels[0]}: what it says is not news. "
-            "Compare calibrations of two drives"
+            f"{labels[1]}: stems from the same drive as {labels[0]}, so it is no independent "
+            "measurement. Compare calibrations of two drives"
         )
     if not set(first.lidars) & set(second.lidars):
         raise ConfigError(
@@ -172,28 +175,28 @@ def compare_terms(
     reference: str,
     p_value: float,
 ) -> Comparison:
-    """`compare`, of what two sets of drives say.
+    """Like `compare`, for the information of two sets of drives.
 
     Args:
-        terms: independent of each other.
-        guesses: of each; they measure what counts as determined, and nothing else.
-        reference: LiDAR that the others of a pair are taken against, if it belongs to the pair.
+        terms: information of each, independent of each other.
+        guesses: guesses of each. They only decide which directions count as determined.
+        reference: the LiDAR that is second in its pairs.
         p_value: see `compare`.
     """
     names, left_out = _comparable(terms)
-    told = _told(terms[0], guesses[0], names), _told(terms[1], guesses[1], names)
-    lidars = {name: _movement((name,), names, told) for name in names}
-    pairs = tuple(_movement(pair, names, told) for pair in sensor_pairs(names, reference))
+    drives = _drive(terms[0], guesses[0], names), _drive(terms[1], guesses[1], names)
+    lidars = {name: _movement((name,), names, drives) for name in names}
+    pairs = tuple(_movement(pair, names, drives) for pair in sensor_pairs(names, reference))
     tested = holm([*lidars.values(), *pairs], p_value)
     lidars = dict(zip(names, tested, strict=False))
     pairs = tuple(tested[len(names) :])
     chi2, dof, p = (0.0, 0, 1.0)
     if names:
         everything = np.concatenate(
-            [vehicle_axes_difference(told[1].poses[n], told[0].poses[n]) for n in names]
+            [vehicle_axes_difference(drives[1].poses[n], drives[0].poses[n]) for n in names]
         )
         identity = np.eye(len(everything))
-        chi2, dof, p = _test(everything, [(identity, t) for t in told])
+        chi2, dof, p = _test(everything, [(identity, drive) for drive in drives])
     return Comparison(
         lidars=lidars,
         pairs=pairs,
@@ -203,7 +206,7 @@ def compare_terms(
         moved=any(m.moved for m in tested),
         conclusion=_conclusion(lidars, pairs),
         not_compared=left_out,
-        undetermined=(told[0].undetermined, told[1].undetermined),
+        undetermined=(drives[0].undetermined, drives[1].undetermined),
     )
 
 
@@ -211,8 +214,8 @@ def holm(movements: Sequence[Movement], p_value: float) -> list[Movement]:
     """Corrects p-values for the number of tests (Holm 1979), and decides.
 
     Args:
-        movements: those without degrees of freedom are no tests.
-        p_value: chance of a false alarm over all of them.
+        movements: those without degrees of freedom count as no test.
+        p_value: probability of a false alarm over all tests.
     """
     tests = sorted((p, i) for i, movement in enumerate(movements) for p in movement.tests)
     smallest: dict[int, float] = {}
@@ -229,8 +232,8 @@ def holm(movements: Sequence[Movement], p_value: float) -> list[Movement]:
 
 
 def _comparable(terms: tuple[DataTerm, DataTerm]) -> tuple[list[str], dict[str, str]]:
-    """LiDARs that both drives say anything about, and why the others are left out."""
-    said = [
+    """LiDARs on which both drives have information, and why the others are left out."""
+    known = [
         {
             name: bool(np.any(np.diag(term.information)[6 * i : 6 * i + 6] > 0.0))
             for i, name in enumerate(term.T_vehicle_lidar)
@@ -238,13 +241,13 @@ def _comparable(terms: tuple[DataTerm, DataTerm]) -> tuple[list[str], dict[str, 
         for term in terms
     ]
     names, left_out = [], {}
-    for name in dict.fromkeys([*said[0], *said[1]]):
+    for name in dict.fromkeys([*known[0], *known[1]]):
         absent = [
-            which for which, s in zip(("first", "second"), said, strict=True) if name not in s
+            which for which, s in zip(("first", "second"), known, strict=True) if name not in s
         ]
         blind = [
             which
-            for which, s in zip(("first", "second"), said, strict=True)
+            for which, s in zip(("first", "second"), known, strict=True)
             if not s.get(name, True)
         ]
         if absent:
@@ -256,15 +259,15 @@ def _comparable(terms: tuple[DataTerm, DataTerm]) -> tuple[list[str], dict[str, 
     return names, left_out
 
 
-def _told(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) -> _Told:
-    """What a drive determines of some LiDARs by the rule of SPEC 4."""
+def _drive(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) -> _Drive:
+    """Splits a drive's information on some LiDARs into determined and undetermined directions."""
     D, c = arranged(term, names)
     unit = scaling(len(names))
-    # A trusted guess would leave nothing determined; here the question is what the data say.
+    # The sigma of a fixed guess is so small that no direction would count as determined.
     sigmas = [DEFAULT_GUESS_SIGMAS if guesses[n].fixed else guesses[n].sigmas for n in names]
     prior = np.diag(np.concatenate([*sigmas, np.zeros(0)]) ** -2.0)
     if not names:
-        return _Told({}, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), ())
+        return _Drive({}, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), ())
     split = spectrum(D, prior)
     W, U = split.vectors[:, ~split.undetermined], split.vectors[:, split.undetermined]
     information = split.information[~split.undetermined]
@@ -273,45 +276,50 @@ def _told(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) ->
         name: retract_vehicle_axes(term.T_vehicle_lidar[name], step[6 * i : 6 * i + 6])
         for i, name in enumerate(names)
     }
-    leak = np.zeros((len(unit), 0))
+    root_prior = np.zeros((len(unit), 0))
     if U.shape[1]:
         certainty = U.T @ (prior * np.outer(unit, unit)) @ U
-        leak = unit[:, None] * U @ np.linalg.inv(np.linalg.cholesky(certainty)).T
-    return _Told(
+        root_prior = unit[:, None] * U @ np.linalg.inv(np.linalg.cholesky(certainty)).T
+    return _Drive(
         poses=poses,
-        data=unit[:, None] * W / np.sqrt(information),
-        leak=leak,
-        lost=U,
+        root_data=unit[:, None] * W / np.sqrt(information),
+        root_prior=root_prior,
+        null=U,
         undetermined=tuple(d.text for d in named(assess(D, prior, poses), poses).undetermined),
     )
 
 
-def _movement(lidars: tuple[str, ...], names: Sequence[str], told: tuple[_Told, _Told]) -> Movement:
-    """The movement of a LiDAR against the vehicle, or of one against another."""
-    before, after = told
+def _movement(
+    lidars: tuple[str, ...], names: Sequence[str], drives: tuple[_Drive, _Drive]
+) -> Movement:
+    """The movement of a LiDAR against the vehicle, or of one LiDAR against another."""
+    before, after = drives
     if len(lidars) == 1:
         (name,) = lidars
         movement = vehicle_axes_difference(after.poses[name], before.poses[name])
     else:
-        # Where the first LiDAR would be, were the second where it was.
+        # The pose of the first LiDAR if the second had not moved.
         source, to = lidars
         T_to_from = after.poses[to].between(after.poses[source])
         expected = before.poses[to].compose(T_to_from)
         movement = vehicle_axes_difference(expected, before.poses[source])
-    parts = [(_selection(lidars, names, t.poses), t) for t in told]
+    parts = [(_selection(lidars, names, drive.poses), drive) for drive in drives]
     chi2, dof, p_value = _test(movement, parts)
     variance = sum(
-        (np.sum((J @ t.data) ** 2, axis=1) + np.sum((J @ t.leak) ** 2, axis=1) for J, t in parts),
+        (
+            np.sum((J @ drive.root_data) ** 2, axis=1) + np.sum((J @ drive.root_prior) ** 2, axis=1)
+            for J, drive in parts
+        ),
         start=np.zeros(6),
     )
-    lost = np.any([_lost_axes(J, t) for J, t in parts], axis=0)
+    undetermined = np.any([_undetermined_axes(J, drive) for J, drive in parts], axis=0)
     sigma = np.sqrt(variance)
-    p_axes = np.where(lost, 1.0, 2.0 * ndtr(-np.abs(movement) / sigma))
+    p_axes = np.where(undetermined, 1.0, 2.0 * ndtr(-np.abs(movement) / sigma))
     return Movement(
         lidars=lidars,
         movement=movement,
         sigma=sigma,
-        told=tuple(not bool(axis) for axis in lost),
+        determined=tuple(not bool(axis) for axis in undetermined),
         chi2=chi2,
         dof=dof,
         p_value=p_value,
@@ -322,7 +330,7 @@ def _movement(lidars: tuple[str, ...], names: Sequence[str], told: tuple[_Told, 
 def _selection(
     lidars: tuple[str, ...], names: Sequence[str], poses: Mapping[str, gtsam.Pose3]
 ) -> Array:
-    """(6, 6n) how a movement follows from those of all LiDARs, vehicle axes."""
+    """(6, 6n) derivative of a movement with respect to all extrinsics, vehicle axes."""
     J = np.zeros((6, 6 * len(names)))
     if len(lidars) == 1:
         start = 6 * names.index(lidars[0])
@@ -337,17 +345,17 @@ def _selection(
     return J
 
 
-def _lost_axes(J: Array, told: _Told) -> Array:
-    """(6,) bool: axes that the undetermined directions reach, by the rule of SPEC 4."""
-    if not told.lost.shape[1]:
+def _undetermined_axes(J: Array, drive: _Drive) -> Array:
+    """(6,) bool: axes with a component in the undetermined directions (uncertainty/README.md)."""
+    if not drive.null.shape[1]:
         return np.zeros(6, dtype=bool)
     unit = scaling(J.shape[1] // 6)
-    share = np.sum(((J * unit / UNIT[:, None]) @ told.lost) ** 2, axis=1)
-    total = float(share.sum())
-    return np.asarray((share > AXIS_SHARE * total) & (total > LIDAR_SHARE))
+    part = np.sum(((J * unit / UNIT[:, None]) @ drive.null) ** 2, axis=1)
+    total = float(part.sum())
+    return np.asarray((part > AXIS_SHARE * total) & (total > LIDAR_SHARE))
 
 
-def _test(difference: Array, parts: Sequence[tuple[Array, _Told]]) -> tuple[float, int, float]:
+def _test(difference: Array, parts: Sequence[tuple[Array, _Drive]]) -> tuple[float, int, float]:
     """Chi-square of a difference along the directions that both drives determine.
 
     Args:
@@ -358,18 +366,21 @@ def _test(difference: Array, parts: Sequence[tuple[Array, _Told]]) -> tuple[floa
         Chi-square, degrees of freedom, p-value.
     """
     unit = scaling(len(difference) // 6)
-    data, leak = (
+    cov_data, cov_prior = (
         sum(
             (_squared(J @ root / unit[:, None]) for J, root in roots),
             start=np.zeros((len(unit),) * 2),
         )
-        for roots in ([(J, t.data) for J, t in parts], [(J, t.leak) for J, t in parts])
+        for roots in (
+            [(J, drive.root_data) for J, drive in parts],
+            [(J, drive.root_prior) for J, drive in parts],
+        )
     )
-    values, vectors = np.linalg.eigh(data + leak)
+    values, vectors = np.linalg.eigh(cov_data + cov_prior)
     whiten = vectors[:, values > 0.0] / np.sqrt(values[values > 0.0])
-    # Between 0, where the data of both tell all, and 1, where those of one tell nothing.
-    share, turn = np.linalg.eigh(whiten.T @ leak @ whiten)
-    whitened = (whiten @ turn[:, share < _LEAK_SHARE]).T @ (difference / unit)
+    # 0 where both drives determine a direction, 1 where one of them has no information on it.
+    fraction, turn = np.linalg.eigh(whiten.T @ cov_prior @ whiten)
+    whitened = (whiten @ turn[:, fraction < _MAX_PRIOR_FRACTION]).T @ (difference / unit)
     dof = len(whitened)
     chi2 = float(whitened @ whitened)
     return chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0
@@ -383,18 +394,18 @@ def _conclusion(lidars: Mapping[str, Movement], pairs: Sequence[Movement]) -> st
     """The verdict in words."""
     movements = [*lidars.values(), *pairs]
     if not any(m.dof for m in movements):
-        return "Nothing can be said: there is no direction that both drives determine."
+        return "Nothing can be said: no direction is determined by both drives."
     moved = [name for name, m in lidars.items() if m.moved]
     apart = [m.lidars for m in pairs if m.moved]
     if not moved and not apart:
         return "No mount has moved, as far as these drives can tell."
     if not moved:
-        said = ", ".join(f"'{a}' against '{b}'" for a, b in apart)
-        return f"A mount has moved: {said}. Which of the two, the drives do not tell."
+        which = ", ".join(f"'{a}' against '{b}'" for a, b in apart)
+        return f"A mount has moved: {which}. The drives do not determine which of the two."
     if len(moved) == len(lidars) > 1 and not apart:
         return (
-            "All LiDARs have moved together against the vehicle frame: what carries them, or the "
-            "frame itself (IMU, GNSS antenna)."
+            "All LiDARs have moved together against the vehicle frame: their common rack "
+            "has moved, or the frame itself (IMU, GNSS antenna)."
         )
     verb = "has" if len(moved) == 1 else "have"
     kind = "LiDAR" if len(moved) == 1 else "LiDARs"

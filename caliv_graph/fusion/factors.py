@@ -19,17 +19,17 @@ NoiseModel = gtsam.noiseModel.Base
 def random_walk(
     key_before: int, key_after: int, duration_s: float, sigmas: Array
 ) -> gtsam.BetweenFactorPose3:
-    """A mounting that may drift slowly: it stays where it was, up to a random walk.
+    """An extrinsic that may drift slowly: a random walk between two times.
 
     Args:
-        key_before: of M at the earlier time.
-        key_after: of M at the later time.
-        duration_s: between them, seconds.
-        sigmas: (6,) of the walk per square root of a second, lidar axes: rotation (rad/sqrt(s)),
-            then translation (m/sqrt(s)).
+        key_before: key of M at the earlier time.
+        key_after: key of M at the later time.
+        duration_s: time between them, seconds.
+        sigmas: (6,) sigmas of the walk, lidar axes: rotation (rad/sqrt(s)), then translation
+            (m/sqrt(s)).
 
     Raises:
-        ValueError: the duration or a sigma is not above zero.
+        ValueError: the duration or a sigma is zero or negative.
     """
     step = math.sqrt(duration_s) * np.asarray(sigmas) if duration_s > 0.0 else np.zeros(6)
     if not (step > 0.0).all():
@@ -55,16 +55,16 @@ def lidar_pose_error(
 def lidar_pose_factor(
     key_vehicle: int, key_extrinsic: int, T_map_lidar: gtsam.Pose3, noise: NoiseModel
 ) -> gtsam.CustomFactor:
-    """A scan that was registered to a map, with the mounting as a variable.
+    """A scan that was registered to a map, with the extrinsic as a variable.
 
-    GTSAM has no native factor of a pose, an extrinsic and a measured product. This one cannot be
-    serialised; where that is needed, `linear_lidar_pose_factor` can.
+    GTSAM has no native factor of a pose, an extrinsic and their measured product. This factor
+    cannot be serialised; `linear_lidar_pose_factor` can.
 
     Args:
-        key_vehicle: of X.
-        key_extrinsic: of M.
-        T_map_lidar: measured.
-        noise: of r, 6 dimensions, lidar axes, rotation before translation.
+        key_vehicle: key of X.
+        key_extrinsic: key of M.
+        T_map_lidar: the measured pose.
+        noise: noise of r, 6 dimensions, lidar axes, rotation before translation.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -85,17 +85,18 @@ def linear_lidar_pose_factor(
     noise: NoiseModel,
     values: gtsam.Values,
 ) -> gtsam.LinearContainerFactor:
-    """The same, native and serialisable: linearised once, at given values.
+    """`lidar_pose_factor` linearised once, at given values: native and serialisable.
 
-    It is what a fixed-lag smoother makes of any factor that leaves its window: exact to first order
-    about `values`. Where the estimate has moved by more than a degree or so, make it anew.
+    A fixed-lag smoother does the same with a factor that leaves its window. It is exact to first
+    order about `values`. Create it again when the estimate has moved by more than about a degree.
 
     Args:
-        key_vehicle: of X.
-        key_extrinsic: of M.
-        T_map_lidar: measured.
-        noise: of r, as in `lidar_pose_factor`. A robust kernel is applied at `values`, for good.
-        values: of X and M; others are left alone.
+        key_vehicle: key of X.
+        key_extrinsic: key of M.
+        T_map_lidar: the measured pose.
+        noise: noise of r, as in `lidar_pose_factor`. The weight of a robust kernel is fixed at
+            `values`.
+        values: values of X and M; others are ignored.
     """
     factor = lidar_pose_factor(key_vehicle, key_extrinsic, T_map_lidar, noise)
     point = gtsam.Values()
@@ -107,11 +108,11 @@ def linear_lidar_pose_factor(
 def serialisable(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 ) -> gtsam.NonlinearFactorGraph:
-    """A graph with every factor that GTSAM cannot serialise replaced by its linearisation.
+    """A graph in which every custom factor is replaced by its linearisation.
 
     Args:
-        graph: any factors; the native ones are kept as they are.
-        values: where to linearise the others.
+        graph: any factors; native ones are kept.
+        values: linearisation point of the custom factors.
     """
     out = gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
@@ -126,7 +127,7 @@ def serialisable(
 
 
 def _insert(point: gtsam.Values, values: gtsam.Values, key: int) -> None:
-    """Copies a pose or a vector."""
+    """Copies a pose or a vector from one `Values` to another."""
     read: Callable[[int], object]
     for read in (values.atPose3, values.atVector):
         try:

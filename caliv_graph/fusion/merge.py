@@ -1,4 +1,4 @@
-"""Several calibrations of one vehicle into one: the data of every drive once, the guesses once."""
+"""Merges calibrations of one vehicle: the data of every drive count once, the guesses once."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
 from caliv_graph.fusion.terms import Fused, fuse, guess_of, moved_to, own_term
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
 from caliv_graph.wording.directions import named
 
 _SAME_GUESS = 1e-6
-"""rad and m: up to here two guesses are the same one, rounded."""
+"""Largest difference of two equal guesses that were rounded, rad and m."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Merger:
     """A merged calibration, and whether its parts agree.
 
     Attributes:
-        calibration: the result; `status: inconsistent` if they do not.
-        agreement: per label, that calibration against the others together. Of two it is the same
-            either way, and only the second stands here.
-        warnings: what a person should know, a line each.
+        calibration: the result; `status: inconsistent` if they do not agree.
+        agreement: per label, that calibration against all others together. For two calibrations,
+            only the second is listed, because the test is symmetric.
+        warnings: warnings for the user, one line each.
     """
 
     calibration: Calibration
@@ -40,18 +40,18 @@ class Merger:
 
 
 def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Merger:
-    """Several calibrations of one vehicle into one.
+    """Merges several calibrations of one vehicle.
 
-    The informations of the data are summed at common extrinsics; the guesses, which the
-    calibrations share, count once: that of a LiDAR is the first file's that has it. Earlier
-    calibrations that served as priors are taken along, each once.
+    The information matrices of the data are summed at common extrinsics. The guess of a LiDAR
+    counts once: that of the first file that has it. Earlier calibrations that were priors are
+    included, each once.
 
     Args:
-        calibrations: two or more, by what to call them in messages (their files).
-        p_value: chance that calibrations of mounts that stayed are said to disagree.
+        calibrations: two or more, by their names in messages (their files).
+        p_value: probability that calibrations of unchanged mounts are reported to disagree.
 
     Raises:
-        ConfigError: two of them stem from the same drive.
+        ConfigError: two of them come from the same drive.
     """
     first = next(iter(calibrations.values()))
     own = {label: own_term(c, label) for label, c in calibrations.items()}
@@ -61,16 +61,6 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     modes = {c.provenance.get("mode") for c in calibrations.values()}
     mode = "joint" if modes == {"joint"} else "auto"
     fused = fuse(terms, guesses, mode)
-    results = {}
-    for name in guesses:
-        of_all = [c.lidars[name] for c in calibrations.values() if name in c.lidars]
-        results[name] = replace(
-            of_all[0],
-            scans_used=sum(r.scans_used for r in of_all),
-            saw_target=any(r.saw_target for r in of_all),
-            time_offset=_mean_offset(of_all),
-            guess=guesses[name],
-        )
     disagree = any(comparison.moved for comparison in agreement.values()) or any(
         c.status == "inconsistent" for c in calibrations.values()
     )
@@ -92,11 +82,13 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     draft = replace(
         first, provenance=provenance, unmet=(), earlier=(), contradictions=contradictions
     )
-    calibration = _assembled(draft, results, fused, data, disagree)
+    calibration = _assembled(
+        draft, _together_per_lidar(calibrations, guesses), fused, data, disagree
+    )
     warnings = [
         *_disagreements(agreement, len(calibrations)),
         *(
-            f"{label}: is inconsistent in itself, and so is what is merged from it"
+            f"{label}: is inconsistent, so the merged calibration is inconsistent too"
             for label, c in calibrations.items()
             if c.status == "inconsistent"
         ),
@@ -105,30 +97,47 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     return Merger(calibration, agreement, tuple(warnings))
 
 
-def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) -> Config:
-    """The config with the extrinsics of an earlier calibration for initial guesses.
+def _together_per_lidar(
+    calibrations: Mapping[str, Calibration], guesses: Mapping[str, Guess]
+) -> dict[str, LidarResult]:
+    """Per LiDAR the first result, with the scans and time offsets of all calibrations."""
+    out = {}
+    for name, guess in guesses.items():
+        of_all = [c.lidars[name] for c in calibrations.values() if name in c.lidars]
+        out[name] = replace(
+            of_all[0],
+            scans_used=sum(r.scans_used for r in of_all),
+            saw_target=any(r.saw_target for r in of_all),
+            time_offset=_mean_offset(of_all),
+            guess=guess,
+        )
+    return out
 
-    How far off they may be stays as the config has it: a mount may have moved since.
+
+def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) -> Config:
+    """The config with the extrinsics of an earlier calibration as initial guesses.
+
+    Their sigmas stay those of the config, because a mount may have moved since.
 
     Args:
         config: the config.
         prior: the earlier calibration.
-        digests: of the drives that are to be calibrated from.
+        digests: digests of the drives to calibrate.
 
     Raises:
-        ConfigError: the earlier one is of the same drive or has none of the LiDARs, or the config
-            asks for the paper's two stages, which know no earlier data.
+        ConfigError: the earlier calibration is of the same drive or has none of the LiDARs, or the
+            mode is the paper's two stages, which cannot use earlier data.
     """
     if config.solve.mode == "staged":
         raise ConfigError(
-            "--prior: solve.mode staged, the paper's procedure, knows no earlier calibration. Set "
-            "solve.mode to auto or joint"
+            "--prior: solve.mode staged, the paper's procedure, cannot use an earlier calibration. "
+            "Set solve.mode to auto or joint"
         )
     known = {source for term in prior_terms(prior) for source in term.sources}
     if known & set(digests):
         raise ConfigError(
-            "--prior: is a result of the drive that is to be calibrated from, which would count "
-            "twice. Give a calibration of another drive"
+            "--prior: is a result of the drive that is to be calibrated, which would count twice. "
+            "Give a calibration of another drive"
         )
     common = [name for name in config.lidars if name in prior.lidars]
     if not common:
@@ -148,25 +157,25 @@ def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) ->
 
 
 def prior_terms(prior: Calibration) -> tuple[DataTerm, ...]:
-    """What an earlier calibration, and those that it was made with, say."""
+    """Information of the data of an earlier calibration and of its own priors."""
     return (own_term(prior, "--prior"), *prior.earlier)
 
 
 def with_earlier(
     calibration: Calibration, prior: Calibration, p_value: float = ALPHA
 ) -> tuple[Calibration, tuple[str, ...]]:
-    """A calibration together with what the data of an earlier one say.
+    """A calibration fused with the data of an earlier one.
 
-    Its own data's information stays its own; the extrinsics, their covariance and the verdicts
-    become those of all data together.
+    The reported data information stays that of the new drives. The extrinsics, their covariance and
+    the verdicts are those of all data together.
 
     Args:
-        calibration: from new drives, solved by itself.
-        prior: the earlier one, of other drives.
-        p_value: chance that mounts that stayed are said to have moved.
+        calibration: of the new drives, solved by itself.
+        prior: the earlier calibration, of other drives.
+        p_value: probability that unchanged mounts are reported to have moved.
 
     Returns:
-        The calibration, `inconsistent` if a mount has moved since, and what a person should know.
+        The calibration, `inconsistent` if a mount has moved since, and warnings.
     """
     own = own_term(calibration, "this drive")
     terms = prior_terms(prior)
@@ -204,18 +213,14 @@ def _assembled(
     """The reported result of a fusion, in right perturbations.
 
     Args:
-        draft: what the fusion leaves alone.
+        draft: a calibration with all fields that the fusion does not change.
         results: per LiDAR likewise.
         fused: the estimate.
-        data: what is reported as the data's own information, at the estimate.
-        disagree: whether what was fused does.
+        data: information reported as that of the data, at the estimate.
+        disagree: whether the fused calibrations disagree.
     """
     poses = fused.T_vehicle_lidar
-    size = 6 * len(poses)
-    to_right = np.zeros((size, size))
-    for i, T in enumerate(poses.values()):
-        block = slice(6 * i, 6 * i + 6)
-        to_right[block, block] = right_to_vehicle_axes(T).T
+    to_right = np.ascontiguousarray(joint_right_to_vehicle_axes(poses.values()).T)
     cov = to_right @ fused.cov @ to_right.T
     information = to_right @ data.information @ to_right.T
     uncertainty = named(assess(fused.information + fused.trusted, fused.prior, poses), poses)
@@ -249,7 +254,7 @@ def _assembled(
 def _every_drive_once(
     own: Mapping[str, DataTerm], calibrations: Mapping[str, Calibration]
 ) -> list[DataTerm]:
-    """Every calibration's own data, and the earlier data that they came with.
+    """Every calibration's own data, and the earlier data that it used as a prior.
 
     Raises:
         ConfigError: a drive would count twice.
@@ -272,9 +277,9 @@ def _every_drive_once(
                 continue
             if known:
                 raise ConfigError(
-                    f"{label}: was made with --prior, of whose drives one is in "
-                    f"{from_label[known[0]]} too, and would count twice. Merge the calibrations "
-                    "of the single drives"
+                    f"{label}: was made with --prior, of whose drives one is also in "
+                    f"{from_label[known[0]]} and would count twice. Merge the calibrations of the "
+                    "single drives"
                 )
             from_label |= dict.fromkeys(term.sources, f"{label} (--prior)")
             terms.append(term)
@@ -297,7 +302,7 @@ def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:
 
 
 def _together(terms: Sequence[DataTerm], guesses: Mapping[str, Guess]) -> DataTerm:
-    """What several drives say, as one term."""
+    """The information of several drives as one term."""
     if len(terms) == 1:
         return terms[0]
     names = {name for term in terms for name in term.T_vehicle_lidar}
@@ -335,31 +340,31 @@ def _disagreements(agreement: Mapping[str, Comparison], files: int) -> list[str]
 
 
 def _largest(comparison: Comparison) -> str:
-    """The most certain movement, in words."""
+    """The most significant movement, in words."""
     movement = min(comparison.movements, key=lambda m: (m.p_corrected, -m.chi2))
     what = " against ".join(f"'{name}'" for name in movement.lidars)
     parts = []
     for unit, axes in (("mrad", AXES[:3]), ("mm", AXES[3:])):
         for axis in axes:
             i = AXES.index(axis)
-            if movement.told[i] and abs(movement.movement[i]) > 3.0 * movement.sigma[i]:
+            if movement.determined[i] and abs(movement.movement[i]) > 3.0 * movement.sigma[i]:
                 value, sigma = 1e3 * movement.movement[i], 1e3 * movement.sigma[i]
                 parts.append(f"{axis} {value:+.2f} +- {sigma:.2f} {unit}")
     return f"{what} by {', '.join(parts) or 'several axes together'} (p = {movement.p_value:.1g})"
 
 
 def _mean_offset(results: Sequence[LidarResult]) -> tuple[float, float] | None:
-    """Mean of the estimated time offsets, weighed by their variances."""
-    told = [r.time_offset for r in results if r.time_offset is not None]
-    if not told:
+    """Mean of the estimated time offsets, weighted by the inverse variances."""
+    estimated = [r.time_offset for r in results if r.time_offset is not None]
+    if not estimated:
         return None
-    weights = np.array([sigma**-2.0 for _, sigma in told])
-    mean = float(weights @ [value for value, _ in told] / weights.sum())
+    weights = np.array([sigma**-2.0 for _, sigma in estimated])
+    mean = float(weights @ [value for value, _ in estimated] / weights.sum())
     return mean, float(weights.sum() ** -0.5)
 
 
 def _differing_guesses(calibrations: Mapping[str, Calibration], merged: Calibration) -> list[str]:
-    """A line where the guess matters, and the calibrations do not share it."""
+    """A warning per LiDAR whose guess decides undetermined axes and differs between files."""
     if not merged.undetermined:
         return []
     out = []
@@ -372,7 +377,7 @@ def _differing_guesses(calibrations: Mapping[str, Calibration], merged: Calibrat
             apart = vehicle_axes_difference(other.T_vehicle_lidar, used.T_vehicle_lidar)
             if np.abs(apart).max() > _SAME_GUESS:
                 out.append(
-                    f"{label}: its initial guess of '{name}' is another one than that which "
-                    "decides here what no drive tells, and is not used"
+                    f"{label}: its initial guess of '{name}' is not used: it differs from that of "
+                    "an earlier file, which decides the undetermined axes"
                 )
     return out

@@ -1,11 +1,11 @@
-"""Is a LiDAR still mounted where it was? A sequential test that runs beside a localiser.
+"""Has a mount moved? A sequential test that runs beside a localiser.
 
-A localiser predicts each scan: the pose by everything else that it knows, the mounting by the
-calibration. What the scan's registration says beyond that is its innovation. As long as nothing has
-moved, the innovations of a consistent estimator are white, with the covariance that it states
-(Kailath 1968). After a knock, those of one LiDAR have a common mean. The test is the generalised
-likelihood ratio of a step of unknown size and time (Willsky and Jones, 1976): over the last n
-innovations of a LiDAR it is a chi-square of six degrees of freedom, whatever n is.
+A localiser predicts each scan from its pose estimate and the calibrated extrinsic. The innovation
+is the difference between the scan's registration and this prediction. If nothing has moved, the
+innovations of a consistent estimator are white with the stated covariance (Kailath 1968). After a
+knock, those of one LiDAR have a common mean. The test is the generalised likelihood ratio of a step
+of unknown size and time (Willsky and Jones, 1976). Over the last n innovations of a LiDAR it is a
+chi-square with six degrees of freedom, for any n.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from caliv_graph.products import Array
 DOF = 6
 
 WINDOWS = range(2, 33)
-"""Scans of a LiDAR that are tested together. Long ones find what is too small to be seen in a few,
-and of all the one that begins at the knock is the loudest, which tells when it was and how far.
-There is none of one scan, and none alarms that would not without any one of its scans: a
-registration may fail once."""
+"""Numbers of scans of a LiDAR that are tested together. Long windows detect small movements. The
+window that begins at the knock has the largest chi-square, so it estimates time and size of the
+knock. One registration may fail, so no window has a single scan, and a window alarms only if it
+would alarm without any one of its scans."""
 
 SECONDS_PER_HOUR = 3600.0
 
 
 @dataclass(frozen=True)
 class Innovation:
-    """What a registered scan says of its LiDAR's mounting, beyond what was predicted.
+    """Innovation of a registered scan, as a movement of its LiDAR's extrinsic.
 
     Attributes:
-        movement: (6,) right perturbation d of the mounting, `T_vehicle_lidar Exp(d)`, that would
+        movement: (6,) right perturbation d of the extrinsic, `T_vehicle_lidar Exp(d)`, that would
             explain the scan: rotation (rad), then translation (m), lidar axes.
-        cov: (6, 6) of it: of the predicted pose, the mounting and the registration together.
+        cov: (6, 6) its covariance, from predicted pose, extrinsic and registration.
     """
 
     movement: Array
@@ -48,25 +48,25 @@ class Innovation:
 
     @property
     def chi2(self) -> float:
-        """Squared length in sigmas; six degrees of freedom if nothing has moved."""
+        """Squared Mahalanobis length; six degrees of freedom if nothing has moved."""
         return float(self.movement @ np.linalg.solve(self.cov, self.movement))
 
 
 @dataclass(frozen=True)
 class MountAlarm:
-    """A mount that is no longer where it was.
+    """A mount that has moved.
 
     Attributes:
         lidar: its name.
-        stamp_ns: of the scan that told.
+        stamp_ns: stamp of the scan that raised the alarm.
         movement: (6,) estimate of the movement, vehicle axes at the LiDAR: rotation (rad), then
             translation (m).
-        sigma: (6,) of it, if these scans all err alike: those that the estimator does without share
-            the error of the mounting that they are held against. Never too small.
-        scans: how many scans of the LiDAR it is taken from.
-        chi2: of these, six degrees of freedom.
-        alone: whether the other LiDARs agree with the prediction. If none does, the vehicle's pose
-            is more likely wrong than all mounts at once.
+        sigma: (6,) its standard deviation for fully correlated scans, an upper bound. Scans that
+            the estimator leaves out share the error of the extrinsic they are compared with.
+        scans: number of scans of the LiDAR that it is estimated from.
+        chi2: chi-square of these scans, six degrees of freedom.
+        alone: whether the other LiDARs agree with the prediction. If none does, an error of the
+            vehicle's pose is more likely than a movement of all mounts.
     """
 
     lidar: str
@@ -90,11 +90,11 @@ def extrinsic_innovation(
     Args:
         T_map_vehicle: predicted without the scan.
         T_vehicle_lidar: predicted without the scan.
-        cov_predicted: (12, 12) of both together, right perturbations, in this order.
-        T_map_lidar: as registered.
-        cov_registration: (6, 6) of it, right perturbation.
+        cov_predicted: (12, 12) joint covariance of both, right perturbations, in this order.
+        T_map_lidar: the registered pose.
+        cov_registration: (6, 6) its covariance, right perturbation.
     """
-    # A mounting that is off by d lets the scan register at Z = X M Exp(d): r = -d.
+    # If the extrinsic has moved by d, the scan registers at Z = X M Exp(d), so r = -d.
     r, by_vehicle, by_extrinsic = lidar_pose_error(T_map_vehicle, T_vehicle_lidar, T_map_lidar)
     J = np.hstack([by_vehicle, by_extrinsic])
     cov = J @ cov_predicted @ J.T + cov_registration
@@ -104,12 +104,12 @@ def extrinsic_innovation(
 def alarm_threshold(scans_per_hour: float, false_alarms_per_hour: float) -> float:
     """Chi-square above which a test alarms.
 
-    Every scan is tested over each of `WINDOWS`. These tests are not independent of one another, but
-    by Boole's inequality the alarms to be expected are at most the sum of all their p-values.
+    Every scan is tested over each of `WINDOWS`. These tests are dependent. By Boole's inequality,
+    the expected number of alarms is at most the sum of all their p-values.
 
     Args:
         scans_per_hour: registered scans of all LiDARs together.
-        false_alarms_per_hour: to be expected at most, if nothing moves.
+        false_alarms_per_hour: upper bound of the expected rate if nothing moves.
 
     Raises:
         ValueError: a rate is not above zero.
@@ -123,9 +123,9 @@ def alarm_threshold(scans_per_hour: float, false_alarms_per_hour: float) -> floa
 class MountMonitor:
     """Watches the innovations of the scans of a localiser.
 
-    The innovations must come from a consistent estimator. One that holds the calibrated extrinsics
-    constant is not: carry them as variables (`priors.prior_factors`). Leave the scans that
-    `suspicious` rejects out of that estimator, or it bends the pose until they fit.
+    The innovations must come from a consistent estimator. An estimator with constant extrinsics is
+    not consistent: carry them as variables (`priors.prior_factors`). The estimator must leave out
+    the scans for which `suspicious` is true, otherwise they bias its pose.
 
     Attributes:
         threshold: chi-square above which it alarms.
@@ -137,12 +137,12 @@ class MountMonitor:
         scans_per_s: float,
         false_alarms_per_hour: float = 0.1,
     ) -> None:
-        """Starts with nothing heard.
+        """Starts without any innovation.
 
         Args:
-            T_vehicle_lidar: calibrated mounting per LiDAR.
+            T_vehicle_lidar: calibrated extrinsic per LiDAR.
             scans_per_s: registered scans per second of all LiDARs together.
-            false_alarms_per_hour: to be expected at most, if nothing moves.
+            false_alarms_per_hour: upper bound of the expected rate if nothing moves.
 
         Raises:
             ValueError: a rate is not above zero, or there is no LiDAR.
@@ -151,25 +151,25 @@ class MountMonitor:
             raise ValueError("MountMonitor: needs at least one LiDAR")
         self.threshold = alarm_threshold(scans_per_s * SECONDS_PER_HOUR, false_alarms_per_hour)
         self._extrinsics = dict(T_vehicle_lidar)
-        self._heard: dict[str, deque[tuple[Array, Array]]] = {
+        self._recent: dict[str, deque[tuple[Array, Array]]] = {
             name: deque(maxlen=WINDOWS[-1]) for name in T_vehicle_lidar
         }
         self._last_ns: dict[str, int] = {}
 
     def suspicious(self, innovation: Innovation) -> bool:
-        """Whether one scan is so far off that the estimator should do without it."""
+        """Whether the estimator should leave out this scan."""
         return innovation.chi2 > self.threshold
 
     def add(self, lidar: str, stamp_ns: int, innovation: Innovation) -> MountAlarm | None:
-        """Hears of one more scan.
+        """Adds the innovation of one scan.
 
         Args:
-            lidar: whose.
-            stamp_ns: of the scan.
-            innovation: of the scan.
+            lidar: name of the LiDAR.
+            stamp_ns: stamp of the scan.
+            innovation: innovation of the scan.
 
         Returns:
-            An alarm while the LiDAR's last scans call for one; None: nothing to be said.
+            An alarm as long as the LiDAR's last scans exceed the threshold; else None.
 
         Raises:
             ValueError: the LiDAR is unknown, its stamps do not increase, or the innovation is not
@@ -177,10 +177,10 @@ class MountMonitor:
         """
         self._check(lidar, stamp_ns, innovation)
         self._last_ns[lidar] = stamp_ns
-        heard = self._heard[lidar]
+        recent = self._recent[lidar]
         certainty: Array = np.asarray(np.linalg.inv(innovation.cov), dtype=np.float64)
-        heard.append((certainty, certainty @ innovation.movement))
-        found = _loudest(tuple(heard), self.threshold)
+        recent.append((certainty, certainty @ innovation.movement))
+        found = _most_significant(tuple(recent), self.threshold)
         if found is None:
             return None
         chi2, scans, mean, cov = found
@@ -193,14 +193,14 @@ class MountMonitor:
             scans=scans,
             chi2=chi2,
             alone=all(
-                _loudest(tuple(others), self.threshold) is None
-                for name, others in self._heard.items()
+                _most_significant(tuple(others), self.threshold) is None
+                for name, others in self._recent.items()
                 if name != lidar
             ),
         )
 
     def reset(self, lidar: str, T_vehicle_lidar: gtsam.Pose3) -> None:
-        """Forgets what it heard of a LiDAR, whose mounting is known anew.
+        """Drops the innovations of a LiDAR and sets its new extrinsic.
 
         Raises:
             ValueError: the LiDAR is unknown.
@@ -208,7 +208,7 @@ class MountMonitor:
         if lidar not in self._extrinsics:
             raise ValueError(self._unknown(lidar))
         self._extrinsics[lidar] = T_vehicle_lidar
-        self._heard[lidar].clear()
+        self._recent[lidar].clear()
 
     def _unknown(self, lidar: str) -> str:
         return f"lidar '{lidar}': is not watched; those are {', '.join(self._extrinsics)}"
@@ -228,22 +228,22 @@ class MountMonitor:
             )
 
 
-def _loudest(
-    heard: Sequence[tuple[Array, Array]], threshold: float
+def _most_significant(
+    recent: Sequence[tuple[Array, Array]], threshold: float
 ) -> tuple[float, int, Array, Array] | None:
-    """The window whose scans speak loudest of a common movement.
+    """The window with the largest chi-square of a common movement.
 
     Args:
-        heard: (6, 6) information and (6,) gradient per scan, the last scan last.
-        threshold: chi-square that a window has to exceed, even if one of its scans were missing.
+        recent: (6, 6) information and (6,) gradient per scan, the last scan last.
+        threshold: chi-square that a window must exceed, also without any one of its scans.
 
     Returns:
         Its chi-square and length, the movement (6,) and its covariance (6, 6), lidar axes; None if
-        none is loud enough.
+        no window exceeds the threshold.
     """
     best: tuple[float, int, Array, Array] | None = None
     information, pull = np.zeros((DOF, DOF)), np.zeros(DOF)
-    for scans, (certainty, gradient) in enumerate(reversed(heard), start=1):
+    for scans, (certainty, gradient) in enumerate(reversed(recent), start=1):
         information, pull = information + certainty, pull + gradient
         if scans not in WINDOWS:
             continue
@@ -251,16 +251,16 @@ def _loudest(
         chi2 = float(pull @ mean)
         if chi2 <= threshold or (best is not None and chi2 <= best[0]):
             continue
-        if _without_any_one(heard[-scans:], information, pull) > threshold:
+        if _without_any_one(recent[-scans:], information, pull) > threshold:
             best = chi2, scans, mean, np.asarray(np.linalg.inv(information), dtype=np.float64)
     return best
 
 
 def _without_any_one(
-    heard: Sequence[tuple[Array, Array]], information: Array, pull: Array
+    recent: Sequence[tuple[Array, Array]], information: Array, pull: Array
 ) -> float:
-    """The smallest chi-square of a window if one of its scans is left out."""
-    rest = information - np.array([certainty for certainty, _ in heard])
-    pulls = pull - np.array([gradient for _, gradient in heard])
+    """The smallest chi-square of a window without one of its scans."""
+    rest = information - np.array([certainty for certainty, _ in recent])
+    pulls = pull - np.array([gradient for _, gradient in recent])
     means = np.linalg.solve(rest, pulls[..., None])[..., 0]
     return float(np.einsum("ni,ni->n", pulls, means).min())

@@ -12,25 +12,25 @@ from caliv_graph.products import Array, Calibration
 from caliv_graph.trajectory.factors import marginal_factor
 
 ExtrinsicKey = Callable[[str], int]
-"""Key of the variable `T_vehicle_lidar` of a LiDAR, by its name."""
+"""Function from the name of a LiDAR to the key of its variable `T_vehicle_lidar`."""
 
 DEFAULT_LETTER = "m"
-"""Letter of the keys if the user names none; X, V, B, G, E, Y are taken in LIO-SAM and GLIM."""
+"""Default letter of the keys. LIO-SAM and GLIM use X, V, B, G, E and Y."""
 
 _LEAST_EIGENVALUE = 1e-10
-"""Of a covariance scaled to ones on its diagonal. Files keep twelve digits: what is known better
-than this against the rest is told no better."""
+"""Lower bound of the eigenvalues of a covariance scaled to a unit diagonal: files keep twelve
+digits, so smaller eigenvalues are rounding errors."""
 
 
 def lettered_keys(calibration: Calibration, letter: str = DEFAULT_LETTER) -> ExtrinsicKey:
     """Keys `letter` 0, 1, ... in the order of the calibration's LiDARs.
 
     Args:
-        calibration: names the LiDARs.
+        calibration: the calibration.
         letter: one character.
 
     Raises:
-        ExportError: it is not one ASCII letter, which is what GTSAM's symbols have.
+        ExportError: it is not one ASCII letter, as GTSAM's symbols need.
     """
     if not (len(letter) == 1 and letter.isascii() and letter.isalpha()):
         raise ExportError(f"letter {letter!r}: expected one letter, a to z or A to Z")
@@ -46,17 +46,17 @@ def prior_factors(
 ) -> gtsam.NonlinearFactorGraph:
     """The calibrated extrinsics as priors on variables of a localiser's graph.
 
-    All factors are native and can be serialised. Along what the drive did not determine they carry
-    the initial guess with its sigma, as the calibration's covariance does.
+    All factors are native and can be serialised. Along undetermined directions they hold the
+    initial guess with its sigma, as the calibration's covariance does.
 
     Args:
         calibration: the result.
-        key: of the variable `T_vehicle_lidar` of each LiDAR.
-        joint: one `LinearContainerFactor` over all of them, which keeps that the LiDARs are known
-            better against each other than against the vehicle. It is a quadratic about the
-            calibrated extrinsics, good for movements of some degrees. Else a `PriorFactorPose3`
-            each, which forgets it: a localiser then thinks the LiDARs apart to be known worse.
-        lidars: which ones; absent: all.
+        key: key of the variable `T_vehicle_lidar` of each LiDAR.
+        joint: one `LinearContainerFactor` over all extrinsics, which keeps their correlation: the
+            relative pose of two LiDARs is known better than each pose. It is a quadratic about the
+            calibrated extrinsics, valid for movements of some degrees. Else one
+            `PriorFactorPose3` each, without the correlation.
+        lidars: LiDARs to include; absent: all.
 
     Raises:
         ExportError: a LiDAR is unknown, keys collide, or a sigma is zero.
@@ -71,7 +71,7 @@ def prior_factors(
     keys = [key(name) for name in names]
     if len(set(keys)) < len(keys):
         raise ExportError(
-            f"keys of {', '.join(names)} are not different: a variable each is needed"
+            f"keys of {', '.join(names)} are not different: each LiDAR needs its own variable"
         )
     order = list(calibration.lidars)
     rows = [6 * order.index(name) + axis for name in names for axis in range(6)]
@@ -89,7 +89,7 @@ def prior_factors(
 
 
 def extrinsic_values(calibration: Calibration, key: ExtrinsicKey) -> gtsam.Values:
-    """The calibrated extrinsics as values of the variables that `prior_factors` is about."""
+    """The calibrated extrinsics as values of the variables of `prior_factors`."""
     values = gtsam.Values()
     for name, lidar in calibration.lidars.items():
         values.insert(key(name), lidar.T_vehicle_lidar)
@@ -97,10 +97,10 @@ def extrinsic_values(calibration: Calibration, key: ExtrinsicKey) -> gtsam.Value
 
 
 def _information(cov: Array) -> Array:
-    """Inverse of a covariance whose numbers differ by orders of magnitude."""
+    """Inverse of a covariance whose entries differ by orders of magnitude."""
     sigma = np.sqrt(np.diag(cov))
     if not np.all(sigma > 0.0):
-        raise ExportError("joint.covariance: has a sigma of zero, and no information to hand on")
+        raise ExportError("joint.covariance: has a sigma of zero, so its information is infinite")
     values, vectors = np.linalg.eigh(cov / np.outer(sigma, sigma))
     half = vectors / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)) / sigma[:, None]
     return np.asarray(half @ half.T)

@@ -1,6 +1,7 @@
-"""What the data of a drive say about the extrinsics, as a quadratic that can be moved and summed.
+"""The information of a drive's data on the extrinsics: a quadratic that can be moved and summed.
 
-Everything is in vehicle axes (see `conventions`), LiDARs in the order of a term's extrinsics.
+All matrices are in vehicle axes (see `conventions`), with LiDARs in the order of a term's
+extrinsics.
 """
 
 from __future__ import annotations
@@ -11,14 +12,13 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from caliv_graph.calibration.assemble import DRIVES
 from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
+    joint_right_to_vehicle_axes,
     retract_vehicle_axes,
-    right_to_vehicle_axes,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, Calibration, DataTerm, Guess, MotionData
@@ -31,27 +31,27 @@ from caliv_graph.uncertainty.observability import (
 
 _STEPS = 20
 _STEP_TOLERANCE = 1e-12
-"""Steps of `fuse`, and the step (rad, m) at which it has converged; each gains several digits."""
+"""Most steps of `fuse`, and the step (rad, m) at which it has converged."""
 
 _STEPS_UNDECIDED = 3
-"""Steps of `fuse` after which the number of undetermined directions is no longer changed."""
+"""Steps of `fuse` after which the number of undetermined directions is fixed."""
 
 _LEAST_EIGENVALUE = 1e-12
-"""Of an information scaled to ones on its diagonal, below which it is zero: files keep twelve
-digits."""
-
+"""Eigenvalues of an information scaled to a unit diagonal count as zero below this: files keep
+twelve digits."""
 
 _DIGESTED_ROWS = 65_536
+"""Rows of an array that are digested at once, to bound the memory of their copy."""
 
 
 def drive_digest(motion: MotionData) -> str:
-    """Digest of a drive, the same for whatever is calibrated from it.
+    """Digest of a drive, the same for every calibration of it.
 
-    It is taken of what the recording tells of the vehicle's motion: to the last digit of the noise
-    no two drives are the same, and LiDARs that share the vehicle's poses share their errors.
+    It is the digest of the vehicle's motion data. The noise makes it different for every drive, and
+    calibrations from the same motion data share its errors, whichever LiDARs they use.
 
     Args:
-        motion: of the recording; its name is left out.
+        motion: motion data of the recording; its name is left out.
     """
     digest = hashlib.sha256()
     _feed(digest, replace(motion, name=""))
@@ -69,7 +69,7 @@ def _feed(digest: hashlib._Hash, value: object) -> None:
     elif isinstance(value, gtsam.Pose3):
         digest.update(np.ascontiguousarray(value.matrix()).tobytes())
     elif isinstance(value, np.ndarray):
-        # In parts: bytes are a copy, and of what repeats one covariance they are all of it.
+        # In parts, because bytes are a copy, and a broadcast array would be expanded as a whole.
         rows = np.atleast_1d(value)
         for begin in range(0, len(rows), _DIGESTED_ROWS):
             digest.update(np.ascontiguousarray(rows[begin : begin + _DIGESTED_ROWS]).tobytes())
@@ -78,22 +78,21 @@ def _feed(digest: hashlib._Hash, value: object) -> None:
 
 
 def own_term(calibration: Calibration, label: str) -> DataTerm:
-    """What the data of a calibration say, without guesses and without earlier calibrations.
+    """The information of a calibration's data, without guesses and earlier calibrations.
 
-    A file that does not state the gradient (another program's) is believed to be where its data
-    are best met, except along the directions that it names as undetermined: of these, its data are
-    taken to say nothing.
+    A file without gradient (by another program) is assumed to be at the optimum of its data, except
+    along the directions that it names as undetermined. Its data have no information along these.
 
     Args:
         calibration: the calibration.
-        label: what to call it in messages.
+        label: its name in messages.
 
     Raises:
-        ConfigError: the gradient is missing from a result in two stages, which is not where its
-            data are best met.
+        ConfigError: the gradient is missing from a result in two stages, which is not at the
+            optimum of its data.
     """
     poses = {name: lidar.T_vehicle_lidar for name, lidar in calibration.lidars.items()}
-    axes = _axes(poses)
+    axes = joint_right_to_vehicle_axes(poses.values())
     information = axes @ calibration.information_data @ axes.T
     if calibration.gradient_data is not None:
         gradient = axes @ calibration.gradient_data
@@ -108,13 +107,8 @@ def own_term(calibration: Calibration, label: str) -> DataTerm:
     return DataTerm(_sources(calibration), poses, 0.5 * (information + information.T), gradient)
 
 
-def _axes(poses: Mapping[str, gtsam.Pose3]) -> Array:
-    """(6n, 6n) from right perturbations to vehicle axes."""
-    return np.asarray(block_diag(*(right_to_vehicle_axes(T) for T in poses.values())))
-
-
 def _without(information: Array, calibration: Calibration, names: Sequence[str]) -> Array:
-    """The information with none along the directions that a file names as undetermined."""
+    """The information without the directions that a file names as undetermined."""
     if not calibration.undetermined:
         return information
     unit = scaling(len(names))
@@ -128,7 +122,7 @@ def _without(information: Array, calibration: Calibration, names: Sequence[str])
 
 
 def _sources(calibration: Calibration) -> tuple[str, ...]:
-    """Digests of the drives; where a file names none, one of what it says."""
+    """Digests of the drives; for a file that names none, a digest of its content."""
     named = calibration.provenance.get(DRIVES)
     if isinstance(named, list | tuple) and named:
         return tuple(str(item) for item in named)
@@ -142,8 +136,8 @@ def _sources(calibration: Calibration) -> tuple[str, ...]:
 def moved_to(term: DataTerm, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> DataTerm:
     """The same quadratic about other extrinsics of its LiDARs, to first order in rotations.
 
-    From `Exp(w_old) R_old = Exp(w_new) R_new`: the old perturbation is the new one, turned by the
-    Jacobian of the logarithm, less the difference of the extrinsics.
+    From `Exp(w_old) R_old = Exp(w_new) R_new`, the old perturbation is the difference of the
+    extrinsics plus the Jacobian of the logarithm times the new perturbation.
     """
     jacobian = np.eye(len(term.gradient))
     difference = np.zeros(len(term.gradient))
@@ -161,7 +155,7 @@ def moved_to(term: DataTerm, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Data
 def arranged(term: DataTerm, names: Sequence[str]) -> tuple[Array, Array]:
     """Information and gradient over the LiDARs `names`, in their order.
 
-    Those that the term does not know get zeros; those that are not asked for are eliminated.
+    LiDARs that the term lacks get zeros. LiDARs of the term that are not in `names` are eliminated.
 
     Args:
         term: the term.
@@ -191,7 +185,7 @@ def arranged(term: DataTerm, names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def _pseudo_inverse(information: Array) -> Array:
-    """Of an information matrix: what it says nothing about is left out."""
+    """Pseudo-inverse of an information matrix, over the directions with information."""
     diagonal = np.diag(information)
     scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
@@ -202,15 +196,15 @@ def _pseudo_inverse(information: Array) -> Array:
 
 @dataclass(frozen=True)
 class Fused:
-    """Where several terms and one set of guesses put the extrinsics.
+    """The extrinsics estimated from several terms and one set of guesses.
 
     Attributes:
         T_vehicle_lidar: the estimate.
-        information: (6n, 6n) of all data, vehicle axes.
-        gradient: (6n,) of all data at the estimate.
-        trusted: (6n, 6n) of the guesses that are `fixed`.
-        prior: (6n, 6n) of all guesses, the fixed ones as if they were not.
-        cov: (6n, 6n) of the estimate, guesses included as `mode` uses them.
+        information: (6n, 6n) information of all data, vehicle axes.
+        gradient: (6n,) gradient of all data at the estimate.
+        trusted: (6n, 6n) information of the guesses that are `fixed`.
+        prior: (6n, 6n) information of all guesses, with default sigmas for the fixed ones.
+        cov: (6n, 6n) covariance of the estimate, with the guesses as `mode` uses them.
     """
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
@@ -222,19 +216,20 @@ class Fused:
 
 
 def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "auto") -> Fused:
-    """Solves for the extrinsics from what the data of several drives say, and the guesses once.
+    """Estimates the extrinsics from the data of several drives and one set of guesses.
 
-    Gauss-Newton on the sum of the quadratics, each moved to the current estimate: the joint solve
-    of the drives, as far as each is quadratic about its own estimate.
+    Gauss-Newton on the sum of the quadratics, each moved to the current estimate. This equals the
+    joint solve of the drives as far as each is quadratic about its own estimate.
 
     Args:
         terms: the data, every drive once.
-        guesses: of every LiDAR, in the order of the result.
-        mode: `auto`: the guesses decide along what all data together do not determine, and only
-            there (SPEC 3). `joint`: they count as one more measurement.
+        guesses: guess of every LiDAR, in the order of the result.
+        mode: `auto`: the guesses decide only along directions that all data together leave
+            undetermined (caliv_graph/calibration/README.md). `joint`: they are one more
+            measurement.
     """
     names = list(guesses)
-    # A trusted guess is a measurement: against itself it would look like nothing determined.
+    # A fixed guess is a measurement. As a prior too, it would make its axes undetermined.
     fixed = np.repeat([guesses[name].fixed for name in names], 6)
     certainty = np.concatenate([guesses[name].sigmas for name in names]) ** -2.0
     trusted = np.diag(fixed * certainty)
@@ -246,14 +241,14 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
         offset = np.concatenate(
             [vehicle_axes_difference(poses[n], guesses[n].T_vehicle_lidar) for n in names]
         )
-        told, pull = D + trusted, c - trusted @ offset
+        measured, pull = D + trusted, c - trusted @ offset
         if mode == "joint":
-            step = np.linalg.solve(told + prior, pull - prior @ offset)
+            step = np.linalg.solve(measured + prior, pull - prior @ offset)
         else:
-            split = spectrum(told, prior, undetermined)
+            split = spectrum(measured, prior, undetermined)
             if step_number >= _STEPS_UNDECIDED:
                 undetermined = int(split.undetermined.sum())
-            step = step_with_prior_in_null_space(told, pull, prior, offset, split)
+            step = step_with_prior_in_null_space(measured, pull, prior, offset, split)
         poses = {
             n: retract_vehicle_axes(poses[n], step[6 * i : 6 * i + 6]) for i, n in enumerate(names)
         }
@@ -268,13 +263,13 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
 
 
 def _start(name: str, terms: Sequence[DataTerm], guess: Guess) -> gtsam.Pose3:
-    """The mounting of a LiDAR as the term that says most of it has it."""
+    """The extrinsic of a LiDAR in the term with the most information on it."""
     best, pose = 0.0, guess.T_vehicle_lidar
     for term in terms:
         for i, (known, T) in enumerate(term.T_vehicle_lidar.items()):
-            said = float(np.diag(term.information)[6 * i : 6 * i + 6] @ scaling(1) ** 2)
-            if known == name and said > best:
-                best, pose = said, T
+            amount = float(np.diag(term.information)[6 * i : 6 * i + 6] @ scaling(1) ** 2)
+            if known == name and amount > best:
+                best, pose = amount, T
     return pose
 
 
@@ -289,6 +284,6 @@ def _total(terms: Sequence[DataTerm], poses: Mapping[str, gtsam.Pose3]) -> tuple
 
 
 def guess_of(calibration: Calibration, name: str) -> Guess:
-    """The guess of a LiDAR; where the file states none, the reported mounting, loosely."""
+    """The guess of a LiDAR; if the file has none, the reported extrinsic with default sigmas."""
     lidar = calibration.lidars[name]
     return lidar.guess or Guess(lidar.T_vehicle_lidar, DEFAULT_GUESS_SIGMAS)

@@ -10,7 +10,7 @@ from caliv_graph.products import Array
 
 
 def relative_jacobian(T_vehicle_a: gtsam.Pose3, T_vehicle_b: gtsam.Pose3) -> Array:
-    """How `T_b_a = T_vehicle_b^-1 T_vehicle_a` moves with the two extrinsics.
+    """Derivative of `T_b_a = T_vehicle_b^-1 T_vehicle_a` with respect to the two extrinsics.
 
     From `(T_vehicle_b Exp(d_b))^-1 T_vehicle_a Exp(d_a) = T_b_a Exp(-Ad(T_b_a^-1) d_b) Exp(d_a)`.
 
@@ -28,8 +28,8 @@ def relative_covariance(
     """Covariance of `T_b_a` to first order.
 
     Args:
-        T_vehicle_a: mounting of LiDAR a.
-        T_vehicle_b: mounting of LiDAR b.
+        T_vehicle_a: extrinsic of LiDAR a.
+        T_vehicle_b: extrinsic of LiDAR b.
         cov_joint: (12, 12) of `T_vehicle_a`, then `T_vehicle_b`; right perturbations, rotation
             then translation, rad and m.
 
@@ -42,9 +42,9 @@ def relative_covariance(
 
 
 def parent_axes_covariance(T_parent_child: gtsam.Pose3, cov: Array) -> Array:
-    """Turns a covariance from the child's axes into the parent's, at the child's origin.
+    """Rotates a covariance from the child's axes into the parent's, at the child's origin.
 
-    For a mounting the parent is the vehicle, and these are *vehicle axes* (see `conventions`).
+    For an extrinsic the parent is the vehicle, and these are *vehicle axes* (see `conventions`).
 
     Args:
         T_parent_child: the pose.

@@ -1,4 +1,4 @@
-"""SE(3) on `gtsam.Pose3`: the few operations GTSAM does not hand out, alone and in batches.
+"""SE(3) on `gtsam.Pose3`: operations that GTSAM lacks in Python, single and in batches.
 
 Frames, tangent order and *vehicle axes* are defined in `caliv_graph.conventions`.
 """
@@ -6,21 +6,23 @@ Frames, tangent order and *vehicle axes* are defined in `caliv_graph.conventions
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from caliv_graph.products import Array
 
 
 def tangent_axes(direction: Array) -> Array:
-    """Two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other.
+    """Two unit vectors (2, 3) perpendicular to a unit vector (3,) and to each other.
 
-    With the direction as third they are a right-handed frame.
+    With the direction as third axis they form a right-handed frame.
     """
     x, y, z = direction.tolist()
-    # At right angles to the coordinate axis that is farthest from the direction, too.
+    # The first is also perpendicular to the coordinate axis farthest from the direction.
     least = min(range(3), key=lambda axis: abs(direction[axis]))
     u = [(0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)][least]
     length = math.hypot(*u)
@@ -52,11 +54,17 @@ def rpy(R_a_b: Array) -> Array:
     return np.asarray(gtsam.Rot3(R_a_b).rpy(), dtype=np.float64)
 
 
+def quaternion_xyzw(rotation: gtsam.Rot3) -> tuple[float, float, float, float]:
+    """The unit quaternion of a rotation in the order x y z w."""
+    q: Any = rotation.toQuaternion()
+    return (q.x(), q.y(), q.z(), q.w())
+
+
 def left_jacobian_inverse(xi: Array) -> Array:
     """Derivative of `Log(Exp(d) Exp(xi))` by d at d = 0.
 
-    GTSAM's `LogmapDerivative` is the inverse of the *right* Jacobian at xi; the left one at xi is
-    the right one at -xi.
+    GTSAM's `LogmapDerivative` is the inverse of the *right* Jacobian at xi. The left Jacobian at xi
+    equals the right one at -xi.
 
     Args:
         xi: (6,), rotation then translation.
@@ -68,15 +76,20 @@ def left_jacobian_inverse(xi: Array) -> Array:
 
 
 def right_to_vehicle_axes(T_vehicle_lidar: gtsam.Pose3) -> Array:
-    """Turns a right perturbation of `T_vehicle_lidar` into vehicle axes; (6, 6), orthonormal.
+    """Rotates a right perturbation of `T_vehicle_lidar` into vehicle axes; (6, 6), orthonormal.
 
-    Its transpose turns vehicle axes into a right perturbation.
+    Its transpose rotates vehicle axes into a right perturbation.
     """
     R = T_vehicle_lidar.rotation().matrix()
     out = np.zeros((6, 6))
     out[:3, :3] = R
     out[3:, 3:] = R
     return out
+
+
+def joint_right_to_vehicle_axes(poses: Iterable[gtsam.Pose3]) -> Array:
+    """(6n, 6n) `right_to_vehicle_axes` of n extrinsics, block diagonal."""
+    return np.asarray(block_diag(*(right_to_vehicle_axes(T) for T in poses)), dtype=np.float64)
 
 
 def vehicle_axes_difference(T_a: gtsam.Pose3, T_b: gtsam.Pose3) -> Array:
@@ -96,7 +109,7 @@ def retract_vehicle_axes(T: gtsam.Pose3, d: Array) -> gtsam.Pose3:
 
 
 def stack(poses: Sequence[gtsam.Pose3]) -> tuple[Array, Array]:
-    """Rotation matrices (n, 3, 3) and translations (n, 3) of poses, for work in batches."""
+    """Rotation matrices (n, 3, 3) and translations (n, 3) of poses, for batch computations."""
     R = np.array([p.rotation().matrix() for p in poses]).reshape(-1, 3, 3)
     t = np.array([p.translation() for p in poses]).reshape(-1, 3)
     return R, t
@@ -105,6 +118,6 @@ def stack(poses: Sequence[gtsam.Pose3]) -> tuple[Array, Array]:
 def unstack(R: Array, t: Array) -> tuple[gtsam.Pose3, ...]:
     """Poses of rotation matrices (n, 3, 3) and translations (n, 3).
 
-    The matrices are made orthonormal again, so that many small steps do not add up to a shear.
+    The matrices are made orthonormal, so that rounding of many small steps does not add up.
     """
     return tuple(gtsam.Pose3(gtsam.Rot3.ClosestTo(Ri), ti) for Ri, ti in zip(R, t, strict=True))

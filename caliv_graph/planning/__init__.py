@@ -1,5 +1,6 @@
-"""Before driving: what a planned drive will tell, and which drive would tell enough."""
+"""Before driving: the covariance that a planned drive allows, and a drive that is good enough."""
 
-from caliv_graph.planning.predict import Assumptions, Prediction, predict
+from caliv_graph.planning.assumptions import Assumptions
+from caliv_graph.planning.predict import Prediction, predict
 
 __all__ = ["Assumptions", "Prediction", "predict"]

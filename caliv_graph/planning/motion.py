@@ -1,16 +1,15 @@
-"""What motion data of a planned drive will tell of the vehicle's poses, before it is driven.
+"""Predicts the joint covariance of the vehicle's poses along a planned drive.
 
-The same chain of states as `trajectory` builds (pose and velocity of the IMU, its biases), with the
-same factors, but linearised along the drive as it is planned: no measurement is drawn and nothing
-is optimised, so that it takes milliseconds. Errors of poses that are near in time are alike, and
-the chain says how much: it is relative errors that matter for extrinsics.
+The chain of states is that of `trajectory` (pose and velocity of the IMU, its biases) with the same
+factors, linearised along the planned drive. No measurement is drawn and nothing is optimised, so
+this takes milliseconds. Errors of poses that are near in time are correlated. The chain gives this
+correlation, and the extrinsics depend on relative errors.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,34 +17,32 @@ import numpy.typing as npt
 from caliv_graph.config.model import NoiseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
+from caliv_graph.planning.assumptions import Source
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive, sample_stamps
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.trajectory.chain import POSE, STATE
 from caliv_graph.trajectory.noise import DEFAULT_FORCE_WALK_M_S3, DEFAULT_GYRO_WALK_RAD_S2
 
-Source = Literal["sensors", "poses"]
-"""Where the vehicle's poses come from: IMU, GNSS and velocity, or given with the recording."""
-
 NODE_NS = NANOSECONDS_PER_SECOND // 10
-"""Nodes are no farther apart, as in `trajectory.nodes`."""
+"""Largest distance of two nodes, as in `trajectory.nodes`."""
 
 MERGE_NS = 1_000_000
-"""Stamps nearer than this share a node."""
+"""Stamps that are nearer to each other share a node."""
 
 SUBSTEPS = 10
-"""Steps in which the IMU's noise is carried from node to node: one per sample at 100 Hz."""
+"""Steps of the IMU's error propagation from node to node: one per sample at 100 Hz."""
 
 LOOSE_RAD = 1.0
-"""What is known of the first orientation without any sensor: it keeps matrices regular."""
+"""Prior sigma of the first orientation. It keeps the matrices regular."""
 
 LEAST_SIGMA = 1e-6
-"""Sigma that stands for none at all, in the unit of whatever is measured."""
+"""Sigma that replaces zero, in the unit of the measurement."""
 
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """The vehicle along a planned drive, and what its sensors will tell of it.
+    """The vehicle along a planned drive, and the information of its sensors on its states.
 
     The states are those of `trajectory.chain`: right perturbation of T_map_imu (rotation, then
     translation), velocity in the map, biases. With given poses the last nine are unused.
@@ -55,7 +52,7 @@ class PlannedMotion:
         R_map_vehicle: (n, 3, 3).
         position_map: (n, 3) metres.
         twist: (n, 6) velocity of the vehicle, a right perturbation of T_map_vehicle per second.
-        to_vehicle: (6, 6) turns a right perturbation of T_map_imu into one of T_map_vehicle.
+        to_vehicle: (6, 6) from a right perturbation of T_map_imu to one of T_map_vehicle.
         diagonal: (n, 15, 15) information on each state.
         coupling: (n - 1, 15, 15) between a state (rows) and the next (columns).
     """
@@ -87,14 +84,14 @@ def plan_motion(
     source: Source,
     spacing_ns: int = NODE_NS,
 ) -> PlannedMotion:
-    """The chain of states along a drive, and all that motion data say of it.
+    """The chain of states along a drive, with the information of the motion data.
 
     Args:
         drive: the drive.
         scenario: sensors and their noise.
-        stamps_ns: (m,) since the start, at which poses are wanted: of LiDAR scans.
+        stamps_ns: (m,) stamps of LiDAR scans since the start; each gets a node.
         source: raw sensors, or given poses.
-        spacing_ns: nodes are no farther apart.
+        spacing_ns: largest distance of two nodes.
     """
     nodes = _nodes(drive, stamps_ns, source, spacing_ns)
     states = drive.states(nodes, scenario.world.ground.height_m)
@@ -115,7 +112,7 @@ def plan_motion(
 def _nodes(drive: Drive, stamps_ns: IntArray, source: Source, spacing_ns: int) -> IntArray:
     end = round(drive.duration_s * NANOSECONDS_PER_SECOND)
     grid = np.arange(0, end + 1, spacing_ns, dtype=np.int64)
-    # Given poses are there at the stamps only; more would be more than there is.
+    # Given poses exist only at the stamps; more nodes would add information.
     fixed = np.unique(stamps_ns) if source == "poses" else np.unique(np.append(stamps_ns, [0, end]))
     if source == "poses":
         return fixed if len(fixed) > 1 else np.unique(np.append(fixed, [0, end]))
@@ -125,11 +122,11 @@ def _nodes(drive: Drive, stamps_ns: IntArray, source: Source, spacing_ns: int) -
 
 
 def _given_poses(nodes: IntArray, R: Array, scenario: Scenario) -> tuple[Array, Array]:
-    """White errors on each pose and, in the states' coordinates 6 to 11, a walk that all share."""
+    """White errors on each pose, and a random walk in the coordinates 6 to 11 of the states."""
     model, n = scenario.poses, len(nodes)
     white = np.maximum([model.rotation_sigma_rad] * 3 + [model.position_sigma_m] * 3, LEAST_SIGMA)
     walk = np.array([model.rotation_walk_rad_sqrts] * 3 + [model.position_walk_m_sqrts] * 3)
-    # The walk is about map axes; a position's perturbation is in vehicle axes, as the pose's.
+    # The walk is in map axes; the perturbation of the pose is in vehicle axes.
     J = np.zeros((n, 6, STATE))
     J[:, :, :6] = np.eye(6)
     J[:, :3, 6:9] = J[:, 3:, 9:12] = -np.swapaxes(R, 1, 2)
@@ -139,28 +136,59 @@ def _given_poses(nodes: IntArray, R: Array, scenario: Scenario) -> tuple[Array, 
     steps = np.maximum(
         walk * np.sqrt(np.diff(nodes) / NANOSECONDS_PER_SECOND)[:, None], LEAST_SIGMA
     )
-    slow = np.arange(6, 12)
+    walks = np.arange(6, 12)
     coupling = np.zeros((n - 1, STATE, STATE))
-    coupling[:, slow, slow] = -(steps**-2.0)
-    diagonal[0, slow, slow] += LEAST_SIGMA**-2.0
-    diagonal[1:, slow, slow] += steps**-2.0
-    diagonal[:-1, slow, slow] += steps**-2.0
+    coupling[:, walks, walks] = -(steps**-2.0)
+    diagonal[0, walks, walks] += LEAST_SIGMA**-2.0
+    diagonal[1:, walks, walks] += steps**-2.0
+    diagonal[:-1, walks, walks] += steps**-2.0
     return diagonal, coupling
 
 
 def _inertial(
     drive: Drive, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
 ) -> tuple[Array, Array]:
-    """The IMU between neighbours: error-state propagation in steps, its noise white.
+    """Diagonal and coupling of the IMU's information between neighbouring nodes."""
+    n = len(nodes)
+    carried, cov = _propagated(drive, nodes, scenario, R_vehicle_imu, arm)
+    # From map axes to the axes of the right perturbation.
+    turn = np.broadcast_to(np.eye(STATE), (n, STATE, STATE)).copy()
+    R_all = drive.states(nodes).R_map_vehicle @ R_vehicle_imu
+    turn[:, 3:6, 3:6] = np.swapaxes(R_all, 1, 2)
+    carried = turn[1:] @ carried @ np.swapaxes(turn[:-1], 1, 2)
+    cov = turn[1:] @ cov @ np.swapaxes(turn[1:], 1, 2)
+    scale = np.sqrt(np.einsum("nii->ni", cov))
+    even = scale[:, :, None] * scale[:, None, :]
+    info = np.linalg.inv(cov / even) / even
+    back = np.swapaxes(carried, 1, 2) @ info
+    diagonal = np.zeros((n, STATE, STATE))
+    diagonal[:-1] += back @ carried
+    diagonal[1:] += info
+    noise_defaults = NoiseConfig()
+    bias = np.repeat(
+        [noise_defaults.accelerometer_bias_m_s2, noise_defaults.gyroscope_bias_rad_s], 3
+    )
+    at_bias = np.arange(9, STATE)
+    diagonal[0, at_bias, at_bias] += bias**-2.0
+    return diagonal, -back
+
+
+def _propagated(
+    drive: Drive, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
+) -> tuple[Array, Array]:
+    """Error-state propagation of the IMU between neighbouring nodes, with white noise.
 
     With b the biases, f the specific force and w the rate, both of the IMU:
     `dR/dt = -w x dR - b_g`, `dp/dt = dv`, `dv/dt = -R (f x dR) - R b_a`.
+
+    Returns:
+        (n - 1, 15, 15) transition matrices and (n - 1, 15, 15) covariances, map axes.
     """
     n = len(nodes)
     imu = scenario.imu
     step = np.diff(nodes) / (SUBSTEPS * NANOSECONDS_PER_SECOND)
     per_root_s = 1.0 / math.sqrt(imu.rate_hz)
-    # What the config that `simulate` writes leaves to the defaults, they decide here as well.
+    # The defaults that apply to the config of `simulate` apply here too.
     force_walk = imu.accelerometer_bias_walk_m_s3_sqrthz or DEFAULT_FORCE_WALK_M_S3
     gyro_walk = imu.gyroscope_bias_walk_rad_s2_sqrthz or DEFAULT_GYRO_WALK_RAD_S2
     density = np.zeros(STATE)
@@ -189,30 +217,11 @@ def _inertial(
         noise = (half * (density * step[:, None])[:, None, :]) @ np.swapaxes(half, 1, 2)
         carried = whole @ carried
         cov = whole @ cov @ np.swapaxes(whole, 1, 2) + noise
-    # From map axes into the right perturbation's.
-    turn = np.broadcast_to(np.eye(STATE), (n, STATE, STATE)).copy()
-    R_all = drive.states(nodes).R_map_vehicle @ R_vehicle_imu
-    turn[:, 3:6, 3:6] = np.swapaxes(R_all, 1, 2)
-    carried = turn[1:] @ carried @ np.swapaxes(turn[:-1], 1, 2)
-    cov = turn[1:] @ cov @ np.swapaxes(turn[1:], 1, 2)
-    scale = np.sqrt(np.einsum("nii->ni", cov))
-    even = scale[:, :, None] * scale[:, None, :]
-    info = np.linalg.inv(cov / even) / even
-    back = np.swapaxes(carried, 1, 2) @ info
-    diagonal = np.zeros((n, STATE, STATE))
-    diagonal[:-1] += back @ carried
-    diagonal[1:] += info
-    noise_defaults = NoiseConfig()
-    bias = np.repeat(
-        [noise_defaults.accelerometer_bias_m_s2, noise_defaults.gyroscope_bias_rad_s], 3
-    )
-    at_bias = np.arange(9, STATE)
-    diagonal[0, at_bias, at_bias] += bias**-2.0
-    return diagonal, -back
+    return carried, cov
 
 
 def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenario) -> None:
-    """GNSS, orientation and velocity, each at the node nearest to it."""
+    """Adds GNSS, orientation and velocity, each sample at its nearest node."""
     states = drive.states(nodes)
     T_vehicle_imu = scenario.imu.mounting.pose()
     R_vi = T_vehicle_imu.rotation().matrix()
@@ -229,12 +238,12 @@ def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenar
         J[:, :, :3] = -R @ skew(arm)
         J[:, :, 3:] = R
         fixes = np.bincount(nearest(nodes, _good_fixes(drive, scenario)), minlength=n)
-        # Outliers are dropped: what is left of the fixes counts.
+        # The smoother drops outliers; the remaining fixes count.
         weight = fixes * (1.0 - gnss.outlier_probability)
         info = np.swapaxes(J, 1, 2) @ ((sigma**-2.0)[:, None] * J)
         diagonal[:, :POSE, :POSE] += weight[:, None, None] * info
     else:
-        # The map begins where the vehicle starts.
+        # The origin of the map is the vehicle's start.
         position = np.arange(3, POSE)
         diagonal[0, position, position] += LEAST_SIGMA**-2.0
     rotation = np.arange(3)
@@ -263,13 +272,13 @@ def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenar
 def _count(
     nodes: IntArray, drive: Drive, what: str, rate_hz: float, phase_s: float
 ) -> npt.NDArray[np.int64]:
-    """(n,) how many samples are nearest to each node."""
+    """(n,) number of samples nearest to each node."""
     stamps = sample_stamps(what, rate_hz, phase_s, drive.duration_s)
     return np.asarray(np.bincount(nearest(nodes, stamps), minlength=len(nodes)))
 
 
 def _good_fixes(drive: Drive, scenario: Scenario) -> IntArray:
-    """Stamps of the fixes that are there and not off by a jump, which the smoother drops."""
+    """Stamps of the fixes without those in a jump, which the smoother drops."""
     gnss = scenario.gnss
     stamps = sample_stamps("gnss", gnss.rate_hz, gnss.phase_s, drive.duration_s)
     time_s = stamps / NANOSECONDS_PER_SECOND

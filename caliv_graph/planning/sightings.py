@@ -1,6 +1,6 @@
-"""Which LiDAR of a planned drive sees which target when, and how well: geometry alone, no rays.
+"""The clouds in which each LiDAR of a planned drive sees each target: geometry only, no rays.
 
-What stands in the way (other objects, the vehicle's own body) is not looked at.
+Occluders (other objects, the vehicle's own body) are ignored.
 """
 
 from __future__ import annotations
@@ -14,53 +14,56 @@ import numpy as np
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.scenario.drives import Drive, sample_stamps
-from caliv_graph.scenario.model import LidarModel, ObjectModel, Scenario, WorldModel
-from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
+from caliv_graph.scenario.drives import Drive, cloud_stamps
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.shapes import object_mesh
 from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.scenario.world_models import ObjectModel
 from caliv_graph.targets.cloud.views import clouds_per_lidar, evenly_spread
 
 SEEN_PART = 0.87
-"""Part of the surface that faces a LiDAR that returns points: the rest hides behind itself. 480
-points of a chair at 10 m, of the paper's LiDAR."""
+"""Fraction of the surface facing a LiDAR that returns points; the target occludes the rest itself.
+It gives 480 points of a chair at 10 m with the paper's LiDAR."""
 
 INDEPENDENT_PART = 0.58
-"""Part of it that counts as independent evidence: 300 points of a chair at 10 m (SPEC 8)."""
+"""Fraction of that surface that counts as independent points: 300 of a chair at 10 m."""
 
 LEVER_PART = 0.59
-"""Points tell of a rotation by the part of their lever along the normal: 0.2 m of a chair's 0.34 m
-about each axis, with which SPEC 8's lower bounds come out."""
+"""Effective fraction of the lever of a target's surface. A point observes a rotation only by the
+component of its lever across the normal: 0.2 m of a chair's 0.34 m about each axis."""
 
 ROTATION_FLOOR_RAD = 1e-3
 POSITION_FLOOR_M = 5e-4
-"""Registration of a cloud is never better (SPEC 8)."""
+"""Smallest sigmas of the registration of one cloud."""
 
 FACING_STEPS = 12
-"""Directions from which the area that a target shows is averaged."""
+"""Number of directions over which the facing area of a target is averaged."""
 
 GROUND_REACH_M = 15.0
 GROUND_LEAST_POINTS = 60
-"""Ground is looked for so far away, and taken from so many points (`targets.ground_planes`)."""
+"""Largest range of ground points and their smallest number, as in `targets.ground.planes`."""
 
 GROUND_COLUMNS = 24
 
 ROUND_SHAPES = ("pole", "cylinder")
-"""Shapes that look the same after any turn about the vertical."""
+"""Shapes that are symmetric about the vertical."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A target at one place, for as long as it stands there.
+    """A target at one place, while it stands there.
 
     Attributes:
-        name: of the object, with a number from the second place on.
-        centre_map: (3,) metres, middle of what is not ground.
-        half_size_m: (3,) of its box, map axes.
-        area_m2: of its surface that faces a LiDAR, on average over directions.
+        name: name of the object, with a number from the second place on.
+        centre_map: (3,) metres, centre of its bounding box.
+        half_size_m: (3,) half sides of its bounding box, map axes.
+        area_m2: projected area of the surface that faces a LiDAR, mean over directions.
         levers_m: (3,) root mean square distance of its surface from the axes through its centre.
-        is_round: it looks the same after any turn about the vertical.
-        begin_s: since the start of the drive.
-        end_s: likewise.
+        is_round: whether it is symmetric about the vertical.
+        begin_s: time at which it is put there, since the start of the drive.
+        end_s: time at which it is taken away.
     """
 
     name: str
@@ -73,13 +76,13 @@ class Placement:
     end_s: float = math.inf
 
     def information(self, points: Array, range_sigma_m: float) -> Array:
-        """(m, 6, 6) what the registration of clouds tells of their poses.
+        """(m, 6, 6) information of the registration of clouds on their poses.
 
-        About the target's centre: left perturbations in the target's frame (map axes), rotation
+        It is about the target's centre: left perturbations in the target frame (map axes), rotation
         then translation. Sigmas fall with the root of the number of points, down to a floor.
 
         Args:
-            points: (m,) independent points of each cloud.
+            points: (m,) number of independent points of each cloud.
             range_sigma_m: noise along the beam.
         """
         with np.errstate(divide="ignore"):
@@ -100,10 +103,10 @@ class Sighting:
     Attributes:
         lidar: its name.
         placement: name of the placement.
-        scans: clouds that the LiDAR takes in all.
-        stamps_ns: (m,) when the clouds in which it sees the target were taken.
-        range_m: (m,) to the target's centre.
-        points: (m,) about how many points of the target.
+        scans: number of all clouds of the LiDAR.
+        stamps_ns: (m,) times of the clouds in which it sees the target.
+        range_m: (m,) range to the target's centre.
+        points: (m,) expected number of points on the target.
         towards_deg: (m,) azimuth in the map from the target to the LiDAR: the side it sees.
         centres_lidar: (m, 3) metres, the target's centre in the lidar frame.
         used: (u,) indices of the clouds that `calibrate` would use.
@@ -121,7 +124,7 @@ class Sighting:
 
 
 def placements(scenario: Scenario) -> tuple[Placement, ...]:
-    """The targets of a scenario, one for each place that they stand at."""
+    """The targets of a scenario, one for each place of each target."""
     terrain = make_terrain(scenario.world.ground)
     out = []
     for name in scenario.world.targets:
@@ -171,12 +174,8 @@ _AT_ORIGIN = {"xy_m": (0.0, 0.0), "yaw_deg": 0.0, "moves": ()}
 
 @lru_cache(maxsize=64)
 def _shape_of(model: ObjectModel) -> tuple[Array, Array, float, Array]:
-    """Lower and upper corner, area that faces a LiDAR, and levers of an object at the origin."""
-    at_origin = {key: v for key, v in _AT_ORIGIN.items() if key in type(model).model_fields}
-    world = make_world(
-        WorldModel(objects={"it": model.model_copy(update=at_origin)}, targets=("it",))
-    )
-    mesh = world.meshes["it"]
+    """Lower and upper corner, facing area and levers of an object at the origin."""
+    mesh = object_mesh(model)
     a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
     normals = 0.5 * np.cross(b - a, c - a)
     azimuth = np.linspace(0.0, 2.0 * math.pi, FACING_STEPS, endpoint=False)
@@ -187,24 +186,17 @@ def _shape_of(model: ObjectModel) -> tuple[Array, Array, float, Array]:
     middle = (a + b + c) / 3.0
     square = weight @ (middle - weight @ middle) ** 2
     levers_m = np.sqrt(square.sum() - square)
-    low, high = world.bounds("it")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     return low, high, area_m2, levers_m
 
 
 def scan_stamps(scenario: Scenario, lidar: str, duration_s: float) -> IntArray:
-    """(n,) when the clouds of a LiDAR are taken, since the start of the drive.
+    """(n,) true times of the clouds of a LiDAR since the start of the drive.
 
-    The true times: a time offset of the stamps is taken off.
+    They are the stamps minus the time offset.
     """
     model = scenario.lidars[lidar]
-    at_start = model.sweep is None or model.sweep.stamp_at == "start"
-    stamps = sample_stamps(
-        f"lidars.{lidar}",
-        model.rate_hz,
-        model.phase_s,
-        duration_s,
-        model.sweep_s if at_start else 0.0,
-    )
+    stamps = cloud_stamps(lidar, model, duration_s)
     taken = stamps - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
     return np.asarray(taken[taken >= 0])
 
@@ -220,20 +212,20 @@ def sight(
 
     Args:
         drive: the drive.
-        scenario: what the LiDAR is like.
+        scenario: the LiDARs.
         lidar: its name.
         placement: the target.
-        extraction: how many points it takes.
+        extraction: how many points are needed.
     """
     model = scenario.lidars[lidar]
     stamps = scan_stamps(scenario, lidar, drive.duration_s)
     states = drive.states(stamps, scenario.world.ground.height_m)
-    # A grid over the target's box: what of it is within the field of view? Clouds that the sides
-    # of it cut off are left out, as in `targets.extract`.
+    # The part of a grid over the target's box that is within the field of view. Clouds that a side
+    # of the field of view cuts are left out, as in `targets.cloud.extract`.
     offsets = np.stack(
         np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [-0.9, -0.45, 0.0, 0.45, 0.9]), axis=-1
     ).reshape(-1, 3)
-    # The corners of the box are farther out than the object is.
+    # The corners of the box are outside the object.
     grid = placement.centre_map + offsets * placement.half_size_m * [0.7, 0.7, 1.0]
     T = model.mounting.pose()
     back = np.swapaxes(states.R_map_vehicle, 1, 2)
@@ -261,33 +253,26 @@ def sight(
     )
 
 
-def thinned(shares: Array, seeing: int, extraction: ExtractionConfig) -> IntArray:
-    """Which of the clouds that see a target are used, as `targets.extract` chooses them.
+def thinned(weights: Array, seeing: int, extraction: ExtractionConfig) -> IntArray:
+    """Indices of the clouds of a target that are used, as `targets.cloud.extract` selects them.
 
     Args:
-        shares: (n,) what each cloud of one LiDAR that sees it counts (`targets.views`).
-        seeing: LiDARs that see it often enough.
+        weights: (n,) weight of each cloud of one LiDAR that sees it (`targets.cloud.views`).
+        seeing: number of LiDARs that see it often enough.
         extraction: how many are used.
     """
-    if len(shares) < extraction.min_scans:
+    if len(weights) < extraction.min_scans:
         return np.zeros(0, dtype=np.int64)
-    return evenly_spread(shares, clouds_per_lidar(extraction.max_scans, seeing))
+    return evenly_spread(weights, clouds_per_lidar(extraction.max_scans, seeing))
 
 
 def sees_ground(model: LidarModel) -> bool:
-    """Whether a LiDAR that stands level has enough points on the ground about it."""
+    """Whether a LiDAR on level ground has enough points on the ground around it."""
     T = model.mounting.pose()
-    elevation = np.radians(_elevations_deg(model))[:, None]
+    elevation = np.radians(channel_elevations_deg(model))[:, None]
     low, high = np.radians(model.horizontal_fov_deg)
     azimuth = low + (high - low) * (np.arange(GROUND_COLUMNS) + 0.5) / GROUND_COLUMNS
-    beams = np.stack(
-        np.broadcast_arrays(
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ),
-        axis=-1,
-    )
+    beams = unit_vectors(elevation, azimuth)
     down = -(beams @ T.rotation().matrix()[2])
     height_m = float(T.translation()[2])
     if height_m <= 0.0:
@@ -301,24 +286,18 @@ def sees_ground(model: LidarModel) -> bool:
     return bool(hit.sum() * columns / GROUND_COLUMNS >= GROUND_LEAST_POINTS)
 
 
-def _elevations_deg(model: LidarModel) -> Array:
-    if model.elevations_deg is not None:
-        return np.array(model.elevations_deg)
-    return np.linspace(*model.vertical_fov_deg, model.channels)
-
-
 def _within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
-    """What of (m, k, 3) points is in the field of view and the range of a LiDAR.
+    """Visibility of m groups of k points (m, k, 3) for a LiDAR.
 
     Returns:
-        (m,) whether all k of them are between the sides of the field of view, and (m,) the part of
-        them that is in it altogether.
+        (m,) whether all k points are between the sides of the field of view, and (m,) the fraction
+        of points inside the field of view and the range.
     """
     range_m = np.linalg.norm(points_lidar, axis=-1)
     azimuth = np.degrees(np.arctan2(points_lidar[..., 1], points_lidar[..., 0]))
     elevation = np.degrees(np.arcsin(np.clip(points_lidar[..., 2] / range_m, -1.0, 1.0)))
     low, high = model.horizontal_fov_deg
-    elevations = _elevations_deg(model)
+    elevations = channel_elevations_deg(model)
     between = (azimuth - low) % 360.0 <= high - low
     inside = (
         between
@@ -331,7 +310,7 @@ def _within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
 
 
 def _solid_angle(model: LidarModel, elevation: Array) -> Array:
-    """(n,) steradians for each beam near some elevations (n,), radians."""
-    elevations = np.radians(_elevations_deg(model))
+    """(n,) solid angle of a beam in steradians, at elevations (n,) in radians."""
+    elevations = np.radians(channel_elevations_deg(model))
     spacing = np.interp(elevation, 0.5 * (elevations[1:] + elevations[:-1]), np.diff(elevations))
     return np.asarray(spacing * math.radians(model.horizontal_resolution_deg) * np.cos(elevation))

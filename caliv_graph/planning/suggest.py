@@ -1,8 +1,8 @@
-"""Which drive would tell enough, in the least space: a small set of manoeuvres, tried out.
+"""Suggests a drive that meets the limits in the smallest space, from a small set of manoeuvres.
 
-Each manoeuvre is driven with the scenario's own vehicle and sensors past its first target, which is
-put at a few places beside the path. They are tried in the order of the space they take, and the
-first that is good enough is taken.
+Each manoeuvre is predicted with the scenario's own vehicle and sensors. Its first target is placed
+at a few positions beside the path. The candidates are tried in the order of the space they need,
+and the first one that meets the limits is returned.
 """
 
 from __future__ import annotations
@@ -17,56 +17,52 @@ import numpy as np
 from caliv_graph.config.model import LIMIT_KEY
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError, ConfigError
-from caliv_graph.planning.predict import Assumptions, Prediction, predict, sigma_of, space
+from caliv_graph.planning.assumptions import Assumptions
+from caliv_graph.planning.predict import Prediction, predict, sigma_of, space
+from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
 from caliv_graph.scenario.drives import Drive, make_drive
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    DriveModel,
-    FigureEightDrive,
-    RampModel,
-    Scenario,
-    SCurveDrive,
-)
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.world_models import RampModel
 
-USUAL_RADIUS_M = 9.16
-USUAL_SPEED_M_S = 2.0
-"""Of a vehicle whose scenario stands or goes straight ahead (SPEC 7)."""
+DEFAULT_RADIUS_M = 9.16
+DEFAULT_SPEED_M_S = 2.0
+"""Radius and speed of the paper's drive, for a scenario that has none (standstill, straight)."""
 
 ARC_RAD = math.radians(210.0)
-"""Turned by an arc: so far that LiDARs to the front and to the rear see the target."""
+"""Angle of an arc, large enough for LiDARs to the front and to the rear to see the target."""
 
 S_RAD = math.radians(120.0)
-"""Turned by each half of an S-curve."""
+"""Angle of each half of an S-curve."""
 
 BESIDE_M = (4.0, 6.0)
 """Distances of the target from the path."""
 
 ALONG = (0.35, 0.5, 0.65)
-"""Parts of the way at which the target may stand beside the path."""
+"""Fractions of the path at which the target may stand beside it."""
 
 CLEAR_M = 3.0
-"""The target is never nearer to any part of the path: the vehicle has to get past."""
+"""Smallest distance of the target from the path, so that the vehicle can pass."""
 
 STRIDE = 4
 QUICK_TOLERANCE = 0.1
-"""A first look takes every fourth cloud for four, and is right to this part."""
+"""A quick prediction uses every fourth cloud with fourfold weight; its relative error."""
 
 RAMP_HEIGHT_M = 0.25
 RAMP_FLANK_M = 4.0
-"""A ramp such as a kerb lane or two boards on bricks: 7.8 degrees at most."""
+"""A ramp such as a dropped kerb or two boards on bricks: 7.8 degrees at most."""
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A drive that would tell enough, or comes nearest to it.
+    """A drive that meets the limits, or the one nearest to them.
 
     Attributes:
-        manoeuvre: what to drive, in words.
-        scenario: the same, ready to be simulated or planned.
-        prediction: what it will tell.
-        met: whether it is good enough.
-        worst: largest ratio of a predicted sigma to the one asked for; 1 or less is met. Without
-            any asked for, the number of directions it leaves undetermined.
+        manoeuvre: the manoeuvre in words.
+        scenario: the same as a scenario, ready to be simulated or planned.
+        prediction: its prediction.
+        met: whether it meets the limits.
+        worst: largest ratio of a predicted sigma to its limit, at most 1 if all limits are met.
+            Without limits, the number of undetermined directions.
     """
 
     manoeuvre: str
@@ -77,13 +73,13 @@ class Suggestion:
 
 
 def parse_goals(items: Sequence[str]) -> dict[str, float]:
-    """Largest sigmas as they are written on a command line.
+    """Limits of sigmas from the command line.
 
     Args:
         items: `s2v_yaw_deg=0.05` and the like.
 
     Raises:
-        ConfigError: one of them is not that.
+        ConfigError: an item has another form.
     """
     goals: dict[str, float] = {}
     for item in items:
@@ -106,18 +102,18 @@ def parse_goals(items: Sequence[str]) -> dict[str, float]:
 
 
 def shortfall(prediction: Prediction, goals: Mapping[str, float]) -> float:
-    """How far a prediction is from what is asked for.
+    """Ratio of a prediction to its limits.
 
     Args:
-        prediction: of a drive.
-        goals: limits as in a config (`s2v_yaw_deg`) -> largest sigma; empty: that nothing be left
+        prediction: prediction of a drive.
+        goals: limit as in a config (`s2v_yaw_deg`) -> largest sigma; empty: no direction may be
             undetermined.
 
     Returns:
         The largest ratio of a sigma to its limit, infinite if a LiDAR sees no target; without goals
         the number of undetermined directions.
     """
-    if prediction.outlook.unseeing:
+    if prediction.covariance.unseeing:
         return math.inf
     if not goals:
         return float(len(prediction.undetermined))
@@ -129,14 +125,14 @@ def shortfall(prediction: Prediction, goals: Mapping[str, float]) -> float:
 
 
 def is_met(worst: float, goals: Mapping[str, float]) -> bool:
-    """Whether `shortfall` says that all is well."""
+    """Whether a `shortfall` meets the goals."""
     return worst <= 1.0 if goals else worst == 0.0
 
 
 def suggest(
     scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
 ) -> Suggestion | None:
-    """The manoeuvre that is good enough in the least space, or the one that comes nearest.
+    """The manoeuvre that meets the goals in the smallest space, or the one nearest to them.
 
     Args:
         scenario: vehicle, sensors, and the target to place (the first).
@@ -144,7 +140,7 @@ def suggest(
         assumptions: how drives will be recorded and calibrated.
 
     Returns:
-        None if in none of them any LiDAR sees the target.
+        None if no LiDAR sees the target in any of them.
     """
     best: Suggestion | None = None
     tried = sorted(candidates(scenario, with_ramp=assumptions.ground != "height"), key=_cost)
@@ -164,7 +160,7 @@ def suggest(
 def _tried(
     manoeuvre: str, scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
 ) -> Suggestion | None:
-    """A candidate and what it tells; None if nobody sees the target."""
+    """A candidate with its prediction; None if no LiDAR sees the target."""
     try:
         prediction = predict(scenario, assumptions=assumptions)
     except CalivError:
@@ -174,7 +170,7 @@ def _tried(
 
 
 def _cost(candidate: tuple[str, Scenario]) -> tuple[float, float]:
-    """Area of the rectangle that it takes, then its duration."""
+    """Area of the rectangle around path and target, then the duration."""
     scenario = candidate[1]
     drive = make_drive(scenario.drive)
     x, y = space([(scenario, drive)])
@@ -182,11 +178,11 @@ def _cost(candidate: tuple[str, Scenario]) -> tuple[float, float]:
 
 
 def candidates(scenario: Scenario, with_ramp: bool = False) -> Iterator[tuple[str, Scenario]]:
-    """The manoeuvres and target placements that are tried, in words and as scenarios.
+    """The manoeuvres and target placements to try, in words and as scenarios.
 
     Args:
         scenario: vehicle, sensors, and the target to place (the first).
-        with_ramp: also over a ramp, which tells the height where the ground does not.
+        with_ramp: also over a ramp, which makes the height observable without the ground.
 
     Raises:
         ConfigError: the scenario has no target.
@@ -210,8 +206,8 @@ def _place(xy_m: tuple[float, float]) -> str:
 
 def _manoeuvres(scenario: Scenario) -> Iterator[tuple[str, DriveModel]]:
     given = scenario.drive
-    radius_m = float(getattr(given, "radius_m", USUAL_RADIUS_M))
-    speed = float(getattr(given, "speed_m_s", USUAL_SPEED_M_S))
+    radius_m = float(getattr(given, "radius_m", DEFAULT_RADIUS_M))
+    speed = float(getattr(given, "speed_m_s", DEFAULT_SPEED_M_S))
     kept: dict[str, Any] = {
         "start_xy_m": (0.0, 0.0),
         "start_yaw_deg": 0.0,
@@ -241,14 +237,14 @@ def _manoeuvres(scenario: Scenario) -> Iterator[tuple[str, DriveModel]]:
 
 
 def _path(drive: Drive, count: int = 400) -> tuple[Any, Any]:
-    """(n, 2) places and (n,) headings along the way, evenly in time."""
+    """(n, 2) positions and (n,) headings along the path, evenly in time."""
     stamps = np.linspace(0.0, drive.duration_s * NANOSECONDS_PER_SECOND, count).astype(np.int64)
     motion = drive.motion(stamps)
     return motion.xy_map, motion.heading_rad
 
 
 def _places(drive: Drive) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Places of the target beside the path that leave room to get past."""
+    """Positions of the target beside the path at which the vehicle can pass."""
     xy, heading = _path(drive)
     seen: set[tuple[float, float]] = set()
     for part in ALONG:
@@ -266,7 +262,7 @@ def _places(drive: Drive) -> Iterator[tuple[float, tuple[float, float]]]:
 
 
 def _ramp(drive: Drive) -> RampModel:
-    """A ramp across the way at a third of it."""
+    """A ramp across the path at a third of the drive's duration."""
     xy, heading = _path(drive)
     at = len(xy) // 3
     return RampModel(
@@ -281,7 +277,7 @@ def _ramp(drive: Drive) -> RampModel:
 def _placed(
     scenario: Scenario, drive: DriveModel, ramps: Sequence[RampModel], xy_m: tuple[float, float]
 ) -> Scenario:
-    """The scenario with another drive and its first target elsewhere; nothing else stands there."""
+    """The scenario with another drive and only its first target, at another place."""
     name = scenario.world.targets[0]
     target = scenario.world.objects[name].model_copy(update={"xy_m": xy_m})
     if hasattr(target, "moves"):

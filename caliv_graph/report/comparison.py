@@ -35,7 +35,7 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
     parts = titled(
         f"Movement from {labels[0]} to {labels[1]}, and 1 sigma, in vehicle axes", table
     )[1:]
-    if not all(all(m.told) for m in comparison.movements):
+    if not all(all(m.determined) for m in comparison.movements):
         parts.append(
             Text(
                 f"{UNKNOWN}: not determined by both calibrations, so not compared.", style="yellow"
@@ -118,7 +118,7 @@ def agreement_document(merger: Merger, p_value: float) -> dict[str, Any]:
 
 def _movement_document(movement: Movement) -> dict[str, Any]:
     def where_determined(values: Any, axes: slice) -> list[float | None]:
-        pairs = zip(values[axes], movement.told[axes], strict=True)
+        pairs = zip(values[axes], movement.determined[axes], strict=True)
         return [float(value) if known else None for value, known in pairs]
 
     rotation, translation = slice(0, 3), slice(3, 6)
@@ -128,7 +128,7 @@ def _movement_document(movement: Movement) -> dict[str, Any]:
         "translation_m": where_determined(movement.movement, translation),
         "sigma_rotation_rad": where_determined(movement.sigma, rotation),
         "sigma_translation_m": where_determined(movement.sigma, translation),
-        "determined": dict(zip(AXES, movement.told, strict=True)),
+        "determined": dict(zip(AXES, movement.determined, strict=True)),
         "chi2": movement.chi2 if tested else None,
         "dof": movement.dof,
         "p_value": movement.p_value if tested else None,
@@ -149,7 +149,7 @@ def _cells(movement: Movement) -> list[Text]:
     cells = []
     for axis in SHOWN_AXES:
         i = AXES.index(axis)
-        if not movement.told[i]:
+        if not movement.determined[i]:
             cells.append(Text(UNKNOWN, style="yellow"))
             continue
         value, sigma = 1e3 * movement.movement[i], 1e3 * movement.sigma[i]

@@ -72,7 +72,7 @@ def plan_table(
         suggestion: the drive that keeps them in the least space, or comes nearest; None: no drive
             was found.
     """
-    predicted = prediction.outlook
+    predicted = prediction.covariance
     x, y = prediction.space_m
     parts: list[RenderableType] = [
         Text.assemble(
@@ -109,7 +109,7 @@ def _prediction_document(prediction: Prediction) -> dict[str, Any]:
         "drives": list(prediction.names),
         "duration_s": round(prediction.duration_s, 3),
         "space_m": [round(side, 2) for side in prediction.space_m],
-        **_covariance_document(prediction.outlook),
+        **_covariance_document(prediction.covariance),
         "sightings": [
             {"drive": drive, **_sighting_document(sighting)}
             for drive, sightings in zip(prediction.names, prediction.sightings, strict=True)

@@ -12,8 +12,7 @@ from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
 from caliv_graph.report.layout import UNKNOWN, new_table, sentences, titled
 from caliv_graph.report.tables import STATUS_STYLES
-from caliv_graph.validation.surfaces import Pole, Thing, Wall
-from caliv_graph.validation.validate import (
+from caliv_graph.validation.findings import (
     AFTER,
     BEFORE,
     STAGES,
@@ -22,6 +21,7 @@ from caliv_graph.validation.validate import (
     ThingResult,
     Validation,
 )
+from caliv_graph.validation.surfaces import Pole, Thing, Wall
 from caliv_graph.workflows.repeatability import Repeatability
 
 MOST_SHOWN = 12
@@ -127,7 +127,10 @@ def repeatability_sentences(repeated: Repeatability, p_value: float) -> list[str
             known = [
                 (abs(d), s)
                 for d, s, t in zip(
-                    movement.movement[axes], movement.sigma[axes], movement.told[axes], strict=True
+                    movement.movement[axes],
+                    movement.sigma[axes],
+                    movement.determined[axes],
+                    strict=True,
                 )
                 if t
             ]

@@ -13,7 +13,7 @@ from caliv_graph.report.figures.drawing import without_template
 from caliv_graph.report.figures.structure import validation_figures
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.validation import repeatability_sentences, tables, validation_status
-from caliv_graph.validation.validate import Validation
+from caliv_graph.validation.findings import Validation
 from caliv_graph.workflows.repeatability import Repeatability
 
 

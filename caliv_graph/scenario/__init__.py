@@ -1,1 +1,1 @@
-"""A planned or simulated drive: its description, path, terrain and shapes."""
+"""A planned or simulated drive: its description, path, terrain, world and beams."""

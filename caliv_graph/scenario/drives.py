@@ -1,11 +1,11 @@
-"""Drives: where the vehicle is at any time, analytic in time and in path length.
+"""Drives: the pose of the vehicle at any time, analytic in time and in path length.
 
-The vehicle steers its front axle (Ackermann, single-track model) and its frame is on the ground at
-the rear axle: it moves along its own x axis, and its heading changes by the curvature per metre.
-Speed is a function of time, curvature one of path length, so that the path does not depend on the
-speed. Distance and heading are closed-form; the position is their integral by quadrature, to
-better than a micrometre. Over a ramp (`terrain`) the frame follows the ground; velocity,
-acceleration and angular velocity are derivatives of that, not differences.
+The model is the single-track model with a steered front axle (Ackermann). The vehicle frame is on
+the ground at the rear axle: it moves along its own x axis, and its heading changes by the curvature
+per metre. The speed is a function of time and the curvature a function of path length, so the path
+does not depend on the speed. Distance and heading are closed-form. The position is their integral
+by quadrature, exact to a micrometre. On a ramp (`terrain`) the frame follows the ground. Velocity,
+acceleration and angular velocity are analytic derivatives, not differences.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
     FigureEightDrive,
@@ -32,6 +32,7 @@ from caliv_graph.scenario.model import (
 )
 
 if TYPE_CHECKING:
+    from caliv_graph.scenario.sensor_models import LidarModel
     from caliv_graph.scenario.terrain import Terrain
 
 PANEL_M = 0.25
@@ -103,8 +104,8 @@ class CurvatureProfile:
 
     Attributes:
         initial_1_m: curvature at the start in 1/m, positive to the left.
-        changes: per change the path length of its middle (m), the length over which it happens (m)
-            and the change of curvature (1/m).
+        changes: per change the path length at its middle (m), the length of the transition (m) and
+            the change of curvature (1/m).
     """
 
     initial_1_m: float
@@ -178,9 +179,9 @@ class VehicleStates:
 class Drive:
     """A drive over ground, flat or with ramps.
 
-    Path, speed and curvature are those of its picture on the map. On a ramp the vehicle's frame
-    lies in the plane that touches the ground below its origin, x axis along the path; it is faster
-    there than `speed` by 1 / cos(slope).
+    Path, speed and curvature are those of the horizontal projection. On a ramp the vehicle frame
+    lies in the tangent plane of the ground at its origin, with its x axis along the path. Its
+    speed along the slope is `speed` / cos(slope).
 
     Attributes:
         speed: speed over time.
@@ -249,7 +250,7 @@ class Drive:
         Args:
             stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
             z_map: height of the vehicle frame in the map where the ground is level, in metres, a
-                number or (n,). Ramps add theirs. The derivatives take it for constant.
+                number or (n,). The height of ramps is added. The derivatives assume it constant.
         """
         motion = self.motion(stamps_ns)
         n = len(motion.stamps_ns)
@@ -266,7 +267,7 @@ class Drive:
         slope = _dot(gradient, along)
         slope_rate = _dot(gradient_rate, along) + _dot(gradient, along_rate)
 
-        # The path's tangent and the ground's normal, and their rates; perpendicular by nature.
+        # The path's tangent lies in the ground, so it is perpendicular to the ground's normal.
         ones, zeros = np.ones((n, 1)), np.zeros((n, 1))
         x, x_rate = _unit(np.hstack([along, slope]), np.hstack([along_rate, slope_rate]))
         z, z_rate = _unit(np.hstack([-gradient, ones]), np.hstack([-gradient_rate, zeros]))
@@ -305,15 +306,15 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _unit(vectors: Array, rates: Array) -> tuple[Array, Array]:
-    """(n, 3) vectors brought to length 1, and the rates of what results."""
+    """(n, 3) vectors normalised to length 1, and the rates of the unit vectors."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     unit = vectors / length
     return unit, (rates - unit * _dot(unit, rates)) / length
 
 
 def _figure_eight(model: FigureEightDrive) -> tuple[SpeedProfile, float]:
-    """Speed profile, and path length of the change, for which each loop turns by 360 degrees."""
-    # The first half of the change turns less than the arc would: the loop is longer by as much.
+    """Speed profile and path length of the change with which each loop turns by 360 degrees."""
+    # The first half of the transition turns less than the arc. The loop is longer to make up.
     longer_m = 2.0 * float(smoothstep_integral(0.5)) * model.transition_m
     middle_m = 2.0 * math.pi * model.radius_m + longer_m
     rolling_s = 2.0 * middle_m / model.speed_m_s + model.ramp_s
@@ -357,14 +358,14 @@ def make_drive(model: DriveModel, terrain: Terrain | None = None) -> Drive:
 def sample_stamps(
     what: str, rate_hz: float, phase_s: float, duration_s: float, last_s: float = 0.0
 ) -> IntArray:
-    """Stamps of what is published at a rate, in nanoseconds since the start of the drive.
+    """Stamps of periodic samples, in nanoseconds since the start of the drive.
 
     Args:
-        what: whose, for messages: its place in the scenario.
+        what: the sensor's place in the scenario, for messages.
         rate_hz: samples per second.
         phase_s: first stamp.
         duration_s: duration of the drive.
-        last_s: how long before its end the last stamp lies at least.
+        last_s: shortest time between the last stamp and the end of the drive.
 
     Returns:
         (n,) strictly increasing, n at least 1.
@@ -380,3 +381,18 @@ def sample_stamps(
         )
     seconds = phase_s + np.arange(count, dtype=np.float64) / rate_hz
     return np.rint(seconds * NANOSECONDS_PER_SECOND).astype(np.int64)
+
+
+def cloud_stamps(lidar: str, model: LidarModel, duration_s: float) -> IntArray:
+    """(n,) stamps of the clouds of a LiDAR, in nanoseconds since the start of the drive.
+
+    Args:
+        lidar: its name, for messages.
+        model: its rate, phase and sweep.
+        duration_s: duration of the drive. Every sweep ends before it.
+
+    Raises:
+        ConfigError: the drive ends before the first cloud.
+    """
+    after_s = model.sweep_s if model.stamps_at_start else 0.0
+    return sample_stamps(f"lidars.{lidar}", model.rate_hz, model.phase_s, duration_s, after_s)

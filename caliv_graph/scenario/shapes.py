@@ -1,43 +1,32 @@
-"""Worlds: triangle meshes made in code, and rays cast against them.
+"""Triangle meshes, made in code, of what a scenario can place.
 
-Each solid is closed and has thickness, as real ones do: a chair's backrest that has one skin only
-would let two LiDARs that see its two sides agree on a surface that does not exist.
+Every solid is closed and has thickness. A backrest with a single skin would let two LiDARs on its
+two sides agree on a surface that a real chair does not have.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import assert_never
 
 import gtsam
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import (
-    BodyBoxModel,
+from caliv_graph.scenario.terrain import Terrain
+from caliv_graph.scenario.world_models import (
     BoxModel,
     ChairModel,
     CylinderModel,
     ObjectModel,
     PoleModel,
     TableModel,
-    WalkerModel,
-    WorldModel,
 )
-from caliv_graph.scenario.terrain import Terrain, make_terrain
-
-GROUND = "ground"
-
-VEHICLE = "vehicle"
-
 
 DRUM_SIDES = 360
-"""Of a cylinder: 24 sides would tell its yaw to some milliradians, these do not."""
-
-CARRIER_M = 0.45
-"""How far behind what is carried the person is who carries it."""
+"""Sides of a cylinder's mesh. With 24 sides its yaw would be observable to some milliradians."""
 
 Point = tuple[float, float, float]
 
@@ -55,18 +44,18 @@ class Mesh:
     triangles: IntArray
 
     def moved(self, T_a_b: gtsam.Pose3) -> Mesh:
-        """The mesh with its vertices taken from frame b into frame a."""
+        """The mesh with its vertices transformed from frame b into frame a."""
         vertices = self.vertices @ T_a_b.rotation().matrix().T + T_a_b.translation()
         return Mesh(vertices, self.triangles)
 
     def signed_volume(self) -> float:
-        """Volume in cubic metres; positive if the mesh is closed and its faces look outwards."""
+        """Volume in cubic metres of a closed mesh; positive if its faces point outwards."""
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one. Solids may overlap: a ray from outside meets the outer skin first."""
+    """Several meshes as one. Solids may overlap: a ray from outside hits the outer skin first."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return Mesh(
         np.vstack([mesh.vertices for mesh in meshes]),
@@ -105,7 +94,7 @@ def solid_between(one: Array, other: Array) -> Mesh:
         ]
     )
     mesh = Mesh(np.vstack([one.reshape(-1, 3), other.reshape(-1, 3)]), triangles)
-    # Which way the faces look depends on which side of `one` the other lies.
+    # The orientation of the faces depends on the side of `one` on which `other` lies.
     return mesh if mesh.signed_volume() > 0.0 else Mesh(mesh.vertices, triangles[:, ::-1])
 
 
@@ -131,13 +120,13 @@ def bar(
         end: centre of the other end.
         begin_size: sides of the rectangle at `begin` along the two axes.
         end_size: sides at `end`.
-        axes: the two of x, y, z (0, 1, 2) that the rectangles span.
+        axes: the two axes of x, y, z (0, 1, 2) that the rectangles span.
     """
     return solid_between(_rectangle(begin, begin_size, axes), _rectangle(end, end_size, axes))
 
 
 def box(size_m: Point) -> Mesh:
-    """A box of this size, its origin in the middle of its bottom face."""
+    """A box of this size; the origin is in the middle of its bottom face."""
     x, y, z = size_m
     return bar((0.0, 0.0, 0.0), (0.0, 0.0, z), (x, y), (x, y))
 
@@ -183,8 +172,8 @@ def _side(side: float) -> list[Mesh]:
 def chair() -> Mesh:
     """A plastic armchair like the CaLiV authors': 0.71 m wide, 0.77 m deep, 1.25 m high.
 
-    Front is +x, origin on the ground below the middle of the seat. Left and right mirror each
-    other; no turn maps it onto itself.
+    Front is +x, the origin is on the ground below the middle of the seat. It has mirror symmetry
+    between left and right and no rotational symmetry.
     """
     return join([_seat(), _backrest(), *_side(1.0), *_side(-1.0)])
 
@@ -192,7 +181,7 @@ def chair() -> Mesh:
 def cylinder(
     begin: Point, end: Point, begin_radius_m: float, end_radius_m: float, sides: int = 24
 ) -> Mesh:
-    """An upright round solid of so many sides between two levels, tapered if the radii differ."""
+    """An upright round solid between two levels, tapered if the radii differ."""
     angle = np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False)
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     low = np.array(begin) + begin_radius_m * rim
@@ -212,7 +201,7 @@ def cylinder(
 
 
 def table(size_m: Point, top_m: float, leg_m: float) -> Mesh:
-    """A table: a top and four square legs at its corners, its origin on the ground below it."""
+    """A table: a top and four square legs at its corners; the origin is on the ground below it."""
     x, y, z = size_m
     top = bar((0.0, 0.0, z - top_m), (0.0, 0.0, z), (x, y), (x, y))
     half_x, half_y = 0.5 * (x - leg_m), 0.5 * (y - leg_m)
@@ -239,9 +228,9 @@ def person() -> Mesh:
 
 
 def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
-    """Ground about the origin, a square at z = 0 with ramps on it, looking up.
+    """Ground around the origin, a square at z = 0 with ramps on it, facing up.
 
-    It alone has no thickness.
+    It is the only mesh without thickness.
     """
     if terrain is None:
         side_m = 2.0 * half_size_m
@@ -253,7 +242,8 @@ def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
     return Mesh(vertices, _grid_quads(np.arange(len(xy)).reshape(x.shape)))
 
 
-def _object_mesh(model: ObjectModel) -> Mesh:
+def object_mesh(model: ObjectModel) -> Mesh:
+    """The mesh of an object, in its own frame: origin on the ground, front along +x."""
     if isinstance(model, ChairModel):
         return chair()
     if isinstance(model, BoxModel):
@@ -267,171 +257,3 @@ def _object_mesh(model: ObjectModel) -> Mesh:
     if isinstance(model, TableModel):
         return table(model.size_m, model.top_m, model.leg_m)
     assert_never(model)
-
-
-@dataclass(frozen=True)
-class Walker:
-    """Somebody who walks to and fro.
-
-    Attributes:
-        mesh: in a frame that walks along: origin on the ground, x axis in the direction of going.
-        model: where and how fast.
-        ground_z_map: height of the level ground in metres.
-        terrain: the ramps on it.
-    """
-
-    mesh: Mesh
-    model: WalkerModel
-    ground_z_map: float
-    terrain: Terrain | None
-
-    def poses(self, times_s: Array) -> tuple[Array, Array]:
-        """(n, 3, 3) R_map_walker and (n, 3) t_map_walker at (n,) seconds since the start."""
-        begin, end = np.array(self.model.from_xy_m), np.array(self.model.to_xy_m)
-        length_m = float(np.linalg.norm(end - begin))
-        way = np.mod(self.model.speed_m_s * times_s / length_m, 2.0)
-        part = np.where(way < 1.0, way, 2.0 - way)
-        xy = begin + part[:, None] * (end - begin)
-        z = np.full(len(xy), self.ground_z_map)
-        if self.terrain is not None:
-            z += self.terrain.heights(xy)[0]
-        cos, sin = np.where(way < 1.0, 1.0, -1.0) * ((end - begin) / length_m)[:, None]
-        zeros, ones = np.zeros_like(z), np.ones_like(z)
-        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
-        return R.reshape(-1, 3, 3), np.column_stack([xy, z])
-
-
-@dataclass(frozen=True)
-class Carried:
-    """Something that is carried from place to place, or the person who carries it.
-
-    Attributes:
-        mesh: origin on the ground; of a person, facing the way.
-        begins_s: (m,) seconds since the start of the drive, picked up.
-        ends_s: (m,) put down again.
-        places_map: (m + 1, 3) metres, where it stands before, between and after.
-        yaws_rad: (m + 1,) its headings there.
-        carrier: whether this is the person: behind what is carried, and elsewhere in between.
-    """
-
-    mesh: Mesh
-    begins_s: Array
-    ends_s: Array
-    places_map: Array
-    yaws_rad: Array
-    carrier: bool = False
-
-    def poses(self, times_s: Array) -> tuple[Array, Array]:
-        """(n, 3, 3) R_map_mesh and (n, 3) t_map_mesh at (n,) seconds since the start."""
-        times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
-        done = np.searchsorted(self.ends_s, times, side="right")
-        move = np.minimum(done, len(self.begins_s) - 1)
-        begin, end = self.begins_s[move], self.ends_s[move]
-        part = np.clip((times - begin) / (end - begin), 0.0, 1.0)
-        carried = (times > begin) & (times < end)
-        way = self.places_map[move + 1] - self.places_map[move]
-        place = self.places_map[move] + part[:, None] * way
-        yaw = self.yaws_rad[move] + part * (self.yaws_rad[move + 1] - self.yaws_rad[move])
-        if self.carrier:
-            yaw = np.arctan2(way[:, 1], way[:, 0])
-            behind = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
-            place = place - CARRIER_M * behind
-            # Where no ray gets to: below the ground.
-            place[~carried, 2] -= 1000.0
-        cos, sin, zeros, ones = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-        R = np.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], axis=-1)
-        return R.reshape(-1, 3, 3), place
-
-
-@dataclass(frozen=True)
-class World:
-    """What there is to be hit, by name.
-
-    Attributes:
-        meshes: what stands, in the map: the ground first, then the objects.
-        targets: names of the objects that serve as targets.
-        ground_z_map: height of the level ground in metres.
-        walkers: who walks, and what is carried about.
-        vehicle: the vehicle's body in its own frame; None: it has none.
-    """
-
-    meshes: dict[str, Mesh]
-    targets: tuple[str, ...]
-    ground_z_map: float
-    walkers: dict[str, Walker | Carried] = field(default_factory=dict)
-    vehicle: Mesh | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names in the order that `RayCaster` counts objects in: what stands, walks, drives."""
-        vehicle = () if self.vehicle is None else (VEHICLE,)
-        return (*self.meshes, *self.walkers, *vehicle)
-
-    def bounds(self, name: str) -> tuple[Array, Array]:
-        """(3,) lower and (3,) upper corner of an object in the map, wherever it stands."""
-        vertices = self._vertices(name)
-        return vertices.min(axis=0), vertices.max(axis=0)
-
-    def bounding_sphere(self, name: str) -> tuple[Array, float]:
-        """(3,) centre in the map and radius in metres of a sphere that holds an object always."""
-        low, high = self.bounds(name)
-        centre = 0.5 * (low + high)
-        return centre, float(np.linalg.norm(self._vertices(name) - centre, axis=1).max())
-
-    def _vertices(self, name: str) -> Array:
-        """(n, 3) metres, map; of what is carried about at all its places."""
-        moving = self.walkers.get(name)
-        if not isinstance(moving, Carried):
-            return self.meshes[name].vertices
-        return np.vstack(
-            [
-                moving.mesh.moved(gtsam.Pose3(gtsam.Rot3.Yaw(yaw), place)).vertices
-                for place, yaw in zip(moving.places_map, moving.yaws_rad, strict=True)
-            ]
-        )
-
-
-def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> World:
-    """The world that a scenario describes.
-
-    Args:
-        model: what stands and walks.
-        vehicle_body: the boxes that the vehicle consists of.
-    """
-    z = model.ground.height_m
-    terrain = make_terrain(model.ground)
-    T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))
-    meshes = {GROUND: ground(model.ground.half_size_m, terrain).moved(T_map_ground)}
-    walkers: dict[str, Walker | Carried] = {
-        name: Walker(person(), who, z, terrain) for name, who in model.walkers.items()
-    }
-    for name, placed in model.objects.items():
-        stands = [placed, *placed.moves]
-        rises = [0.0 if terrain is None else terrain.height_at(s.xy_m) for s in stands]
-        places = np.array([[*s.xy_m, z + r] for s, r in zip(stands, rises, strict=True)])
-        yaws = np.radians([s.yaw_deg for s in stands])
-        if placed.moves:
-            begins = np.array([move.begin_s for move in placed.moves])
-            ends = np.array([move.end_s for move in placed.moves])
-            walkers[name] = Carried(_object_mesh(placed), begins, ends, places, yaws)
-            walkers[f"who carries {name}"] = Carried(
-                person(), begins, ends, places, yaws, carrier=True
-            )
-        else:
-            T_map_object = gtsam.Pose3(gtsam.Rot3.Yaw(float(yaws[0])), places[0])
-            meshes[name] = _object_mesh(placed).moved(T_map_object)
-    parts = [
-        box(part.size_m).moved(
-            gtsam.Pose3(
-                gtsam.Rot3(), np.array(part.centre_m) - np.array([0.0, 0.0, 0.5 * part.size_m[2]])
-            )
-        )
-        for part in vehicle_body
-    ]
-    return World(
-        meshes,
-        model.targets,
-        z,
-        walkers,
-        join(parts) if parts else None,
-    )

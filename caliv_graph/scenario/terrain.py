@@ -1,4 +1,4 @@
-"""The ground as a function: its height anywhere, with slope and bend, for drives and for meshes."""
+"""The ground as a function: height, gradient and second derivatives, for drives and for meshes."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import GroundModel, RampModel
+from caliv_graph.scenario.world_models import GroundModel, RampModel
 
 MESH_STEP_M = 0.1
-"""Grid of a ramp's mesh: within 0.3 mm of it where it bends by 0.1 per metre."""
+"""Grid step of a ramp's mesh. The mesh error is 0.3 mm at a second derivative of 0.1 per metre."""
 
 COARSE_STEP_M = 4.0
-"""Half of the grid of the level ground about it."""
+"""Half of the grid step of the level ground around it."""
 
 
 def _rise(u: Array) -> tuple[Array, Array, Array]:
     """0 below 0, 1 above 1, between them 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7; two derivatives.
 
-    It has three continuous derivatives, one more than the drives' own steps: the height's second
-    one is the pitch rate, and with a kink in that no IMU at 100 Hz would tell the pitch to better
-    than 10 microradians, which is decimetres after a minute.
+    The step has three continuous derivatives, one more than the steps of the drives. The second
+    derivative of the height is the pitch rate. With a kink in the pitch rate, an IMU at 100 Hz
+    would measure the pitch with an error of 10 microradians, which is decimetres after a minute.
     """
     v = np.clip(u, 0.0, 1.0)
     w = v * (1.0 - v)
@@ -31,7 +31,7 @@ def _rise(u: Array) -> tuple[Array, Array, Array]:
 
 
 def _profile(way_m: Array, top_m: float, flank_m: float) -> tuple[Array, Array, Array]:
-    """0, up a flank to 1, down a flank to 0 across `way_m` (n,), with two derivatives."""
+    """A profile along `way_m` (n,): 0, flank up to 1, flank down to 0; two derivatives."""
     up = _rise((way_m + 0.5 * top_m) / flank_m + 1.0)
     down = _rise((way_m - 0.5 * top_m) / flank_m)
     return up[0] - down[0], (up[1] - down[1]) / flank_m, (up[2] - down[2]) / flank_m**2
@@ -54,7 +54,7 @@ def _ramp_heights(ramp: RampModel, xy_map: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Level ground with ramps, whose heights add up where they overlap.
+    """Level ground with ramps. Where ramps overlap, their heights add up.
 
     Attributes:
         ramps: the ramps.
@@ -63,7 +63,7 @@ class Terrain:
     ramps: tuple[RampModel, ...]
 
     def heights(self, xy_map: Array) -> tuple[Array, Array, Array]:
-        """Height above the level ground, and how it changes.
+        """Height above the level ground and its derivatives.
 
         Args:
             xy_map: (n, 2) metres.
@@ -84,7 +84,7 @@ class Terrain:
 
     def grid_lines(self, half_size_m: float) -> tuple[Array, Array]:
         """Lines in x and in y of a grid over the square ground, fine where a ramp is."""
-        # Coarse ones too: triangles as long as the ground would be too thin for float32.
+        # Coarse lines too: triangles as long as the ground would be too thin for float32.
         coarse = np.linspace(-half_size_m, half_size_m, math.ceil(half_size_m / COARSE_STEP_M) + 1)
         lines = [set(coarse.tolist()) for _ in range(2)]
         for ramp in self.ramps:

@@ -1,8 +1,8 @@
-"""Simulated drives past a target, with known truth.
+"""Simulated drives past a target, with known truth. README.md has the models.
 
-`scenario` describes a drive, `terrain` and `worlds` make the ground and the meshes and cast rays at
-them, `drives` moves the vehicle, `lidar` takes the scans, `motion` says what IMU, GNSS and odometry
-measure, `noise` draws the rest. `recording` has it all in memory, `bag` and `writer` write it down.
+`rays` casts rays into the world of a scenario, `lidar` takes the scans, `motion` computes the
+measurements of IMU, GNSS and odometry, and `noise` draws all other errors. `recording` holds a
+drive in memory; `bag`, `caliv_folder` and `writer` write it.
 """
 
 from caliv_graph.scenario.model import Scenario, load_scenario

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -25,8 +25,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import quaternion_xyzw
 from caliv_graph.products import Array, LidarScan
-from caliv_graph.scenario.model import LidarModel, Scenario
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import TOPIC_GNSS, TOPIC_IMU, TOPIC_TWIST, topic_of_lidar
 
@@ -37,7 +39,7 @@ FRAME_IMU = "imu_link"
 FRAME_GNSS = "gnss_link"
 
 BAG_VERSION: Literal[8] = 8
-"""The newest version of rosbag2's metadata whose QoS profiles Humble's reader still takes."""
+"""The newest version of rosbag2's metadata that the reader of ROS 2 Humble accepts."""
 
 TIME_FIELDS: dict[str, tuple[str, int, int, int]] = {
     "t": ("<u4", 12, 6, 16),
@@ -48,19 +50,19 @@ TIME_FIELDS: dict[str, tuple[str, int, int, int]] = {
 """Per time field: its type, its offset, its type's number in a PointField, and bytes per point."""
 
 _NEVER = QosTime(sec=9_223_372_036, nsec=854_775_807)
-"""rosbag2's way to write that there is no deadline."""
+"""No deadline, as rosbag2 writes it."""
 
 UNKNOWN_VARIANCE = 1e9
-"""Of what a twist does not tell: the vehicle's angular velocity."""
+"""Variance of the vehicle's angular velocity, which the twist messages do not contain."""
 
 
 def frame_of_lidar(name: str) -> str:
-    """Frame that a LiDAR's clouds are given in."""
+    """Frame of a LiDAR's clouds."""
     return f"lidar_{name}"
 
 
 def cloud_layout(model: LidarModel) -> tuple[np.dtype[Any], list[tuple[str, int, int]]]:
-    """How a point is laid out in a PointCloud2.
+    """Memory layout of a point in a PointCloud2.
 
     Returns:
         The type of a point, and name, offset and type number of each of its fields.
@@ -101,14 +103,14 @@ def cloud_bytes(scan: LidarScan, model: LidarModel) -> npt.NDArray[np.uint8]:
 
 
 class BagWriter:
-    """Writes the messages of a recording in the order in which a recorder would get them."""
+    """Writes the messages of a recording in the order in which a recorder receives them."""
 
     def __init__(self, folder: Path, recording: SimulatedRecording) -> None:
-        """Makes the bag and its topics.
+        """Creates the bag and its topics.
 
         Args:
             folder: the bag's folder; must not exist.
-            recording: what is recorded.
+            recording: the recording.
 
         Raises:
             ConfigError: a LiDAR whose name cannot be part of a topic.
@@ -152,10 +154,10 @@ class BagWriter:
             self._writer.abort()
 
     def write(self, scan: LidarScan) -> None:
-        """Writes a cloud, and before it all else that was recorded before it.
+        """Writes a cloud, after all other messages that were recorded before it.
 
         Args:
-            scan: complete no earlier than those before it.
+            scan: complete no earlier than the scans before it.
         """
         model = self._scenario.lidars[scan.lidar]
         record_ns = self._recording.complete_ns(scan)
@@ -185,7 +187,7 @@ class BagWriter:
         )
 
     def _write_others(self, until_ns: int | None) -> None:
-        """Writes what is no cloud, up to a time; None: to the end."""
+        """Writes all messages except clouds up to a time; None: to the end."""
         while self._next is not None and (until_ns is None or self._next[0] <= until_ns):
             record_ns, connection, message = self._next
             self._write(connection, record_ns, message)
@@ -221,12 +223,12 @@ class BagWriter:
         x, y, z = (float(value) for value in values)
         return self._store.types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
 
-    def _quaternion(self, xyzw: Array) -> Any:
+    def _quaternion(self, xyzw: Iterable[float]) -> Any:
         x, y, z, w = (float(value) for value in xyzw)
         return self._store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
 
     def _tf_static(self) -> Iterator[tuple[int, Connection, Any]]:
-        """The extrinsics as the vehicle believes them to be: LiDARs at their initial guesses."""
+        """The extrinsics that the vehicle publishes: LiDARs at their initial guesses."""
         connection = self._connection(TOPIC_TF_STATIC, "tf2_msgs/msg/TFMessage", latched=True)
         scenario, types = self._scenario, self._store.types
         stamp_ns = self._recording.truth.start_ns
@@ -240,14 +242,13 @@ class BagWriter:
             extrinsics[FRAME_GNSS] = gtsam.Pose3(gtsam.Rot3(), antenna)
         transforms = []
         for frame, pose in extrinsics.items():
-            q: Any = pose.rotation().toQuaternion()
             transforms.append(
                 types["geometry_msgs/msg/TransformStamped"](
                     header=self._header(stamp_ns, FRAME_VEHICLE),
                     child_frame_id=frame,
                     transform=types["geometry_msgs/msg/Transform"](
                         translation=self._vector(pose.translation()),
-                        rotation=self._quaternion(np.array([q.x(), q.y(), q.z(), q.w()])),
+                        rotation=self._quaternion(quaternion_xyzw(pose.rotation())),
                     ),
                 )
             )
@@ -300,7 +301,7 @@ class BagWriter:
                 connection,
                 types["sensor_msgs/msg/NavSatFix"](
                     header=self._header(stamp_ns, FRAME_GNSS),
-                    # GBAS fix of GPS, or none.
+                    # A GBAS fix by GPS, or no fix.
                     status=types["sensor_msgs/msg/NavSatStatus"](
                         status=-1 if k is None else 2, service=1
                     ),
@@ -339,5 +340,5 @@ class BagWriter:
 
 
 def _flat(cov: Array | None) -> Array:
-    """(9,) a covariance row by row; zeros mean that it is unknown."""
+    """(9,) a covariance row by row; zeros mean unknown."""
     return np.zeros(9) if cov is None else np.ascontiguousarray(cov, dtype=np.float64).reshape(9)

@@ -1,4 +1,4 @@
-"""Simulated LiDARs: which beams there are, what they hit, and what is reported of it."""
+"""Simulated LiDARs: their beams, what each beam hits, and the range that is reported."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy.typing as npt
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.scenario.model import CropModel, EdgeModel, LidarModel
-from caliv_graph.scenario.shapes import GROUND, World
+from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
+from caliv_graph.scenario.model import CropModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel
+from caliv_graph.scenario.world import GROUND, World
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SingleArray = npt.NDArray[np.float32]
@@ -21,31 +23,17 @@ SingleArray = npt.NDArray[np.float32]
 def beam_directions(model: LidarModel) -> Array:
     """Directions of all beams.
 
-    Channels spread evenly from the lowest to the highest elevation, both included, unless each has
-    an elevation of its own. Columns spread
-    evenly over the azimuths, as near to the resolution asked for as a whole number of them allows,
-    each in the middle of its slot, so that a full turn has none twice.
+    The columns are evenly spaced over the azimuths. Their number is the whole number nearest to
+    the requested resolution. Each is in the middle of its slot, so a full turn has no column twice.
 
     Returns:
         (channels, columns, 3) of length 1, lidar frame.
     """
-    elevations_deg = (
-        np.linspace(*model.vertical_fov_deg, model.channels)
-        if model.elevations_deg is None
-        else np.array(model.elevations_deg)
-    )
-    elevation = np.radians(elevations_deg)[:, None]
+    elevation = np.radians(channel_elevations_deg(model))[:, None]
     low, high = model.horizontal_fov_deg
     columns = round((high - low) / model.horizontal_resolution_deg)
     azimuth = np.radians(low + (high - low) * (np.arange(columns) + 0.5) / columns)[None, :]
-    return np.stack(
-        np.broadcast_arrays(
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ),
-        axis=-1,
-    )
+    return unit_vectors(elevation, azimuth)
 
 
 def beams_through_sphere(directions: Array, centre: Array, radius_m: float) -> BoolArray:
@@ -54,7 +42,7 @@ def beams_through_sphere(directions: Array, centre: Array, radius_m: float) -> B
     Args:
         directions: (..., 3) of length 1.
         centre: (3,) metres, in the frame of the directions, or one for each of their last axis.
-        radius_m: radius; a sphere that holds the origin is met by every beam.
+        radius_m: radius; every beam passes through a sphere that contains the origin.
     """
     along_m = (
         directions @ centre
@@ -86,13 +74,13 @@ def column_times(model: LidarModel, columns: int) -> Array:
 
 @dataclass(frozen=True)
 class LidarReturns:
-    """What a LiDAR reports of one scan.
+    """The returns of one scan.
 
     Attributes:
         points_lidar: (n, 3) metres, lidar frame.
-        objects: (n,) index into `World.names` of what each beam hit; `NO_OBJECT` for a return from
+        objects: (n,) index into `World.names` of the object hit; `NO_OBJECT` for a return from
             between two surfaces.
-        beams: (n,) number of each beam: its channel times the columns, and its column.
+        beams: (n,) index of each beam: its channel times the number of columns, plus its column.
     """
 
     points_lidar: Array
@@ -104,9 +92,9 @@ class SimulatedLidar:
     """A LiDAR on the vehicle.
 
     Attributes:
-        T_vehicle_lidar: its true mounting.
-        channels: beams above one another.
-        columns: beams of a channel.
+        T_vehicle_lidar: its true extrinsic.
+        channels: number of channels.
+        columns: number of beams of a channel.
         column_times_s: see `column_times`.
     """
 
@@ -121,17 +109,17 @@ class SimulatedLidar:
         """Lays out the beams.
 
         Args:
-            model: its characteristics and true mounting.
-            world: what stands around it.
-            caster: casts at that world.
+            model: its characteristics and true extrinsic.
+            world: the world around it.
+            caster: casts rays into that world.
             crop: which beams to keep; None: all.
-            rng: source of its noise, and of nothing else.
+            rng: source of its noise only.
         """
         self.T_vehicle_lidar = model.mounting.pose()
         self._model = model
         self._caster = caster
         self._rng = rng
-        # Of its own, so that a LiDAR with edge effects has the range noise of one without.
+        # A separate stream: the range noise is the same with and without edge effects.
         self._edge_rng = rng.spawn(1)[0]
         directions = beam_directions(model)
         self.channels, self.columns = directions.shape[:2]
@@ -155,11 +143,11 @@ class SimulatedLidar:
         )
 
     def scan(self, T_map_vehicle: gtsam.Pose3, time_s: float = 0.0) -> LidarReturns:
-        """One cloud, taken from one pose. The order of the points is that of the beams.
+        """One cloud, taken from one pose. The points are in the order of the beams.
 
         Args:
             T_map_vehicle: true pose of the vehicle.
-            time_s: since the start of the drive: where walkers are.
+            time_s: since the start of the drive, for the walkers.
         """
         return self.sweep(
             T_map_vehicle.rotation().matrix()[None],
@@ -168,7 +156,7 @@ class SimulatedLidar:
         )
 
     def skip(self) -> None:
-        """Draws what the next cloud would draw, so that the one after it stays what it is."""
+        """Draws the noise of the next cloud and drops it. Later clouds then stay the same."""
         self._draw_noise()
         if self._model.edges is not None:
             self._draw_edges()
@@ -183,11 +171,11 @@ class SimulatedLidar:
 
         Args:
             R_map_vehicle: (columns, 3, 3) true rotation of the vehicle at each of
-                `column_times_s`; (1, 3, 3): all is taken from there.
+                `column_times_s`; (1, 3, 3): one pose for all columns.
             t_map_vehicle: (columns, 3) or (1, 3) metres.
             times_s: (columns,) or (1,) seconds since the start of the drive.
         """
-        # Drawn for all beams, so that cropping leaves the noise of the beams that it keeps alone.
+        # Noise is drawn for all beams: cropping does not change the noise of the kept ones.
         noise_m = self._draw_noise()
         edges = None if self._model.edges is None else self._draw_edges()
         towards = self.beams_towards(R_map_vehicle, t_map_vehicle, self._spheres_map)
@@ -210,16 +198,16 @@ class SimulatedLidar:
         rng: np.random.Generator,
         wave: Array | None = None,
     ) -> LidarReturns:
-        """Like `sweep`, of some beams alone; nothing is drawn for the others.
+        """Like `sweep`, for some beams only. No noise is drawn for the others.
 
         Args:
-            beams: (n,) ascending numbers of beams; the crop does not matter.
+            beams: (n,) ascending indices of beams; the crop is not applied.
             R_map_vehicle: see `sweep`.
             t_map_vehicle: see `sweep`.
             times_s: see `sweep`.
             rng: source of the noise.
-            wave: (3,) slopes along map x and y, and metres at the foot of the LiDAR, by which the
-                ground is higher than the world has it; None: it is not.
+            wave: (3,) offset of the ground from the world's ground: slopes along map x and y, and
+                height in metres below the LiDAR; None: no offset.
         """
         n = len(beams)
         noise_m = self._model.range_sigma_m * rng.standard_normal(n)
@@ -229,7 +217,7 @@ class SimulatedLidar:
     def beams_towards(
         self, R_map_vehicle: Array, t_map_vehicle: Array, spheres_map: Sequence[tuple[Array, float]]
     ) -> BoolArray:
-        """(beams,) which of them pass through one of the spheres.
+        """(beams,) which beams pass through one of the spheres.
 
         Args:
             R_map_vehicle: see `sweep`.
@@ -264,7 +252,7 @@ class SimulatedLidar:
         edges: tuple[SingleArray, SingleArray] | None,
         wave: Array | None = None,
     ) -> LidarReturns:
-        """What some beams report, given what was drawn for each of them."""
+        """Returns of some beams, given the noise of each."""
         R_map_lidar, t_map_lidar = self._poses(R_map_vehicle, t_map_vehicle)
         column = np.zeros(1, np.int64) if len(R_map_lidar) == 1 else beams % self.columns
         origin_map, times_s = t_map_lidar[column], times_s[column]
@@ -287,7 +275,7 @@ class SimulatedLidar:
             normal, uniform = edges
             beside_map = turned(_beside(directions_lidar, self._model.edges, normal))
             aside_m, _ = self._caster.cast(origin_map, beside_map, times_s)
-            # Infinite or no number where nothing was hit, or the beam grazes: no such face.
+            # Infinite or NaN without a hit or for a grazing beam: there is no such face.
             with np.errstate(divide="ignore", invalid="ignore"):
                 faced = np.einsum("ni,ni->n", directions_map, normals_map)
                 same_face_m = distance_m * faced / np.einsum("ni,ni->n", beside_map, normals_map)
@@ -323,17 +311,17 @@ class SimulatedLidar:
 
 
 def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Array) -> Array:
-    """(n,) how far beams go to ground that is higher by a plane; exact where it is level.
+    """(n,) range to ground that is offset by a plane; exact where the ground is level.
 
     Args:
         wave: see `SimulatedLidar.sweep_of`.
-        distance_m: (n,) metres to where they meet the ground.
+        distance_m: (n,) range to the ground without the offset, metres.
         directions_map: (n, 3) of length 1.
-        origins: (n, 3) or (1, 3) metres, map axes, from the LiDAR's mean place.
+        origins: (n, 3) or (1, 3) metres, map axes, relative to the LiDAR's mean position.
     """
     xy = origins[:, :2] + distance_m[:, None] * directions_map[:, :2]
     higher_m = xy @ wave[:2] + wave[2]
-    # How fast a beam comes down upon the raised ground.
+    # Rate at which a beam approaches the raised ground.
     falls = directions_map[:, 2] - directions_map[:, :2] @ wave[:2]
     meets = falls < -1e-4
     longer_m: Array = distance_m + higher_m / np.where(meets, falls, -1.0)
@@ -341,13 +329,13 @@ def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Arr
 
 
 def _edge_draws(rng: np.random.Generator, n: int) -> tuple[SingleArray, SingleArray]:
-    # Single precision in half the time; nothing depends on more.
+    # Single precision takes half the time, and its resolution is sufficient.
     return rng.standard_normal((n, 2), dtype=np.float32), rng.random((n, 3), dtype=np.float32)
 
 
 def _beside(directions: Array, edges: EdgeModel, draws: SingleArray) -> Array:
-    """(n, 3) directions of another part of each beam: its sigma is a quarter of its width."""
-    # A quarter of the full width; to first order in it, and square to the beam up to its length.
+    """(n, 3) directions of a second part of each beam, drawn within the beam's width."""
+    # Sigma is a quarter of the full width. The offset is perpendicular to the beam, to first order.
     sigma_rad = 0.25e-3 * edges.divergence_mrad
     horizontal = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))])
     horizontal /= np.maximum(np.linalg.norm(horizontal, axis=1, keepdims=True), 1e-9)
@@ -365,18 +353,18 @@ def _at_edges(
     same_face_m: Array,
     draws: SingleArray,
 ) -> tuple[Array, IntArray]:
-    """Distance and object of each beam, given how far another part of it reaches.
+    """Distance and object of each beam, given the range of a second part of the beam.
 
     Args:
-        edges: how the LiDAR takes edges.
-        distance_m: (n,) what the middle of each beam hits.
-        objects: (n,) likewise.
-        aside_m: (n,) what the other part hits.
-        same_face_m: (n,) what it would hit if the face in the middle went on for ever: a beam that
-            grazes the ground is long, but meets no edge.
+        edges: parameters of returns at edges.
+        distance_m: (n,) range of the middle of each beam.
+        objects: (n,) object that the middle of each beam hits.
+        aside_m: (n,) range of the second part.
+        same_face_m: (n,) range of the second part if the face in the middle were infinite. With it
+            the long spot of a beam that grazes the ground does not count as an edge.
         draws: (n, 3) uniform.
     """
-    # Infinite minus infinite is no edge.
+    # Infinite minus infinite is NaN, which is not an edge.
     with np.errstate(invalid="ignore"):
         step_m = aside_m - distance_m
         edge = ~(np.abs(aside_m - same_face_m) <= edges.gap_m) & (np.abs(step_m) > edges.gap_m)
@@ -384,7 +372,7 @@ def _at_edges(
     lost = (draws[:, 0] < edges.dropout_probability) | (
         edge & (draws[:, 1] < edges.lost_probability)
     )
-    # Of what remains at an edge, the share that melts; uniform once more, given that it is left.
+    # The fraction of the remaining edge returns that merges. Rescaled, the draw is uniform again.
     chosen = (draws[:, 1] - edges.lost_probability) / max(1.0 - edges.lost_probability, 1e-12)
     mixed = edge & ~lost & (gap_m <= edges.mixing_m) & (chosen < edges.mixed_probability)
     distance_m = distance_m + draws[:, 2] * np.where(mixed, step_m, 0.0)

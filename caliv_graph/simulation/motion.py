@@ -1,7 +1,7 @@
-"""What IMU, GNSS and odometry say of a drive: the truth's derivatives, seen from where they sit.
+"""Measurements of IMU, GNSS and odometry: derivatives of the true drive at each sensor.
 
-Nothing here integrates: specific force and angular rate are derivatives of the drive as it is
-written down, so that whoever integrates them must arrive where the drive does.
+Specific force and angular rate are analytic derivatives of the drive. Nothing is integrated here,
+so their integral reproduces the drive.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from scipy.spatial.transform import Rotation
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, TwistSamples
 from caliv_graph.scenario.drives import Drive, VehicleStates, sample_stamps
-from caliv_graph.scenario.model import GnssModel, ImuModel, Scenario
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import GnssModel, ImuModel
 from caliv_graph.simulation.noise import Stream, random_stream
 
 ANGULAR_ACCELERATION_STEP_NS = 50_000
-"""Half of the time over which angular acceleration is differenced: exact to 1e-7 rad/s^2."""
+"""Half step of the difference for the angular acceleration, exact to 1e-7 rad/s^2."""
 
 
 @dataclass(frozen=True)
 class SimulatedImu:
-    """What an IMU says, and its true errors.
+    """Measurements of an IMU, and its true biases.
 
     Attributes:
-        samples: what it says.
+        samples: the measurements.
         accelerometer_bias: (n, 3) m/s^2, imu frame, part of the samples.
         gyroscope_bias: (n, 3) rad/s, imu frame, part of the samples.
     """
@@ -40,11 +41,11 @@ class SimulatedImu:
 
 @dataclass(frozen=True)
 class SimulatedGnss:
-    """What a GNSS receiver says, and when it has no fix.
+    """Fixes of a GNSS receiver, and the times without a fix.
 
     Attributes:
-        fixes: its fixes.
-        lost_ns: (m,) stamps at which it says that it has none.
+        fixes: the fixes.
+        lost_ns: (m,) stamps at which it reports no fix.
     """
 
     fixes: GnssFixes
@@ -64,11 +65,11 @@ def angular_acceleration(drive: Drive, stamps_ns: IntArray) -> Array:
 def true_imu(
     drive: Drive, model: ImuModel, gravity_m_s2: float, stamps_ns: IntArray
 ) -> tuple[Array, Array, Rotation]:
-    """What a perfect IMU measures.
+    """Measurements of a perfect IMU.
 
     Args:
         drive: the drive.
-        model: where the IMU is.
+        model: its mounting.
         gravity_m_s2: towards map -z.
         stamps_ns: (n,) since the start of the drive.
 
@@ -94,7 +95,7 @@ def true_imu(
 def _bias(
     sigma: float | tuple[float, float, float], walk: float, dt_s: Array, draws: Array
 ) -> Array:
-    """(n, 3) a constant drawn from `sigma` and a random walk from zero; `draws` (n, 3) normal."""
+    """(n, 3) a constant drawn with `sigma` plus a random walk; `draws` (n, 3) are normal."""
     steps = walk * np.sqrt(dt_s)[:, None] * draws
     steps[0] = np.broadcast_to(np.asarray(sigma), (3,)) * draws[0]
     bias: Array = np.cumsum(steps, axis=0)
@@ -102,12 +103,12 @@ def _bias(
 
 
 def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
-    """What the scenario's IMU says during the drive.
+    """Measurements of the scenario's IMU during the drive.
 
     Args:
         drive: the drive.
         scenario: the IMU, gravity, and the stamp of the start.
-        seed: of its noise.
+        seed: seed of the noise.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.
@@ -157,13 +158,13 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
 
 
 def simulate_gnss(drive: Drive, scenario: Scenario, z_map: float, seed: int) -> SimulatedGnss:
-    """What the scenario's GNSS receiver says during the drive.
+    """Fixes of the scenario's GNSS receiver during the drive.
 
     Args:
         drive: the drive.
         scenario: the receiver, and the stamp of the start.
         z_map: height of the vehicle frame in the map where the ground is level, in metres.
-        seed: of its noise.
+        seed: seed of the noise.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.
@@ -211,12 +212,12 @@ def antenna_positions(states: VehicleStates, model: GnssModel) -> Array:
 
 
 def simulate_velocity(drive: Drive, scenario: Scenario, seed: int) -> TwistSamples:
-    """What the scenario's odometry says during the drive.
+    """Velocities that the scenario's odometry measures during the drive.
 
     Args:
         drive: the drive.
         scenario: the sensor, and the stamp of the start.
-        seed: of its noise.
+        seed: seed of the noise.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.

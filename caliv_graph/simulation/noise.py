@@ -1,7 +1,7 @@
-"""What a simulation draws besides the LiDARs' noise; each from a random stream of its own.
+"""Random draws of a simulation other than LiDAR noise, each from its own random stream.
 
-Streams are separate so that a change in one place (another LiDAR, other pose errors) leaves all
-other draws of the same seed as they were.
+Because the streams are separate, a change in one place (another LiDAR, other pose errors) does not
+change any other draw of the same seed.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import PoseNoiseModel
 
 
 class Stream(enum.IntEnum):
-    """What is drawn. The numbers are part of what a seed means: append, never renumber."""
+    """The random streams. A seed means the same only while the numbers stay: append only."""
 
     POSES = 0
     SUSPENSION = 1
@@ -38,7 +39,7 @@ class Stream(enum.IntEnum):
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:
-    """The generator of one stream; `index` tells LiDARs apart, and clouds if each has its own.
+    """The generator of one stream; `index` is that of a LiDAR, and of a cloud if each has one.
 
     Raises:
         ConfigError: the seed is negative.
@@ -48,22 +49,16 @@ def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, *(index or (0,)))))
 
 
-def vehicle_heights(model: SuspensionModel, count: int, rng: np.random.Generator) -> Array:
-    """(count,) heights of the vehicle frame above the ground in metres, one per frame.
-
-    White from frame to frame: frames are 0.1 s apart, and a body on its springs forgets as fast.
-    """
-    height_m, heave_m = height_and_heave(model, count, rng)
-    return height_m + heave_m
-
-
 def height_and_heave(
     model: SuspensionModel, count: int, rng: np.random.Generator
 ) -> tuple[float, Array]:
-    """What `vehicle_heights` adds up: one height for the drive, and the heave of each frame.
+    """Errors of the vehicle frame's height above the ground: one per drive, one per frame.
+
+    Heave is white from frame to frame: frames are 0.1 s apart, longer than the correlation time of
+    a sprung body.
 
     Returns:
-        Metres, and (count,) metres.
+        The height error of the drive in metres, and (count,) heave of each frame in metres.
     """
     height_m = model.height_sigma_m * float(rng.standard_normal())
     heave_m: Array = model.heave_sigma_m * rng.standard_normal(count)
@@ -76,18 +71,18 @@ def noisy_poses(
     model: PoseNoiseModel,
     rng: np.random.Generator,
 ) -> tuple[gtsam.Pose3, ...]:
-    """Poses as a filter would give them: the true ones with white errors and a random walk.
+    """Poses with the errors of a filter: white errors and a random walk.
 
     Args:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n true poses.
         model: sizes of the errors.
-        rng: their source.
+        rng: source of the errors.
 
     Returns:
         n poses. Position errors are along map axes. The white rotation error is a right
-        perturbation (vehicle axes); the walk is one of the map (left), where a filter's heading
-        drifts.
+        perturbation (vehicle axes). The walk is a left perturbation (map axes), like the heading
+        drift of a filter.
     """
     n = len(stamps_ns)
     white = rng.standard_normal((n, 6)) * np.repeat(
@@ -107,9 +102,9 @@ def noisy_poses(
 
 
 def perturbed_extrinsic(
-    mounting: PoseConfig, model: InitialGuessModel, rng: np.random.Generator
+    extrinsic: PoseConfig, model: InitialGuessModel, rng: np.random.Generator
 ) -> PoseConfig:
-    """An initial guess: uniform errors of position per vehicle axis, and of rotation.
+    """An initial guess with uniform errors of position per vehicle axis, and of rotation.
 
     The rotation is R_true Rxyz, with roll, pitch and yaw of Rxyz drawn uniformly (CaLiV, section
     IV, Evaluation).
@@ -119,7 +114,7 @@ def perturbed_extrinsic(
     """
     shift_m = rng.uniform(-1.0, 1.0, 3) * model.translation_m
     turn_rad = rng.uniform(-1.0, 1.0, 3) * math.radians(model.rotation_deg)
-    T_vehicle_lidar = mounting.pose()
+    T_vehicle_lidar = extrinsic.pose()
     rotation = T_vehicle_lidar.rotation().compose(gtsam.Rot3.RzRyRx(*turn_rad))
     return PoseConfig(
         xyz=_rounded(T_vehicle_lidar.translation() + shift_m),

@@ -1,4 +1,4 @@
-"""Rays cast into a world: what a beam hits, and where. The one user of open3d."""
+"""Rays cast into a world: the object that each ray hits, and the distance. Uses open3d."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from caliv_graph._open3d import import_open3d
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.shapes import GROUND, Mesh, World
+from caliv_graph.scenario.shapes import Mesh
+from caliv_graph.scenario.world import GROUND, World
 
 NO_OBJECT = -1
 
@@ -22,7 +23,7 @@ class RayCaster:
         """Builds the scenes.
 
         Args:
-            world: what to cast at.
+            world: the world.
             threads: number of threads; the results do not depend on it.
 
         Raises:
@@ -30,7 +31,7 @@ class RayCaster:
         """
         self._o3d: Any = import_open3d()
         self._threads = threads
-        # float32 resolves 1 micrometre at 10 m but 30 mm at the 500 km of a UTM grid.
+        # float32 resolves 1 micrometre at 10 m, but only 30 mm at the 500 km of a UTM grid.
         self._origin_map = _middle(world)
         self._scene = self._scene_of(
             [
@@ -57,7 +58,7 @@ class RayCaster:
         return self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=dtype))
 
     def _hits(self, scene: Any, origin: Array, directions: Array) -> tuple[Array, IntArray, Array]:
-        """Distance, number of the mesh in the scene, and normal of its face."""
+        """Distance, index of the mesh in the scene, and normal of its face."""
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = origin
         rays[:, 3:] = directions
@@ -69,16 +70,16 @@ class RayCaster:
     def cast(
         self, origin_map: Array, directions_map: Array, times_s: npt.ArrayLike = 0.0
     ) -> tuple[Array, IntArray]:
-        """Casts rays at all but the vehicle.
+        """Casts rays at everything except the vehicle.
 
         Args:
             origin_map: (3,) or (n, 3) metres.
             directions_map: (n, 3) of length 1.
-            times_s: seconds since the start of the drive, one number or (n,): where walkers are.
+            times_s: seconds since the start of the drive, one number or (n,), for the walkers.
 
         Returns:
             (n,) distance in metres, infinite without a hit, and (n,) index into `World.names` of
-            what was hit, `NO_OBJECT` without a hit.
+            the object hit, `NO_OBJECT` without a hit.
         """
         distance_m, objects, _ = self.cast_with_normals(origin_map, directions_map, times_s)
         return distance_m, objects
@@ -86,7 +87,7 @@ class RayCaster:
     def cast_with_normals(
         self, origin_map: Array, directions_map: Array, times_s: npt.ArrayLike = 0.0
     ) -> tuple[Array, IntArray, Array]:
-        """Like `cast`, and (n, 3) normals in the map of the faces that were hit."""
+        """Like `cast`, with (n, 3) normals of the faces that were hit, map axes."""
         distance_m, objects, normals = self._hits(
             self._scene, origin_map - self._origin_map, directions_map
         )
@@ -119,7 +120,7 @@ class RayCaster:
         return self._hits(self._vehicle, origin, directions)[0], self._vehicle_index
 
     def distance(self, points_map: Array) -> Array:
-        """(n,) distance in metres of each of (n, 3) points to the nearest surface that stands."""
+        """(n,) distance in metres of each of (n, 3) points to the nearest static surface."""
         points = self._tensor(points_map - self._origin_map, np.float32)
         distance_m = self._scene.compute_distance(points, nthreads=self._threads)
         result: Array = distance_m.numpy().astype(np.float64)
@@ -135,7 +136,7 @@ def _turned(R_a_b: Array, vectors_a: Array) -> Array:
 
 
 def _middle(world: World) -> Array:
-    """(3,) a place in the map near to what matters: the first target, else the objects."""
+    """(3,) the middle of the scene in the map: the first target, else the mean of the objects."""
     if world.targets:
         return world.bounding_sphere(world.targets[0])[0]
     standing = [name for name in world.meshes if name != GROUND]

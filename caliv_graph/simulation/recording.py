@@ -1,4 +1,4 @@
-"""A simulated drive as a recording, in memory: what a reader of its bag would hand out."""
+"""A simulated drive as a recording in memory, equal to a reader of its bag."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import numpy as np
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray, LidarScan, MotionData
-from caliv_graph.scenario.drives import Drive, VehicleStates, make_drive, sample_stamps
-from caliv_graph.scenario.model import LidarModel, Scenario
-from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.scenario.drives import Drive, VehicleStates, cloud_stamps, make_drive
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.terrain import make_terrain
+from caliv_graph.scenario.world import World, make_world
 from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
 from caliv_graph.simulation.motion import (
     SimulatedGnss,
@@ -34,27 +35,27 @@ from caliv_graph.simulation.noise import (
 from caliv_graph.simulation.rays import RayCaster
 
 HEAVE_PERIOD_NS = NANOSECONDS_PER_SECOND // 10
-"""The heave of the vehicle is drawn anew as often: clouds taken together share it."""
+"""Period with which the heave of the vehicle is redrawn. Clouds of one period share it."""
 
 
 @dataclass(frozen=True)
 class SimulatedTruth:
-    """What is true of a simulated drive.
+    """The truth of a simulated drive.
 
-    Stamps are those of the recording. The map is ENU, its origin at the datum; `trajectory` is
-    free to choose another origin (the first fix), so compare poses after moving one to the other.
+    Stamps are those of the recording. The map is ENU with its origin at the datum. `trajectory` may
+    choose another origin (the first fix), so align the origins before comparing poses.
 
     Attributes:
-        T_vehicle_lidar: mounting per LiDAR.
+        T_vehicle_lidar: true extrinsic per LiDAR.
         time_offset_s: per LiDAR, stamp minus true acquisition time.
         datum: latitude and longitude in degrees and altitude in metres of the map's origin.
         start_ns: stamp of the start.
         end_ns: stamp of the end.
-        drive: the drive, its stamps counted from its start.
+        drive: the drive; its stamps count from its start.
         level_z_map: height of the vehicle frame in the map where the ground is level, in metres:
-            that of the ground, and this drive's error of the vehicle's height.
-        heave_m: (n,) metres that the vehicle is lifted by while clouds are taken, one value per
-            `HEAVE_PERIOD_NS` of their stamps. The poses of this class are without it.
+            the ground's height plus this drive's height error.
+        heave_m: (n,) lift of the vehicle while clouds are taken, metres, one value per
+            `HEAVE_PERIOD_NS` of their stamps. The poses of this class exclude it.
     """
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
@@ -77,13 +78,13 @@ class SimulatedTruth:
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """One cloud and what is true of it.
+    """One cloud and its truth.
 
     Attributes:
         scan: the cloud.
-        frame: number of the cloud of this LiDAR, from 0.
-        objects: (n,) index into `World.names` of what each point lies on, -1 for a return that
-            comes from between two surfaces.
+        frame: index of the cloud of this LiDAR, from 0.
+        objects: (n,) index into `World.names` of the object of each point, -1 for a return from
+            between two surfaces.
     """
 
     scan: LidarScan
@@ -92,22 +93,22 @@ class SimulatedScan:
 
 
 class SimulatedRecording:
-    """A simulated drive (products.Recording). Casts rays when it is asked for clouds.
+    """A simulated drive (products.Recording). It casts rays only when clouds are requested.
 
     Attributes:
-        scenario: what is simulated.
-        seed: of all that is drawn.
-        world: what stands around.
-        truth: what is true.
+        scenario: the scenario.
+        seed: seed of all draws.
+        world: the world around the drive.
+        truth: the truth.
         guesses: initial guess of T_vehicle_lidar per LiDAR.
     """
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
-        """Draws what concerns the whole drive.
+        """Draws the errors that hold for the whole drive.
 
         Args:
             scenario: the drive.
-            seed: of all that is drawn.
+            seed: seed of all draws.
             threads: threads that cast rays; the result does not depend on it.
 
         Raises:
@@ -149,7 +150,7 @@ class SimulatedRecording:
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Its name in messages."""
         return f"simulated {self.scenario.name}, seed {self.seed}"
 
     @property
@@ -159,14 +160,14 @@ class SimulatedRecording:
 
     @cached_property
     def imu(self) -> SimulatedImu | None:
-        """The IMU's samples with their true biases; None if there is none."""
+        """The IMU's samples with their true biases; None if the vehicle has no IMU."""
         if not self.scenario.imu.enabled:
             return None
         return simulate_imu(self.truth.drive, self.scenario, self.seed)
 
     @cached_property
     def gnss(self) -> SimulatedGnss | None:
-        """The GNSS receiver's fixes, and when it had none; None if there is none."""
+        """Fixes and times without a fix; None if the vehicle has no GNSS receiver."""
         if not self.scenario.gnss.enabled:
             return None
         return simulate_gnss(self.truth.drive, self.scenario, self.truth.level_z_map, self.seed)
@@ -184,46 +185,38 @@ class SimulatedRecording:
         )
 
     def motion(self) -> MotionData:
-        """IMU, GNSS and velocity, as far as the scenario has them."""
+        """IMU, GNSS and velocity, those that the scenario has."""
         return self._motion
 
     def warnings(self) -> Sequence[str]:
-        """Nothing: nothing is left out."""
+        """None: a simulated recording is complete."""
         return ()
 
     def _frame_stamps(self, lidar: str) -> IntArray:
         """(n,) stamps of the clouds of a LiDAR, counted from the start of the drive."""
         model = self.scenario.lidars[lidar]
-        at_start = model.sweep is None or model.sweep.stamp_at == "start"
-        stamps_ns = sample_stamps(
-            f"lidars.{lidar}",
-            model.rate_hz,
-            model.phase_s,
-            self.truth.drive.duration_s,
-            model.sweep_s if at_start else 0.0,
-        )
-        # A sweep that began before the drive did is no part of it.
-        first_ns = 0 if at_start else round(model.sweep_s * NANOSECONDS_PER_SECOND)
+        stamps_ns = cloud_stamps(lidar, model, self.truth.drive.duration_s)
+        # A sweep that begins before the drive is left out.
+        first_ns = 0 if model.stamps_at_start else round(model.sweep_s * NANOSECONDS_PER_SECOND)
         return stamps_ns[stamps_ns >= first_ns]
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
-        """Stamps of the clouds of one LiDAR, ascending, without casting a ray."""
+        """Stamps of the clouds of one LiDAR, ascending, without casting rays."""
         stamps = self._frame_stamps(lidar) + self.truth.start_ns
         return [int(stamp) for stamp in stamps]
 
     def complete_ns(self, scan: LidarScan) -> int:
-        """When a cloud is complete, by the clock of its stamps: its stamp, or the sweep's end."""
+        """Time at which a cloud is complete, in the clock of its stamps: the end of its sweep."""
         return scan.stamp_ns + self._sweep_after_ns(scan.lidar)
 
     def complete_stamps_ns(self, lidar: str) -> Sequence[int]:
-        """`complete_ns` of the clouds of one LiDAR, without casting a ray."""
+        """`complete_ns` of the clouds of one LiDAR, without casting rays."""
         after_ns = self._sweep_after_ns(lidar)
         return [stamp_ns + after_ns for stamp_ns in self.scan_stamps_ns(lidar)]
 
     def _sweep_after_ns(self, lidar: str) -> int:
         model = self.scenario.lidars[lidar]
-        at_start = model.sweep is None or model.sweep.stamp_at == "start"
-        return round(model.sweep_s * NANOSECONDS_PER_SECOND) if at_start else 0
+        return round(model.sweep_s * NANOSECONDS_PER_SECOND) if model.stamps_at_start else 0
 
     @cached_property
     def _caster(self) -> RayCaster:
@@ -232,7 +225,7 @@ class SimulatedRecording:
     def scans_with_truth(
         self, lidar: str, wanted: Container[int] | None = None
     ) -> Iterator[SimulatedScan]:
-        """Like `scans`, with what each point lies on."""
+        """Like `scans`, with the object of each point."""
         model = self.scenario.lidars[lidar]
         index = list(self.scenario.lidars).index(lidar)
         simulated = SimulatedLidar(
@@ -263,7 +256,7 @@ class SimulatedRecording:
     def _take(
         self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int
     ) -> tuple[LidarReturns, Array | None]:
-        """A cloud and its times after the stamp, which is counted from the start of the drive."""
+        """A cloud and its point times after the stamp. The stamp counts from the drive's start."""
         taken_ns, states = self._moments(simulated, model, stamp_ns)
         returns = simulated.sweep(
             states.R_map_vehicle, states.position_map, taken_ns / NANOSECONDS_PER_SECOND
@@ -273,7 +266,7 @@ class SimulatedRecording:
     def _moments(
         self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int
     ) -> tuple[IntArray, VehicleStates]:
-        """When the columns of a cloud are truly taken, since the start of the drive, and where."""
+        """True times of the columns of a cloud, since the drive's start, and the states there."""
         taken_ns = (
             stamp_ns
             + np.rint(simulated.column_times_s * NANOSECONDS_PER_SECOND).astype(np.int64)
@@ -285,18 +278,18 @@ class SimulatedRecording:
     def _point_times_s(
         self, simulated: SimulatedLidar, model: LidarModel, returns: LidarReturns
     ) -> Array | None:
-        """(n,) times of the points of a cloud after its stamp; None: all are of the stamp."""
+        """(n,) times of the points of a cloud after its stamp; None: all at the stamp."""
         if model.sweep is None:
             return None
         times_s: Array = simulated.column_times_s[simulated.columns_of(returns)]
         return times_s
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in order of their stamps; each is what it is without the others.
+        """The clouds of one LiDAR in order of their stamps. They do not depend on each other.
 
         Args:
             lidar: its name.
-            wanted: stamps of the clouds that are asked for, None: all.
+            wanted: stamps of the requested clouds; None: all.
 
         Raises:
             CalivError: open3d cannot be loaded.
@@ -305,13 +298,13 @@ class SimulatedRecording:
 
 
 def simulate_drive(scenario: Scenario, seed: int, threads: int = 1) -> SimulatedRecording:
-    """Simulates a drive in memory: motion data at once, clouds when they are asked for.
+    """Simulates a drive in memory: motion data at once, clouds on request.
 
-    The same scenario and seed give the same numbers as `write_drive` writes.
+    The numbers equal those that `write_drive` writes for the same scenario and seed.
 
     Args:
         scenario: the drive.
-        seed: of all that is drawn.
+        seed: seed of all draws.
         threads: threads that cast rays; the result does not depend on it.
 
     Raises:

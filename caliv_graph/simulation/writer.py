@@ -1,7 +1,4 @@
-"""Writing what lies beside a simulated drive: its truth, and a config that is ready to run.
-
-And the parts of a CaLiV folder; `bag` writes bags.
-"""
+"""Files beside a simulated recording: truth, true trajectory, config and scenario."""
 
 from __future__ import annotations
 
@@ -18,23 +15,27 @@ import yaml
 from caliv_graph.config.load import parse_config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
+from caliv_graph.geometry.se3 import quaternion_xyzw
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.model import Scenario, dump_scenario
+from caliv_graph.scenario.model import UNIFORM_TO_SIGMA, Scenario, dump_scenario
+from caliv_graph.simulation.caliv_folder import (
+    CALIV_FOLDER,
+    frame_poses,
+    pose_values,
+    sensor_folders,
+)
 from caliv_graph.simulation.motion import antenna_positions
 from caliv_graph.simulation.recording import SimulatedRecording
 
 BAG_FOLDER = "drive"
 """Name of the bag in the folder of a simulated drive."""
 
+TRAJECTORY_PERIOD_NS = NANOSECONDS_PER_SECOND // 100
+"""Period of the true poses written beside a bag, in addition to those at cloud stamps."""
+
 TOPIC_IMU = "/imu/data"
 TOPIC_GNSS = "/gnss/fix"
 TOPIC_TWIST = "/vehicle/twist"
-
-CALIV_FOLDER = "caliv"
-"""Name of the CaLiV folder in the folder of a simulated drive."""
-
-UNIFORM_TO_SIGMA = 1.0 / math.sqrt(3.0)
-"""Standard deviation of a uniform draw from -1 to 1."""
 
 
 def topic_of_lidar(name: str) -> str:
@@ -51,82 +52,13 @@ def topic_of_lidar(name: str) -> str:
     return f"/lidar/{name}/points"
 
 
-def write_pcd(path: Path, points: Array) -> None:
-    """Writes a cloud as binary PCD v0.7 with fields x y z, float32.
-
-    Args:
-        path: the file.
-        points: (n, 3) metres, every value finite.
-    """
-    n = len(points)
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\n"
-        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
-    )
-    path.write_bytes(header.encode() + np.ascontiguousarray(points, dtype="<f4").tobytes())
-
-
-def _quaternion_xyzw(rotation: gtsam.Rot3) -> tuple[float, float, float, float]:
-    q: Any = rotation.toQuaternion()
-    return (q.x(), q.y(), q.z(), q.w())
-
-
-def _pose_values(pose: gtsam.Pose3) -> list[str]:
-    """The numbers x y z qx qy qz qw, to a picometre and a picoradian.
-
-    Never in Python's own form: 1e-05 is a string to YAML 1.1.
-    """
-    values = (*pose.translation(), *_quaternion_xyzw(pose.rotation()))
-    # Adding zero turns the minus zero of a rounded -1e-17 into zero.
-    return [f"{round(v, 12) + 0.0:.12f}" for v in values]
-
-
-def write_ego_poses(path: Path, poses: Mapping[str, Sequence[tuple[int, gtsam.Pose3]]]) -> None:
-    """Writes `ego_poses.yaml` of a CaLiV folder.
-
-    Args:
-        path: the file.
-        poses: per sensor (`sensor_1`, ...) its frame numbers with T_map_vehicle.
-    """
-    lines = []
-    for sensor, entries in poses.items():
-        lines.append(f"{sensor}:" if entries else f"{sensor}: []")
-        for frame, pose in entries:
-            lines.append(f"- [{frame}.pcd, [{', '.join(_pose_values(pose))}]]")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def write_tum(
-    path: Path, stamps_ns: IntArray, T_map_vehicle: Sequence[gtsam.Pose3], comment: str = ""
-) -> None:
-    """Writes a trajectory in the TUM format: stamp in seconds, x y z qx qy qz qw.
-
-    Args:
-        path: the file.
-        stamps_ns: (n,) nanoseconds.
-        T_map_vehicle: n poses.
-        comment: one line to put before them, after `#`.
-    """
-    lines = [f"# {comment}"] if comment else []
-    for stamp_ns, pose in zip(stamps_ns.tolist(), T_map_vehicle, strict=True):
-        seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
-        lines.append(f"{seconds}.{nanoseconds:09d} {' '.join(_pose_values(pose))}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def sensor_folders(scenario: Scenario) -> tuple[str, ...]:
-    """Folder of each LiDAR in a CaLiV folder, in the scenario's order: sensor_1, sensor_2, ..."""
-    return tuple(f"sensor_{number}" for number in range(1, len(scenario.lidars) + 1))
-
-
 def truth_of(
     T_vehicle_lidar: Mapping[str, gtsam.Pose3], time_offset_s: Mapping[str, float]
 ) -> dict[str, Any]:
     """The content of `truth.yaml`.
 
     Args:
-        T_vehicle_lidar: true mounting per LiDAR.
+        T_vehicle_lidar: true extrinsic per LiDAR.
         time_offset_s: per LiDAR, stamp minus true acquisition time.
     """
     return {
@@ -134,7 +66,7 @@ def truth_of(
             name: {
                 "T_vehicle_lidar": {
                     "translation": [float(v) for v in pose.translation()],
-                    "quaternion_xyzw": list(_quaternion_xyzw(pose.rotation())),
+                    "quaternion_xyzw": list(quaternion_xyzw(pose.rotation())),
                 },
                 "time_offset": time_offset_s[name],
             }
@@ -146,7 +78,7 @@ def truth_of(
 def _target_regions(recording: SimulatedRecording, has_bag: bool) -> list[dict[str, Any]]:
     world = recording.world
     margin_m = recording.scenario.world.region_margin_m
-    # With a bag, the map begins where the antenna had its first fix.
+    # With a bag, the origin of the map is the antenna at the first fix.
     origin_map = _first_antenna_position(recording) if has_bag else np.zeros(3)
     regions = []
     for name in world.targets:
@@ -172,7 +104,7 @@ def _first_antenna_position(recording: SimulatedRecording) -> Array:
 
 
 def _positive(noise: Mapping[str, float]) -> dict[str, float]:
-    """Only what there is, for a sigma cannot be zero."""
+    """The entries above zero, because a sigma in a config cannot be zero."""
     return {key: value for key, value in noise.items() if value > 0.0}
 
 
@@ -181,7 +113,7 @@ def _range_sigma_m(scenario: Scenario) -> float:
 
 
 def _noise_of_poses(scenario: Scenario, duration_s: float) -> dict[str, float]:
-    """What the config says of the noise of a CaLiV folder."""
+    """The config's noise section for a CaLiV folder."""
     poses = scenario.poses
     root_s = math.sqrt(duration_s)
     return _positive(
@@ -189,7 +121,7 @@ def _noise_of_poses(scenario: Scenario, duration_s: float) -> dict[str, float]:
             "lidar_range_m": _range_sigma_m(scenario),
             "pose_position_m": poses.position_sigma_m,
             "pose_rotation_deg": math.degrees(poses.rotation_sigma_rad),
-            # What the walk has come to by the end of the drive.
+            # The sigma of the walk at the end of the drive.
             "pose_drift_position_m": poses.position_walk_m_sqrts * root_s,
             "pose_drift_rotation_deg": math.degrees(poses.rotation_walk_rad_sqrts) * root_s,
         }
@@ -197,7 +129,7 @@ def _noise_of_poses(scenario: Scenario, duration_s: float) -> dict[str, float]:
 
 
 def _noise_of_sensors(scenario: Scenario) -> dict[str, float]:
-    """What the config says of the noise of a bag: what its messages do not say."""
+    """The config's noise section for a bag: the noise that its messages do not state."""
     imu, gnss = scenario.imu, scenario.gnss
     noise = {"lidar_range_m": _range_sigma_m(scenario)}
     if imu.enabled:
@@ -206,7 +138,7 @@ def _noise_of_sensors(scenario: Scenario) -> dict[str, float]:
             "gyroscope_bias_walk_rad_s2_sqrthz": imu.gyroscope_bias_walk_rad_s2_sqrthz,
         }
     if scenario.bag.covariances == "unknown":
-        # White noise of a sample becomes a density over the time that it stands for.
+        # Density of white noise: sigma of a sample times the root of the sampling period.
         root_s = 1.0 / math.sqrt(imu.rate_hz)
         if imu.enabled:
             noise |= {
@@ -224,7 +156,7 @@ def _noise_of_sensors(scenario: Scenario) -> dict[str, float]:
 
 
 def _motion_sections(scenario: Scenario) -> dict[str, Any]:
-    """Topics and places of what moves the vehicle, as far as it has them."""
+    """Topics and mountings of IMU, GNSS and odometry, those that the vehicle has."""
     topics: dict[str, str] = {}
     sections: dict[str, Any] = {}
     if scenario.imu.enabled:
@@ -242,11 +174,11 @@ def _motion_sections(scenario: Scenario) -> dict[str, Any]:
 
 
 def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
-    """The content of a `config.yaml` that calibrates the drive as it is written.
+    """The content of a `config.yaml` with which the written drive can be calibrated.
 
     Args:
         recording: the drive.
-        has_bag: it is written as a bag; else as a CaLiV folder.
+        has_bag: whether it is written as a bag; else as a CaLiV folder.
 
     Raises:
         ConfigError: a LiDAR whose name cannot be part of a topic.
@@ -296,7 +228,7 @@ def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
 def write_config(path: Path, recording: SimulatedRecording, has_bag: bool) -> None:
     """Writes `config.yaml`; see `config_of`."""
     content = config_of(recording, has_bag)
-    # What is called ready to run shall at least be a config.
+    # The written config must be valid.
     parse_config(content, str(path), path.parent)
     text = (
         f"# A simulated drive: scenario '{recording.scenario.name}', seed {recording.seed}.\n"
@@ -310,6 +242,43 @@ def write_truth(
 ) -> None:
     """Writes `truth.yaml`; see `truth_of`."""
     path.write_text(_dump_yaml(truth_of(T_vehicle_lidar, time_offset_s)), encoding="utf-8")
+
+
+def write_tum(
+    path: Path, stamps_ns: IntArray, T_map_vehicle: Sequence[gtsam.Pose3], comment: str = ""
+) -> None:
+    """Writes a trajectory in the TUM format: stamp in seconds, x y z qx qy qz qw.
+
+    Args:
+        path: the file.
+        stamps_ns: (n,) nanoseconds.
+        T_map_vehicle: n poses.
+        comment: a first line, after `#`.
+    """
+    lines = [f"# {comment}"] if comment else []
+    for stamp_ns, pose in zip(stamps_ns.tolist(), T_map_vehicle, strict=True):
+        seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+        lines.append(f"{seconds}.{nanoseconds:09d} {' '.join(pose_values(pose))}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_trajectory(path: Path, recording: SimulatedRecording, has_bag: bool) -> None:
+    """Writes `trajectory.tum`, the true poses; see `simulate.write_drive`."""
+    if not has_bag:
+        write_tum(path, *frame_poses(recording))
+        return
+    truth = recording.truth
+    stamps = [np.arange(truth.start_ns, truth.end_ns + 1, TRAJECTORY_PERIOD_NS, dtype=np.int64)]
+    stamps += [np.array(recording.scan_stamps_ns(name), np.int64) for name in recording.lidars]
+    stamps_ns = np.unique(np.concatenate(stamps))
+    latitude, longitude, altitude = truth.datum
+    write_tum(
+        path,
+        stamps_ns,
+        truth.T_map_vehicle(stamps_ns),
+        f"map: ENU, origin at latitude {latitude:.9f} longitude {longitude:.9f} degrees, altitude "
+        f"{altitude:.4f} m (WGS84). vehicle: {recording.scenario.name}, without heave",
+    )
 
 
 def write_scenario(path: Path, scenario: Scenario, seed: int) -> None:

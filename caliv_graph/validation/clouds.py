@@ -1,7 +1,7 @@
-"""What stands around a drive, thinned: points of many scans, ready to be put into the map.
+"""Points of the static surroundings of a drive, thinned, from many scans.
 
-Scans are streamed. What is kept of them is bounded: `SCANS` scans of each LiDAR and `POINTS` points
-of each, so that an hour's drive needs no more memory than a minute's.
+Scans are streamed. At most `SCANS` scans of each LiDAR and `POINTS` points of each scan are kept,
+so memory does not grow with the duration of the drive.
 """
 
 from __future__ import annotations
@@ -25,64 +25,64 @@ from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 SCANS = 100
-"""Of one LiDAR: a figure-eight has one every metre then."""
+"""Number of scans of one LiDAR: one per metre of a figure-eight."""
 
 POINTS = 2000
-"""Of one scan that are kept."""
+"""Number of points of one scan that are kept."""
 
 CELL_M = 0.1
-"""At most one point of a scan per cell of this size: near walls have thousands."""
+"""Cell size with at most one point of a scan each: near walls have thousands of points."""
 
 CLEARANCE_M = 0.15
-"""Points nearer to the ground than this are ground."""
+"""Height above ground below which points are ground."""
 
 GROUND_CELL_M = 0.5
-"""The same where the ground itself is looked at, which has far more points than anything else."""
+"""Cell size for ground points, which are far more numerous than all others."""
 
 GROUND_RANGE_M = 15.0
-"""Farther ground is seen at too flat an angle to tell its height."""
+"""Largest range of ground points. Farther ground has too flat an angle for its height."""
 
 TARGET_MARGIN_M = 0.5
-"""About a target's region: what a calibration that is wrong moves its points by."""
+"""Margin around a target's region, for points moved by a wrong calibration."""
 
 BODY_X_M = (-2.0, 5.0)
 BODY_Y_M = (-1.4, 1.4)
-"""Of the vehicle frame: what the LiDARs see of the vehicle they are on is no structure."""
+"""Limits of the vehicle's body in the vehicle frame. Points within are no structure."""
 
 TURN_M = 5.0
-"""A turn by a radian shows as much that is new as this way."""
+"""Path length that counts like a turn of 1 rad when scans are spread over a drive."""
 
 CREEP_M_S = 0.02
-"""Standing still counts as this speed, so that a drive without any motion has scans too."""
+"""Smallest speed that is assumed, so that a drive without motion has scans too."""
 
 
 @dataclass(frozen=True)
 class Extrinsics:
-    """Extrinsics to be looked at.
+    """A set of extrinsics to measure.
 
     Attributes:
-        T_vehicle_lidar: per LiDAR.
-        time_offset_s: per LiDAR, stamp minus true time; LiDARs without one have none.
+        T_vehicle_lidar: extrinsic per LiDAR.
+        time_offset_s: per LiDAR, stamp minus true time; absent: zero.
     """
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
     time_offset_s: Mapping[str, float]
 
     def true_ns(self, lidar: str, stamps_ns: IntArray) -> IntArray:
-        """When clouds were taken, by their stamps (n,)."""
+        """(n,) true times of clouds with stamps (n,)."""
         shift_ns = round(1e9 * self.time_offset_s.get(lidar, 0.0))
         return np.asarray(stamps_ns, dtype=np.int64) - shift_ns
 
 
 @dataclass(frozen=True)
 class Placed:
-    """The points as one set of extrinsics has them.
+    """The points under one set of extrinsics.
 
     Attributes:
-        extrinsics: these.
-        taken_ns: (S,) when each scan was taken.
-        R_map_vehicle: (S, 3, 3) the vehicle's attitude then.
-        t_map_vehicle: (S, 3) metres, where it was.
+        extrinsics: the extrinsics.
+        taken_ns: (S,) true time of each scan.
+        R_map_vehicle: (S, 3, 3) the vehicle's attitude at these times.
+        t_map_vehicle: (S, 3) metres, the vehicle's position.
         points_lidar: (N, 3) metres, motion compensated with these extrinsics.
     """
 
@@ -95,16 +95,15 @@ class Placed:
 
 @dataclass(frozen=True)
 class Clouds:
-    """Points that stand around a drive, of all LiDARs.
+    """Points of the static surroundings of a drive, of all LiDARs.
 
     Attributes:
         lidars: names, in the config's order.
-        lidar: (N,) index into them, of each point.
-        scan: (N,) index of its scan, counted over all LiDARs.
-        placed: by the name of a set of extrinsics.
-        scans: per LiDAR, how many were read.
-        target_points: how many points were left out, being in the region of a target.
-        notes: what a person should know, a line each.
+        lidar: (N,) index of the LiDAR of each point.
+        scan: (N,) index of the scan of each point, counted over all LiDARs.
+        placed: the points by the name of a set of extrinsics.
+        scans: number of scans read per LiDAR.
+        target_points: number of points left out because they are in a target's region.
     """
 
     lidars: tuple[str, ...]
@@ -113,14 +112,13 @@ class Clouds:
     placed: Mapping[str, Placed]
     scans: Mapping[str, int]
     target_points: int = 0
-    notes: tuple[str, ...] = ()
 
     def points_vehicle(self, placed: Placed, poses: Sequence[gtsam.Pose3] | None = None) -> Array:
         """(N, 3) metres, vehicle frame.
 
         Args:
             placed: the points.
-            poses: T_vehicle_lidar in the order of `lidars`, instead of those of `placed`.
+            poses: T_vehicle_lidar in the order of `lidars` instead of those of `placed`.
         """
         if poses is None:
             poses = [placed.extrinsics.T_vehicle_lidar[name] for name in self.lidars]
@@ -145,11 +143,11 @@ class Clouds:
 
 
 def choose_scans(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> IntArray:
-    """At most `SCANS` stamps, evenly spread over the way and the turns.
+    """At most `SCANS` stamps, evenly spread over path length and turns.
 
     Args:
         stamps_ns: ascending.
-        trajectory: of the drive; stamps outside its span are left out.
+        trajectory: trajectory of the drive; stamps outside its span are left out.
     """
     begin, end = trajectory.span_ns
     stamps = np.array([t for t in stamps_ns if begin <= t <= end], dtype=np.int64)
@@ -169,7 +167,7 @@ def choose_scans(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> Int
 def target_regions(
     recording: Recording, trajectory: VehicleTrajectory, config: Config, progress: Progress
 ) -> tuple[tuple[TargetRegion, ...], tuple[str, ...]]:
-    """Where the targets are, which the solve did use; and a line if there is none.
+    """Regions of the targets, which the solve used, and a note if there is none.
 
     Raises:
         RecordingError: a cloud could not be read.
@@ -184,7 +182,7 @@ def target_regions(
 
 
 class _Regions:
-    """Whether points of the map are in the region of a target."""
+    """Test whether points of the map are in the region of a target."""
 
     def __init__(self, regions: Sequence[TargetRegion], trajectory: VehicleTrajectory) -> None:
         begin, _ = trajectory.span_ns
@@ -216,28 +214,28 @@ def read_clouds(
     with_ground: bool,
     progress: Progress,
 ) -> Clouds:
-    """Reads what stands around a drive.
+    """Reads the static surroundings of a drive.
 
     Args:
         recording: the drive.
-        trajectory: of it; the chosen stamps are within its span.
+        trajectory: its trajectory; the chosen stamps are within its span.
         chosen: per LiDAR the stamps of the scans to read.
-        extrinsics: sets of extrinsics by name. The first set decides what is ground and what is
+        extrinsics: sets of extrinsics by name. The first set decides which points are ground and
             target.
-        regions: of the targets, left out.
-        with_ground: keep the ground as well: the solve did not use it.
-        progress: told of every scan.
+        regions: regions of the targets, left out.
+        with_ground: whether the ground is kept, because the solve did not use it.
+        progress: advanced at every scan.
 
     Raises:
-        RecordingError: a cloud could not be read, or none of them holds a point.
+        RecordingError: a cloud could not be read, or no scan has a point.
     """
     first = next(iter(extrinsics))
     reader = _Reader(trajectory, extrinsics, _Regions(regions, trajectory), with_ground)
     names = tuple(chosen)
     total = sum(map(len, chosen.values()))
-    # Matrices are small: threads of a linear algebra library would mostly wait for each other.
+    # The matrices are small: threads of the linear algebra library would make this slower.
     with (
-        progress.stage("reading what stands around", total) as advance,
+        progress.stage("reading the surroundings", total) as advance,
         threadpool_limits(limits=1),
     ):
         for index, name in enumerate(names):
@@ -269,7 +267,7 @@ def read_clouds(
 
 
 class _Reader:
-    """Takes scans and keeps what stands."""
+    """Collects scans and keeps the points of static structure."""
 
     def __init__(
         self,
@@ -305,14 +303,14 @@ class _Reader:
             whole[key], self._extrinsics[key].T_vehicle_lidar[scan.lidar], taken[key]
         )
         if len(kept) > POINTS:
-            # The same scan gives the same points.
+            # A fixed seed: the same scan gives the same points.
             rng = np.random.default_rng(0)
             kept = kept[np.sort(rng.choice(len(kept), POINTS, replace=False))]
         self.scans.append((lidar, {k: points[kept] for k, points in whole.items()}))
         self.taken_ns.append(taken)
 
     def _standing(self, points: Array, T_vehicle_lidar: gtsam.Pose3, at_ns: int) -> IntArray:
-        """Indices of the points of what stands, target and vehicle left out."""
+        """Indices of the points of structure, without target and vehicle."""
         if not len(points):
             return np.zeros(0, dtype=np.int64)
         R, t = self._trajectory.poses_at([at_ns])
@@ -339,7 +337,7 @@ def _within(values: Array, limits: tuple[float, float]) -> BoolArray:
 
 
 def _ground(level: Array, height: Array) -> BoolArray:
-    """Points on the ground near the LiDAR, one per cell."""
+    """Mask of points on the ground near the LiDAR, one per cell."""
     on = np.flatnonzero(
         (np.abs(height) < CLEARANCE_M) & (np.hypot(level[:, 0], level[:, 1]) < GROUND_RANGE_M)
     )
@@ -350,7 +348,7 @@ def _ground(level: Array, height: Array) -> BoolArray:
 
 
 def _thinned(scan: LidarScan) -> LidarScan:
-    """Near points of a scan, one per cell."""
+    """The scan with its near points only, one per cell."""
     reach_m = math.hypot(HALF_SIZE_M, HALF_SIZE_M)
     near = np.flatnonzero(np.einsum("ni,ni->n", scan.points_lidar, scan.points_lidar) < reach_m**2)
     cell = np.floor(scan.points_lidar[near] / CELL_M).astype(np.int64) + 1024

@@ -1,10 +1,9 @@
-"""How well the LiDARs agree about a wall or a pole, and how well they could be expected to.
+"""Thickness of a wall or pole and distances between LiDARs on it, measured and expected.
 
-Everything measured is linear in small errors of the extrinsics, of the vehicle's poses and of the
-ranges, so that its variance follows from their joint covariances (propagation of errors). The
-errors of extrinsics and of poses are taken as independent. On the very drive that was calibrated
-they are not: the extrinsics were found such that they fit the poses, errors and all, and what is
-expected is then rather too large than too small.
+Every measure is linear in small errors of the extrinsics, of the vehicle's poses and of the ranges.
+Its variance follows from their joint covariances by propagation of errors. The errors of extrinsics
+and of poses are assumed independent. On the drive that was calibrated they are correlated, because
+the extrinsics fit the poses with their errors. The expected values are then too large.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray
@@ -29,35 +29,35 @@ from caliv_graph.validation.surfaces import (
 )
 
 OWN_POINTS = 15
-"""A LiDAR with fewer points on a surface has no surface of its own."""
+"""Smallest number of points with which a LiDAR has its own fit of a surface."""
 
 WALL_TRUE_M = 0.002
 POLE_TRUE_M = 0.005
-"""How far a wall is from a plane over metres, 1 sigma, and a pole from a round one, ranges that
-depend on angle and material included: what two LiDARs that see different parts of it differ by."""
+"""Deviation of a wall from a plane over metres, and of a pole from a cylinder, 1 sigma. It includes
+range errors that depend on angle and material, and makes LiDARs with different views differ."""
 
 NEIGHBOURS = 8
-"""Points of the other LiDAR that make up its surface next to a point."""
+"""Number of points of the other LiDAR that define its surface near a point."""
 
 REACH_M = 0.5
-"""Without that many of them so near, the other LiDAR has no surface there."""
+"""Largest distance of these points. If one is farther, the other LiDAR has no surface there."""
 
 COMPARED_POINTS = 4000
-"""Of one LiDAR that the cloud-to-cloud distance is taken at."""
+"""Number of points of one LiDAR at which the cloud-to-cloud distance is measured."""
 
 SURFACE_FLATNESS = 0.35
-"""Neighbours are a surface if they scatter across it by less than this part of along it."""
+"""Largest ratio of the neighbours' scatter across the surface to the scatter along it."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What the alignment may be off by.
+    """Known errors of the alignment.
 
     Attributes:
         cov_extrinsics: (6 L, 6 L) joint, vehicle axes, LiDARs in the order of the clouds.
         cov_poses: (6 S, 6 S) joint, of the vehicle's poses at the scans, right perturbations.
-        sigma_range_m: along the beam.
-        sigma_heave_m: of the body on its springs, per scan, which the trajectory does not know.
+        sigma_range_m: range noise along the beam.
+        sigma_heave_m: heave per scan, which the trajectory does not contain.
     """
 
     cov_extrinsics: Array
@@ -71,8 +71,8 @@ class Thickness:
     """Scatter of points about a surface fitted to them, root mean square, metres.
 
     Attributes:
-        merged: all LiDARs on one surface.
-        alone: per LiDAR, on a surface of its own.
+        merged: of the points of all LiDARs on one surface.
+        alone: per LiDAR, of its points on its own surface.
     """
 
     merged: float
@@ -81,13 +81,13 @@ class Thickness:
 
 @dataclass(frozen=True)
 class Apart:
-    """How far two LiDARs have a surface apart.
+    """Distance between the surfaces of two LiDARs on one wall or pole.
 
     Attributes:
         lidars: the two.
-        distance_m: root mean square distance between their surfaces, where both have it; of poles
-            the distance between their axes at middle height.
-        offset_m: (k,) in the middle, signed: along the normal of a wall, in x and y for a pole.
+        distance_m: root mean square distance between their surfaces, over the part that both see;
+            for poles the distance between their axes at middle height.
+        offset_m: (k,) signed distance in the middle: along the normal of a wall, x and y of a pole.
     """
 
     lidars: tuple[str, str]
@@ -97,14 +97,14 @@ class Apart:
 
 @dataclass(frozen=True)
 class Expected:
-    """What an alignment without other errors than those known would show.
+    """Measures expected from the known errors alone.
 
     Attributes:
         merged: thickness, root of the expected square, metres.
-        alone: likewise, per LiDAR.
+        alone: likewise per LiDAR.
         distance_m: per pair, root of the expected square.
-        rows: per pair (k, 6 L + 6 S), how the offset moves with extrinsics and poses.
-        noise: per pair (k, k) covariance of the offset from ranges and shape.
+        rows: per pair (k, 6 L + 6 S), derivative of the offset by extrinsics and poses.
+        noise: per pair (k, k) covariance of the offset from range noise and shape.
     """
 
     merged: float
@@ -116,7 +116,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class _Refitted:
-    """A surface as one set of extrinsics has its points."""
+    """A surface fitted to its points under one set of extrinsics."""
 
     surface: Wall | Pole
     points: Array
@@ -124,14 +124,14 @@ class _Refitted:
 
 
 class SurfaceMeter:
-    """Measures one surface under any extrinsics; its points stay the same."""
+    """Measures one surface under any extrinsics, always with the same points."""
 
     def __init__(self, clouds: Clouds, surface: Wall | Pole) -> None:
-        """Binds the points.
+        """Selects the points.
 
         Args:
             clouds: all points.
-            surface: as the best alignment has it, with its points.
+            surface: the surface under the best alignment, with its points.
         """
         self._clouds = clouds
         self._surface = surface
@@ -140,7 +140,7 @@ class SurfaceMeter:
         self._own = [i for i, name in enumerate(clouds.lidars) if self.points[name] >= OWN_POINTS]
 
     def pairs(self) -> list[tuple[str, str]]:
-        """LiDARs that both have a surface of their own."""
+        """Pairs of LiDARs that both have their own fit."""
         names = [self._clouds.lidars[i] for i in self._own]
         return list(itertools.combinations(names, 2))
 
@@ -150,8 +150,8 @@ class SurfaceMeter:
         """Thickness and distances between LiDARs.
 
         Args:
-            placed: the points under some extrinsics.
-            poses: T_vehicle_lidar to take instead, in the order of the LiDARs.
+            placed: the points under one set of extrinsics.
+            poses: T_vehicle_lidar instead of these, in the order of the LiDARs.
         """
         points = self._clouds.points_map(placed, poses)[self._surface.members]
         beams = self._clouds.beams_map(placed, poses)[self._surface.members]
@@ -161,7 +161,7 @@ class SurfaceMeter:
             name = self._clouds.lidars[i]
             of = self._lidar == i
             own = _refitted(points[of], beams[of], self._surface)
-            alone[name] = _rms(own.residual)
+            alone[name] = rms(own.residual)
             fits[name] = _own_parameters(merged, of, beams[of])
         apart = {}
         for a, b in self.pairs():
@@ -169,11 +169,11 @@ class SurfaceMeter:
             if len(at):
                 gap = fits[a] - fits[b]
                 distance = np.linalg.norm(at @ gap, axis=1)
-                apart[a, b] = Apart((a, b), _rms(distance), at.mean(axis=0) @ gap)
-        return Thickness(_rms(merged.residual), alone), apart
+                apart[a, b] = Apart((a, b), rms(distance), at.mean(axis=0) @ gap)
+        return Thickness(rms(merged.residual), alone), apart
 
     def _where(self, merged: _Refitted, a: str, b: str) -> Array:
-        """(m, k, parameters) where two LiDARs' surfaces are compared; m is 0 if nowhere."""
+        """(m, k, parameters) places at which two surfaces are compared; m is 0 without overlap."""
         if isinstance(merged.surface, Pole):
             return np.hstack([np.eye(2), np.zeros((2, 2))])[None]
         place = (merged.points - merged.surface.centre) @ merged.surface.axes.T
@@ -188,7 +188,7 @@ class SurfaceMeter:
         return np.column_stack([np.ones(int(inside.sum())), place[inside]])[:, None, :]
 
     def expect(self, placed: Placed, errors: Errors) -> Expected:
-        """What `measure` would give on average, if only the known errors were there."""
+        """Expectation of `measure` under the known errors alone."""
         clouds, members = self._clouds, self._surface.members
         names = clouds.lidars
         poses = [placed.extrinsics.T_vehicle_lidar[name] for name in names]
@@ -245,20 +245,20 @@ class SurfaceMeter:
 
 
 def _own_parameters(merged: _Refitted, which: Array, beams: Array) -> Array:
-    """(k,) how the surface of some of the points differs from the merged one."""
+    """(k,) parameters of the surface of some points relative to the merged one."""
     points = merged.points[which]
     if isinstance(merged.surface, Wall):
         residual, _, basis = linearised(merged.surface, points)
         return np.asarray(np.linalg.lstsq(basis, residual)[0])
     pole = merged.surface
     own = fit_pole(points, beams, np.arange(len(points)), pole.radius_m)
-    assert own is not None  # a known radius is never refused
+    assert own is not None  # with a known radius the fit always succeeds
     shift = pole.middle_z - own.middle_z
     return np.array([*(own.foot + own.slope * shift - pole.foot), *(own.slope - pole.slope)])
 
 
 def _propagated(rows: Array, errors: Errors) -> Array:
-    """Covariance (k, k) of what moves with extrinsics and poses by `rows`."""
+    """Covariance (k, k) of quantities whose derivative by extrinsics and poses is `rows`."""
     split = len(errors.cov_extrinsics)
     by_extrinsics, by_poses = rows[:, :split], rows[:, split:]
     return np.asarray(
@@ -281,10 +281,10 @@ def offset_covariance(
 
 
 def _refitted(points: Array, beams: Array, surface: Wall | Pole) -> _Refitted:
-    """The surface through its points as they are now."""
+    """The surface fitted to its points at their current places."""
     if isinstance(surface, Wall):
         centre, axes, _ = plane_of(points)
-        # The same sides and directions as before, so that signs compare.
+        # The same side and directions as before, so that signs are comparable.
         normal = axes[2] if axes[2] @ surface.normal > 0.0 else -axes[2]
         long = surface.axes[0] - (surface.axes[0] @ normal) * normal
         long /= np.linalg.norm(long)
@@ -297,28 +297,28 @@ def _refitted(points: Array, beams: Array, surface: Wall | Pole) -> _Refitted:
         )
         return _Refitted(fitted, points, (points - centre) @ normal)
     members = np.arange(len(points))
-    # Torn apart by extrinsics that are wrong it has no radius: that of the best ones is taken.
+    # Under wrong extrinsics the radius is not observable: that of the best alignment is used.
     pole = fit_pole(points, beams, members, surface.radius_m)
-    assert pole is not None  # a known radius is never refused
+    assert pole is not None  # with a known radius the fit always succeeds
     residual, _ = pole_residuals(points, pole.foot, pole.slope, pole.middle_z, pole.radius_m)
     return _Refitted(pole, points, residual)
 
 
 def _sparse(own: Array, lidar: IntArray, lidars: int) -> Array:
-    """(n, 6 L) of (n, 6) that belong to a LiDAR each."""
+    """(n, 6 L) rows whose (n, 6) entries are in the columns of each point's LiDAR."""
     out = np.zeros((len(own), 6 * lidars))
     np.put_along_axis(out, 6 * lidar[:, None] + np.arange(6), own, axis=1)
     return out
 
 
 def _scatter(J: Array, cov: Array, basis: Array) -> float:
-    """Mean square of what errors of covariance `cov` leave after the surface was fitted."""
+    """Mean square residual of a fitted surface due to errors with covariance `cov`."""
     kept = J - basis @ np.linalg.lstsq(basis, J)[0]
     return float(np.einsum("ni,ij,nj->", kept, cov, kept)) / len(J)
 
 
 def _scatter_of_scans(J: Array, scan: IntArray, cov: Array, basis: Array) -> float:
-    """The same, of errors of the scans' poses: J (n, 6) is that of each point's own scan."""
+    """Like `_scatter`, for the scans' poses: J (n, 6) is by the pose of each point's scan."""
     used, at = np.unique(scan, return_inverse=True)
     m, k = len(used), basis.shape[1]
     rows = (6 * used[:, None] + np.arange(6)).ravel()
@@ -338,16 +338,16 @@ def _scatter_of_scans(J: Array, scan: IntArray, cov: Array, basis: Array) -> flo
 def cloud_distances(
     points: Array, lidar: IntArray, names: Sequence[str]
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Distance of each LiDAR's points from the surfaces that the others' points make up.
+    """Distance of each LiDAR's points from the surfaces of the other LiDARs' points.
 
     Args:
         points: (N, 3) metres, map.
         lidar: (N,) index into `names`.
-        names: of the LiDARs.
+        names: names of the LiDARs.
 
     Returns:
-        Per (from, to) the median distance in metres, and the part of the points of `from` that have
-        a surface of `to` within `REACH_M`; only the pairs of which any has.
+        Per (from, to) the median distance in metres, and the fraction of the points of `from` with
+        a surface of `to` within `REACH_M`; pairs without such points are left out.
     """
     out = {}
     rng = np.random.default_rng(0)
@@ -367,7 +367,7 @@ def cloud_distances(
         off = around - centre[:, None]
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
         to_plane = np.abs(np.einsum("ni,ni->n", some[near] - centre, vectors[:, :, 0]))
-        # Points in a line or a heap have no surface: the nearest of them stands for it.
+        # Points along a line or in a volume define no surface: the nearest point replaces it.
         flat = np.sqrt(np.maximum(values[:, 0], 0.0)) < SURFACE_FLATNESS * np.sqrt(
             np.maximum(values[:, 1], 1e-12)
         )
@@ -377,18 +377,19 @@ def cloud_distances(
 
 
 def thing_distance(points: Array, lidar: IntArray, a: int, b: int) -> float | None:
-    """Mean distance of each point of an object from the nearest one of the other LiDAR, metres.
+    """Mean distance of each point of an object from the other LiDAR's nearest point, metres.
 
-    Both ways (chamfer distance). Never zero: beams do not meet the same spots.
+    It is the mean over both directions (chamfer distance). It is never zero, because beams of two
+    LiDARs do not hit the same points.
 
     Args:
         points: (n, 3) metres, map.
-        lidar: (n,) index of each one's LiDAR.
-        a: a LiDAR.
-        b: another one.
+        lidar: (n,) index of each point's LiDAR.
+        a: index of a LiDAR.
+        b: index of another LiDAR.
 
     Returns:
-        None if one of them has fewer than `OWN_POINTS`.
+        None if one of them has fewer than `OWN_POINTS` points.
     """
     p, q = points[lidar == a], points[lidar == b]
     if min(len(p), len(q)) < OWN_POINTS:
@@ -397,5 +398,7 @@ def thing_distance(points: Array, lidar: IntArray, a: int, b: int) -> float | No
     return float(0.5 * (np.mean(there) + np.mean(back)))
 
 
-def _rms(values: Array) -> float:
+def rms(values: npt.ArrayLike) -> float:
+    """Root mean square; 0 of no values."""
+    values = np.asarray(values, dtype=np.float64)
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0

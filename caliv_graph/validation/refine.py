@@ -1,10 +1,10 @@
-"""Which points belong together: the extrinsics moved until walls and poles are thin.
+"""Assigns points to surfaces: aligns the extrinsics until walls and poles are thinnest.
 
-A measure that looked only at points that are near each other already would find every calibration
-good. So the extrinsics are moved, from a gate of half a metre down, until the structure is as thin
-as it gets; which points lie on which surface is settled there, and kept for every set of extrinsics
-that is measured. What this gives for extrinsics is a bound for how well this structure can be
-aligned, and no calibration: its errors follow those of the trajectory.
+A measure on points that are already near each other would rate every calibration as good. So the
+extrinsics are optimised, with a gate that shrinks from 0.6 m, until the structure is as thin as
+possible. The assignment of points to surfaces at this optimum is used for every set of extrinsics
+that is measured. The optimum is a bound for the alignment of this structure. It is no calibration,
+because it follows the errors of the trajectory.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, skew, stack
+from caliv_graph.geometry.se3 import retract_vehicle_axes, skew, stack, vehicle_axes_difference
 from caliv_graph.products import Array, IntArray
 from caliv_graph.validation.clouds import Clouds, Placed
 from caliv_graph.validation.surfaces import Pole, Structure, Wall, find_structure, pole_residuals
 
 GATES_M = (0.6, 0.35, 0.2, 0.1, 0.06)
-"""Half thickness of what is taken for one surface, round by round."""
+"""Half thickness of the gate around a surface, per round."""
 
 STEPS = 4
-"""Of Gauss-Newton in each."""
+"""Gauss-Newton steps per round."""
 
 CORRELATED = 10.0
-"""Points of a scan share the error of its pose: they count as so many times fewer."""
+"""Factor by which the points are down-weighted, because points of a scan share its pose error."""
 
 LEAST_SIGMA_M = 0.015
-"""Scatter of a point about a surface, at least: range noise and the trajectory."""
+"""Smallest scatter of a point about a surface, from range noise and the trajectory."""
 
 COUNT_CELL_M = 0.25
-"""Cells in which one sees how sharp a map is."""
+"""Size of the cells that are counted to compare how sharp two maps are."""
 
 
 def sharper(clouds: Clouds, names: Sequence[str]) -> str:
-    """Which set of extrinsics has the points in fewer cells of the map, with the fewest first."""
+    """The set of extrinsics whose points occupy the fewest cells of the map."""
 
     def cells(name: str) -> int:
         points = clouds.points_map(clouds.placed[name])
@@ -48,17 +48,17 @@ def sharper(clouds: Clouds, names: Sequence[str]) -> str:
 def align(
     clouds: Clouds, placed: Placed, sigmas: Array, with_ground: bool
 ) -> tuple[Structure, tuple[gtsam.Pose3, ...]]:
-    """Finds the structure, and extrinsics under which it is as thin as it gets.
+    """Finds the structure, and the extrinsics under which it is thinnest.
 
     Args:
         clouds: points of all LiDARs.
-        placed: under the extrinsics to begin with.
-        sigmas: (L, 6) how far these may be off, vehicle axes, rad and m: what the structure does
-            not tell stays.
-        with_ground: level planes count too.
+        placed: the points under the extrinsics to start from.
+        sigmas: (L, 6) prior sigmas of these, vehicle axes, rad and m. They hold the directions that
+            the structure does not determine.
+        with_ground: whether level planes count too.
 
     Returns:
-        The structure, its geometry as those extrinsics have it, and T_vehicle_lidar per LiDAR.
+        The structure under those extrinsics, and T_vehicle_lidar per LiDAR.
     """
     start = [placed.extrinsics.T_vehicle_lidar[name] for name in clouds.lidars]
     poses = list(start)
@@ -71,7 +71,9 @@ def align(
         sigma_m = max(0.5 * gate_m, LEAST_SIGMA_M)
         for _ in range(STEPS):
             H, g = _normal_equations(clouds, placed, poses, found, sigma_m)
-            moved = np.concatenate([_between(a, b) for a, b in zip(poses, start, strict=True)])
+            moved = np.concatenate(
+                [vehicle_axes_difference(a, b) for a, b in zip(poses, start, strict=True)]
+            )
             step = np.linalg.solve(H + prior, -g - prior @ moved)
             poses = [retract_vehicle_axes(T, step[6 * i : 6 * i + 6]) for i, T in enumerate(poses)]
     return _found(clouds, placed, poses, GATES_M[-1], with_ground, True), tuple(poses)
@@ -89,26 +91,20 @@ def _found(
     return find_structure(points, beams, clouds.scan, gate_m, with_ground, columns)
 
 
-def _between(T: gtsam.Pose3, start: gtsam.Pose3) -> Array:
-    """(6,) vehicle axes, from `start` to T."""
-    R = T.rotation().compose(start.rotation().inverse())
-    return np.concatenate([gtsam.Rot3.Logmap(R), T.translation() - start.translation()])
-
-
 def extrinsic_jacobian(
     clouds: Clouds, placed: Placed, poses: Sequence[gtsam.Pose3], members: IntArray, normal: Array
 ) -> Array:
-    """How points move along a direction with the mounting of their LiDAR.
+    """Derivative of points along a direction with respect to the extrinsic of their LiDAR.
 
     Args:
         clouds: the points.
-        placed: under some extrinsics.
-        poses: T_vehicle_lidar to take instead.
-        members: (n,) the points, by index.
+        placed: the points under one set of extrinsics.
+        poses: T_vehicle_lidar instead of these.
+        members: (n,) indices of the points.
         normal: (n, 3) the direction, map.
 
     Returns:
-        (n, 6) per vehicle-axes perturbation of the mounting of each point's own LiDAR.
+        (n, 6) by the vehicle-axes perturbation of the extrinsic of each point's LiDAR.
     """
     R_map_vehicle = placed.R_map_vehicle[clouds.scan[members]]
     normal_vehicle = np.einsum("nji,nj->ni", R_map_vehicle, normal)
@@ -125,7 +121,7 @@ def _normal_equations(
     structure: Structure,
     sigma_m: float,
 ) -> tuple[Array, Array]:
-    """Information and gradient on all extrinsics, vehicle axes, the surfaces eliminated."""
+    """Information and gradient on all extrinsics, vehicle axes; the surfaces are eliminated."""
     size = 6 * len(poses)
     H, g = np.zeros((size, size)), np.zeros(size)
     points = clouds.points_map(placed, poses)
@@ -147,16 +143,15 @@ def _normal_equations(
 
 
 def linearised(surface: Wall | Pole, points: Array) -> tuple[Array, Array, Array]:
-    """Points against the surface they lie on.
+    """Distances of points from their surface, linearised.
 
     Args:
         surface: a wall or a pole.
-        points: (n, 3) metres, of it.
+        points: (n, 3) metres, points on it.
 
     Returns:
-        Distances (n,) from it; directions (n, 3) in which they grow; and (n, k) how they change
-        with the surface's own parameters: offset and two tilts of a wall; place, lean and radius of
-        a pole.
+        Distances (n,); their gradients (n, 3); and their derivatives (n, k) with respect to the
+        surface's parameters: offset and two tilts of a wall; position, lean and radius of a pole.
     """
     if isinstance(surface, Wall):
         off = points - surface.centre
@@ -171,24 +166,16 @@ def linearised(surface: Wall | Pole, points: Array) -> tuple[Array, Array, Array
     return residual, normal, np.column_stack([out, out * z, np.ones(len(points))])
 
 
-def vehicle_axes_covariance(poses: Sequence[gtsam.Pose3], cov_right: Array) -> Array:
-    """A joint covariance of right perturbations, turned into vehicle axes; (6 L, 6 L)."""
-    turn = np.zeros_like(cov_right)
-    for i, T in enumerate(poses):
-        turn[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = right_to_vehicle_axes(T)
-    return np.asarray(turn @ cov_right @ turn.T)
-
-
 def pose_jacobian(
     clouds: Clouds, placed: Placed, points_vehicle: Array, members: IntArray, normal: Array
 ) -> Array:
-    """How points move along a direction with the vehicle's pose, (n, 6) right perturbation.
+    """Derivative of points along a direction by the vehicle's pose, (n, 6) right perturbation.
 
     Args:
         clouds: the points.
-        placed: under some extrinsics.
+        placed: the points under one set of extrinsics.
         points_vehicle: (n, 3) the points, vehicle frame.
-        members: (n,) by index.
+        members: (n,) indices of the points.
         normal: (n, 3) the direction, map.
     """
     R = placed.R_map_vehicle[clouds.scan[members]]

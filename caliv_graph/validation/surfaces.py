@@ -1,7 +1,7 @@
-"""Walls, poles and objects among points of the map.
+"""Finds walls, poles and objects in points of the map.
 
-Walls grow from flat cells, in whatever direction they face; what is left over stands in columns:
-thin and tall ones are poles, compact ones objects. Points belong to one of them at most.
+Walls grow from flat cells and may have any direction. The remaining points are grouped in columns:
+thin and tall columns are poles, compact ones are objects. A point belongs to at most one of them.
 """
 
 from __future__ import annotations
@@ -15,55 +15,55 @@ from scipy.ndimage import label
 from caliv_graph.products import Array, BoolArray, IntArray
 
 SEED_CELL_M = 1.5
-"""Cells in which flat pieces are looked for: a wall seen by one point in 0.4 m fills them."""
+"""Cells in which flat pieces are searched, for point spacings up to 0.4 m."""
 
 SEED_POINTS = 8
-"""Fewer points in a cell are no piece."""
+"""Smallest number of points of a piece."""
 
 PIECE_M = 1.5
-"""A wall may have gaps of this size; what is farther apart is another one."""
+"""Largest gap within a wall. Pieces with a larger gap are two walls."""
 
 WALL_POINTS = 60
 WALL_LENGTH_M = 1.0
 WALL_WIDTH_M = 0.4
-"""A wall has at least so many points and is as long and as wide."""
+"""Smallest number of points, length and width of a wall."""
 
 MOST_WALLS = 40
-"""The largest ones say it all."""
+"""Largest number of walls."""
 
 LEVEL = 0.8
-"""Vertical part of a normal from which on a plane is ground, or a roof, which tells the same."""
+"""Vertical component of a normal above which a plane is level (ground or roof)."""
 
 UNIFORM = 0.5
-"""Points that fill the gate evenly have 0.58 of it for their scatter: they are no plane."""
+"""Largest scatter of a plane in units of the gate. Evenly spread points have 0.58."""
 
 ROUNDS = 4
-"""Of fitting a wall and gathering its points."""
+"""Rounds of fitting a wall and collecting its points."""
 
 COLUMN_CELL_M = 0.2
-"""Cells, seen from above, in which poles and objects are told apart."""
+"""Horizontal cells in which columns of points are separated."""
 
 CELL_POINTS = 3
-"""Fewer points in such a cell are chance."""
+"""Smallest number of points of an occupied cell."""
 
 POLE_WIDTH_M = 0.5
 POLE_HEIGHT_M = 1.2
-"""A pole is thinner than the one and taller than the other."""
+"""Largest width and smallest height of a pole."""
 
 POLE_RADIUS_M = (0.02, 0.3)
-"""Radii that a pole may have."""
+"""Smallest and largest radius of a pole."""
 
 OBJECT_WIDTH_M = (0.2, 2.5)
-"""Largest horizontal extent of an object. Who walks through leaves a longer trace."""
+"""Limits of an object's horizontal extent. A person who walks leaves a longer trace."""
 
 COLUMN_POINTS = 20
-"""Fewer points are no pole and no object."""
+"""Smallest number of points of a pole or an object."""
 
 MIN_SCANS = 5
-"""What is in fewer scans may be passing by."""
+"""Smallest number of scans of a structure. Structure in fewer scans may be moving."""
 
 POLE_STEPS = 15
-"""Of Gauss-Newton for a pole."""
+"""Gauss-Newton steps of the fit of a pole."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Wall:
     """A plane.
 
     Attributes:
-        members: (n,) its points, by index.
+        members: (n,) indices of its points.
         centre: (3,) metres.
         normal: (3,) unit.
         axes: (2, 3) unit vectors in the plane, the longer extent first.
@@ -86,7 +86,7 @@ class Wall:
 
     @property
     def is_level(self) -> bool:
-        """Whether it is ground rather than a wall."""
+        """Whether it is level: ground rather than a wall."""
         return bool(abs(self.normal[2]) > LEVEL)
 
 
@@ -95,11 +95,11 @@ class Pole:
     """An upright round column: (x, y) of its axis at height z is `foot + slope (z - middle_z)`.
 
     Attributes:
-        members: (n,) its points, by index.
-        foot: (2,) metres, where the axis is at `middle_z`.
-        slope: (2,) how far it leans, per metre.
-        middle_z: metres, middle of its points.
-        radius_m: of it.
+        members: (n,) indices of its points.
+        foot: (2,) metres, position of the axis at `middle_z`.
+        slope: (2,) inclination of the axis, metres per metre.
+        middle_z: metres, middle height of its points.
+        radius_m: its radius.
         height_m: from its lowest to its highest point.
     """
 
@@ -116,7 +116,7 @@ class Thing:
     """A compact object of any shape.
 
     Attributes:
-        members: (n,) its points, by index.
+        members: (n,) indices of its points.
         centre: (3,) metres.
         extent_m: largest horizontal extent.
     """
@@ -128,7 +128,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Structure:
-    """What was found."""
+    """All structure that was found."""
 
     walls: tuple[Wall, ...]
     poles: tuple[Pole, ...]
@@ -138,11 +138,6 @@ class Structure:
     def surfaces(self) -> tuple[Wall | Pole, ...]:
         """Walls and poles."""
         return (*self.walls, *self.poles)
-
-    @property
-    def count(self) -> int:
-        """Of all kinds."""
-        return len(self.walls) + len(self.poles) + len(self.things)
 
 
 def find_structure(
@@ -157,17 +152,17 @@ def find_structure(
 
     Args:
         points: (N, 3) metres, map.
-        beams: (N, 3) unit vectors along which they were seen, map.
-        scan: (N,) the scan of each point.
-        gate_m: how far from a surface a point of it may be.
-        with_ground: level planes count too.
-        columns: look for poles and objects as well.
+        beams: (N, 3) unit vectors of their beams, map.
+        scan: (N,) index of the scan of each point.
+        gate_m: largest distance of a point from its surface.
+        with_ground: whether level planes count too.
+        columns: whether poles and objects are searched too.
     """
     if not len(points):
         return Structure((), (), ())
     free = np.ones(len(points), dtype=bool)
     walls: list[Wall] = []
-    # Tried before, and found to be none.
+    # Points of seeds that did not grow into a wall.
     spent = np.zeros(len(points), dtype=bool)
     while len(walls) < MOST_WALLS:
         seed = _flattest(points, free & ~spent, gate_m)
@@ -178,7 +173,7 @@ def find_structure(
             spent[seed] = True
             continue
         free[wall.members] = False
-        # What trails behind its edges, or is a little off, is not another wall.
+        # Points slightly off the wall or behind its edges are not another wall.
         off = np.abs((points - wall.centre) @ wall.normal)
         spent |= (off < 2.0 * gate_m) & _beside(points, wall)
         if with_ground or not wall.is_level:
@@ -199,7 +194,7 @@ def _beside(points: Array, wall: Wall) -> BoolArray:
 
 
 def _flattest(points: Array, free: BoolArray, gate_m: float) -> IntArray | None:
-    """Points of the cell that has the most, of the flat ones."""
+    """Points of the flat cell with the most points."""
     index = np.flatnonzero(free)
     if len(index) < SEED_POINTS:
         return None
@@ -232,7 +227,7 @@ def plane_of(points: Array) -> tuple[Array, Array, Array]:
 
 
 def _grown(points: Array, free: BoolArray, seed: IntArray, gate_m: float) -> Wall | None:
-    """The wall that a piece belongs to, if it is one."""
+    """The wall that grows from a piece; None if it is no wall."""
     members = seed
     index = np.flatnonzero(free)
     for _ in range(ROUNDS):
@@ -258,7 +253,7 @@ def _connected(place: Array, at: Array) -> BoolArray:
     """Whether places (n, 2) are connected with the one at (2,), over gaps of PIECE_M."""
     cell = np.floor(place / PIECE_M).astype(np.int64)
     low = cell.min(axis=0, initial=0) - 1
-    # Points far away in the plane are far away on the grid: kilometres of it are not made.
+    # The grid is limited: points far away in the plane are put at its border.
     cell = np.clip(cell - low, 0, 400)
     filled = np.zeros(cell.max(axis=0, initial=0) + 2, dtype=bool)
     filled[cell[:, 0], cell[:, 1]] = True
@@ -273,7 +268,7 @@ def _connected(place: Array, at: Array) -> BoolArray:
 def _columns(
     points: Array, beams: Array, scan: IntArray, free: BoolArray
 ) -> tuple[list[Pole], list[Thing]]:
-    """What stands beside the walls."""
+    """Poles and objects among the points that belong to no wall."""
     index = np.flatnonzero(free)
     if not len(index):
         return [], []
@@ -310,21 +305,21 @@ def fit_pole(
 
     Args:
         p: (n, 3) metres, its points.
-        beams: (n, 3) along which they were seen: the axis is behind them.
-        members: (n,) to be called its members.
-        radius_m: of it, if it is known.
+        beams: (n, 3) unit vectors of their beams; the axis is behind the points.
+        members: (n,) indices of the points, for the result.
+        radius_m: its radius, if it is known.
 
     Returns:
-        None if it is too thick or too thin for one.
+        None if the radius is not that of a pole.
     """
     low, high = np.quantile(p[:, 2], [0.02, 0.98])
     middle = float(0.5 * (low + high))
     z = p[:, 2] - middle
     start_m = radius_m or 0.1
-    # The mean of a half circle is 2/pi of the radius before its centre.
+    # The centroid of a half circle is 2/pi of the radius in front of its centre.
     behind = np.median(p[:, :2] + 2.0 / math.pi * start_m * beams[:, :2], axis=0)
     state = np.array([*behind, 0.0, 0.0, start_m])
-    # Weak: from one side alone, radius and place can hardly be told apart.
+    # A weak prior: from one side alone, radius and position are almost unobservable.
     expected, weak = np.array([*state[:2], 0.0, 0.0, 0.1]), np.array([1.0, 1.0, 0.05, 0.05, 0.1])
     if radius_m is not None:
         weak[4] = 1e-9
@@ -346,7 +341,7 @@ def fit_pole(
 def pole_residuals(
     points: Array, foot: Array, slope: Array, middle_z: float, radius_m: float
 ) -> tuple[Array, Array]:
-    """Distances (n,) of points from a pole's surface, and (n, 2) which way is out."""
+    """Distances (n,) of points from a pole's surface, and (n, 2) outward directions."""
     off = points[:, :2] - foot - slope * (points[:, 2] - middle_z)[:, None]
     distance = np.linalg.norm(off, axis=1)
     return distance - radius_m, off / np.maximum(distance, 1e-6)[:, None]

@@ -1,8 +1,8 @@
-"""Does a drive say the same twice? Its two halves, calibrated each by itself.
+"""Repeatability: the two halves of a drive, each calibrated by itself, compared with each other.
 
-The early stages of `pipeline.calibrate` are done once; the target's clouds are then shared out to
-two halves, each is solved, and the two results are tested against each other as those of two drives
-would be (`fusion.compare`): on the joint covariance, along the directions that both determine.
+The first stages of `pipeline.calibrate` run once. The target's clouds are then split into two
+halves, and each half is solved. The two results are tested against each other like those of two
+drives (`fusion.compare`): with their joint covariance, along the directions that both determine.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from caliv_graph.products import (
 )
 
 PASS_GAP_NS = 5_000_000_000
-"""A LiDAR that has not seen the target for so long passes it once more."""
+"""Gap between two clouds of the target after which a new pass begins."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Repeatability:
     """The halves of a drive against each other.
 
     Attributes:
-        halves: what they are, in words.
-        comparison: of the two results; None if a half could not be calibrated.
-        by_passes: whether they are passes of the target; if not, they share the errors of the
+        halves: names of the halves, in words.
+        comparison: comparison of the two results; None if a half could not be calibrated.
+        by_passes: whether they are passes of the target. If not, they share the errors of the
             trajectory, and agree better than two drives would.
-        reason: why not.
+        reason: the reason why there is no comparison.
     """
 
     halves: tuple[str, str]
@@ -53,11 +53,11 @@ Halves = tuple[tuple[TargetCloud, ...], tuple[TargetCloud, ...]]
 
 
 def split(observation: TargetObservation, fewest: int) -> Halves | None:
-    """Shares the clouds of a target out to two halves by passes.
+    """Splits the clouds of a target into two halves by passes.
 
     Args:
-        observation: of the target.
-        fewest: clouds that each LiDAR needs in each half.
+        observation: the clouds of the target.
+        fewest: number of clouds that each LiDAR needs in each half.
 
     Returns:
         The two halves; None if a LiDAR passed the target only once.
@@ -77,7 +77,7 @@ def split(observation: TargetObservation, fewest: int) -> Halves | None:
 
 
 def alternate(observation: TargetObservation) -> Halves:
-    """Shares the clouds of a target out to two halves in turns, per LiDAR."""
+    """Splits the clouds of a target into two halves alternately, per LiDAR."""
     halves: tuple[list[TargetCloud], list[TargetCloud]] = ([], [])
     for name in dict.fromkeys(cloud.lidar for cloud in observation.clouds):
         clouds = [cloud for cloud in observation.clouds if cloud.lidar == name]
@@ -95,16 +95,16 @@ def split_halves(
 ) -> Repeatability:
     """Calibrates the two halves of a drive and compares them.
 
-    The halves are those of the passes of the target if every LiDAR has two: then little but the
-    extrinsics is common to them. Otherwise every other scan: such halves share the errors of
-    the trajectory, so that they agree better than two drives would.
+    If every LiDAR passes the target twice, the halves are the passes, and their errors are almost
+    independent. Otherwise each half has every other scan. Such halves share the errors of the
+    trajectory, so they agree better than two drives would.
 
     Args:
         recording: the drive.
         config: as for `calibrate`.
         progress: reports every stage.
-        p_value: chance of a false alarm over all tests.
-        motion: what the recording tells of the vehicle's motion, if it has been read already.
+        p_value: probability of a false alarm over all tests.
+        motion: the recording's motion data, if they have been read already.
 
     Raises:
         RecordingError, TrajectoryError: the recording could not be read.

@@ -18,17 +18,10 @@ from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    ChairModel,
-    CropModel,
-    GnssModel,
-    GroundModel,
-    LidarModel,
-    ObjectModel,
-    Scenario,
-    WorldModel,
-)
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import CropModel, Scenario
+from caliv_graph.scenario.sensor_models import GnssModel, LidarModel
+from caliv_graph.scenario.world_models import ChairModel, GroundModel, ObjectModel, WorldModel
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate

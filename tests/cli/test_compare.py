@@ -110,8 +110,8 @@ def test_what_cannot_be_compared(files: tuple[Path, Path], tmp_path: Path) -> No
     result = run("compare", files[0], files[0])
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr == (
-        f"error: {files[0]}: stems from the same drive as {files[0]}: what it says is not news. "
-        "Compare calibrations of two drives\n"
+        f"error: {files[0]}: stems from the same drive as {files[0]}, so it is no independent "
+        "measurement. Compare calibrations of two drives\n"
     )
 
     files[1].write_text(files[1].read_text().replace("data_gradient: [", "data_gradient: [7.0, "))

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app, run
 from caliv_graph.results.calibration_file import write_calibration
-from caliv_graph.simulation.writer import write_ego_poses, write_pcd
+from caliv_graph.simulation.caliv_folder import write_ego_poses, write_pcd
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import FRAME_NS, GUESSES, Scene, calibration_of, make_recording
 from tests.validation.test_validate import WRONG
@@ -127,7 +127,7 @@ def test_nothing_to_validate_on(tmp_path: Path) -> None:
     assert document["structure"] is False
     assert document["verdict"]["better"] is document["verdict"]["p_value"] is None
     assert document["thickness_m"]["merged"]["after"] is None
-    assert result.stderr.startswith("warning: Nothing can be said: no wall")
+    assert result.stderr.startswith("warning: Nothing can be said: there is no wall")
     assert (tmp_path / "out" / "validation.html").exists()
 
 

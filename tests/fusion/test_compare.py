@@ -94,8 +94,8 @@ def test_a_shared_guess_proves_nothing() -> None:
     assert not found.moved
     for name in NAMES:
         movement = found.lidars[name]
-        assert dict(zip("rpwxyz", movement.told, strict=True))["w"] is False
-        assert (movement.told[3], movement.dof) == (False, 5)
+        assert dict(zip("rpwxyz", movement.determined, strict=True))["w"] is False
+        assert (movement.determined[3], movement.dof) == (False, 5)
     assert found.pairs[0].dof == 6
     assert all("turn centre" in texts[0] for texts in found.undetermined)
 
@@ -117,7 +117,7 @@ def test_one_drive_that_says_nothing() -> None:
 
     assert not found.moved
     assert [m.dof for m in found.movements] == [0, 0, 0]
-    assert not any(any(m.told) for m in found.movements)
+    assert not any(any(m.determined) for m in found.movements)
     assert found.conclusion.startswith("Nothing can be said")
 
 

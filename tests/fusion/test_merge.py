@@ -70,7 +70,7 @@ def test_two_drives_by_hand() -> None:
 
 
 def test_left_and_right_arc_determine_what_neither_does() -> None:
-    """SPEC 4: a left arc and a right arc as two drives."""
+    """A left arc and a right arc as two drives determine what neither does alone."""
     right, left = arc_information(NAMES, 1), arc_information(NAMES, 2, left=True)
     guess = shift(NAMES, "front", x=0.05, yaw=0.01) + shift(NAMES, "rear", x=0.02, yaw=-0.02)
     parts = [

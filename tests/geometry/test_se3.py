@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.geometry.se3 import (
+    joint_right_to_vehicle_axes,
     left_jacobian_inverse,
+    quaternion_xyzw,
     retract_vehicle_axes,
     right_to_vehicle_axes,
     rpy,
@@ -171,6 +173,23 @@ def test_right_perturbations_turn_into_vehicle_axes(a: Array, d: Array) -> None:
     moved = vehicle_axes_difference(T.retract(small), T)
     # To first order: what is left is of the size of small^2.
     assert moved == pytest.approx(Q @ small, abs=1e-8)
+
+
+def test_joint_axes_of_several_lidars() -> None:
+    # The first LiDAR looks to the left: its x is the vehicle's y.
+    T = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi / 2.0), np.zeros(3))
+    cov = np.diag(np.arange(1.0, 13.0))
+
+    axes = joint_right_to_vehicle_axes([T, gtsam.Pose3()])
+
+    turned = np.diag(axes @ cov @ axes.T)
+    assert turned[:6] == pytest.approx([2.0, 1.0, 3.0, 5.0, 4.0, 6.0])
+    assert turned[6:] == pytest.approx(np.arange(7.0, 13.0))
+
+
+def test_quaternions_end_with_the_scalar() -> None:
+    rotation = gtsam.Rot3.RzRyRx(0.4, 0.0, 0.0)
+    assert quaternion_xyzw(rotation) == pytest.approx((math.sin(0.2), 0.0, 0.0, math.cos(0.2)))
 
 
 def test_difference_in_vehicle_axes_by_hand() -> None:

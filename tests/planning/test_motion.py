@@ -13,26 +13,15 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import retract_vehicle_axes
+from caliv_graph.planning.assumptions import Assumptions, Ground
+from caliv_graph.planning.information import Columns, add_clouds, add_ground, eliminate_heave
 from caliv_graph.planning.motion import NODE_NS, PlannedMotion, nearest, plan_motion
-from caliv_graph.planning.predict import (
-    Assumptions,
-    Ground,
-    _add_clouds,
-    _add_ground,
-    _Columns,
-    _with_heave,
-)
 from caliv_graph.planning.sightings import Sighting, placements, sight
 from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, SCurveDrive, StraightDrive
 from caliv_graph.scenario.drives import Drive, make_drive
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    DriveModel,
-    OutageModel,
-    Scenario,
-    SCurveDrive,
-    StraightDrive,
-)
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import OutageModel
 from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
@@ -191,7 +180,7 @@ class OneScan:
         self.stamps = whole.stamps_ns[[at]]
         self.motion = plan_motion(self.drive, self.scenario, self.stamps, "sensors")
         self.node = int(self.motion.nodes_of(self.stamps)[0])
-        self.columns = _Columns(("front",), True, [self.placement.name], ground)
+        self.columns = Columns(("front",), True, [self.placement.name], ground)
         self.X = gtsam.Pose3(
             gtsam.Rot3(self.motion.R_map_vehicle[self.node]), self.motion.position_map[self.node]
         )
@@ -225,7 +214,7 @@ def test_clouds_information_is_that_of_numerical_derivatives() -> None:
     scan = OneScan("none")
     H = np.zeros((len(scan.motion.nodes_ns), scan.size, scan.size))
 
-    _add_clouds(H, scan.motion, scan.scenario, scan.sighting, scan.placement, scan.columns)
+    add_clouds(H, scan.motion, scan.scenario, scan.sighting, scan.placement, scan.columns)
 
     X, E, C = scan.parts(np.zeros(scan.size))
     Z = C.compose(X).compose(E)
@@ -247,7 +236,7 @@ def test_grounds_information_is_that_of_numerical_derivatives() -> None:
     columns = scan.columns
     H = np.zeros((len(scan.motion.nodes_ns), scan.size, scan.size))
 
-    _add_ground(
+    add_ground(
         H,
         scan.motion,
         scan.scenario,
@@ -286,7 +275,7 @@ def test_heave_is_one_more_unknown_of_each_scan() -> None:
     H = root @ np.swapaxes(root, 1, 2)
     sigma = 0.3
 
-    found = _with_heave(H, sigma)
+    found = eliminate_heave(H, sigma)
 
     for before, after in zip(H, found, strict=True):
         # With the heave as a variable of its own beside z, marginalised by covariances.

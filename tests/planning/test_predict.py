@@ -1,4 +1,4 @@
-"""Predicted sigmas against SPEC 8's lower bounds, and verdicts against the table of SPEC 4."""
+"""Predicted sigmas against lower bounds of an ideal estimator, and verdicts against null spaces."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from caliv_graph.config.model import ExtractionConfig, PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict
-from caliv_graph.planning.predict import Ground, Prediction, predict_drives, sigma_of
-from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile
-from caliv_graph.scenario.model import (
+from caliv_graph.planning.assumptions import Ground
+from caliv_graph.planning.predict import Prediction, predict_drives, sigma_of
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
-    ChairModel,
     DriveModel,
     FigureEightDrive,
-    GroundModel,
-    PoleModel,
-    RampModel,
-    Scenario,
     SCurveDrive,
     StandstillDrive,
     StraightDrive,
+)
+from caliv_graph.scenario.drives import CurvatureProfile, Drive, SpeedProfile
+from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.scenario.world_models import (
+    ChairModel,
+    GroundModel,
+    PoleModel,
+    RampModel,
     WorldModel,
-    load_scenario,
 )
 from tests.drives_with_chair import paper_lidar, paper_scenario
 
@@ -37,7 +39,7 @@ SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 
 RADIUS_M = 9.16
 
-# ------------------------------------------------------------------ SPEC 8, "Lower bound"
+# ------------------------------------------------------------------ lower bounds
 
 BOUND = Assumptions(
     heave_sigma_m=0.0,
@@ -110,7 +112,7 @@ def test_lower_bounds_of_an_ideal_estimator(name: str, ground: Ground) -> None:
             assert value == pytest.approx(float(text), abs=part * float(text) + half_digit(text))
 
 
-# ------------------------------------------------------------------ SPEC 4, the table
+# ------------------------------------------------------------------ null directions of drives
 
 HEIGHT = "height of all LiDARs together"
 TURN = "rotation of all LiDARs about the turn centre: x and yaw together, 9.16 m per rad"
@@ -191,7 +193,7 @@ def test_the_table_of_what_drives_leave_open(name: str, ground: Ground) -> None:
     assert len(prediction.undetermined) == COUNTS.get(name, (len(lost),) * 3)[column]
     # S2S is told in all of these.
     assert all(d.together for d in prediction.undetermined)
-    assert all(all(axes.values()) for axes in prediction.outlook.determined_s2s.values())
+    assert all(all(axes.values()) for axes in prediction.covariance.determined_s2s.values())
     assert all(d.remedy for d in prediction.undetermined)
 
 
@@ -208,7 +210,7 @@ def test_null_directions_are_null_without_any_threshold(name: str) -> None:
             first, others, replace(Assumptions(ground=ground, heave_sigma_m=0.0), **exact)
         )
 
-        sigma = prediction.outlook.uncertainty.spectrum
+        sigma = prediction.covariance.uncertainty.spectrum
         lost = COUNTS.get(name, tuple(len(t) for t in TABLE[name]))[column]
         assert (sigma > 50.0).sum() == lost
         if name != "standstill":
@@ -235,11 +237,11 @@ def test_without_a_shared_view_standing_still_tells_nothing_of_the_pair() -> Non
 
     prediction = predict(scenario)
 
-    assert prediction.outlook.lidars == ("front",)
-    assert prediction.outlook.unseeing == ("rear",)
+    assert prediction.covariance.lidars == ("front",)
+    assert prediction.covariance.unseeing == ("rear",)
     guess = np.array([math.radians(3.0)] * 3 + [0.1] * 3) / math.sqrt(3.0)
     assert prediction.sigma_s2v["rear"] == pytest.approx(guess)
-    assert not any(prediction.outlook.calibration.lidars["rear"].determined.values())
+    assert not any(prediction.covariance.calibration.lidars["rear"].determined.values())
     assert "'rear' never sees a target" in " ".join(prediction.warnings)
 
 
@@ -333,7 +335,7 @@ def test_two_drives_tell_more_than_either() -> None:
     both = planned("left arc, right arc", "height")
     for single in DRIVES["left arc, right arc"]:
         alone = predict(single)
-        information = both.outlook.information_data - alone.outlook.information_data
+        information = both.covariance.information_data - alone.covariance.information_data
         assert np.linalg.eigvalsh(information).min() > -1e-3 * np.trace(information)
     assert both.duration_s == pytest.approx(34.0)
 
@@ -360,7 +362,7 @@ def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:
 
 
 def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
-    # SPEC 4: at constant speed on an arc an offset is the same direction; freeing it loses S2S.
+    # At constant speed on an arc an offset has the direction of x/yaw; freeing it loses S2S.
     # Its start and its end, where the speed does change, are not seen.
     scenario = DRIVES["arc"][0]
     rolling = scenario.model_copy(
@@ -379,11 +381,11 @@ def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
     )
     eight = planned("figure-eight", "height", time_offset=True)
 
-    assert min(freed.outlook.offsets_s.values()) > 0.03
+    assert min(freed.covariance.offsets_s.values()) > 0.03
     assert sum("does not determine its time offset" in line for line in freed.warnings) == 2
     # So it is not freed.
     assert freed.sigma_s2s["front", "rear"] == pytest.approx(without.sigma_s2s["front", "rear"])
-    assert max(eight.outlook.offsets_s.values()) < 0.0015
+    assert max(eight.covariance.offsets_s.values()) < 0.0015
     assert eight.undetermined == ()
     assert (
         eight.sigma_s2s["front", "rear"]
@@ -417,14 +419,14 @@ def test_given_poses_average_out_if_white_and_do_not_if_they_wander() -> None:
 # ------------------------------------------------------------------ what is wrong
 
 
-def test_a_round_target_tells_no_heading_by_itself() -> None:
+def test_the_yaw_of_a_round_target_is_unobservable() -> None:
     scenario = DRIVES["figure-eight"][0]
     world = WorldModel(objects={"pole": PoleModel(xy_m=(12.08, 0.0))}, targets=("pole",))
 
     prediction = predict(scenario.model_copy(update={"world": world}))
     chair = predict(scenario)
 
-    assert any("'pole' looks the same after any turn" in line for line in prediction.warnings)
+    assert any("'pole' is symmetric about its axis" in line for line in prediction.warnings)
     # Its place at many distances still does.
     assert prediction.sigma_s2v["front"][2] > chair.sigma_s2v["front"][2]
 

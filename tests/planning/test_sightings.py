@@ -19,17 +19,16 @@ from caliv_graph.planning.sightings import (
     sight,
     thinned,
 )
+from caliv_graph.scenario.drive_models import StandstillDrive, StraightDrive
 from caliv_graph.scenario.drives import make_drive
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world_models import (
     BoxModel,
     ChairModel,
     GroundModel,
-    LidarModel,
     PoleModel,
     RampModel,
-    Scenario,
-    StandstillDrive,
-    StraightDrive,
     WorldModel,
 )
 from caliv_graph.simulation.recording import simulate_drive

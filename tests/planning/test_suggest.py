@@ -100,7 +100,7 @@ def test_a_vehicle_that_stood_gets_something_to_drive() -> None:
 
     assert found is not None
     assert found.met
-    assert found.prediction.outlook.unseeing == ()
+    assert found.prediction.covariance.unseeing == ()
 
 
 def test_candidates_leave_room_to_get_past_and_can_be_simulated() -> None:

@@ -19,8 +19,10 @@ from caliv_graph.config.model import (
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, TargetCloud, TargetObservation
-from caliv_graph.scenario.model import ChairModel, CropModel, LidarModel, WorldModel
-from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.scenario.model import CropModel
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import World, make_world
+from caliv_graph.scenario.world_models import ChairModel, WorldModel
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 

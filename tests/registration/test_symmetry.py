@@ -22,17 +22,17 @@ from caliv_graph.registration.symmetry import (
     refit,
     symmetries,
 )
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.model import CropModel
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import make_world
+from caliv_graph.scenario.world_models import (
     BoxModel,
     ChairModel,
-    CropModel,
     CylinderModel,
-    LidarModel,
     ObjectModel,
     TableModel,
     WorldModel,
 )
-from caliv_graph.scenario.shapes import make_world
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from tests.registration.scenes import STRAIGHT, config_of, looking_at_target, observe

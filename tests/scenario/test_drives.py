@@ -8,6 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from caliv_graph.products import IntArray
+from caliv_graph.scenario.drive_models import (
+    ArcDrive,
+    DriveModel,
+    FigureEightDrive,
+    SCurveDrive,
+    StandstillDrive,
+    StraightDrive,
+)
 from caliv_graph.scenario.drives import (
     Drive,
     Motion,
@@ -15,14 +23,6 @@ from caliv_graph.scenario.drives import (
     smoothstep,
     smoothstep_integral,
     smoothstep_rate,
-)
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    DriveModel,
-    FigureEightDrive,
-    SCurveDrive,
-    StandstillDrive,
-    StraightDrive,
 )
 
 MOVING: dict[str, DriveModel] = {

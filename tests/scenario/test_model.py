@@ -7,15 +7,9 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ConfigError
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    FigureEightDrive,
-    Scenario,
-    dump_scenario,
-    load_scenario,
-    parse_scenario,
-)
-from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.drive_models import ArcDrive, FigureEightDrive
+from caliv_graph.scenario.model import Scenario, dump_scenario, load_scenario, parse_scenario
+from caliv_graph.scenario.world import make_world
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 

@@ -7,7 +7,22 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.shapes import (
+    Mesh,
+    _backrest,
+    _seat,
+    _side,
+    bar,
+    box,
+    chair,
+    cylinder,
+    ground,
+    join,
+    person,
+)
+from caliv_graph.scenario.terrain import Terrain
+from caliv_graph.scenario.world import GROUND, World, make_world
+from caliv_graph.scenario.world_models import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
@@ -18,23 +33,6 @@ from caliv_graph.scenario.model import (
     WalkerModel,
     WorldModel,
 )
-from caliv_graph.scenario.shapes import (
-    GROUND,
-    Mesh,
-    World,
-    _backrest,
-    _seat,
-    _side,
-    bar,
-    box,
-    chair,
-    cylinder,
-    ground,
-    join,
-    make_world,
-    person,
-)
-from caliv_graph.scenario.terrain import Terrain
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SOLIDS: dict[str, Mesh] = {

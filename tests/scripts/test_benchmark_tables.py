@@ -16,7 +16,8 @@ import pytest
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import SolveError
 from caliv_graph.products import GroundObservation
-from caliv_graph.scenario.model import ArcDrive, SuspensionModel, load_scenario
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import SuspensionModel, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 from scripts import _tables_rows as rows
@@ -59,7 +60,7 @@ def test_statistics_are_as_by_hand_in_mm_and_mrad() -> None:
 def test_what_is_not_determined_is_left_out_and_counted() -> None:
     s = tables.statistics([ONE, replace(TWO, determined=NO_X)])
 
-    np.testing.assert_array_equal(s.told, [1, 2, 2, 2, 2, 2])
+    np.testing.assert_array_equal(s.determined, [1, 2, 2, 2, 2, 2])
     np.testing.assert_allclose(s.mean_abs, [4.0, 5.0, 6.0, 2.0, 2.0, 3.0])
     np.testing.assert_allclose(s.sigma, [1.0] + [5.0] * 5)
     assert s.held[0] == pytest.approx(8.0)

@@ -44,7 +44,7 @@ def test_the_main_job_is_done_and_explained(
         "Determined: all six axes.",
         f"demo_arc.yaml --out {out}/drive --seed 1 --force",
         "Not determined, in brackets: x, yaw.",
-        "On an arc the vehicle only ever turns about one point.",
+        "On an arc the vehicle turns about one point only.",
     ):
         assert text in shown
     assert (out / "result/calibration.yaml").is_file()

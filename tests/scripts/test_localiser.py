@@ -13,6 +13,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_differe
 from caliv_graph.products import Array, Calibration, LidarResult, LidarScan
 from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from scripts import _localiser_runs, localiser_example
 from scripts._localiser import Extrinsics, Localiser, Track, WallMap, make_map, register
@@ -105,8 +106,9 @@ def test_points_of_the_map_lie_on_what_stands(
     beside = 0.02 * walls.normals_map[chosen]
 
     # A beam that comes down on a point along its normal meets it there.
+    caster = RayCaster(recording.world)
     for point, out in zip(walls.points_map[chosen], beside, strict=True):
-        distance_m, _ = recording._caster.cast((point + out)[None], -out[None] / 0.02)
+        distance_m, _ = caster.cast((point + out)[None], -out[None] / 0.02)
         assert distance_m[0] == pytest.approx(0.02, abs=2e-4)
     assert np.linalg.norm(walls.normals_map, axis=1) == pytest.approx(1.0)
 

@@ -14,16 +14,13 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, LidarScan, Recording, TargetObservation
-from caliv_graph.scenario.model import (
-    ArcDrive,
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel
+from caliv_graph.scenario.world_models import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
-    EdgeModel,
-    InitialGuessModel,
-    LidarModel,
-    SuspensionModel,
-    SweepModel,
     WalkerModel,
     WorldModel,
 )
@@ -191,7 +188,7 @@ def test_with_noise_it_is_the_same_kind_of_cloud() -> None:
 
 
 def test_the_ground_is_told_as_well_as_its_floors() -> None:
-    """The normal to 0.5 mrad, the distance to 2 mm; the noise adds next to nothing."""
+    """The normal to 0.5 mrad, the distance to 2 mm; the noise adds almost nothing."""
     scenario = scenario_of()
     recording = ThinnedRecording(scenario, selected(), 5)
     found = []

@@ -15,11 +15,9 @@ from caliv_graph.config.load import load_config
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    BagModel,
-    ChairModel,
-    CropModel,
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import BagModel, CropModel
+from caliv_graph.scenario.sensor_models import (
     GnssModel,
     ImuModel,
     LidarModel,
@@ -27,8 +25,8 @@ from caliv_graph.scenario.model import (
     OutageModel,
     SweepModel,
     VelocityModel,
-    WorldModel,
 )
+from caliv_graph.scenario.world_models import ChairModel, WorldModel
 from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive, write_drive
 
 BEGIN_NS = 1_750_000_000 * 10**9

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import ConfigError
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.model import parse_scenario
+from caliv_graph.scenario.shapes import table
+from caliv_graph.scenario.world import World, make_world
+from caliv_graph.scenario.world_models import (
     BoxModel,
     CylinderModel,
     MoveModel,
     TableModel,
     WorldModel,
-    parse_scenario,
 )
-from caliv_graph.scenario.shapes import World, make_world, table
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 MOVES = (

@@ -8,17 +8,10 @@ import pytest
 
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import (
-    BodyBoxModel,
-    BoxModel,
-    ChairModel,
-    CropModel,
-    EdgeModel,
-    LidarModel,
-    SweepModel,
-    WorldModel,
-)
-from caliv_graph.scenario.shapes import World, make_world
+from caliv_graph.scenario.model import CropModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel
+from caliv_graph.scenario.world import World, make_world
+from caliv_graph.scenario.world_models import BodyBoxModel, BoxModel, ChairModel, WorldModel
 from caliv_graph.simulation.lidar import (
     LidarReturns,
     SimulatedLidar,

@@ -11,28 +11,27 @@ from scipy.spatial.transform import Rotation
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, GnssFixes, ImuSamples, TwistSamples
-from caliv_graph.scenario.drives import make_drive, sample_stamps
-from caliv_graph.scenario.model import (
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
-    BagModel,
-    ChairModel,
     DriveModel,
     FigureEightDrive,
+    SCurveDrive,
+    StandstillDrive,
+    StraightDrive,
+)
+from caliv_graph.scenario.drives import make_drive, sample_stamps
+from caliv_graph.scenario.model import BagModel
+from caliv_graph.scenario.sensor_models import (
     GnssModel,
-    GroundModel,
     ImuModel,
     JumpModel,
     LidarModel,
     OrientationModel,
     OutageModel,
-    RampModel,
-    SCurveDrive,
-    StandstillDrive,
-    StraightDrive,
     VelocityModel,
-    WorldModel,
 )
 from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.scenario.world_models import ChairModel, GroundModel, RampModel, WorldModel
 from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
 from caliv_graph.simulation.motion import angular_acceleration, true_imu
 

@@ -9,13 +9,14 @@ import pytest
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array
-from caliv_graph.scenario.model import InitialGuessModel, PoseNoiseModel, SuspensionModel
+from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import PoseNoiseModel
 from caliv_graph.simulation.noise import (
     Stream,
+    height_and_heave,
     noisy_poses,
     perturbed_extrinsic,
     random_stream,
-    vehicle_heights,
 )
 
 N = 4000
@@ -94,7 +95,8 @@ def test_without_noise_poses_are_true() -> None:
 
 def test_heights_have_a_common_and_a_white_part() -> None:
     model = SuspensionModel(height_sigma_m=0.02, heave_sigma_m=0.005)
-    draws = np.array([vehicle_heights(model, 100, np.random.default_rng(i)) for i in range(1000)])
+    parts = [height_and_heave(model, 100, np.random.default_rng(i)) for i in range(1000)]
+    draws = np.array([height_m + heave_m for height_m, heave_m in parts])
     assert draws.mean(axis=1).std() == pytest.approx(0.02, rel=0.1)
     within = draws - draws.mean(axis=1, keepdims=True)
     assert within.std() == pytest.approx(0.005, rel=0.02)

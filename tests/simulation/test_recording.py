@@ -8,20 +8,15 @@ import pytest
 
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.products import Array, LidarScan, Recording
-from caliv_graph.scenario.model import (
-    ArcDrive,
+from caliv_graph.scenario.drive_models import ArcDrive, FigureEightDrive, SCurveDrive
+from caliv_graph.scenario.model import CropModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel
+from caliv_graph.scenario.world_models import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
-    CropModel,
-    EdgeModel,
-    FigureEightDrive,
     GroundModel,
-    LidarModel,
     RampModel,
-    SCurveDrive,
-    SuspensionModel,
-    SweepModel,
     WalkerModel,
     WorldModel,
 )

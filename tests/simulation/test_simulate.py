@@ -16,18 +16,11 @@ from caliv_graph.config.model import PoseConfig
 from caliv_graph.errors import ConfigError, OutputError
 from caliv_graph.products import Array
 from caliv_graph.readers.caliv_folder import CalivFolder
-from caliv_graph.scenario.model import (
-    ArcDrive,
-    ChairModel,
-    CropModel,
-    InitialGuessModel,
-    LidarModel,
-    PoseNoiseModel,
-    SuspensionModel,
-    SweepModel,
-    WorldModel,
-)
-from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.drive_models import ArcDrive
+from caliv_graph.scenario.model import CropModel, InitialGuessModel, SuspensionModel
+from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel, SweepModel
+from caliv_graph.scenario.world import make_world
+from caliv_graph.scenario.world_models import ChairModel, WorldModel
 from caliv_graph.simulation import (
     Scenario,
     SimulatedDrive,

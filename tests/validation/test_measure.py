@@ -6,7 +6,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.geometry.se3 import retract_vehicle_axes
@@ -24,7 +23,6 @@ from caliv_graph.validation.measure import (
 from caliv_graph.validation.refine import (
     extrinsic_jacobian,
     pose_jacobian,
-    vehicle_axes_covariance,
 )
 from caliv_graph.validation.surfaces import Structure, find_structure
 from tests.samples import pose
@@ -131,16 +129,6 @@ def test_what_is_expected_is_what_errors_of_the_known_size_give(
     noise = np.array([meter.measure(placed)[0].alone["front"] ** 2 for meter in meters])
     thick = np.sqrt(np.mean(alone, axis=0) - noise)
     assert thick[:2] == pytest.approx([e.alone["front"] for e in expected[:2]], rel=0.3)
-
-
-def test_a_covariance_is_turned_into_vehicle_axes() -> None:
-    # A LiDAR that looks to the left: its x is the vehicle's y.
-    T = gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2.0), np.zeros(3))
-    cov = block_diag(np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), np.eye(6))
-
-    turned = vehicle_axes_covariance([T, gtsam.Pose3()], cov)
-
-    assert np.diag(turned)[:6] == pytest.approx([2.0, 1.0, 3.0, 5.0, 4.0, 6.0])
 
 
 def test_cloud_distance_of_two_plates() -> None:

@@ -10,15 +10,10 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, PoseNoise
+from caliv_graph.validation.covariances import given_pose_covariance
+from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation
 from caliv_graph.validation.surfaces import Pole, Wall
-from caliv_graph.validation.validate import (
-    AFTER,
-    BEFORE,
-    BEST,
-    Validation,
-    given_pose_covariance,
-    validate,
-)
+from caliv_graph.validation.validate import validate
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import (
     BOX_XY,

@@ -68,7 +68,7 @@ def test_halves_of_a_drive_agree() -> None:
     assert found.halves == ("every other scan", "the scans in between")
     assert not found.comparison.moved
     (pair,) = found.comparison.pairs
-    assert all(pair.told)
+    assert all(pair.determined)
     assert 0.0 < pair.chi2 < 20.0
     # An arc leaves the turn about its centre open: that is no axis to compare.
-    assert not found.comparison.lidars["front"].told[2]
+    assert not found.comparison.lidars["front"].determined[2]

@@ -15,18 +15,16 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, GroundConfig, RegistrationConfig
 from caliv_graph.pipeline import Prepared, prepare
 from caliv_graph.planning import Assumptions, predict
-from caliv_graph.planning.predict import Ground
-from caliv_graph.scenario.model import (
+from caliv_graph.planning.assumptions import Ground
+from caliv_graph.scenario.drive_models import (
     ArcDrive,
-    ChairModel,
-    CropModel,
-    CylinderModel,
     DriveModel,
-    Scenario,
     SCurveDrive,
     StandstillDrive,
     StraightDrive,
 )
+from caliv_graph.scenario.model import CropModel, Scenario
+from caliv_graph.scenario.world_models import ChairModel, CylinderModel
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.workflows.survey import Survey, survey, survey_observations
 from tests.drives_with_chair import paper_lidar, paper_scenario

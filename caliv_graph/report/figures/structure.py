@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.report.figures.drawing import SYMBOLS, Figure, colours, finish, label, small
-from caliv_graph.validation.validate import AFTER, BEFORE, Validation
+from caliv_graph.validation.findings import AFTER, BEFORE, Validation
 
 MOST_POINTS = 2500
 """Points of one LiDAR in one picture."""

@@ -25,14 +25,9 @@ from caliv_graph.products import (
     TargetObservation,
     Trajectory,
 )
-from caliv_graph.scenario.model import (
-    BoxModel,
-    ChairModel,
-    LidarModel,
-    ObjectModel,
-    WorldModel,
-)
-from caliv_graph.scenario.shapes import GROUND, World, make_world
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import GROUND, World, make_world
+from caliv_graph.scenario.world_models import BoxModel, ChairModel, ObjectModel, WorldModel
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.targets.cloud.extract import extract_targets

@@ -22,29 +22,18 @@ from caliv_graph.config.model import (
 )
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
-from caliv_graph.products import (
-    Array,
-    GivenPoses,
-    IntArray,
-    LidarScan,
-    MotionData,
-    Trajectory,
-)
-from caliv_graph.scenario.model import (
-    ArcDrive,
+from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData, Trajectory
+from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, StandstillDrive
+from caliv_graph.scenario.model import InitialGuessModel, Scenario
+from caliv_graph.scenario.sensor_models import LidarModel, SweepModel
+from caliv_graph.scenario.world_models import (
     BodyBoxModel,
     BoxModel,
     ChairModel,
-    DriveModel,
     GroundModel,
-    InitialGuessModel,
-    LidarModel,
     ObjectModel,
     PoleModel,
     RampModel,
-    Scenario,
-    StandstillDrive,
-    SweepModel,
     WalkerModel,
     WorldModel,
 )

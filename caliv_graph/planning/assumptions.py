@@ -1,0 +1,47 @@
+"""Assumptions of a prediction about how the drive will be recorded and calibrated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M
+from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
+
+Source = Literal["sensors", "poses"]
+"""Source of the vehicle's poses: IMU, GNSS and velocity, or given poses."""
+
+Ground = Literal["none", "plane", "height"]
+"""Use of the ground: none; a plane of unknown height; one at a known height under the wheels."""
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """How a planned drive will be recorded and calibrated.
+
+    Attributes:
+        ground: use of the ground.
+        ground_height_sigma_m: sigma of the vehicle's height above ground; None: the scenario's.
+        heave_sigma_m: sigma of the heave of the vehicle and its LiDARs at each stamp.
+        ground_tilt_sigma_rad: sigma of the plane's normal in one scan, of asphalt. A simulated
+            ground is flatter.
+        ground_distance_sigma_m: sigma of the LiDAR's distance from the plane in one scan.
+        source: source of the poses; None: raw sensors if the scenario has them.
+        time_offset: whether a time offset of each LiDAR is estimated.
+        extraction: how many points and scans are used.
+        ground_everywhere: whether the ground is measured at every scan. `calibrate` measures it
+            only at scans that see a target.
+        stride: for a quick prediction, only every n-th cloud is used, with n-fold weight.
+    """
+
+    ground: Ground = "height"
+    ground_height_sigma_m: float | None = None
+    heave_sigma_m: float = HEAVE_SIGMA_M
+    ground_tilt_sigma_rad: float = NORMAL_FLOOR_RAD
+    ground_distance_sigma_m: float = DISTANCE_FLOOR_M
+    source: Source | None = None
+    time_offset: bool = False
+    extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
+    ground_everywhere: bool = False
+    stride: int = 1

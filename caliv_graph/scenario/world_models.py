@@ -1,0 +1,176 @@
+"""Ground, objects and people that a scenario can describe, as frozen pydantic models.
+
+The units stand in the `Field` descriptions. `terrain` and `world` compute heights and meshes from
+these models.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from caliv_graph.config.sections import Finite, NonNegative, Positive, PositiveTriple, Section
+from caliv_graph.scenario.drive_models import Pair
+
+
+class RampModel(Section):
+    """A smooth rise of the ground: up a flank, a level top, down a flank.
+
+    The steepest place of a flank has a slope of 35/16 height_m / flank_m.
+    """
+
+    xy_m: Pair = Field(description="metres, middle of its top in the map")
+    yaw_deg: Finite = Field(0.0, description="degrees, direction of its flanks, from map +x")
+    height_m: Positive = Field(description="metres from the ground to the top")
+    flank_m: Positive = Field(description="metres, horizontal length of each flank")
+    top_m: NonNegative = Field(0.0, description="metres, length of the level top")
+    width_m: Positive = Field(
+        6.0, description="metres, width of the level top; it has flanks on these two sides too"
+    )
+
+
+class GroundModel(Section):
+    """Flat ground, a square about the map's origin, with ramps on it."""
+
+    height_m: Finite = Field(0.0, description="metres, its z in the map")
+    half_size_m: Positive = Field(200.0, description="metres from the origin to each edge")
+    ramps: tuple[RampModel, ...] = Field((), description="absent: flat all over")
+
+
+class MoveModel(Section):
+    """A person carries an object to another place. The person is absent between moves."""
+
+    begin_s: NonNegative = Field(description="seconds since the start of the drive, picked up")
+    end_s: Positive = Field(description="seconds since the start of the drive, put down")
+    xy_m: Pair = Field(description="metres, its new origin in the map")
+    yaw_deg: Finite = Field(0.0, description="degrees, its +x from map +x at the new place")
+
+    @model_validator(mode="after")
+    def _takes_time(self) -> MoveModel:
+        if self.begin_s >= self.end_s:
+            raise ValueError(f"begin_s ({self.begin_s} s) must be before end_s ({self.end_s} s)")
+        return self
+
+
+class _ObjectSection(Section):
+    xy_m: Pair = Field(description="metres, its origin in the map; it stands on the ground")
+    yaw_deg: Finite = Field(0.0, description="degrees, its +x (a chair's front) from map +x")
+    moves: tuple[MoveModel, ...] = Field(
+        (), description="where it is carried, one after the other; absent: it stands all the time"
+    )
+
+    @model_validator(mode="after")
+    def _one_move_after_the_other(self) -> _ObjectSection:
+        for before, after in itertools.pairwise(self.moves):
+            if before.end_s > after.begin_s:
+                raise ValueError(
+                    f"moves: one begins at {after.begin_s} s, before the one at "
+                    f"{before.begin_s} s has ended"
+                )
+        return self
+
+
+class ChairModel(_ObjectSection):
+    """The plastic armchair of `shapes.chair`: 0.71 m wide, 0.77 m deep, 1.25 m high."""
+
+    shape: Literal["chair"] = "chair"
+
+
+class BoxModel(_ObjectSection):
+    """A box. A long flat one is a wall."""
+
+    shape: Literal["box"] = "box"
+    size_m: PositiveTriple = Field(description="metres along its x, y, z")
+
+
+class PoleModel(_ObjectSection):
+    """An upright round pole."""
+
+    shape: Literal["pole"] = "pole"
+    radius_m: Positive = Field(0.08, description="metres")
+    height_m: Positive = Field(4.0, description="metres")
+
+
+class CylinderModel(_ObjectSection):
+    """A drum. It is symmetric about its axis: its mesh has 360 sides, a pole's has 24."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    radius_m: Positive = Field(0.3, description="metres")
+    height_m: Positive = Field(0.9, description="metres")
+
+
+class TableModel(_ObjectSection):
+    """A table on four legs. It is symmetric under half a turn only."""
+
+    shape: Literal["table"] = "table"
+    size_m: PositiveTriple = Field((1.1, 0.7, 0.72), description="metres along its x, y, z")
+    top_m: Positive = Field(0.04, description="metres, thickness of its top")
+    leg_m: Positive = Field(0.07, description="metres, side of its square legs")
+
+    @model_validator(mode="after")
+    def _legs_below_the_top(self) -> TableModel:
+        if self.top_m >= self.size_m[2] or 2.0 * self.leg_m > min(self.size_m[:2]):
+            raise ValueError(
+                f"size_m {self.size_m} leaves no room for a top of {self.top_m} m and legs of "
+                f"{self.leg_m} m"
+            )
+        return self
+
+
+ObjectModel = Annotated[
+    ChairModel | BoxModel | PoleModel | CylinderModel | TableModel, Field(discriminator="shape")
+]
+
+
+class WalkerModel(Section):
+    """A person, 1.75 m tall, who walks back and forth along a line."""
+
+    from_xy_m: Pair = Field(description="metres, one end of the line in the map")
+    to_xy_m: Pair = Field(description="metres, the other end")
+    speed_m_s: Positive = Field(1.3, description="metres per second")
+
+    @model_validator(mode="after")
+    def _somewhere_to_go(self) -> WalkerModel:
+        if math.dist(self.from_xy_m, self.to_xy_m) < 0.1:
+            raise ValueError("from_xy_m and to_xy_m are less than 0.1 m apart: nowhere to walk")
+        return self
+
+
+class WorldModel(Section):
+    """Everything around the drive."""
+
+    ground: GroundModel = GroundModel()
+    objects: dict[str, ObjectModel] = Field({}, description="objects, by name")
+    walkers: dict[str, WalkerModel] = Field({}, description="people who walk, by name")
+    targets: tuple[str, ...] = Field(
+        (), description="names of the objects that serve as calibration targets"
+    )
+    region_margin_m: Positive = Field(
+        5.0,
+        description="metres around each target that the region in the written config includes",
+    )
+
+    @model_validator(mode="after")
+    def _targets_are_objects(self) -> WorldModel:
+        for name in self.targets:
+            if name not in self.objects:
+                raise ValueError(
+                    f"target '{name}' is not one of the objects: {', '.join(self.objects)}"
+                )
+        for name in self.walkers:
+            if name in self.objects:
+                raise ValueError(f"'{name}' is the name of an object and of a walker")
+        for name in (*self.objects, *self.walkers):
+            if name in ("ground", "vehicle"):
+                raise ValueError(f"'{name}' is the name of something else: give another one")
+        return self
+
+
+class BodyBoxModel(Section):
+    """A box that is part of the vehicle."""
+
+    centre_m: tuple[Finite, Finite, Finite] = Field(description="metres, vehicle frame")
+    size_m: PositiveTriple = Field(description="metres along the vehicle's x, y, z")

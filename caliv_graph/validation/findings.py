@@ -1,0 +1,153 @@
+"""What a validation measures: per surface, per object, per pair of LiDARs, and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+
+from caliv_graph.products import Array
+from caliv_graph.validation.clouds import Clouds
+from caliv_graph.validation.measure import Apart, Expected, Thickness
+from caliv_graph.validation.surfaces import Pole, Thing, Wall
+
+BEFORE, AFTER, BEST = "before", "after", "best"
+"""The initial guesses, the calibration, and the extrinsics with the best alignment."""
+
+STAGES = (BEFORE, AFTER, BEST)
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class SurfaceResult:
+    """A wall or a pole.
+
+    Attributes:
+        name: its name, such as "wall 1".
+        surface: its geometry under the best alignment, with its points.
+        points: number of points per LiDAR.
+        thickness: thickness by stage (`STAGES`).
+        apart: distances by stage, per pair of LiDARs that both see it.
+        expected: expected values after calibration, from known errors alone.
+    """
+
+    name: str
+    surface: Wall | Pole
+    points: Mapping[str, int]
+    thickness: Mapping[str, Thickness]
+    apart: Mapping[str, Mapping[Pair, Apart]]
+    expected: Expected
+
+
+@dataclass(frozen=True)
+class ThingResult:
+    """An object that is neither wall nor pole: a second target, a box, a bush.
+
+    Attributes:
+        name: its name, such as "object 1".
+        thing: its geometry and points.
+        points: number of points per LiDAR.
+        distance_m: by stage, per pair of LiDARs, mean distance from the other's nearest point.
+    """
+
+    name: str
+    thing: Thing
+    points: Mapping[str, int]
+    distance_m: Mapping[str, Mapping[Pair, float]]
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """Two LiDARs, over all walls and poles that both see.
+
+    Attributes:
+        lidars: the two.
+        surfaces: number of these surfaces.
+        distance_m: by stage, root mean square over the surfaces.
+        expected_m: after calibration, from known errors alone.
+        cloud_m: by stage, median distance of a point from the other's surface, mean of both ways;
+            None without overlap.
+        overlap: by stage, fraction of the points with a surface of the other LiDAR nearby.
+    """
+
+    lidars: Pair
+    surfaces: int
+    distance_m: Mapping[str, float]
+    expected_m: float
+    cloud_m: Mapping[str, float | None]
+    overlap: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Verdict of a validation.
+
+    Attributes:
+        better: ratio of the measure before calibration to after it; None: nothing measured.
+        measure: `distance` between LiDARs, or `thickness` where no two see the same surface.
+        of_expected: ratio of the measure after calibration to its expected value.
+        chi2: chi-square of all offsets between LiDARs with their joint covariance.
+        dof: its degrees of freedom; 0: no test is possible.
+        p_value: probability of a larger `chi2` if all stated covariances are right.
+        contradicts: whether the p-value is beyond 5 sigma.
+        sentences: the verdict in words.
+    """
+
+    better: float | None
+    measure: str
+    of_expected: float | None
+    chi2: float
+    dof: int
+    p_value: float | None
+    contradicts: bool
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Result of a validation.
+
+    Attributes:
+        drive: name of the drive.
+        lidars: names of the LiDARs.
+        scans: number of scans used per LiDAR.
+        surfaces: walls, then poles, the largest first.
+        things: objects.
+        pairs: pairs of LiDARs with a common surface or overlapping clouds.
+        thickness_m: by stage, thickness of merged clouds, root mean square over the surfaces.
+        alone_m: by stage, per LiDAR, likewise of its cloud alone.
+        expected_thickness_m: after calibration, from known errors alone.
+        expected_alone_m: likewise per LiDAR.
+        verdict: the verdict.
+        clouds: the points, for figures.
+        best: extrinsics with the best alignment, in the order of `lidars`; no calibration.
+        warnings: warnings for the user, one line each.
+    """
+
+    drive: str
+    lidars: tuple[str, ...]
+    scans: Mapping[str, int]
+    surfaces: tuple[SurfaceResult, ...]
+    things: tuple[ThingResult, ...]
+    pairs: tuple[PairResult, ...]
+    thickness_m: Mapping[str, float]
+    alone_m: Mapping[str, Mapping[str, float]]
+    expected_thickness_m: float
+    expected_alone_m: Mapping[str, float]
+    verdict: Verdict
+    clouds: Clouds
+    best: tuple[gtsam.Pose3, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def has_structure(self) -> bool:
+        """Whether any structure was found."""
+        return bool(self.surfaces or self.things)
+
+    def points_map(self, stage: str) -> Array:
+        """(N, 3) metres, all points under the extrinsics of a stage, map."""
+        if stage == BEST:
+            return self.clouds.points_map(self.clouds.placed[AFTER], self.best)
+        return self.clouds.points_map(self.clouds.placed[stage])

@@ -1,0 +1,146 @@
+"""The verdict of a validation: a chi-square test of the offsets, and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.special import chdtrc
+
+from caliv_graph.validation.findings import (
+    AFTER,
+    BEFORE,
+    STAGES,
+    Pair,
+    PairResult,
+    SurfaceResult,
+    ThingResult,
+    Verdict,
+)
+from caliv_graph.validation.measure import (
+    POLE_TRUE_M,
+    WALL_TRUE_M,
+    Errors,
+    offset_covariance,
+    rms,
+)
+
+CONTRADICTION = 5.7e-7
+"""Probability beyond 5 sigma. Below it the data contradict each other, which is exit code 4."""
+
+
+def is_shared(surface: SurfaceResult, pair: Pair) -> bool:
+    """Whether the distance of two LiDARs on a surface is measurable at all stages."""
+    stages = [surface.expected.distance_m, *surface.apart.values()]
+    return all(pair in of_stage for of_stage in stages)
+
+
+def judge(
+    surfaces: Sequence[SurfaceResult],
+    things: Sequence[ThingResult],
+    pairs: Sequence[PairResult],
+    alone: tuple[Mapping[str, Mapping[str, float]], Mapping[str, float]],
+    errors: Errors,
+) -> Verdict:
+    """The verdict on what was measured.
+
+    Args:
+        surfaces: walls and poles.
+        things: objects.
+        pairs: pairs of LiDARs.
+        alone: thickness by stage and LiDAR, and its expected value by LiDAR.
+        errors: the known errors.
+    """
+    tested = _tested(surfaces)
+    chi2, p_value = 0.0, None
+    dof = sum(len(s.apart[AFTER][pair].offset_m) for s, pair in tested)
+    if tested:
+        offsets = np.concatenate([s.apart[AFTER][pair].offset_m for s, pair in tested])
+        cov = offset_covariance([(s.expected, pair) for s, pair in tested], errors)
+        chi2 = max(float(offsets @ np.linalg.solve(cov, offsets)), 0.0)
+        p_value = float(chdtrc(dof, chi2))
+    shared = [pair for pair in pairs if pair.surfaces]
+    measure = "distance" if shared else "thickness"
+    if shared:
+        values = {s: rms([p.distance_m[s] for p in shared]) for s in STAGES}
+        expected = rms([p.expected_m for p in shared])
+    else:
+        values = {s: rms(list(alone[0][s].values())) for s in STAGES}
+        expected = rms(list(alone[1].values()))
+    found = bool(surfaces)
+    better = values[BEFORE] / values[AFTER] if found and values[AFTER] > 0.0 else None
+    of_expected = values[AFTER] / expected if found and expected > 0.0 else None
+    contradicts = p_value is not None and p_value < CONTRADICTION
+    sentences = _sentences(
+        values, expected, better, (chi2, dof, p_value, contradicts), (shared, surfaces, things)
+    )
+    if shared and better is not None:
+        thick = ", ".join(
+            f"'{name}' {1e3 * value:.1f} mm (expected {1e3 * alone[1][name]:.1f})"
+            for name, value in alone[0][AFTER].items()
+        )
+        sentences += (f"Thickness of {_kinds(surfaces)} by each LiDAR alone: {thick}.",)
+    return Verdict(better, measure, of_expected, chi2, dof, p_value, contradicts, sentences)
+
+
+def _tested(surfaces: Sequence[SurfaceResult]) -> list[tuple[SurfaceResult, Pair]]:
+    """Linearly independent offsets: of n LiDARs on a wall, n - 1."""
+    out = []
+    for surface in surfaces:
+        pairs = [pair for pair in surface.apart[AFTER] if is_shared(surface, pair)]
+        hub = max(surface.points, key=lambda name: surface.points[name])
+        out += [(surface, pair) for pair in pairs if hub in pair]
+    return out
+
+
+def _sentences(
+    values: Mapping[str, float],
+    expected: float,
+    better: float | None,
+    test: tuple[float, int, float | None, bool],
+    found: tuple[Sequence[PairResult], Sequence[SurfaceResult], Sequence[ThingResult]],
+) -> tuple[str, ...]:
+    shared, surfaces, things = found
+    if not surfaces and not things:
+        return (
+            "Nothing can be said: there is no wall, pole or object near the drive except the "
+            "target and the ground. Drive past a house, or put up a second target.",
+        )
+    if not surfaces or better is None:
+        return (
+            "There is no wall and no pole near the drive. The table has the distances of objects, "
+            "but their expected values are not known.",
+        )
+    before, after, best = (f"{1e3 * values[stage]:.1f} mm" for stage in STAGES)
+    kinds = _kinds(surfaces)
+    how = f"{better:.1f} times better" if better >= 1.0 else f"{1.0 / better:.1f} times WORSE"
+    what = (
+        f"The distance between LiDARs on {kinds} is"
+        if shared
+        else f"No two LiDARs see the same surface. Each alone measures a thickness of {kinds} of"
+    )
+    out = [f"{what} {after} after calibration, {before} before: {how} than the initial guess."]
+    chi2, dof, p_value, contradicts = test
+    ratio = values[AFTER] / expected
+    remains = (
+        "Noise, trajectory, the calibration's own sigmas and the shape of real walls and poles "
+        f"({1e3 * WALL_TRUE_M:.0f} and {1e3 * POLE_TRUE_M:.0f} mm) give an expected value of "
+        f"{1e3 * expected:.1f} mm; the measured value is {ratio:.1f} times that"
+    )
+    if p_value is None:
+        out.append(f"{remains}.")
+    else:
+        tested = f"chi2 {chi2:.1f} of {dof} dof, p {p_value:.2g}"
+        word = "They do not explain it" if contradicts else "They explain it"
+        if not contradicts and p_value < 0.01:
+            word = "They explain it poorly"
+        out.append(f"{remains}. {word} ({tested}).")
+    out.append(f"Extrinsics fitted to this structure alone would leave {best}.")
+    return tuple(out)
+
+
+def _kinds(surfaces: Sequence[SurfaceResult]) -> str:
+    """The kinds of surfaces that were found, in words."""
+    words = {"wall": "walls", "pole": "poles", "ground": "planes of the ground"}
+    found = dict.fromkeys(surface.name.split()[0] for surface in surfaces)
+    return " and ".join(words[kind] for kind in found)

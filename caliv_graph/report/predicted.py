@@ -32,7 +32,7 @@ LONGEST_PAUSE = 3.5
 
 def survey_table(survey: Survey) -> RenderableType:
     """The result of `observability` as tables."""
-    predicted = survey.outlook
+    predicted = survey.covariance
     parts: list[RenderableType] = [
         Text.assemble(("Expected accuracy", "bold"), f": {', '.join(survey.names)}"),
         *_sigma_parts(predicted, "Expected"),
@@ -50,7 +50,7 @@ def survey_document(survey: Survey) -> dict[str, Any]:
     """The result as plain values: metres, degrees, seconds."""
     return {
         "drives": list(survey.names),
-        **_covariance_document(survey.outlook),
+        **_covariance_document(survey.covariance),
         "scans": [
             {"target": target, "lidar": lidar, "scans": count}
             for (target, lidar), count in survey.scans.items()

@@ -45,14 +45,14 @@ class Survey:
 
     Attributes:
         names: of the recordings.
-        outlook: sigmas, covariance, directions; extrinsics are rough estimates.
+        covariance: predicted sigmas and directions; extrinsics are rough estimates.
         scans: (target, LiDAR) -> number of clouds that count.
         unmet: what `require` and `limits` of the config ask for and will not get, a sentence each.
         warnings: what a person should know, a line each.
     """
 
     names: tuple[str, ...]
-    outlook: PredictedCovariance
+    covariance: PredictedCovariance
     scans: Mapping[tuple[str, str], int]
     unmet: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -123,7 +123,7 @@ def _verdict(
         target = observations[int(problem.cloud_placement[j])].name
         key = (target, problem.lidars[int(problem.cloud_lidar[j])])
         scans[key] = scans.get(key, 0) + 1
-    outlook = predict_covariance(
+    covariance = predict_covariance(
         D,
         problem.lidars,
         problem.reference,
@@ -140,5 +140,5 @@ def _verdict(
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},
         solved.offsets_s,
     )
-    unmet = unmet_requirements(outlook.calibration, config).unmet
-    return Survey((), named_prediction(outlook), scans, unmet, solved.warnings)
+    unmet = unmet_requirements(covariance.calibration, config).unmet
+    return Survey((), named_prediction(covariance), scans, unmet, solved.warnings)

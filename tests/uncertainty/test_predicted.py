@@ -20,7 +20,7 @@ LIDARS = {name: pose(*MOUNTINGS[name]) for name in ("front", "rear")}
 SIGMAS = np.array([0.03] * 3 + [0.06] * 3)
 
 
-def make_outlook() -> tuple[Array, PredictedCovariance]:
+def make_predicted() -> tuple[Array, PredictedCovariance]:
     rng = np.random.default_rng(5)
     root = rng.normal(size=(12, 48)) * np.tile(1.0 / np.array([1e-3] * 3 + [5e-3] * 3), 2)[:, None]
     D = root @ root.T
@@ -32,11 +32,11 @@ def make_outlook() -> tuple[Array, PredictedCovariance]:
 
 def test_sigmas_of_a_pair_are_those_of_evaluates_errors() -> None:
     # Draw extrinsics, and let `evaluate` say how far the one is off against the other.
-    D, outlook = make_outlook()
+    D, predicted = make_predicted()
     rng = np.random.default_rng(6)
     root = np.linalg.cholesky(np.linalg.inv(D))
     errors = []
-    calibration = outlook.calibration
+    calibration = predicted.calibration
     cov_pairs = {("front", "rear"): np.eye(6)}
     for _ in range(400):
         e = (root @ rng.normal(size=12)).reshape(2, 6)
@@ -44,7 +44,7 @@ def test_sigmas_of_a_pair_are_those_of_evaluates_errors() -> None:
         pair = evaluate(calibration, truth, cov_pairs)["pairs"][0]
         errors.append([*pair["rotation_rad"], *pair["translation_m"]])
 
-    sigma = outlook.sigma_s2s["front", "rear"]
+    sigma = predicted.sigma_s2s["front", "rear"]
     # 400 draws: a sigma to 3.5 percent, 1 sigma.
     assert np.std(errors, axis=0) / sigma == pytest.approx(np.ones(6), abs=0.15)
 
@@ -53,7 +53,7 @@ def test_a_lidar_without_data_keeps_its_guess() -> None:
     lidars = {**LIDARS, "left": pose(*MOUNTINGS["left"])}
     sigmas = {"front": SIGMAS, "rear": SIGMAS, "left": 2.0 * SIGMAS}
 
-    outlook = predict_covariance(
+    predicted = predict_covariance(
         np.diag(np.tile([1e8] * 3 + [1e6] * 3, 2)),
         ("front", "rear"),
         "rear",
@@ -63,13 +63,13 @@ def test_a_lidar_without_data_keeps_its_guess() -> None:
         {},
     )
 
-    assert outlook.unseeing == ("left",)
-    assert outlook.sigma_s2v["left"] == pytest.approx(2.0 * SIGMAS)
-    result = outlook.calibration.lidars["left"]
+    assert predicted.unseeing == ("left",)
+    assert predicted.sigma_s2v["left"] == pytest.approx(2.0 * SIGMAS)
+    result = predicted.calibration.lidars["left"]
     assert not any(result.determined.values())
     assert not result.saw_target
     assert result.cov.trace() == pytest.approx(4.0 * (SIGMAS**2).sum())
-    assert outlook.sigma_s2v["front"] == pytest.approx([1e-4] * 3 + [1e-3] * 3)
+    assert predicted.sigma_s2v["front"] == pytest.approx([1e-4] * 3 + [1e-3] * 3)
     expected = math.hypot(1e-3, 1e-3)
     # x of the pair: both, and nothing of rotations for LiDARs in a row along x.
-    assert outlook.sigma_s2s["front", "rear"][3] == pytest.approx(expected, rel=1e-6)
+    assert predicted.sigma_s2s["front", "rear"][3] == pytest.approx(expected, rel=1e-6)

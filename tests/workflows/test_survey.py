@@ -107,17 +107,17 @@ GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
 def test_the_table_on_noisy_drives(name: str, ground: Ground) -> None:
     column = GROUNDS.index(ground)
 
-    outlook = surveyed(name, ground).outlook
+    covariance = surveyed(name, ground).covariance
 
     count, axes = TABLE[name][0][column], TABLE[name][1][column]
-    texts = [d.text for d in outlook.undetermined]
+    texts = [d.text for d in covariance.undetermined]
     assert len(texts) == count, texts
     if axes is not None:
-        for verdict in outlook.uncertainty.determined.values():
+        for verdict in covariance.uncertainty.determined.values():
             assert {a for a, known in verdict.items() if not known} == axes
     # S2S is told, whatever becomes of the vehicle.
-    assert all(d.together for d in outlook.undetermined)
-    assert all(all(v.values()) for v in outlook.determined_s2s.values())
+    assert all(d.together for d in covariance.undetermined)
+    assert all(all(v.values()) for v in covariance.determined_s2s.values())
     if name.startswith("arc"):
         turn = next(t for t in texts if t.startswith(TURN))
         assert float(turn.removeprefix(TURN).split()[0]) == pytest.approx(9.16, abs=0.2)
@@ -129,7 +129,7 @@ def test_the_table_on_noisy_drives(name: str, ground: Ground) -> None:
 @pytest.mark.parametrize("name", ["arc", "S-curve"])
 def test_a_plan_predicts_what_the_recording_tells(name: str) -> None:
     predicted = predict(scenario_of(name), assumptions=Assumptions(ground="height"))
-    found = surveyed(name, "height", RegistrationConfig()).outlook
+    found = surveyed(name, "height", RegistrationConfig()).covariance
 
     for lidar, sigma in predicted.sigma_s2v.items():
         assert found.sigma_s2v[lidar] / sigma == pytest.approx(np.ones(6), abs=0.35)
@@ -154,7 +154,7 @@ def test_from_the_recording_on() -> None:
     assert progress.stages[0].name == "smoothing the trajectory"
     # Rough, but near: the guess was up to 0.1 m and 3 degrees off.
     truth = recording.truth.T_vehicle_lidar["front"].translation()
-    rough = found.outlook.calibration.lidars["front"].T_vehicle_lidar.translation()
+    rough = found.covariance.calibration.lidars["front"].T_vehicle_lidar.translation()
     assert abs(rough[2] - truth[2]) < 0.03
     assert abs(rough[1] - truth[1]) < 0.05
 
@@ -172,7 +172,7 @@ def test_a_fixed_lidar_is_told_and_tells_where_the_other_one_is() -> None:
         drive.prepared.grounds,
         config,
         SilentProgress(),
-    ).outlook
+    ).covariance
 
     assert found.undetermined == ()
     assert all(all(verdict.values()) for verdict in found.uncertainty.determined.values())
@@ -196,7 +196,7 @@ def test_a_target_that_looks_the_same_after_any_turn_is_named() -> None:
 
     assert any("looks the same after any turn about the vertical" in w for w in found.warnings)
     # Where a drum is, from poses that turn, tells the pair's yaw all the same.
-    assert all(found.outlook.determined_s2s["front", "rear"].values())
+    assert all(found.covariance.determined_s2s["front", "rear"].values())
 
 
 def test_a_chair_does_not_look_the_same_after_a_turn() -> None:

@@ -26,7 +26,7 @@ from caliv_graph.products import (
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.targets.cloud.extract import extract_targets
-from caliv_graph.targets.ground.planes import measure_grounds
+from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 
 
@@ -38,7 +38,7 @@ class Prepared:
         trajectories: one per drive, with a node at every scan that sees a target.
         observations: the targets' clouds.
         grounds: the ground as the LiDARs saw it.
-        warnings: what a person should know, a line each.
+        warnings: for the user, a line each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -58,8 +58,8 @@ def prepare(
     Args:
         recordings: opened drives.
         config: topics, noise, target, ground.
-        motions: what each drive, by its index, tells of the vehicle's motion.
-        progress: told of every stage.
+        motions: motion data of each drive, by its index.
+        progress: reports every stage.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -97,10 +97,10 @@ def calibrate(
     Args:
         recordings: opened drives (`readers.open_recording`).
         config: the configuration.
-        progress: told of every stage.
-        prior: an earlier calibration of the vehicle. Its extrinsics are the guesses that the solve
-            starts from, and what its drives' data say is added to what these drives' say. The
-            solve itself does without: it shall find a mount that has moved since.
+        progress: reports every stage.
+        prior: an earlier calibration of the vehicle. Its extrinsics are the initial guesses of the
+            solve, and the data of its drives are added to the result. The solve itself does not
+            use these data: it shall find a mount that has moved since.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -142,7 +142,7 @@ def _calibrate(
 def with_prior(
     calibration: Calibration, prior: Calibration | None, config: Config
 ) -> tuple[Calibration, tuple[str, ...]]:
-    """Adds what the drives of an earlier calibration say; and a warning for each conflict."""
+    """Adds the data of an earlier calibration's drives; and a warning for each conflict."""
     if prior is None:
         return calibration, ()
     fused, conflicts = with_earlier(calibration, prior)

@@ -1,4 +1,4 @@
-"""What passes from stage to stage: frozen dataclasses, in the order in which they arise.
+"""The data that pass from stage to stage: frozen dataclasses, in the order in which they arise.
 
 A new reader starts here: LidarScan -> Trajectory -> TargetObservation -> Registration ->
 Solution -> Uncertainty -> Calibration. Frames and tangent order are in `conventions`.
@@ -13,6 +13,7 @@ from typing import Protocol
 import gtsam
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -29,7 +30,7 @@ class LidarScan:
         points_lidar: (N, 3) float64, metres, lidar frame; every value finite.
         source: what to call it in messages: a file, or a topic and stamp.
         point_times_s: (N,) seconds after the stamp at which each point was taken (negative where
-            stamps mark the end of the sweep), or None if the format does not tell: then all points
+            stamps mark the end of the sweep), or None if the format has no times: then all points
             are as of the stamp.
     """
 
@@ -58,7 +59,7 @@ class GivenPoses:
 
 @dataclass(frozen=True)
 class ImuSamples:
-    """What the IMU said, in its own frame.
+    """Measurements of the IMU, in its own frame.
 
     Attributes:
         stamps_ns: (n,) strictly increasing.
@@ -116,7 +117,7 @@ class TwistSamples:
 
 @dataclass(frozen=True)
 class MotionData:
-    """Everything in a recording that tells how the vehicle moved; None: it is not there.
+    """All measurements of the vehicle's motion in a recording; None: it is not there.
 
     Attributes:
         name: of the recording, for messages.
@@ -157,7 +158,7 @@ class Recording(Protocol):
         """
 
     def motion(self) -> MotionData:
-        """What the recording tells of the vehicle's motion, read in one pass."""
+        """The recording's measurements of the vehicle's motion, read in one pass."""
 
     def warnings(self) -> Sequence[str]:
         """What was left out so far, and why, a line each."""
@@ -165,18 +166,19 @@ class Recording(Protocol):
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Error model of given poses: white errors on each, and slow errors correlated in time.
+    """Error model of given poses: a white error on each, and a Gauss-Markov error over time.
 
-    The slow part is a first-order Gauss-Markov process (exponential correlation), which is what a
-    filter's estimate does: it wanders. Position errors are in map axes, rotation errors in vehicle
-    axes; all axes alike. See SPEC 3 on why white noise alone is the wrong model.
+    The errors of filtered poses are correlated in time, so white noise alone is the wrong model:
+    a first-order Gauss-Markov process (exponential correlation) stands for the drift. Position
+    errors are in map axes, rotation errors in vehicle axes; all axes alike. The covariance that a
+    pose's message states replaces the white part.
 
     Attributes:
         white_rotation_rad: 1 sigma of the white part, per axis.
         white_position_m: 1 sigma of the white part, per axis.
-        drift_rotation_rad: stationary 1 sigma of the slow part, per axis.
-        drift_position_m: stationary 1 sigma of the slow part, per axis.
-        drift_time_s: correlation time of the slow part.
+        drift_rotation_rad: stationary 1 sigma of the Gauss-Markov part, per axis.
+        drift_position_m: stationary 1 sigma of the Gauss-Markov part, per axis.
+        drift_time_s: correlation time of the Gauss-Markov part.
     """
 
     white_rotation_rad: float
@@ -194,27 +196,13 @@ class Trajectory:
         stamps_ns: (n,) strictly increasing.
         T_map_vehicle: n poses.
         cov: (n, 6, 6) marginal covariance of each pose, right perturbation (vehicle frame),
-            rotation then translation, rad and m; None: not known.
-        velocity_vehicle: (n, 3) m/s of the vehicle's origin in vehicle axes; None: not known.
-        angular_velocity_vehicle: (n, 3) rad/s in vehicle axes; None: not known.
+            rotation then translation, rad and m; of given poses as the messages state it, NaN where
+            unknown. None: not known.
     """
 
     stamps_ns: IntArray
     T_map_vehicle: tuple[gtsam.Pose3, ...]
     cov: Array | None = None
-    velocity_vehicle: Array | None = None
-    angular_velocity_vehicle: Array | None = None
-
-    def pose_at(self, stamp_ns: int) -> gtsam.Pose3:
-        """The pose at a stamp of the trajectory.
-
-        Raises:
-            KeyError: the trajectory has no such stamp.
-        """
-        index = int(np.searchsorted(self.stamps_ns, stamp_ns))
-        if index == len(self.stamps_ns) or self.stamps_ns[index] != stamp_ns:
-            raise KeyError(stamp_ns)
-        return self.T_map_vehicle[index]
 
 
 @dataclass(frozen=True)
@@ -227,10 +215,10 @@ class TargetCloud:
         stamp_ns: stamp of the scan.
         points_lidar: (N, 3) float64, metres, lidar frame.
         source: what to call the scan in messages.
-        cut: True if the edge of the field of view may cut the target off: its points tell less
-            about position than they seem to.
-        swept: the points as they were measured, each at its own time, if the LiDAR tells: they can
-            be brought together again once the mounting is known better.
+        cut: True if the edge of the field of view may cut the target off: its points determine
+            the position less well than they seem to.
+        swept: the points as they were measured, each at its own time, if the LiDAR gives times:
+            for a new motion compensation once the extrinsic is known better.
     """
 
     lidar: str
@@ -270,20 +258,20 @@ class GroundObservation:
     Attributes:
         lidar: name of the LiDAR.
         drive: index of the drive.
-        stamp_ns: stamp of the pose that the scan speaks for.
+        stamp_ns: stamp of the pose that the scan is assigned to.
         normal_lidar: (3,) unit normal, upwards, lidar frame.
         distance_m: of the LiDAR's origin above the plane, along the normal.
         axes_lidar: (2, 3) unit vectors u and v, at right angles to the normal and to each other.
         cov: (3, 3) of (a, b, distance), the normal being along `normal + a u + b v`; rad, rad, m.
         centre_lidar: (3,) metres, centre of the points on the plane.
         points: how many there are.
-        R_vehicle_lidar: (3, 3) of the mounting that the motion was compensated with, a guess; None:
-            nothing was to be compensated.
+        R_vehicle_lidar: (3, 3) of the extrinsic, a guess, that the motion was compensated with;
+            None: no compensation was needed.
         by_extrinsic: (3, 3) derivative of (a, b, distance) by the extrinsic's rotation w,
             `R_vehicle_lidar Exp(w)`; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
             the ground rise by a centimetre during a sweep.
-        apart_ns: how long after `stamp_ns` the scan was really taken. The trajectory brings it
-            there, but for what it does not know: the body's heave on its springs.
+        apart_ns: time of the scan after `stamp_ns`. The trajectory carries the observation there;
+            it does not contain the heave of the body on its springs.
     """
 
     lidar: str
@@ -321,15 +309,17 @@ class Mixture:
 
 @dataclass(frozen=True)
 class Registration:
-    """Every cloud of a placement registered to the latent target frame (SPEC 3, GMMCalib).
+    """Every cloud of a placement registered to the latent target frame.
+
+    After GMMCalib; the derivation is in `caliv_graph/registration/README.md`.
 
     Attributes:
         observation: what was registered.
         T_target_lidar: a pose per cloud.
         information: (J, 6, 6) of each pose given the shape, rotation then translation, rad and m,
             left perturbation (target frame): `Exp(d) T_target_lidar`.
-        information_joint: (6 J, 6 J) of all poses together, the shape estimated from the same
-            points: what `information` claims, less what the shape took of it.
+        information_joint: (6 J, 6 J) of all poses together, the shape eliminated: it was estimated
+            from the same points.
         mixture: the reconstructed target.
         inlier_ratio: (J,) part of each cloud's points that the mixture explains.
         iterations: EM iterations done.
@@ -351,14 +341,14 @@ class Registration:
 
 @dataclass(frozen=True)
 class Iteration:
-    """One round of the joint loop: a new shape, a graph solve, new weights.
+    """One iteration of the joint loop: a new shape, a graph solve, new weights.
 
     Attributes:
-        turn_rad: largest rotation of a mounting by the step.
+        turn_rad: largest rotation of an extrinsic by the step.
         shift_m: largest shift of one.
         sigmas: the step in joint standard deviations of the extrinsics.
         weight_change: largest change of a cloud's robust weight.
-        undetermined: directions that the data did not determine; None: not asked (mode `joint`).
+        undetermined: number of undetermined directions; None: mode `joint`.
     """
 
     turn_rad: float
@@ -366,6 +356,36 @@ class Iteration:
     sigmas: float
     weight_change: float
     undetermined: int | None = None
+
+
+@dataclass(frozen=True)
+class LinearisedGraph:
+    """The solved graph at the estimate, linearised; Gauss-Markov pose errors are eliminated.
+
+    M coordinates of all variables, J clouds. `d^T information d / 2 - gradient^T d` is minus the
+    log-likelihood of a step d of the variables, without the initial guesses.
+
+    Attributes:
+        information: (M, M) of poses, ground, trusted extrinsics and clouds, with the gauge prior
+            on the target frames.
+        gradient: (M,).
+        information_guesses: (M, M) of the initial guesses.
+        cloud_jacobian: (6 J, M) derivative of the clouds' poses T_target_lidar (left
+            perturbations) with respect to the variables.
+        cloud_information: (6 J, 6 J) of these poses, robust weights included.
+        cloud_gradient: (6 J,) derivative of minus the clouds' log-likelihood.
+        by_vehicle: (J, 6, 6) derivative of each cloud's pose with respect to its vehicle pose.
+        by_extrinsic: (J, 6, 6) with respect to its LiDAR's T_vehicle_lidar, right perturbation.
+    """
+
+    information: Array
+    gradient: Array
+    information_guesses: Array
+    cloud_jacobian: scipy.sparse.csr_array
+    cloud_information: Array
+    cloud_gradient: Array
+    by_vehicle: Array
+    by_extrinsic: Array
 
 
 @dataclass(frozen=True)
@@ -377,30 +397,32 @@ class Solution:
 
     Attributes:
         mode: staged, joint or auto.
-        lidars: names of the LiDARs that take part (they saw a target, or are fixed).
+        lidars: LiDARs in the graph: they saw a target, or are fixed.
         reference: name of the reference LiDAR.
         T_vehicle_lidar: estimate per LiDAR.
         T_map_vehicle: estimated vehicle pose per (drive, stamp_ns).
         T_target_map: estimate per placement.
-        registrations: what the graph was built from, a registration per placement.
+        registrations: the graph's input, a registration per placement.
         cloud_weights: robust weight of each cloud, per placement, 1 full and 0 dropped.
         residuals: whitened pose-factor residuals, (J, 6) per placement.
         pose_noise: error model of the given poses that was used; None: no poses were given.
-        registration_scale: factor on the sigmas of the registration that the data called for.
-        information_data: (6n, 6n) what the data alone say, no prior on the extrinsics.
+        registration_scale: factor on the sigmas of the registration, estimated from the data.
+        information_data: (6n, 6n) of the data alone, no prior on the extrinsics.
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
         held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
         graph: the factor graph.
+        factor_kinds: of each of its factors, in order: `calibration.graph.FactorKind`.
         values: its values.
+        linearised: the graph at these values.
         stage_times_s: seconds per stage.
         time_offsets: per LiDAR whose offset was estimated its value and sigma in seconds: header
             stamp minus true acquisition time.
-        warnings: what a person should know, a line each.
-        gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not worked out.
-        course: the rounds of the joint loop; empty where there is none (staged).
+        warnings: for the user, a line each.
+        gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not computed.
+        course: the iterations of the joint loop; empty without one (`staged`).
     """
 
     mode: str
@@ -421,7 +443,9 @@ class Solution:
     iterations: int
     converged: bool
     graph: gtsam.NonlinearFactorGraph
+    factor_kinds: tuple[str, ...]
     values: gtsam.Values
+    linearised: LinearisedGraph
     stage_times_s: Mapping[str, float] = field(default_factory=dict)
     time_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -435,11 +459,11 @@ class Direction:
 
     Attributes:
         vector: per LiDAR (6,), vehicle axes, rotation (rad) then translation (m).
-        sigma_data: 1 sigma of the data along it; inf if they say nothing. In units of `vector`.
+        sigma_data: 1 sigma of the data along it; inf if unobservable. In units of `vector`.
         sigma_prior: 1 sigma of the prior along it, same units.
-        text: how a person says it.
-        together: whether all LiDARs move as one, so that sensor-to-sensor is left alone.
-        remedy: the manoeuvre or the setting that would determine it, as a person says it.
+        text: its name for the user; empty until `wording.directions.named` fills it in.
+        together: whether all LiDARs move as one, so that S2S does not change.
+        remedy: the manoeuvre or the setting that would determine it; filled in with `text`.
     """
 
     vector: Mapping[str, Array]
@@ -452,10 +476,10 @@ class Direction:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the drive could and could not tell (SPEC 4).
+    """What the drive determines (`uncertainty/README.md`).
 
     Attributes:
-        undetermined: directions along which the prior decides.
+        undetermined: directions along which the prior alone decides.
         weak: directions that the data determine no better than ten times the prior.
         determined: per LiDAR and axis of `conventions.AXES`.
         spectrum: sigma of the data, scaled so that 1 mrad and 10 mm compare, ascending, in mrad.
@@ -469,12 +493,12 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Guess:
-    """A mounting as it was known before any data: from a drawing or a tape measure.
+    """The initial guess of an extrinsic: from a drawing or a tape measure.
 
     Attributes:
         T_vehicle_lidar: the guess.
         sigmas: (6,) in vehicle axes, rad and m.
-        fixed: the user trusts it; it was not estimated.
+        fixed: the user trusts it; it is not estimated.
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -484,14 +508,14 @@ class Guess:
 
 @dataclass(frozen=True)
 class DataTerm:
-    """What the data of some drives, and nothing else, say about extrinsics.
+    """The likelihood of the extrinsics from the data of some drives alone.
 
     Minus the log-likelihood of a perturbation e of the extrinsics is
     `e^T information e / 2 - gradient^T e`, in vehicle axes, LiDARs in the order of
     `T_vehicle_lidar`, six coordinates each.
 
     Attributes:
-        sources: digests of the drives, to count none twice.
+        sources: digests of the drives, so that none counts twice.
         T_vehicle_lidar: where e is zero.
         information: (6n, 6n).
         gradient: (6n,).
@@ -505,17 +529,17 @@ class DataTerm:
 
 @dataclass(frozen=True)
 class LidarResult:
-    """One LiDAR's mounting as it is reported.
+    """The reported extrinsic of one LiDAR.
 
     Attributes:
         T_vehicle_lidar: the estimate, or the initial guess if the LiDAR saw no target.
         cov: (6, 6) right perturbation (lidar frame), rotation then translation, rad and m.
         determined: per axis of `conventions.AXES`, vehicle axes.
         scans_used: scans of a target that carried weight.
-        saw_target: False if it took no part.
+        saw_target: False if it never saw a target.
         time_offset: (value, sigma) in seconds, header stamp minus true acquisition time; None: not
             estimated.
-        guess: the mounting before any data; None: not known (another program's file).
+        guess: the initial guess; None: not known (another program's file).
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -529,7 +553,7 @@ class LidarResult:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result, as written to calibration.yaml (SPEC 6).
+    """The result, as written to calibration.yaml (`results/README.md`).
 
     Attributes:
         status: ok, partial or inconsistent.
@@ -540,15 +564,14 @@ class Calibration:
             columns for a LiDAR that saw no target.
         undetermined: directions, vehicle axes.
         weak: directions, vehicle axes.
-        unmet: what `require` or `limits` asked for and did not get, a sentence each.
+        unmet: requirements and limits that are not met, a sentence each.
         provenance: versions, configuration digest, inputs; plain values only.
-        gradient_data: (6n,) of the data's log-likelihood at the extrinsics, same coordinates: by
-            themselves the data would have them move by `solve(information_data, gradient_data)`.
-            None: not known (another program's file).
-        earlier: what earlier drives said, where they were taken for a prior. Not part of
-            `information_data`, but of the extrinsics and `cov_joint`.
-        contradictions: what contradicts what, a sentence each; the status is inconsistent if there
-            is any.
+        gradient_data: (6n,) of the data's log-likelihood at the extrinsics, same coordinates: the
+            maximum of the data alone is `solve(information_data, gradient_data)` away. None: not
+            known (another program's file).
+        earlier: data terms of earlier drives that served as a prior. They are part of the
+            extrinsics and of `cov_joint`, not of `information_data`.
+        contradictions: a sentence each; with any the status is inconsistent.
     """
 
     status: str

@@ -16,16 +16,16 @@ from typing import Any
 import gtsam
 from scipy.stats import chi2
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, Calibration, Direction
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.simulation.writer import write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s, sigmas_s2v
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 COMMAND = Path(sys.executable).with_name("caliv-graph")

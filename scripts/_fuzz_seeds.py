@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from caliv_graph.config.load import dump_config, parse_config
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Calibration, DataTerm, Direction, Guess, LidarResult
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.scenario.model import dump_scenario, parse_scenario
 
 REPOSITORY = Path(__file__).resolve().parents[1]

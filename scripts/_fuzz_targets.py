@@ -46,7 +46,8 @@ from caliv_graph.readers.pointcloud2 import (
     decode_pointcloud2,
 )
 from caliv_graph.readers.rosbag import RosbagRecording
-from caliv_graph.results.files import calibration_document, read_calibration_file, read_truth
+from caliv_graph.results.calibration_file import calibration_document, read_calibration_file
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.model import dump_scenario, load_scenario, parse_scenario
 from scripts import _fuzz_seeds as seeds
 
@@ -239,7 +240,7 @@ def _motion(folder: Path) -> Callable[[bytes], None]:
         found = collector.finish()
         assert all(isinstance(note, str) for note in collector.notes())
         if found is None:
-            raise DamagedMessageError("tells nothing")
+            raise DamagedMessageError("has no measurements")
         kind = {GnssCollector: "gnss", ImuCollector: "imu", TwistCollector: "twist"}
         _check_motion(MotionData("fuzz", **{kind.get(collector_type, "poses"): found}))
 

@@ -21,7 +21,7 @@ from caliv_graph.geometry.se3 import (
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, Calibration, LidarScan, MotionData
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.scenario.drive_models import StandstillDrive
 from caliv_graph.scenario.model import Scenario, dump_scenario
 from caliv_graph.scenario.world import World

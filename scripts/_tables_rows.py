@@ -12,7 +12,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
@@ -33,10 +32,10 @@ from caliv_graph.results.run import CalibrationRun
 from caliv_graph.simulation import SimulatedRecording, SimulatedTruth
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.targets.ground.planes import GroundMeter
+from caliv_graph.targets.ground.measure import GroundMeter
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs, sigmas_s2s, sigmas_s2v
 
 PERCENTILE = 10.0
 """Percentile k of the paper's filter."""

@@ -2,7 +2,7 @@
 
 The IMU is the control input; GNSS, velocity and orientation are measurements. The state is
 orientation, position and velocity of the IMU in the map and both biases, on the manifold: sigma
-points are perturbations of the mean (right perturbations of the rotation). It is told the true
+points are perturbations of the mean (right perturbations of the rotation). It knows the true
 noise, starts from the first measurement of each kind, and has the smoother's prior on the biases.
 It sees the past only; that is what the comparison is about.
 """

@@ -35,18 +35,19 @@ import numpy as np
 from rosbags.interfaces import Connection
 from scipy.special import jn_zeros
 
-from caliv_graph.calibration.requirements import sigmas_s2s
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, Calibration
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.drives import CurvatureProfile
 from caliv_graph.scenario.model import Scenario, parse_scenario
 from caliv_graph.simulation.bag import BagWriter
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import BAG_FOLDER, write_config, write_truth
 from caliv_graph.uncertainty.evaluation import evaluate
+from caliv_graph.uncertainty.pairs import sigmas_s2s
 from scripts._command import COMMAND, Usage, between, calibrate_measured, exit_code_of
 
 RATE_HZ = 10.0

@@ -37,7 +37,7 @@ from caliv_graph.fusion.terms import guess_of, own_term
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, Calibration
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.observability import scaling, spectrum

@@ -31,7 +31,6 @@ import gtsam
 import numpy as np
 import yaml
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.config.load import dump_config, load_config, parse_config
 from caliv_graph.config.model import Config, RobustKernel, SolveMode
@@ -40,6 +39,7 @@ from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.products import Array, Calibration
 from caliv_graph.scenario.model import InitialGuessModel
 from caliv_graph.simulation.noise import perturbed_extrinsic
+from caliv_graph.uncertainty.pairs import sigmas_s2s, sigmas_s2v
 from caliv_graph.workflows.draft import draft_config
 from scripts._command import COMMAND, calibrate_measured, exit_code_of, positive
 

@@ -8,21 +8,32 @@ start, and compares both with the truth at the LiDAR's stamps, the first 2 s lef
 the length of the error vector. NEES is e^T C^-1 e of each pose with the covariance that the
 smoother states, 6 if that is right; its interval is for as many independent poses as there are
 seeds. Joint NEES is that of all poses of a drive together, per degree of freedom, 1 if right.
+
+    .venv/bin/python scripts/benchmark_trajectory.py --solvers
+
+compares this package's Levenberg-Marquardt loop with GTSAM's optimisers on the graph of the
+`figure_eight` drive of seed 0 (60 s), from the same initial guess, and times the marginals. Each
+line gives the fastest of three solves, its ratio to the package's own loop in the same run, and the
+largest difference of a pose.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: the matrices are small
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the filter beside this script, run from anywhere
 
+import gtsam
 import numpy as np
 import pymap3d
 from scipy.spatial.transform import Rotation
@@ -30,19 +41,29 @@ from scipy.stats import chi2
 
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
+from caliv_graph.conventions import key_imu
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation import simulate_drive
 from caliv_graph.simulation.recording import SimulatedTruth
+from caliv_graph.trajectory.build import build_graph, to_values
+from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.initial import first_states
+from caliv_graph.trajectory.inputs import check_input
+from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.nodes import place_nodes
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.smoothing import smooth_trajectory
+from caliv_graph.trajectory.solve import ERROR_TOLERANCE, MAX_STEPS, chain_of, optimise
 from scripts._ukf import filter_trajectory
 
 SCENARIOS = ("paper_arc", "figure_eight")
 LEFT_OUT_S = 2.0
 JOINT_STRIDE = 5
 """Every so many poses enter the joint NEES: that of all of a long drive takes seconds."""
+
+T = TypeVar("T")
 
 TARGET_POSITION, TARGET_ROTATION = 1.5, 1.3
 
@@ -185,11 +206,107 @@ def table(name: str, runs: list[Run]) -> str:
     )
 
 
+def fastest(call: Callable[[], T]) -> tuple[T, float]:
+    """What a call returns, and the seconds of the fastest of three."""
+    seconds = math.inf
+    for _ in range(3):
+        begin = time.perf_counter()
+        out = call()
+        seconds = min(seconds, time.perf_counter() - begin)
+    return out, seconds
+
+
+def pose_difference(a: gtsam.Values, b: gtsam.Values, n: int) -> tuple[float, float]:
+    """Largest difference of the IMU's poses, radians and metres, per axis."""
+    pairs = [(a.atPose3(key_imu(i)), b.atPose3(key_imu(i))) for i in range(n)]
+    steps = np.abs(np.array([one.localCoordinates(other) for one, other in pairs]))
+    return float(steps[:, :3].max()), float(steps[:, 3:].max())
+
+
+def gtsam_optimisers(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values
+) -> Iterator[tuple[str, Callable[[], gtsam.Values]]]:
+    """Names and solves of GTSAM's optimizers, their tolerances set as close to ours as they go."""
+    for solver in ("MULTIFRONTAL_CHOLESKY", "SEQUENTIAL_CHOLESKY"):
+        for parameters in (gtsam.GaussNewtonParams(), gtsam.LevenbergMarquardtParams()):
+            parameters.setRelativeErrorTol(ERROR_TOLERANCE)
+            parameters.setAbsoluteErrorTol(ERROR_TOLERANCE)
+            parameters.setMaxIterations(MAX_STEPS)
+            parameters.setLinearSolverType(solver)
+            name = type(parameters).__name__.removesuffix("Params")
+            optimiser: Any = getattr(gtsam, f"{name}Optimizer")
+
+            def solve(make: Any = optimiser, parameters: Any = parameters) -> gtsam.Values:
+                found: gtsam.Values = make(graph, start, parameters).optimize()
+                return found
+
+            yield f"{name}Optimizer, {solver}", solve
+
+
+def compare_joint(
+    chain: Chain, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, some: IntArray
+) -> None:
+    """Prints the time and difference of the joint information of some poses."""
+    keys = [key_imu(i) for i in some.tolist()]
+    ours, own_s = fastest(lambda: chain.pose_information(some))
+    theirs, seconds = fastest(
+        lambda: gtsam.Marginals(graph, values).jointMarginalInformation(keys).fullMatrix()
+    )
+    size = np.sqrt(np.outer(ours.diagonal(), ours.diagonal()))
+    print(
+        f"joint information of {len(some)} poses: trajectory.chain {own_s:.2f} s, gtsam.Marginals "
+        f"{seconds:.2f} s, {seconds / own_s:.1f} times as long, relative difference "
+        f"{np.abs((theirs - ours) / size).max():.1e}"
+    )
+
+
+def compare_solvers(seed: int = 0) -> None:
+    """Prints times and differences on one drive of a minute."""
+    scenario = load_scenario(REPOSITORY / "configs/scenarios/figure_eight.yaml")
+    recording = simulate_drive(scenario, seed)
+    data, _ = check_input(recording.motion(), config_of(scenario))
+    stamps = np.unique(np.concatenate([recording.scan_stamps_ns(n) for n in recording.lidars]))
+    inertial = data.inertial
+    inside = (stamps >= inertial.begin_ns) & (stamps <= inertial.end_ns)
+    nodes = place_nodes(inertial, stamps[inside])
+    n = len(nodes)
+    states = first_states(data, nodes)
+    none, kernel = np.zeros(0, dtype=np.int64), data.config.robust.kernel
+    graph, seconds = fastest(lambda: build_graph(data, nodes, states, none, kernel).factors)
+    start = to_values(states, data)
+    print(
+        f"drive of {1e-9 * (nodes[-1] - nodes[0]):.0f} s: {n} nodes, {graph.size()} factors, "
+        f"built in {seconds:.2f} s"
+    )
+    own, own_s = fastest(lambda: optimise(graph, start, n, ERROR_TOLERANCE))
+    print(f"trajectory.solve.optimise: {own_s:.2f} s, error {graph.error(own):.6f}", flush=True)
+    for name, solve in gtsam_optimisers(graph, start):
+        found, seconds = fastest(solve)
+        turn, shift = pose_difference(own, found, n)
+        print(
+            f"{name}: {seconds:.2f} s, {seconds / own_s:.1f} times as long, error "
+            f"{graph.error(found):.6f}, poses differ by up to {turn:.1e} rad, {shift:.1e} m",
+            flush=True,
+        )
+    linear = graph.linearize(own)
+    ordering = node_ordering(n, data.yaw_bias)
+    poses = [key_imu(i) for i in range(n)]
+    _, seconds = fastest(lambda: Marginals(linear, ordering).covariances(poses))
+    print(f"marginal covariances of {n} poses, GTSAM's Bayes tree by QR: {seconds:.2f} s")
+    chain = chain_of(linear, n, data.yaw_bias)
+    for stride in (4, 2):
+        compare_joint(chain, graph, own, np.arange(0, n, stride))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20, help="number of seeds, from 0")
     parser.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), help="by name")
+    parser.add_argument("--solvers", action="store_true", help="compare optimizers instead")
     arguments = parser.parse_args()
+    if arguments.solvers:
+        compare_solvers()
+        return 0
     for name in arguments.scenarios:
         scenario = load_scenario(REPOSITORY / f"configs/scenarios/{name}.yaml")
         print(table(name, [run(scenario, seed) for seed in range(arguments.seeds)]), flush=True)

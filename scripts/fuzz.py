@@ -38,16 +38,12 @@ HERE = Path(__file__).resolve().parent
 _BAG_MODULES = ("caliv_graph.readers", "rosbags")
 
 MODULES: Mapping[str, Sequence[str]] = {
-    "config": ("caliv_graph.config.model",),
-    "manifest": ("caliv_graph.batch.manifest", "caliv_graph.config.model"),
-    "scenario": ("caliv_graph.config.model", "caliv_graph.scenario.model"),
-    "calibration": (
-        "caliv_graph.config.model",
-        "caliv_graph.common.fields",
-        "caliv_graph.results.files",
-    ),
-    "truth": ("caliv_graph.config.model", "caliv_graph.common.fields", "caliv_graph.results.files"),
-    "poses": ("caliv_graph.config.model", "caliv_graph.readers.caliv_folder"),
+    "config": ("caliv_graph.config",),
+    "manifest": ("caliv_graph.batch.manifest", "caliv_graph.config"),
+    "scenario": ("caliv_graph.config", "caliv_graph.scenario.model"),
+    "calibration": ("caliv_graph.config", "caliv_graph.results"),
+    "truth": ("caliv_graph.config", "caliv_graph.results"),
+    "poses": ("caliv_graph.config", "caliv_graph.readers.caliv_folder"),
     "pcd": ("caliv_graph.readers.pcd",),
     "pointcloud2": ("caliv_graph.readers",),
     "livox": ("caliv_graph.readers",),

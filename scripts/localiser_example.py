@@ -44,7 +44,7 @@ import numpy as np
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.fusion.monitor import DOF, alarm_threshold
 from caliv_graph.products import Array
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.scenario.model import Scenario, load_scenario
 from scripts._localiser import FALSE_ALARMS_PER_HOUR
 from scripts._localiser_runs import KEYFRAME_S, VARIANTS, Run, Task, cached_runs

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import (
     Array,
     Calibration,
     Direction,
     LidarResult,
+    LinearisedGraph,
     Mixture,
     PoseNoise,
     Registration,
@@ -147,6 +150,32 @@ def make_solution(placements: int = 1) -> Solution:
         iterations=4,
         converged=True,
         graph=gtsam.NonlinearFactorGraph(),
+        factor_kinds=(),
         values=gtsam.Values(),
+        linearised=LinearisedGraph(
+            information=np.zeros((12, 12)),
+            gradient=np.zeros(12),
+            information_guesses=np.eye(12),
+            cloud_jacobian=scipy.sparse.csr_array((6 * placements, 12)),
+            cloud_information=np.zeros((6 * placements, 6 * placements)),
+            cloud_gradient=np.zeros(6 * placements),
+            by_vehicle=np.zeros((placements, 6, 6)),
+            by_extrinsic=np.zeros((placements, 6, 6)),
+        ),
         stage_times_s={"solve": 0.5},
     )
+
+
+def twist_of_all(twist: Sequence[float], lidars: Mapping[str, gtsam.Pose3]) -> dict[str, Array]:
+    """What each LiDAR does, by differences, if all are moved by a small twist of the vehicle."""
+    step = 1e-6
+    motion = gtsam.Pose3.Expmap(step * np.array(twist))
+    return {
+        name: vehicle_axes_difference(motion.compose(T), T) / step for name, T in lidars.items()
+    }
+
+
+def turn_about(centre_xy: tuple[float, float]) -> list[float]:
+    """Twist of a rotation about the vertical through a point of the vehicle frame."""
+    x, y = centre_xy
+    return [0.0, 0.0, 1.0, y, -x, 0.0]

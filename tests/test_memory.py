@@ -29,7 +29,7 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground.planes import measure_grounds
+from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.trajectory.select import smooth_trajectories
 
 config = load_config(Path(sys.argv[1]))

@@ -149,7 +149,7 @@ def test_a_person_is_told() -> None:
     )
     (line,) = (w for w in unshared().warnings if "moved" in w)
     assert "2 places" in line
-    assert "No place tells how LiDARs are to each other: put it where two of them see it" in line
+    assert "No placement is shared, so S2S is unobservable: put it where two LiDARs see it" in line
 
 
 def test_a_chair_that_nobody_moves_is_one_placement() -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import (
@@ -31,7 +30,7 @@ from caliv_graph.readers import open_recording
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.world_models import ChairModel, CylinderModel
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_covariance
+from caliv_graph.uncertainty.pairs import pair_covariance, sigmas_s2s, sigmas_s2v
 from tests.drives_with_chair import (
     RADIUS_M,
     S_CHAIR_XY_M,

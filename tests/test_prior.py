@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.requirements import sigmas_s2v
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import NoiseConfig
 from caliv_graph.errors import ConfigError
@@ -17,6 +16,7 @@ from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_differen
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, Calibration
 from caliv_graph.results.run import CalibrationRun
+from caliv_graph.uncertainty.pairs import sigmas_s2v
 from tests.drives_with_chair import (
     ARC,
     ARC_LEFT,

@@ -29,7 +29,7 @@ from typing import Any, Self
 from caliv_graph.batch.digests import JOB_SCHEMA, DigestCache
 from caliv_graph.common.files import atomic_write, check_output_folder, output_folder
 from caliv_graph.errors import OutputError
-from caliv_graph.results.files import CALIBRATION_FILE, RESULT_FILES
+from caliv_graph.results.names import CALIBRATION_FILE, RESULT_FILES
 
 SUMMARY_SCHEMA = "caliv-graph/batch/1"
 SUMMARY_FILE = "summary.json"

@@ -54,7 +54,7 @@ class FinishedJob:
             self.config,
             self.stages,
             self.warnings,
-            self.run.evidence,
+            self.run.record,
         )
 
 
@@ -104,7 +104,7 @@ def run_job(
     Args:
         recordings: opened drives.
         config: the configuration.
-        progress: told of every stage.
+        progress: reports every stage.
         prior: an earlier calibration of the vehicle.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The manifest of a batch: which drives are to be calibrated, by which configs."""
+"""The manifest of a batch: its drives, and the config of each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_CHARACTERS = 80
 """Of a name: a file system allows 255 bytes, and scratch names beside it are longer."""
 
 RESERVED = ("index.html", "summary.csv", "summary.json")
-"""What stands beside the jobs' folders."""
+"""Names of the files beside the folders of the jobs."""
 
 _NAME = re.compile(r"\w(?:[\w.-]*[\w-])?")
 _VEHICLE = re.compile(r"\w(?:[\w. -]*[\w.-])?")
@@ -33,7 +33,7 @@ class Job:
     Attributes:
         name: of the job and of its folder.
         config: the config.
-        vehicle: what the jobs of one vehicle have in common; None: compared with no other.
+        vehicle: jobs of the same vehicle are compared; None: with no other job.
         data: drives instead of the config's; empty: the config's.
         prior: an earlier calibration; None: none.
         mode: instead of the config's `solve.mode`.
@@ -52,7 +52,7 @@ class Job:
 
 
 class _Settings(Section):
-    """What a job says, or the defaults for all."""
+    """The settings of a job, or the defaults of all jobs."""
 
     config: Path | None = Field(None, description="the config, relative to the manifest")
     vehicle: str | None = Field(None, description="jobs of one vehicle are compared")
@@ -116,7 +116,7 @@ class _Manifest(Section):
 
 
 def load_manifest(path: Path) -> tuple[Job, ...]:
-    """Reads a manifest. Whether configs and drives are there, their jobs will tell.
+    """Reads a manifest. Each job checks its config and drives when it runs.
 
     Args:
         path: the file; paths in it are relative to its folder.
@@ -130,12 +130,12 @@ def load_manifest(path: Path) -> tuple[Job, ...]:
     jobs = tuple(_job(entry, manifest.defaults, base, path) for entry in manifest.jobs)
     seen: dict[str, str] = {}
     for job in jobs:
-        # Some file systems do not tell cases apart.
+        # Some file systems ignore case.
         folder = job.name.casefold()
         if folder in seen:
             first = "twice" if seen[folder] == job.name else f"beside '{seen[folder]}'"
             raise ConfigError(
-                f"{path}: job name '{job.name}' stands {first}: each job has a folder of its own. "
+                f"{path}: job name '{job.name}' is used {first}: each job has its own folder. "
                 "Rename one"
             )
         seen[folder] = job.name
@@ -174,7 +174,7 @@ def _without_limits(require: Any) -> Any:
 
 def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> Job:
     def setting(key: str) -> Any:
-        # A job says `prior: null` where the default prior is not to count.
+        # `prior: null` in a job switches the default prior off.
         return getattr(entry if key in entry.model_fields_set else defaults, key)
 
     config, prior = setting("config"), setting("prior")
@@ -198,7 +198,7 @@ def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> J
 def _plain(raw: Any, pattern: re.Pattern[str], also: str) -> str:
     """A name that is safe as a folder, in a table and on a page."""
     if not isinstance(raw, str):
-        raise ValueError("is no text to YAML: write it in quotes")
+        raise ValueError("is not text in YAML: write it in quotes")
     # One spelling of what looks the same.
     name = unicodedata.normalize("NFC", raw)
     if len(name) > MOST_CHARACTERS or len(name.encode(errors="replace")) > 2 * MOST_CHARACTERS:

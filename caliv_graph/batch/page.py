@@ -16,7 +16,7 @@ from caliv_graph.report.html import mounting_row
 from caliv_graph.report.layout import SHOWN_AXES, new_table, sentences, titled
 from caliv_graph.report.page import environment
 from caliv_graph.report.tables import STATUS_STYLES
-from caliv_graph.results.files import REPORT_FILE
+from caliv_graph.results.names import REPORT_FILE
 
 FAR_SIGMAS = 3.0
 """From which a drive counts as far from the others, to the eye: the verdict is a test's."""

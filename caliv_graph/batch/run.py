@@ -30,7 +30,8 @@ from caliv_graph.common.exits import DEFECT, USAGE
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import BatchError, CalivError
-from caliv_graph.results.files import CALIBRATION_FILE, read_calibration
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.names import CALIBRATION_FILE
 
 _POLL_S = 0.2
 

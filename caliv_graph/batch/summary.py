@@ -25,7 +25,7 @@ from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.report.layout import SHOWN_AXES
-from caliv_graph.results.files import REPORT_FILE
+from caliv_graph.results.names import REPORT_FILE
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What makes a spreadsheet take text for a formula."""

@@ -208,7 +208,7 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     from caliv_graph.common.cores import on_one_core
     from caliv_graph.common.exits import exit_code
     from caliv_graph.errors import RecordingError
-    from caliv_graph.results.files import read_calibration
+    from caliv_graph.results.calibration_file import read_calibration
 
     if task.version != caliv_graph.__version__:
         raise CalivError(

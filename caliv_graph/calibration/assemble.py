@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 import caliv_graph
-from caliv_graph.calibration.guesses import configured_guess, guess_covariance
+from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
-from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import (
-    right_to_vehicle_axes,
     vehicle_axes_difference,
 )
 from caliv_graph.products import (
     Array,
     Calibration,
     Guess,
-    LidarResult,
     Recording,
     Solution,
 )
+from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess
+from caliv_graph.wording.directions import named
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -48,67 +46,37 @@ def assemble(
         recordings: the drives, for the provenance.
         digests: of the drives (`drive_digest`).
     """
-    uncertainty = assess(
-        solution.information_data,
-        solution.information_prior,
+    uncertainty = named(
+        assess(
+            solution.information_data,
+            solution.information_prior,
+            solution.T_vehicle_lidar,
+            solution.held,
+        ),
         solution.T_vehicle_lidar,
-        solution.held,
     )
-    names = config.lidar_order()
-    index = {name: i for i, name in enumerate(solution.lidars)}
-    used = _scans_used(solution)
-    size = 6 * len(names)
-    to_right = np.zeros((size, 6 * len(solution.lidars)))
-    cov_joint, information = np.zeros((size, size)), np.zeros((size, size))
-    guesses = {name: configured_guess(config, name) for name in names}
-    information_data, gradient_data = _without_trust(solution, guesses)
-    poses: dict[str, gtsam.Pose3] = {}
-    for row, name in enumerate(names):
-        block = slice(6 * row, 6 * row + 6)
-        if name in index:
-            poses[name] = solution.T_vehicle_lidar[name]
-            column = slice(6 * index[name], 6 * index[name] + 6)
-            to_right[block, column] = right_to_vehicle_axes(poses[name]).T
-        else:
-            poses[name] = guesses[name].T_vehicle_lidar
-            cov_joint[block, block] = guess_covariance(guesses[name], poses[name])
-    cov_joint += to_right @ solution.cov @ to_right.T
-    information += to_right @ information_data @ to_right.T
-    lidars = {}
-    for row, name in enumerate(names):
-        block = slice(6 * row, 6 * row + 6)
-        lidars[name] = LidarResult(
-            T_vehicle_lidar=poses[name],
-            cov=cov_joint[block, block],
-            determined=dict(uncertainty.determined.get(name, dict.fromkeys(AXES, False))),
-            scans_used=used.get(name, 0),
-            saw_target=used.get(name, 0) > 0,
-            time_offset=solution.time_offsets.get(name),
-            guess=guesses[name],
-        )
-    complete = not uncertainty.undetermined and all(
-        all(lidar.determined.values()) for lidar in lidars.values()
+    guesses = {name: configured_guess(config, name) for name in config.lidar_order()}
+    information, gradient = _without_trust(solution, guesses)
+    draft = assemble_matrices(
+        {name: solution.T_vehicle_lidar[name] for name in solution.lidars},
+        guesses,
+        solution.cov,
+        information,
+        uncertainty,
+        solution.reference,
+        _scans_used(solution),
+        gradient,
+        solution.time_offsets,
     )
-    draft = Calibration(
-        status="ok" if complete else "partial",
-        reference=solution.reference,
-        lidars=lidars,
-        cov_joint=0.5 * (cov_joint + cov_joint.T),
-        information_data=0.5 * (information + information.T),
-        undetermined=uncertainty.undetermined,
-        weak=uncertainty.weak,
-        unmet=(),
-        provenance=_provenance(config, recordings, solution, digests),
-        gradient_data=None if gradient_data is None else to_right @ gradient_data,
-    )
-    return unmet_requirements(draft, config)
+    provenance = _provenance(config, recordings, solution, digests)
+    return unmet_requirements(replace(draft, provenance=provenance), config)
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
-    """Information and gradient of the data (vehicle axes), less what `fixed: true` put in.
+    """Information and gradient of the data (vehicle axes), without what `fixed: true` added.
 
-    The solve takes a trusted mounting for one more measurement; it is still a guess, and two
-    calibrations that share it must not count it twice.
+    The solve counts a trusted extrinsic as a measurement. It is still a guess, and two calibrations
+    that share it must not count it twice.
     """
     information = solution.information_data.copy()
     gradient = None if solution.gradient_data is None else solution.gradient_data.copy()
@@ -124,7 +92,7 @@ def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Ar
             moved = vehicle_axes_difference(solution.T_vehicle_lidar[name], guess.T_vehicle_lidar)
             gradient[rows] += certainty * moved
         if name not in seen:
-            # Nothing is left but the rounding of large numbers.
+            # Only the rounding of large numbers is left.
             information[rows], information[:, rows] = 0.0, 0.0
             if gradient is not None:
                 gradient[rows] = 0.0

@@ -6,31 +6,34 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from caliv_graph.calibration.score_tests import (
-    assumptions,
-    cloud_counts,
-    registration_sigma,
-    score_tests,
-    typical_speed,
-)
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.robust import FAR_OFF
+from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.errors import SolveError
 from caliv_graph.products import (
+    Array,
     Calibration,
+    IntArray,
     MotionData,
     Recording,
     Solution,
 )
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
+from caliv_graph.uncertainty.consistency import Assumed, AssumedKind, CloudCount
+from caliv_graph.wording.contradictions import contradiction_sentence
 
 
 def _headings(
     trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData]
 ) -> dict[int, HeadingDisagreement]:
-    """Per drive that tells it, how the orientation source and the direction of travel differ."""
+    """Heading of the orientation source against the direction of travel, per drive index."""
     out = {}
     for index, trajectory in enumerate(trajectories):
         if isinstance(trajectory, SmoothedTrajectory):
@@ -54,7 +57,7 @@ def check(
         solution: the solved graph.
         recordings: the drives.
         trajectories: one per drive.
-        motions: what each drive, by its index, tells of the vehicle's motion.
+        motions: motion data of each drive, by its index.
 
     Returns:
         The calibration, inconsistent if something contradicts something; and warnings: headings
@@ -69,7 +72,7 @@ def check(
     try:
         between = score_tests(solution, trajectories, trusted)
     except SolveError as e:
-        # The result stands; that it was tested must not be believed.
+        # The result stands, and the user must know that it was not tested.
         between = ()
         untested = (f"parts of the drive were not tested against each other: {e}",)
     found = consistency.contradictions(
@@ -94,6 +97,114 @@ def check(
         )
     )
     if found:
-        calibration = replace(calibration, status="inconsistent", contradictions=found)
+        sentences = tuple(contradiction_sentence(each) for each in found)
+        calibration = replace(calibration, status="inconsistent", contradictions=sentences)
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)
+
+
+def cloud_counts(
+    solution: Solution, trajectories: Sequence[VehicleTrajectory]
+) -> tuple[CloudCount, ...]:
+    """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie.
+
+    Args:
+        solution: the solved graph.
+        trajectories: one per drive, for the yaw rates.
+    """
+    observed = [c for r in solution.registrations for c in r.observation.clouds]
+    weights = np.concatenate(solution.cloud_weights)
+    down = weights < 0.5
+    if solution.mode != "staged":  # `staged` holds the translation at the guess, so no cloud fits
+        down |= (np.concatenate(solution.residuals) ** 2).sum(axis=1) > FAR_OFF
+    middles, turns, rates = _middles(solution), [], []
+    for cloud in observed:
+        rates.append(twists_at(trajectories[cloud.drive], [cloud.stamp_ns])[0, 2])
+        turns.append(solution.T_map_vehicle[cloud.drive, cloud.stamp_ns].rotation().matrix())
+    rate = np.array(rates)
+    out = []
+    for name in solution.lidars:
+        mine = np.array([j for j, c in enumerate(observed) if c.lidar == name], np.int64)
+        if not len(mine):
+            continue
+        mine = mine[np.argsort([observed[j].stamp_ns for j in mine], kind="stable")]
+
+        def part(which: IntArray) -> tuple[int, int]:
+            return len(which), int(down[which].sum())
+
+        lost = mine[down[mine]]
+        offset = None
+        if len(lost) and not down.all():
+            usual = np.median(middles[~down], axis=0)
+            offset = np.median([turns[j].T @ (middles[j] - usual) for j in lost], axis=0)
+        out.append(
+            CloudCount(
+                name,
+                *part(mine),
+                left=part(mine[rate[mine] > MIN_YAW_RATE_RAD_S]),
+                right=part(mine[rate[mine] < -MIN_YAW_RATE_RAD_S]),
+                early=part(mine[: len(mine) // 2]),
+                late=part(mine[len(mine) // 2 :]),
+                offset_vehicle=offset,
+            )
+        )
+    return tuple(out)
+
+
+def _middles(solution: Solution) -> Array:
+    """(J, 3) middle of the extent of each cloud, map axes, from its target's origin."""
+    out = []
+    for T_target_map, registration in zip(
+        solution.T_target_map, solution.registrations, strict=True
+    ):
+        centre = T_target_map.inverse().translation()
+        for cloud in registration.observation.clouds:
+            T = solution.T_map_vehicle[cloud.drive, cloud.stamp_ns]
+            T = T.compose(solution.T_vehicle_lidar[cloud.lidar])
+            points = T.transformFrom(cloud.points_lidar.T).T
+            low, high = np.percentile(points, [5, 95], axis=0)
+            out.append(0.5 * (low + high) - centre)
+    return np.array(out)
+
+
+def registration_sigma(solution: Solution) -> tuple[float, float]:
+    """Sigma per axis of the median cloud's registration, scaled: rotation (rad), position (m)."""
+    information = np.concatenate([r.information for r in solution.registrations])
+    variance = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
+    sigma = np.sqrt(np.median(variance.reshape(-1, 2, 3).mean(axis=2), axis=0))
+    turn, shift = (solution.registration_scale * sigma).tolist()
+    return turn, shift
+
+
+def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...]:
+    """Height and tilt of the vehicle above the ground: the assumption and the estimate.
+
+    Args:
+        solution: the solved graph.
+        drives: what to call them.
+    """
+    out = []
+    for index, kind in enumerate(solution.factor_kinds):
+        if kind not in ("ground_height", "ground_tilt"):
+            continue
+        factor: Any = solution.graph.at(index)
+        drive = drives[gtsam.symbolIndex(factor.keys()[0])]
+        raw = factor.unwhitenedError(solution.values)
+        sigmas = raw / np.where(raw == 0.0, 1.0, factor.whitenedError(solution.values))
+        axes: list[AssumedKind] = ["height"] if kind == "ground_height" else ["tilt_x", "tilt_y"]
+        for axis, value, sigma in zip(axes, raw.tolist(), sigmas.tolist(), strict=True):
+            if value:
+                out.append(Assumed(drive, axis, value, abs(sigma)))
+    return tuple(out)
+
+
+def typical_speed(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> float:
+    """Median speed of the vehicle over the clouds, m/s."""
+    return float(
+        np.median(
+            [
+                np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
+                for drive, stamp in solution.T_map_vehicle
+            ]
+        )
+    )

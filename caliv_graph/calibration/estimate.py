@@ -6,7 +6,7 @@ stages. `joint` and `auto` go on (`refine`): expectation-maximisation whose M-st
 solve.
 
 Gauge: the target frames stay where they are, for the shapes are free; the map is held by the given
-poses, the extrinsics by the data or the guesses (SPEC 3, `auto`).
+poses, the extrinsics by the data or the guesses (mode `auto`, `caliv_graph/uncertainty/README.md`).
 """
 
 from __future__ import annotations
@@ -16,16 +16,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
-import numpy as np
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.graph import linearise_clouds
+from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
+from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.solve import (
-    OFFSET_DETERMINED_S,
     solve_registered,
-    with_determined_offsets,
 )
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.common.progress import Progress
@@ -33,16 +31,8 @@ from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import GroundObservation, Registration, Solution, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.registration.symmetry import (
-    Symmetry,
-    alarming,
-    symmetries,
-    symmetry_sentence,
-    views_of,
-)
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.uncertainty.predicted import undetermined_offsets
 
 
 def estimate(
@@ -52,13 +42,13 @@ def estimate(
     progress: Progress,
     grounds: Sequence[GroundObservation] = (),
 ) -> Solution:
-    """Registers, solves and refines, as `solve.mode` says.
+    """Registers, solves and refines, by `solve.mode`.
 
     Args:
         observations: clouds of each target placement.
         trajectories: one per drive.
         config: modes, kernels, priors.
-        progress: told of every stage.
+        progress: reports every stage.
         grounds: the ground under the vehicle, as the LiDARs saw it. The paper's procedure,
             `staged`, does without.
 
@@ -85,60 +75,46 @@ def _estimate(
 ) -> Solution:
     """The stages of `estimate`, timed."""
     limit = config.registration.max_iterations
+    rough = rough_solve(problem, observations, grounds, config, progress, limit)
+    problem, times = rough.state.problem, {"registration": rough.registration_s}
+
+    # Register again, from the solved graph: EM ends near where it starts, and the result shall
+    # depend on the data, not on the initial guess. Aligned clouds also give better normals.
     begun = time.perf_counter()
+    lines = linearise_clouds(problem, rough.state.values)
+    extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
     states = [
-        JointRegistration(o, config, rough=True, shares=problem.view_weights(m))
+        JointRegistration(
+            _deskewed(o, extrinsics, trajectories),
+            config,
+            normals=False,
+            view_weights=problem.view_weights(m),
+        )
         for m, o in enumerate(observations)
     ]
     registrations = []
-    with progress.stage("registering the clouds", len(states)) as advance:
-        for m, state in enumerate(states):
-            registrations.append(register_jointly(state, prealigned(problem, m), limit))
-            advance()
-    times = {"registration": time.perf_counter() - begun}
-    with progress.stage("solving the graph", None):
-        solve = solve_registered(problem, registrations, grounds, config)
-        times["graph"] = solve.graph_seconds
-        problem, offsets_s = with_determined_offsets(solve, registrations)
-        warnings = tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
-        if warnings:
-            solve = solve_registered(problem, registrations, grounds, config)
-            times["graph"] += solve.graph_seconds
-
-    # Once more, from where the graph puts the clouds: EM ends near where it starts, and the result
-    # shall depend on the data, not on the initial guess. And aligned clouds show normals that
-    # single ones do not.
-    begun = time.perf_counter()
-    lines = linearise_clouds(problem, solve.values)
-    extrinsics = {name: problem.extrinsic(solve.values, name) for name in problem.lidars}
-    observations = [_deskewed(o, extrinsics, trajectories) for o in observations]
-    states = [
-        JointRegistration(o, config, normals=False, shares=problem.view_weights(m))
-        for m, o in enumerate(observations)
-    ]
-    again = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
         for state, (R, t) in zip(states, per_placement(states, lines), strict=True):
             state.refine_normals(R, t)
-            again.append(register_jointly(state, unstack(R, t), limit, coarse=False))
+            registrations.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()
-    turns, alike = symmetries_of_targets(again, config)
-    warnings += alike
+    found, alike = symmetries_of_targets(registrations, config)
     times["registration"] += time.perf_counter() - begun
+
     begun = time.perf_counter()
-    solve = solve_registered(problem, again, grounds, config, turns)
+    solve = solve_registered(problem, registrations, grounds, config, found)
+    times["graph"] = rough.graph_s
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
-            solution = staged_solution(solve, again)
+            solution = staged_solution(solve, registrations)
     else:
         most = refinements(config.noise.lidar_range_m)
         with progress.stage("refining shape and graph together", most) as advance:
             solution = refined(solve, states, most, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
-    return replace(
-        solution, stage_times_s=times, warnings=(*warnings, *_unconverged(solution.registrations))
-    )
+    warnings = (*rough.warnings, *alike, *_unconverged(solution.registrations))
+    return replace(solution, stage_times_s=times, warnings=warnings)
 
 
 def _deskewed(
@@ -158,37 +134,6 @@ def _deskewed(
             cloud = replace(cloud, points_lidar=scan.points_lidar)
         clouds.append(cloud)
     return replace(observation, clouds=tuple(clouds))
-
-
-def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:
-    """T_map_vehicle T_vehicle_lidar of the clouds of a placement, at the guesses."""
-    out = []
-    for j in np.flatnonzero(problem.cloud_placement == placement):
-        guess = problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
-        out.append(problem.T_map_vehicle[problem.cloud_pose[j]].compose(guess))
-    return out
-
-
-def symmetries_of_targets(
-    registrations: Sequence[Registration], config: Config
-) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
-    """Per placement the turn that its target looks the same after, any turn; and what to tell.
-
-    How far a cloud of a drum is turned about it is not in the cloud: it comes from noise and from
-    how the beams fell, and is forgotten wherever clouds speak.
-    """
-    turns: list[Symmetry | None] = []
-    told = []
-    sigma = max(max(lidar.sigma.rpy_rad()) for lidar in config.lidars.values())
-    for registration in registrations:
-        found = symmetries(registration.mixture, views_of(registration), config.noise.lidar_range_m)
-        turns.append(next((s for s in found if s.continuous and s.upright), None))
-        told += [
-            symmetry_sentence(s, registration.observation.name, sigma)
-            for s in found
-            if alarming(s, sigma)
-        ]
-    return tuple(turns), tuple(told)
 
 
 def _unconverged(registrations: Sequence[Registration]) -> list[str]:

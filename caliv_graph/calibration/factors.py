@@ -1,8 +1,9 @@
 """The factors of the calibration graph, one function per kind.
 
 Variables (keys in `conventions`): X_i = T_map_vehicle, E = T_vehicle_ref, S_a = T_ref_a for every
-LiDAR but the reference, C = T_target_map, and per pose a slow error b_i (6: rotation in vehicle
-axes, position in map axes). All Jacobians are analytic; the tests check them numerically.
+LiDAR but the reference, C = T_target_map, and per given pose a Gauss-Markov error b_i (6: rotation
+in vehicle axes, position in map axes). All Jacobians are analytic; the tests check them
+numerically.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ def predict_cloud(
     """
     if twist is None:
         return chain_jacobians([values.atPose3(key) for key in keys])
-    target, vehicle, offset, *mounting = keys
+    target, vehicle, offset, *extrinsic = keys
     back = gtsam.Pose3.Expmap(-float(values.atVector(offset)[0]) * twist)
     chain = [values.atPose3(target), values.atPose3(vehicle), back]
-    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in mounting])
+    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in extrinsic])
     moves[2] = moves[2] @ -twist[:, None]
     return Z, moves
 
@@ -69,7 +70,7 @@ def target_pose_factor(
     information: Array,
     twist: Array | None = None,
 ) -> gtsam.CustomFactor:
-    """A registered cloud: `r = Log(Zhat Z^-1)`, at the target (SPEC 3).
+    """A registered cloud: `r = Log(Zhat Z^-1)`, at the target (`README.md`, "Clouds").
 
     Args:
         keys: as in `predict_cloud`, which gives Zhat.
@@ -98,15 +99,27 @@ def given_pose_factor(
     T_map_vehicle: gtsam.Pose3,
     sigma_rotation_rad: float,
     sigma_position_m: float,
+    cov: Array | None = None,
 ) -> gtsam.CustomFactor:
-    """A given pose with a white error and the slow error b_i of its drive.
+    """A given pose with a white error and the Gauss-Markov error b_i.
 
     `r = [Log(R_given^T R) - b_rotation, t - t_given - b_position]`: rotation in vehicle axes,
     position in map axes, since a position filter's error does not turn with the vehicle.
+
+    Args:
+        key_pose: of X_i.
+        key_pose_error: of b_i.
+        T_map_vehicle: as given.
+        sigma_rotation_rad: of the white error, per axis.
+        sigma_position_m: of the white error, per axis.
+        cov: (6, 6) of the white error, in place of the two sigmas; None: the sigmas.
     """
     R_given = T_map_vehicle.rotation()
     t_given = T_map_vehicle.translation()
     sigmas = np.array([sigma_rotation_rad] * 3 + [sigma_position_m] * 3)
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    if cov is not None:
+        noise = gtsam.noiseModel.Gaussian.Covariance(cov)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T = values.atPose3(key_pose)
@@ -119,18 +132,16 @@ def given_pose_factor(
             jacobians[1] = -np.eye(6)
         return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
 
-    return gtsam.CustomFactor(
-        gtsam.noiseModel.Diagonal.Sigmas(sigmas), [key_pose, key_pose_error], error
-    )
+    return gtsam.CustomFactor(noise, [key_pose, key_pose_error], error)
 
 
 def gauss_markov_factor(
     key_before: int, key_after: int, decay: float, sigmas: Array
 ) -> gtsam.LinearContainerFactor:
-    """A step of the slow error, `b_after = decay * b_before + noise` (first-order Gauss-Markov).
+    """A step of the first-order Gauss-Markov error, `b_after = decay * b_before + noise`.
 
     Args:
-        key_before: key of the slow error before the step.
+        key_before: key of the error before the step.
         key_after: key of the one after it.
         decay: exp(-dt / correlation time).
         sigmas: (6,) of the step.
@@ -152,7 +163,7 @@ def gauss_markov_factor(
 def extrinsic_prior(
     keys: Sequence[int], T_vehicle_lidar: gtsam.Pose3, sigmas: Array
 ) -> gtsam.CustomFactor:
-    """The initial guess of one LiDAR's mounting, on `T_vehicle_a = E S_a`, in vehicle axes.
+    """The initial guess of one LiDAR's extrinsic, on `T_vehicle_a = E S_a`, in vehicle axes.
 
     Args:
         keys: of E and, unless the LiDAR is the reference, S_a.

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config, PoseSigmaConfig
-from caliv_graph.geometry.se3 import (
-    right_to_vehicle_axes,
-)
 from caliv_graph.products import (
-    Array,
     Guess,
 )
 
@@ -18,8 +13,8 @@ DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
 """(6,) 1 sigma of a guess for which nothing is stated: the defaults of the config."""
 
 TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
-"""Sigmas of a mounting that the user says to trust (`fixed: true`): a tenth of a millimetre and
-0.01 mrad, far below what any drive tells and still a covariance that can be inverted."""
+"""Sigmas of an extrinsic that the user trusts (`fixed: true`): 0.1 mm and 0.01 mrad, far below what
+any drive determines, and still an invertible covariance."""
 
 
 def configured_guess(config: Config, name: str) -> Guess:
@@ -27,9 +22,3 @@ def configured_guess(config: Config, name: str) -> Guess:
     lidar = config.lidars[name]
     sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
     return Guess(lidar.initial.pose(), sigmas, lidar.fixed)
-
-
-def guess_covariance(guess: Guess, T_vehicle_lidar: gtsam.Pose3) -> Array:
-    """(6, 6) covariance of a guess, right perturbation of `T_vehicle_lidar`."""
-    axes = right_to_vehicle_axes(T_vehicle_lidar)
-    return np.asarray(axes.T @ np.diag(guess.sigmas**2) @ axes)

@@ -1,23 +1,24 @@
-"""How good the given poses are, read off the data themselves.
+"""Noise of the given poses and scale of the registration, estimated from the data.
 
-Filtered poses come without a usable covariance, and their errors are correlated in time; a wrong
-guess of either costs accuracy and makes every sigma a lie. The variances (white and slow, rotation
-and position) and one scale on the registration's sigmas are estimated by restricted maximum
-likelihood: the extrinsics and the targets are integrated out, so that what they absorb is not
-taken for precision (Patterson & Thompson 1971).
+Filtered poses come without a usable covariance, and their errors are correlated in time. The
+variances (white and Gauss-Markov, rotation and position) and one scale on the registration's sigmas
+are estimated by restricted maximum likelihood: extrinsics and targets are integrated out, so that
+the residuals which they absorb do not count as precision (Patterson & Thompson 1971). The
+likelihood and its prior are derived in `caliv_graph/calibration/README.md`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize
 
-from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.model import NoiseConfig
 from caliv_graph.conventions import key_pose_error, key_vehicle
@@ -30,28 +31,28 @@ TYPICAL = PoseNoise(
     drift_position_m=3e-3,
     drift_time_s=4.0,
 )
-"""What is assumed before the data speak: a filter of a good GNSS/INS."""
+"""Median of the prior: the filter of a good GNSS/INS."""
 
 TYPICAL_SCALE = 1.5
-"""Sigmas of a registration against what its mixture claims, before the data speak."""
+"""Median of the prior of the scale on the registration's sigmas."""
 
 LOG_SPREAD = math.log(10.0)
-"""One sigma of how far the truth may be from `TYPICAL`: a factor of ten."""
+"""1 sigma of the log-normal prior about `TYPICAL`: a factor of ten."""
 
 FLOORS = np.array([2e-5, 2e-4, 1e-5, 1e-4, 0.5])
-"""Smallest values: rotation rad, position m (white, slow), scale. Below them nothing changes."""
+"""Smallest values: rotation rad, position m (white, Gauss-Markov), scale."""
 
 CEILINGS = np.array([0.05, 1.0, 0.1, 2.0, 10.0])
 
 GROSS = 30.0
-"""A cloud whose squared residual is this many times the median's has no say in the noise levels."""
+"""A cloud whose squared residual is this many times the median is left out of the noise fit."""
 
 CLOUDS_USED = 50
 """Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
 
 
 def _names(noise: NoiseConfig) -> list[float | None]:
-    """What the user gave, in SI units, in the order of the parameters."""
+    """The values of the config in SI units, in the order of the parameters."""
     rad = [
         None if v is None else math.radians(v)
         for v in (noise.pose_rotation_deg, noise.pose_drift_rotation_deg)
@@ -66,7 +67,7 @@ def _names(noise: NoiseConfig) -> list[float | None]:
 
 
 def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
-    """What the config says, and `TYPICAL` where it is silent."""
+    """The values of the config, and `TYPICAL` for the others."""
     given = _names(noise)
     typical = [
         TYPICAL.white_rotation_rad,
@@ -85,26 +86,29 @@ def sound_clouds(
     values: gtsam.Values,
     noise: PoseNoise,
 ) -> BoolArray:
-    """Which clouds are not far off: (J,), those to estimate noise levels from.
+    """(J,) which clouds are not far off: those that noise levels are estimated from.
 
-    A cloud is judged where the given pose puts it. The solved pose would not do: it follows a cloud
-    that is a third of a metre off, and the white error of the poses would be taken for as large.
+    Residuals are taken at the given poses. Solved poses follow a cloud that is 0.3 m off, and the
+    white error of the poses would seem as large.
 
     Args:
         problem: the clouds and poses.
         measured: registered pose of each cloud.
         information: (J, 6, 6), without robust weights.
         values: the current extrinsics and targets, and the poses as given.
-        noise: what is assumed of the poses so far.
+        noise: present error model of the poses.
     """
     lines = linearise_clouds(problem, values)
     every = np.arange(problem.clouds)
     r, _, B, R = _stacked(problem, lines, measured, information, values, every)
     rotation = noise.white_rotation_rad**2 + noise.drift_rotation_rad**2
     position = noise.white_position_m**2 + noise.drift_position_m**2
-    spread = np.array([rotation] * 3 + [position] * 3)
+    spread = np.tile([rotation] * 3 + [position] * 3, (problem.clouds, 1))
+    stated = problem.stated()[problem.cloud_pose]
+    spread[stated] = [noise.drift_rotation_rad**2] * 3 + [noise.drift_position_m**2] * 3
     given = problem.given()[problem.cloud_pose]
-    V = R + np.einsum("jax,x,jbx->jab", B * given[:, None, None], spread, B)
+    V = R + np.einsum("jax,jx,jbx->jab", B * given[:, None, None], spread, B)
+    V += _stated_effect(problem, B, every)
     V += np.einsum("jax,jxy,jby->jab", B, _motion_covariance(problem, values, every), B)
     r = r.reshape(-1, 6)
     squared = np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0])
@@ -121,6 +125,10 @@ def fit_pose_noise(
 ) -> tuple[PoseNoise, float]:
     """Variances of the given poses and the scale of the registration's sigmas.
 
+    Where a pose's message states a covariance, that is the white part of its error: nothing is
+    fitted for it, while the Gauss-Markov part is fitted for all. If all poses state one, the white
+    figures returned are the root mean square of theirs.
+
     Args:
         problem: the clouds and poses.
         measured: registered pose of each cloud.
@@ -131,78 +139,128 @@ def fit_pose_noise(
         config: what is given there is kept.
     """
     first = first_pose_noise(config)
-    given = _names(config)
-    chosen = _spread(problem, sound)
-    lines = linearise_clouds(problem, values)
-    r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
-    times = problem.times_s()[problem.cloud_pose[chosen]]
-    drives = problem.drives()[problem.cloud_pose[chosen]]
-    apart = np.abs(times[:, None] - times[None])
-    together = drives[:, None] == drives[None]
-    same = ((apart < 1e-9) & together).astype(np.float64)
-    slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
-    joint = _motion_covariance(problem, values, chosen, together=True)
-    known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
-    known = known.reshape(6 * len(chosen), 6 * len(chosen))
-    # Rotation and position parts of what a pose error does to the clouds' residuals.
-    B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
-    effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
-    spread = [e @ e.T for e in effect]
-    ones = np.ones((6, 6))
-    parts = [
-        spread[0] * np.kron(same, ones),
-        spread[1] * np.kron(same, ones),
-        spread[0] * np.kron(slow, ones),
-        spread[1] * np.kron(slow, ones),
-        scipy.linalg.block_diag(*R),
-    ]
-    ridge = _ridge(problem, A.shape[1])
-    start = np.log(
-        [
-            first.white_rotation_rad,
-            first.white_position_m,
-            first.drift_rotation_rad,
-            first.drift_position_m,
-            TYPICAL_SCALE,
-        ]
-    )
-    # Without given poses there is nothing to be found out about their errors.
-    free = np.array([g is None for g in given]) & (problem.given().any() | (np.arange(5) == 4))
+    likelihood = _RestrictedLikelihood.at(problem, measured, information, sound, values, first)
+    # What the config states is kept; without given poses there are no pose errors to estimate.
+    free = np.array([g is None for g in _names(config)])
+    fitted = problem.given() & ~problem.stated()
+    free &= np.array([fitted.any()] * 2 + [problem.given().any()] * 2 + [True])
+
+    def logarithms(x: Array) -> Array:
+        full = likelihood.prior.copy()
+        full[free] = x
+        return full
 
     def cost(x: Array) -> float:
-        full = start.copy()
-        full[free] = x
-        scale = np.exp(2.0 * np.clip(full, np.log(FLOORS), np.log(CEILINGS)))
-        V = known + sum(s * p for s, p in zip(scale, parts, strict=True))
+        return likelihood.cost(logarithms(x))
+
+    found = minimize(
+        cost,
+        likelihood.prior[free],
+        # Nelder-Mead stops short in the valleys between white and Gauss-Markov errors.
+        method="Powell",
+        options={"maxfev": 300, "xtol": 1e-2, "ftol": 1e-5},
+    )
+    bounded = np.clip(logarithms(found.x), np.log(FLOORS), np.log(CEILINGS))
+    value = np.exp(bounded).tolist()
+    if problem.stated_cov is not None and problem.stated().any() and not fitted.any():
+        variances = np.diagonal(problem.stated_cov[problem.stated()], axis1=1, axis2=2)
+        value[:2] = np.sqrt([variances[:, :3].mean(), variances[:, 3:].mean()]).tolist()
+    noise = PoseNoise(value[0], value[1], value[2], value[3], first.drift_time_s)
+    return noise, float(value[4])
+
+
+@dataclass(frozen=True)
+class _RestrictedLikelihood:
+    """The restricted likelihood of the noise levels of m clouds, with its prior.
+
+    Attributes:
+        residuals: (6m,) of the clouds at the given poses.
+        design: (6m, p) their derivatives with respect to extrinsics, targets and time offsets.
+        known: (6m, 6m) covariance that smoothed poses bring, and the stated white errors.
+        parts: (6m, 6m) each, what the variances multiply: white rotation and position,
+            Gauss-Markov rotation and position, registration.
+        ridge: (p, p) weak information on what the design multiplies.
+        prior: (5,) medians of the prior on the logarithms of the sigmas.
+    """
+
+    residuals: Array
+    design: Array
+    known: Array
+    parts: tuple[Array, ...]
+    ridge: Array
+    prior: Array
+
+    @classmethod
+    def at(
+        cls,
+        problem: Problem,
+        measured: Sequence[gtsam.Pose3],
+        information: Array,
+        sound: BoolArray,
+        values: gtsam.Values,
+        first: PoseNoise,
+    ) -> _RestrictedLikelihood:
+        """Linearised at `values`; arguments as in `fit_pose_noise`."""
+        chosen = _spread(problem, sound)
+        lines = linearise_clouds(problem, values)
+        r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
+        times = problem.times_s()[problem.cloud_pose[chosen]]
+        drives = problem.drives()[problem.cloud_pose[chosen]]
+        apart = np.abs(times[:, None] - times[None])
+        together = drives[:, None] == drives[None]
+        same = ((apart < 1e-9) & together).astype(np.float64)
+        slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
+        joint = _motion_covariance(problem, values, chosen, together=True)
+        known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
+        known += _stated_effect(problem, B, chosen, same)
+        # Rotation and position parts of what a pose error does to the clouds' residuals.
+        unstated = ~problem.stated()[problem.cloud_pose[chosen]]
+        B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
+        effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
+        spread = [e @ e.T for e in effect]
+        same = same * np.outer(unstated, unstated)
+        ones = np.ones((6, 6))
+        return cls(
+            residuals=r,
+            design=A,
+            known=known.reshape(6 * len(chosen), 6 * len(chosen)),
+            parts=(
+                spread[0] * np.kron(same, ones),
+                spread[1] * np.kron(same, ones),
+                spread[0] * np.kron(slow, ones),
+                spread[1] * np.kron(slow, ones),
+                scipy.linalg.block_diag(*R),
+            ),
+            ridge=_ridge(problem, A.shape[1]),
+            prior=np.log(
+                [
+                    first.white_rotation_rad,
+                    first.white_position_m,
+                    first.drift_rotation_rad,
+                    first.drift_position_m,
+                    TYPICAL_SCALE,
+                ]
+            ),
+        )
+
+    def cost(self, logarithms: Array) -> float:
+        """Minus the logarithm of likelihood times prior, of the logarithms (5,) of the sigmas."""
+        scale = np.exp(2.0 * np.clip(logarithms, np.log(FLOORS), np.log(CEILINGS)))
+        V = self.known + sum(s * p for s, p in zip(scale, self.parts, strict=True))
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:
             return 1e12
-        white = scipy.linalg.solve_triangular(
-            L, np.column_stack([A, r]), lower=True, check_finite=False
-        )
-        N = white[:, :-1].T @ white[:, :-1] + ridge
+        stacked = np.column_stack([self.design, self.residuals])
+        white = scipy.linalg.solve_triangular(L, stacked, lower=True, check_finite=False)
+        N = white[:, :-1].T @ white[:, :-1] + self.ridge
         LN = scipy.linalg.cholesky(N, lower=True, check_finite=False)
         y = scipy.linalg.solve_triangular(LN, white[:, :-1].T @ white[:, -1], lower=True)
         misfit = white[:, -1] @ white[:, -1] - y @ y
-        surprise = np.sum(((full - start) / LOG_SPREAD) ** 2)
+        surprise = np.sum(((logarithms - self.prior) / LOG_SPREAD) ** 2)
         return float(
             np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)
         )
-
-    found = minimize(
-        cost,
-        start[free],
-        method="Powell",  # Nelder-Mead stops short in the valleys between white and slow errors
-        options={"maxfev": 300, "xtol": 1e-2, "ftol": 1e-5},
-    )
-    full = start.copy()
-    full[free] = found.x
-    value = np.exp(np.clip(full, np.log(FLOORS), np.log(CEILINGS)))
-    noise = PoseNoise(
-        float(value[0]), float(value[1]), float(value[2]), float(value[3]), first.drift_time_s
-    )
-    return noise, float(value[4])
 
 
 def _spread(problem: Problem, sound: BoolArray) -> IntArray:
@@ -226,10 +284,9 @@ def squares_without_own_pose(
 ) -> Array:
     """Squared residuals (J,) of the clouds, the white error of their own pose integrated out.
 
-    A solved pose follows its cloud as far as the given pose lets it: a cloud that is a third of a
-    metre off would be judged by a pose that has moved with it. So the white error that the solve
-    found is taken back, and counted as noise. The slow error stays: the neighbours in time have a
-    say in it.
+    A solved pose follows its cloud within the noise of the given pose: a cloud that is 0.3 m off
+    would be judged by a pose that moved with it. So the white error that the solve found is taken
+    back and counted as noise. The Gauss-Markov error stays: its neighbours in time determine it.
 
     Args:
         problem: the clouds and poses.
@@ -249,9 +306,36 @@ def squares_without_own_pose(
         error = np.concatenate([turn, X.translation() - given.translation()])
         found[i] = error - values.atVector(key_pose_error(i))
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
-    B = B * problem.given()[problem.cloud_pose][:, None, None]
-    V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B)
+    stated = _stated_effect(problem, B, np.arange(problem.clouds))
+    fitted = problem.given() & ~problem.stated()
+    B = B * fitted[problem.cloud_pose][:, None, None]
+    V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B) + stated
     return np.asarray(np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0]))
+
+
+def _stated_effect(
+    problem: Problem, B: Array, chosen: IntArray, same: Array | None = None
+) -> Array:
+    """What the stated white errors of given poses add to the covariance of the clouds' residuals.
+
+    Args:
+        problem: the clouds and poses.
+        B: (m, 6, 6) effects of the pose errors on the chosen clouds.
+        chosen: (m,) clouds.
+        same: (m, m) 1 where two clouds share a pose; None: only each cloud's own.
+
+    Returns:
+        (m, 6, 6), or with `same` (m, 6, m, 6); zero where no covariance is stated.
+    """
+    m, pose = len(chosen), problem.cloud_pose[chosen]
+    stated = problem.stated()[pose]
+    if problem.stated_cov is None or not stated.any():
+        return np.zeros((m, 6, 6) if same is None else (m, 6, m, 6))
+    cov = np.zeros((m, 6, 6))
+    cov[stated] = problem.stated_cov[pose[stated]]
+    if same is None:
+        return np.asarray(np.einsum("jax,jxy,jby->jab", B, cov, B))
+    return np.asarray(np.einsum("pax,pxy,qby,pq->paqb", B, cov, B, same, optimize=True))
 
 
 def _motion_covariance(

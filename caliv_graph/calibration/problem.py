@@ -1,4 +1,4 @@
-"""What is to be solved: LiDARs, poses, registered clouds, and their indices in the graph."""
+"""The variables of a calibration: LiDARs, poses, clouds, and their keys in the graph."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.cloud.views import view_weights
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.trajectory.noise import given_pose_covariances
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 HEAVE_SIGMA_M = 0.005
-"""How far the body on its springs, and the LiDARs with it, is off its height at each stamp. The
-smoothed trajectory knows nothing of it; given poses are told apart from it by the data."""
+"""1 sigma of the heave, the height of the body on its springs, at each stamp. The smoothed
+trajectory does not contain it; given poses do."""
 
 
 @dataclass(frozen=True)
@@ -44,19 +45,23 @@ class Problem:
         poses: (drive, stamp_ns) of every pose used, ascending.
         T_map_vehicle: the given or smoothed pose of each, its map's origin moved to `origins_map`.
         origins_map: (3,) per drive, metres: where the problem's map begins in the drive's. Poses in
-            a national grid are thousands of kilometres from its origin; no matrix bears that.
+            a national grid are thousands of kilometres from its origin, too far for double
+            precision.
         cloud_lidar: (J,) index into `lidars`.
         cloud_pose: (J,) index into `poses`.
         cloud_placement: (J,) index of the placement.
         placements: number of placements.
-        motion: per drive with a smoothed trajectory, what the motion data say about its poses: the
-            (6 m, 6 m) information on the m of them, in order, right perturbations, rotation then
-            translation. The poses of the other drives were given, with errors to be found out.
+        motion: per drive with a smoothed trajectory the (6 m, 6 m) information of the motion data
+            on its m poses, in order, right perturbations, rotation then translation. The poses
+            of the other drives were given; their errors are estimated.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is.
-        shares: (J,) what each cloud counts beside others from the same place, 0 to 1
-            (`targets.views`); None: all count fully.
+        stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
+            it, rotation in vehicle axes, then position in map axes, rad and m; NaN: not stated, its
+            white error is fitted. None: no pose has one.
+        weights_of_views: (J,) weight of each cloud for repeated views of one place, 0 to 1
+            (`targets.cloud.views`); None: all one.
     """
 
     lidars: tuple[str, ...]
@@ -74,7 +79,8 @@ class Problem:
     motion: Mapping[int, Array] = field(default_factory=dict)
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
-    shares: Array | None = None
+    stated_cov: Array | None = None
+    weights_of_views: Array | None = None
 
     @property
     def clouds(self) -> int:
@@ -82,9 +88,10 @@ class Problem:
         return len(self.cloud_lidar)
 
     def view_weights(self, placement: int | None = None) -> Array:
-        """What each cloud counts, of all (J,) or of those of one placement."""
-        shares = np.ones(self.clouds) if self.shares is None else self.shares
-        return shares if placement is None else shares[self.cloud_placement == placement]
+        """Weights for repeated views, of all clouds (J,) or of those of one placement."""
+        weights = self.weights_of_views
+        weights = np.ones(self.clouds) if weights is None else weights
+        return weights if placement is None else weights[self.cloud_placement == placement]
 
     def extrinsic_keys_of(self, lidar: str) -> tuple[int, ...]:
         """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""
@@ -131,25 +138,31 @@ class Problem:
         return tuple(key_offset(i) for i, name in enumerate(self.lidars) if name in self.offsets)
 
     def guess_information(self) -> Array:
-        """(6n, 6n) what the guesses say, vehicle axes; the trusted ones as if they were not.
+        """(6n, 6n) information of the guesses, vehicle axes; trusted ones with default sigmas.
 
-        The trust is among the data (`prior_graph`), and a direction is determined if the data know
-        it better than a guess: against its own 0.1 mm a trusted mounting would not be.
+        The trust is among the data (`prior_graph`). A direction is determined if the data know it
+        better than a usual guess.
         """
         return np.diag(np.concatenate([self.guess_sigmas(n) for n in self.lidars]) ** -2.0)
 
     def guess_sigmas(self, lidar: str) -> Array:
-        """(6,) what the guess of a LiDAR is worth, vehicle axes; a trusted one as any other."""
+        """(6,) sigmas of the guess of a LiDAR, vehicle axes; the defaults for a trusted one."""
         return DEFAULT_GUESS_SIGMAS if lidar in self.fixed else self.prior_sigmas[lidar]
 
     def times_s(self) -> Array:
-        """(n,) times of the poses in seconds; between drives they mean nothing."""
+        """(n,) times of the poses in seconds; comparable within a drive only."""
         first = self.poses[0][1]
         return np.array([(stamp - first) / NANOSECONDS_PER_SECOND for _, stamp in self.poses])
 
     def given(self) -> BoolArray:
         """(n,) whether each pose was given, not smoothed from motion data."""
         return ~np.isin(self.drives(), list(self.motion))
+
+    def stated(self) -> BoolArray:
+        """(n,) whether each pose is given with the covariance of its white error."""
+        if self.stated_cov is None:
+            return np.zeros(len(self.poses), dtype=bool)
+        return np.asarray(np.isfinite(self.stated_cov).all(axis=(1, 2)))
 
     def drives(self) -> IntArray:
         """(n,) drive of each pose."""
@@ -197,17 +210,17 @@ def pose_problem(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
 ) -> Problem:
-    """Lists what takes part.
+    """Lists LiDARs, poses and clouds that take part.
 
     Raises:
-        SolveError: nothing does.
+        SolveError: there is no cloud.
     """
     clouds = [(o.placement, c) for o in observations for c in o.clouds]
     if not clouds:
         raise SolveError("no cloud of a target to calibrate with")
     seen = {c.lidar for _, c in clouds}
     lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
-    # If the configured reference saw nothing, another LiDAR has to carry the mounting.
+    # If the configured reference saw no target, another LiDAR carries E.
     reference = config.reference if config.reference in lidars else lidars[0]
     poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds}))
     index = {pose: i for i, pose in enumerate(poses)}
@@ -250,16 +263,17 @@ def pose_problem(
         },
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
-        shares=np.concatenate([_shares(o, of_pose, config) for o in observations]),
+        stated_cov=_stated_covariances(trajectories, poses, config),
+        weights_of_views=np.concatenate([_view_weights(o, of_pose, config) for o in observations]),
     )
 
 
-def _shares(
+def _view_weights(
     observation: TargetObservation,
     T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3],
     config: Config,
 ) -> Array:
-    """What each cloud of a placement counts; by the guesses, which move all of a LiDAR's alike."""
+    """Weights for repeated views of a placement, at the guesses: their errors are common."""
     out = np.ones(len(observation.clouds))
     names = np.array([c.lidar for c in observation.clouds])
     for name in dict.fromkeys(names.tolist()):
@@ -274,8 +288,25 @@ def _shares(
     return out
 
 
+def _stated_covariances(
+    trajectories: Sequence[VehicleTrajectory],
+    poses: Sequence[tuple[int, int]],
+    config: Config,
+) -> Array | None:
+    """(n, 6, 6) covariances that the messages of given poses state; see `Problem.stated_cov`."""
+    out = np.full((len(poses), 6, 6), np.nan)
+    drives = np.array([drive for drive, _ in poses])
+    for d, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, GivenTrajectory) and (drives == d).any():
+            stamps = [stamp for drive, stamp in poses if drive == d]
+            cov = given_pose_covariances(trajectory.error_covariances(stamps), config)
+            if cov is not None:
+                out[drives == d] = cov
+    return out if np.isfinite(out).any() else None
+
+
 def _with_heave(information: Array) -> Array:
-    """Information (6 m, 6 m) on poses when each is off by its own heave, along the vehicle's z."""
+    """Information (6 m, 6 m) on poses with a heave of its own each, along the vehicle's z."""
     cov = np.linalg.inv(information)
     z = np.arange(5, len(cov), 6)
     cov[z, z] += HEAVE_SIGMA_M**2

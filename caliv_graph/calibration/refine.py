@@ -11,24 +11,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from caliv_graph.calibration.graph import CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import squares_without_own_pose
+from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
     WEIGHT_TOLERANCE,
     SolveState,
     base_graph,
     offset_from_guesses,
-    packed_solution,
-    reduce_to_extrinsics,
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, Iteration, Solution
-from caliv_graph.registration.mixture import ShapeQuadratic
+from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
     FINE_SIGMA_M,
     JointRegistration,
@@ -43,8 +43,8 @@ from caliv_graph.uncertainty.observability import (
 )
 
 SHAPES_BEGUN_AGAIN = 8
-"""Iteration of the joint loop after which normals and mixture begin anew, now that annealing has
-come to its end, or near it."""
+"""Iteration of the joint loop after which normals and mixture are made anew: annealing is at its
+end, or near it."""
 
 REFINEMENTS = 20
 """Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
@@ -54,13 +54,13 @@ LAST_REFINEMENTS = 4
 """Iterations that are left at the noise level, at least."""
 
 DECIDED_AFTER = 9
-"""Iterations after which the number of undetermined directions is no longer changed, so that one
-at the threshold does not make the estimate jump for ever."""
+"""Iteration from which the number of undetermined directions is fixed, so that a direction at the
+threshold does not make the estimate jump for ever."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
 STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
-what 100 clouds of a chair can tell. Or else in joint standard deviations of the extrinsics."""
+the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
 
 def refinements(sigma_range_m: float) -> int:
@@ -84,75 +84,116 @@ def refined(
         advance: called after each.
 
     Raises:
-        SolveError: a pose or a target is tied to nothing.
+        SolveError: a pose or a target has no measurement.
     """
-    problem, config = state.problem, state.config
-    prior = problem.guess_information()
-    steady = base_graph(state)
+    loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
     _begin_shapes(state, states, normals=False)
-    undetermined: int | None = None
     course: list[Iteration] = []
-    converged, iteration = False, 0
-    while iteration < most and not converged:
-        iteration += 1
-        lines = linearise_clouds(problem, state.values)
-        shapes = _expect(states, lines, state.turns)
+    converged = False
+    while len(course) < most and not converged:
+        course.append(loop.iterate(len(course) + 1))
+        converged = loop.has_converged(course[-1], len(course))
+        advance()
+    return replace(
+        _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
+    )
+
+
+@dataclass
+class _Loop:
+    """What the iterations of the joint loop carry along.
+
+    Attributes:
+        state: values, weights, noise.
+        states: the registration of each placement.
+        base: the graph without clouds and guesses, which stays the same.
+        prior: (6n, 6n) information of the guesses, vehicle axes.
+        undetermined: number of undetermined directions once it is fixed; None: not yet.
+    """
+
+    state: SolveState
+    states: Sequence[JointRegistration]
+    base: CalibrationGraph
+    prior: Array
+    undetermined: int | None = None
+
+    def linearised(self) -> tuple[_Shapes, Reduced]:
+        """E-step at the poses that the graph predicts, and the graph with its quadratic."""
+        state = self.state
+        lines = linearise_clouds(state.problem, state.values)
+        shapes = _expect(self.states, lines, state.turns)
         clouds = shapes.joint(state.scale)
         begun = time.perf_counter()
-        reduced = reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
-        lost: int | None = None
-        if config.solve.mode == "auto":
-            split = spectrum(reduced.D, prior, undetermined)
-            lost = int(split.undetermined.sum())
-            if iteration >= DECIDED_AFTER:
-                undetermined = int(split.undetermined.sum())
-            step = step_with_prior_in_null_space(
-                reduced.D, reduced.c, prior, offset_from_guesses(state), split
-            )
-        else:
-            step = reduced.step_with(prior, offset_from_guesses(state))
-        wanted = _shape_measurements(state, shapes)
-        single = wanted.information / problem.view_weights()[:, None, None]
-        squared = squares_without_own_pose(
-            problem, lines, -wanted.pull, single, state.values, state.noise
-        )
+        reduced = reduce_to_extrinsics(state.problem, state.values, self.base, clouds, lines)
+        state.graph_seconds += time.perf_counter() - begun
+        return shapes, reduced
+
+    def iterate(self, number: int) -> Iteration:
+        """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
+        state = self.state
+        shapes, reduced = self.linearised()
+        begun = time.perf_counter()
+        step, lost = self._step(reduced, number)
+        squared = self._squares(shapes, reduced.lines)
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
-        new = linearise_clouds(problem, state.values)
-        for shape, (R, t) in zip(states, per_placement(states, new), strict=True):
+        new = linearise_clouds(state.problem, state.values)
+        for shape, (R, t) in zip(self.states, per_placement(self.states, new), strict=True):
             shape.maximise(R, t)
-        change = 0.0
-        if config.robust.kernel != "tls":
-            # Truncated weights stay as the annealed solve of the pose factors left them: a cloud
-            # that is dropped has no say in the shape that it would then be judged by.
-            explained = np.concatenate([explained_part(shape.inlier_ratio) for shape in states])
-            change = state.weights.update(squared, explained)
-        _hand_weights(state, states)
-        if iteration == SHAPES_BEGUN_AGAIN:
-            _begin_shapes(state, states, normals=True)
+        change = self._weigh(squared)
+        if number == SHAPES_BEGUN_AGAIN:
+            _begin_shapes(state, self.states, normals=True)
         size = np.abs(step.reshape(-1, 6))
-        sigmas = float(np.sqrt(step @ (reduced.D + prior) @ step))
-        small = size[:, :3].max() < STEP_TOLERANCE[0] and size[:, 3:].max() < STEP_TOLERANCE[1]
-        converged = bool(
-            iteration > SHAPES_BEGUN_AGAIN
-            and all(s.finest for s in states)
-            and (small or sigmas < STEP_SIGMAS)
-            and change < 10.0 * WEIGHT_TOLERANCE
+        sigmas = float(np.sqrt(step @ (reduced.D + self.prior) @ step))
+        return Iteration(float(size[:, :3].max()), float(size[:, 3:].max()), sigmas, change, lost)
+
+    def _step(self, reduced: Reduced, number: int) -> tuple[Array, int | None]:
+        """The step (6n,) of the extrinsics; and in mode `auto` the undetermined directions."""
+        offset = offset_from_guesses(self.state)
+        if self.state.config.solve.mode != "auto":
+            return reduced.step_with(self.prior, offset), None
+        split = spectrum(reduced.D, self.prior, self.undetermined)
+        lost = int(split.undetermined.sum())
+        if number >= DECIDED_AFTER:
+            self.undetermined = lost
+        step = step_with_prior_in_null_space(reduced.D, reduced.c, self.prior, offset, split)
+        return step, lost
+
+    def _squares(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
+        """(J,) squared residuals of the clouds, to weigh them by."""
+        state = self.state
+        wanted = _shape_measurements(state, shapes)
+        single = wanted.information / state.problem.view_weights()[:, None, None]
+        return squares_without_own_pose(
+            state.problem, lines, -wanted.pull, single, state.values, state.noise
         )
-        last_step = (float(size[:, :3].max()), float(size[:, 3:].max()))
-        course.append(Iteration(*last_step, sigmas, change, lost))
-        advance()
-    solution = _refined_solution(
-        state, states, steady, prior, undetermined, iteration, converged, last_step
-    )
-    return replace(solution, course=tuple(course))
+
+    def _weigh(self, squared: Array) -> float:
+        """Updates the robust weights; their largest change."""
+        state, change = self.state, 0.0
+        if state.weights.kernel.in_joint_loop:
+            explained = np.concatenate(
+                [explained_part(shape.inlier_ratio) for shape in self.states]
+            )
+            change = state.weights.update(squared, explained)
+        _hand_weights(state, self.states)
+        return change
+
+    def has_converged(self, last: Iteration, number: int) -> bool:
+        """Whether the loop may end after an iteration."""
+        small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
+        return bool(
+            number > SHAPES_BEGUN_AGAIN
+            and all(s.finest for s in self.states)
+            and (small or last.sigmas < STEP_SIGMAS)
+            and last.weight_change < 10.0 * WEIGHT_TOLERANCE
+        )
 
 
 def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
-    """A new mixture, and if asked for new normals, where the graph puts the clouds.
+    """A new mixture, and if asked for new normals, at the poses of the graph.
 
-    EM ends near where it starts: what it starts from shall not depend on the way that the
-    registration took from the initial guess.
+    EM ends near its start: the start shall not depend on the initial guess.
     """
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
@@ -233,10 +274,10 @@ class _Shapes:
 
 @dataclass
 class _ShapeMeasurements:
-    """What each cloud by itself, given the shape at its best, would have its pose be.
+    """The pose of each cloud by itself, given the shape.
 
     Attributes:
-        pull: (J, 6) left perturbations that lead there from the predicted poses.
+        pull: (J, 6) left perturbations from the predicted poses to these.
         information: (J, 6, 6) without robust weights.
     """
 
@@ -249,7 +290,7 @@ def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurement
     weights = state.weights.values
     blocks, gradient = shapes.single
     information = blocks / weights[:, None, None] / state.scale**2
-    # A sliver of a ridge: a cloud that sees one plane of the target has a singular block.
+    # A small ridge: a cloud that sees one plane of the target has a singular block.
     ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
     information = information + ridge[:, None, None] * np.eye(6)
     force = gradient / weights[:, None] / state.scale**2
@@ -257,33 +298,22 @@ def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurement
     return _ShapeMeasurements(pull, information)
 
 
-def _refined_solution(
-    state: SolveState,
-    states: Sequence[JointRegistration],
-    steady: gtsam.NonlinearFactorGraph,
-    prior: Array,
-    undetermined: int | None,
-    iterations: int,
-    converged: bool,
-    last_step: tuple[float, float],
-) -> Solution:
+def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: bool) -> Solution:
     """Reads covariance, residuals and registrations off the last estimate."""
-    problem = state.problem
-    lines = linearise_clouds(problem, state.values)
-    shapes = _expect(states, lines, state.turns)
-    clouds = shapes.joint(state.scale)
+    state, problem = loop.state, loop.state.problem
+    shapes, reduced = loop.linearised()
     begun = time.perf_counter()
-    reduced = reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
     if state.config.solve.mode == "auto":
-        split = spectrum(reduced.D, prior, undetermined)
-        cov = covariance_with_prior_in_null_space(prior, split)
+        split = spectrum(reduced.D, loop.prior, loop.undetermined)
+        cov = covariance_with_prior_in_null_space(loop.prior, split)
     else:
-        cov = np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
+        cov = np.asarray(np.linalg.inv(reduced.D + loop.prior), np.float64)
     pulls = _shape_measurements(state, shapes)
-    # The robust weights of the clouds are kept apart from what they say.
+    # The robust weights of the clouds are kept apart from their information.
     weighted = shapes.single[0]
+    last_step = (last.turn_rad, last.shift_m)
     registrations, start = [], 0
-    for shape, (R, t), (H, _) in zip(states, shapes.poses, shapes.joints, strict=True):
+    for shape, (R, t), (H, _) in zip(loop.states, shapes.poses, shapes.joints, strict=True):
         part = slice(start, start + shape.clouds.count)
         start = part.stop
         R, t = left_step(R, t, pulls.pull[part])
@@ -294,7 +324,7 @@ def _refined_solution(
     return packed_solution(
         state,
         registrations,
-        steady,
+        reduced,
         pulls.information,
         reduced.D,
         cov,
@@ -302,5 +332,4 @@ def _refined_solution(
         iterations=iterations,
         converged=converged,
         time_offsets=reduced.time_offsets(problem, cov),
-        gradient_data=reduced.c,
     )

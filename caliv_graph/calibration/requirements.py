@@ -6,13 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from caliv_graph.config.model import LIMIT_KEY, Config
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.covariance import parent_axes_covariance
-from caliv_graph.products import Array, Calibration
-from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
+from caliv_graph.products import Calibration
+from caliv_graph.uncertainty.pairs import (
+    pair_determined,
+    sensor_pairs,
+    sigmas_s2s,
+    sigmas_s2v,
+)
 
 
 def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
@@ -51,19 +53,6 @@ def _unmet(calibration: Calibration, requirement: str) -> list[str]:
         if lost:
             out.append(f"require {requirement}: {', '.join(lost)} of {what} not determined")
     return out
-
-
-def sigmas_s2v(calibration: Calibration, name: str) -> Array:
-    """(6,) sigmas of a LiDAR's mounting in vehicle axes, rad and m."""
-    lidar = calibration.lidars[name]
-    return np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
-
-
-def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
-    """(6,) sigmas of `source` against `to` in vehicle axes, rad and m."""
-    cov = pair_covariance(calibration, source, to)
-    T_vehicle_source = calibration.lidars[source].T_vehicle_lidar
-    return np.sqrt(np.diag(parent_axes_covariance(T_vehicle_source, cov)))
 
 
 def _over_limit(calibration: Calibration, key: str, limit: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""Clouds that were registered to the wrong place, found by what all clouds say together."""
+"""Data snooping: clouds that were registered to the wrong place, found by the joint information."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    adjusted_residuals,
-    dense_system,
-    linearise_clouds,
-    with_given_poses,
-)
+from caliv_graph.calibration.graph import with_given_poses
+from caliv_graph.calibration.kernels import DOF
+from caliv_graph.calibration.linear import adjusted_residuals, dense_system, linearise_clouds
 from caliv_graph.calibration.noise import fit_pose_noise
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.robust import DOF, MIN_WEIGHT, deletion_squares, own_blocks
+from caliv_graph.calibration.robust import MIN_WEIGHT, deletion_squares, own_blocks
 from caliv_graph.calibration.solve import (
     SolveState,
     cloud_residuals,
@@ -29,32 +26,31 @@ from caliv_graph.calibration.solve import (
 from caliv_graph.products import Array, BoolArray, Registration
 
 AGREEING = 0.75
-"""Part of the clouds, those that agree best, by whose noise all are judged first."""
+"""Part of the clouds, those that agree best, that the first noise estimate uses."""
 
 MOST_LOST = 0.25
-"""Part of a LiDAR's clouds that can be lost for reasons of their own; from a tenth on they are told
-as a contradiction (`uncertainty.consistency.OUTLIERS`)."""
+"""Part of a LiDAR's clouds that may be lost one by one. From a tenth on they are reported as a
+contradiction (`uncertainty.consistency.OUTLIERS`)."""
 
 MIN_REDUNDANCY = 0.5
-"""Weight below which a cloud says nothing where it is not clear which are wrong: the joint
-information has the longer lever, and less than half a say would still bend all."""
+"""Weight below which a cloud is dropped where it is not clear which clouds are wrong: even
+down-weighted, it would bias the solution by the joint information."""
 
 SNOOPINGS = 6
-"""Rounds of dropping clouds and measuring the noise without them, at most."""
+"""Rounds of dropping clouds and estimating the noise without them, at most."""
 
 
 def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> None:
-    """Weighs the clouds anew by their joint information, and measures the noise without the lost.
+    """Weighs the clouds by their joint information, and estimates the noise without the lost ones.
 
-    The graph of single pose factors judges a cloud by what its own pose does not explain, and does
-    not know what it shares with the others: of the clouds that were registered to the wrong place
-    it lets some through that the joint information, with its longer lever, cannot bear. And these
-    have made the fitted noise larger, that of the registration or that of the poses, and would hide
-    behind it: clouds are judged by the noise of those that agree best.
+    The graph of single pose factors judges a cloud by the residual of its own pose and ignores the
+    correlation between clouds. So it misses some clouds that were registered to the wrong place
+    and that bias the joint solution. These also widen the fitted noise, of the registration or of
+    the poses, and hide in it: clouds are judged by the noise of those that agree best.
 
-    If a LiDAR would lose more than MOST_LOST, it is not its clouds that are wrong but its clock,
-    its mount or the target, and that is to be told (`score_tests`): noise and values stay as they
-    are, and of the weights those below MIN_REDUNDANCY become none. Kernel `none` changes nothing.
+    If a LiDAR would lose more than MOST_LOST of its clouds, its clock, its mount or the target is
+    wrong rather than the clouds, and `score_tests` reports it: noise and values stay as they are,
+    and weights below MIN_REDUNDANCY become zero. Kernel `none` changes nothing.
 
     Args:
         state: of `solve_registered`; gets new weights and values, and where clouds are lost new
@@ -64,7 +60,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     Raises:
         SolveError: the graph is singular.
     """
-    if state.config.robust.kernel == "none" or not state.sound.any():
+    if not state.weights.kernel.drops or not state.sound.any():
         return
     problem, fitted = state.problem, (state.noise, state.scale)
     sound, weights, values = state.sound, state.weights.values, state.values
@@ -73,8 +69,8 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     explained = explained_parts(registrations)
     whole = np.maximum(explained, MIN_WEIGHT)
     state.weights.values = whole
-    squares, freedom = deletion_squares(*_left_over(state, registrations, measured))
-    # Where less is controlled there is less to be off by.
+    squares, freedom = deletion_squares(*_adjusted(state, registrations, measured))
+    # Fewer controlled directions give smaller squares.
     squares = (squares * DOF / np.maximum(freedom, 1))[sound]
     by = np.zeros(problem.clouds, dtype=bool)
     by[np.flatnonzero(sound)[squares <= np.quantile(squares, AGREEING)]] = True
@@ -87,11 +83,11 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
             state.noise, state.scale = fit_pose_noise(
                 problem, measured, single, by, given, state.config.noise
             )
-        # Clouds that are a metre off have bent the values so much that all others seem to be off.
+        # Clouds that are a metre off bend the values so much that all others seem to be off.
         state.weights.values = np.where(by, whole, MIN_WEIGHT)
         settle(state, registrations, step_of_all(state))
         state.weights.values = whole
-        kept = state.weights.snoop(*_left_over(state, registrations, measured), explained)
+        kept = state.weights.snoop(*_adjusted(state, registrations, measured), explained)
         if _too_many(problem, ~kept & (explained > 0.5)):
             state.noise, state.scale = fitted
             state.sound, state.values = sound, values
@@ -103,16 +99,16 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
 
 
 def _too_many(problem: Problem, lost: BoolArray) -> bool:
-    """Whether more than MOST_LOST of a LiDAR's clouds are."""
+    """Whether a LiDAR loses more than MOST_LOST of its clouds."""
     clouds = np.bincount(problem.cloud_lidar, minlength=len(problem.lidars))
     gone = np.bincount(problem.cloud_lidar, lost, minlength=len(problem.lidars))
     return bool((gone > MOST_LOST * clouds).any())
 
 
-def _left_over(
+def _adjusted(
     state: SolveState, registrations: Sequence[Registration], measured: Sequence[gtsam.Pose3]
 ) -> tuple[Array, Array, Array]:
-    """W and v of `adjusted_residuals`, and (J, 6, 6) what each cloud says with the others held."""
+    """W and v of `adjusted_residuals`, and (J, 6, 6) information of each cloud, the others held."""
     problem = state.problem
     H = joint_information(state, registrations)
     lines = linearise_clouds(problem, state.values)

@@ -1,14 +1,14 @@
-"""The graph solve that every mode starts from, and what all modes share of it.
+"""The graph solve of registered clouds, and what all modes use of it.
 
 The paper's minimisation: one pose factor per registered cloud, robust weights, noise levels from
-the data. Then the problem reduced to the extrinsics, which the stages step on and read covariances
-off, and the result as it is passed on.
+the data. Then the problem reduced to the extrinsics, for steps and covariances, and the packed
+result.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -16,27 +16,22 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.graph import (
-    CloudLinearisation,
-    DenseSystem,
-    add_shape,
+    CalibrationGraph,
     cloud_graph,
-    dense_system,
     initial_values,
-    linearise_clouds,
     merged,
     motion_graph,
     offset_graph,
     optimise,
     pose_graph,
     prior_graph,
-    retract,
     with_given_poses,
 )
-from caliv_graph.calibration.ground import (
-    GroundWeights,
-    ground_graph,
-    ground_values,
-    ground_weights,
+from caliv_graph.calibration.ground import GroundWeights, ground_graph, ground_values
+from caliv_graph.calibration.ground_weights import ground_weights
+from caliv_graph.calibration.linear import (
+    CloudLinearisation,
+    linearise_clouds,
 )
 from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
@@ -45,11 +40,10 @@ from caliv_graph.calibration.noise import (
     sound_clouds,
     squares_without_own_pose,
 )
-from caliv_graph.calibration.problem import Problem, moved_map
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config.model import Config, RobustConfig
-from caliv_graph.conventions import key_offset, key_target, key_vehicle
-from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import (
     Array,
@@ -57,7 +51,6 @@ from caliv_graph.products import (
     GroundObservation,
     PoseNoise,
     Registration,
-    Solution,
 )
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry
 
@@ -76,12 +69,12 @@ WEIGHT_TOLERANCE = 0.02
 """Largest change of a weight at which reweighting stops."""
 
 OFFSET_DETERMINED_S = 0.005
-"""A time offset with a larger sigma, a centimetre at 2 m/s, is not told by the drive."""
+"""A time offset with a larger sigma, a centimetre at 2 m/s, is not determined by the drive."""
 
 
 @dataclass
 class SolveState:
-    """What the solve carries along."""
+    """State of the solve."""
 
     problem: Problem
     config: Config
@@ -89,62 +82,13 @@ class SolveState:
     noise: PoseNoise
     scale: float
     weights: RobustWeights
-    motion: gtsam.NonlinearFactorGraph
+    motion: CalibrationGraph
     sound: BoolArray
-    """(J,) the clouds that the noise was measured by."""
+    """(J,) the clouds that the noise was estimated from."""
     grounds: tuple[GroundObservation, ...] = ()
     turns: tuple[Symmetry | None, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
-
-
-@dataclass
-class Reduced:
-    """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
-
-    `D` and `c`: the quadratic `e^T D e / 2 - c^T e` of the data in a step e of the extrinsics.
-    """
-
-    D: Array
-    c: Array
-    _to_axes: Array
-    _keys: tuple[int, ...]
-    _G: Array
-    _g: Array
-    _values: gtsam.Values
-    _system: DenseSystem
-
-    def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
-        """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
-
-        Args:
-            problem: which they are.
-            cov: (6n, 6n) of the extrinsics, vehicle axes.
-        """
-        inverse = np.linalg.inv(self._to_axes)
-        tangent = inverse @ cov @ inverse.T
-        out = {}
-        for i, name in enumerate(problem.lidars):
-            if name in problem.offsets:
-                variance = self._system.covariance_of(key_offset(i), tangent)[0, 0]
-                value = float(self._values.atVector(key_offset(i))[0])
-                out[name] = (value, float(np.sqrt(variance)))
-        return out
-
-    def step_with(self, prior: Array, offset: Array) -> Array:
-        """The step (6n,) that data and guesses together call for.
-
-        Args:
-            prior: (6n, 6n) information of the guesses.
-            offset: (6n,) where the estimate is from them.
-        """
-        return np.asarray(np.linalg.solve(self.D + prior, self.c - prior @ offset), np.float64)
-
-    def move(self, step: Array) -> gtsam.Values:
-        """All values after a step (6n,) of the extrinsics, the rest following."""
-        tangent = np.linalg.solve(self._to_axes, step)
-        rest = self._g - self._G @ tangent
-        return retract(self._values, self._keys, np.concatenate([rest, tangent]))
 
 
 def solve_registered(
@@ -157,11 +101,11 @@ def solve_registered(
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
 
     Args:
-        problem: what takes part.
+        problem: LiDARs, poses and clouds.
         registrations: of its placements, in order.
         grounds: the ground as the LiDARs saw it.
         config: kernels, noise, ground.
-        turns: per placement the turn that its target looks the same after; empty: none known.
+        turns: per placement the continuous symmetry of its target; empty: none.
 
     Raises:
         SolveError: the graph is singular.
@@ -181,21 +125,21 @@ def solve_registered(
         turns=turns,
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
-    # Before the noise is known, weights would take the slow error of the poses for outliers, and
-    # the variances would then find none of it: solve plainly, and leave out what is far off.
+    # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and
+    # the noise fit would find none of it: solve without weights, and leave out what is far off.
     plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
-    state.weights, kernel = plain, state.weights
+    state.weights, robust = plain, state.weights
     explained = explained_parts(registrations)
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
-    # How far a cloud by itself may be off: what it shares with others from its place included.
+    # Of a cloud by itself, with the error that it has in common with others from its place.
     single = information / problem.view_weights()[:, None, None]
     state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
     state.noise, state.scale = fit_pose_noise(
         problem, measured, single, state.sound, given, config.noise
     )
-    state.weights = kernel
-    rounds = REWEIGHTINGS if config.robust.kernel != "tls" else 4 * REWEIGHTINGS
+    state.weights = robust
+    rounds = REWEIGHTINGS * state.weights.kernel.patience
     _reweight(state, measured, information, explained, rounds)
     state.graph_seconds += time.perf_counter() - begun
     return state
@@ -224,7 +168,7 @@ def _reweight(
             squares_without_own_pose(problem, lines, r, single, state.values, state.noise),
             explained,
         )
-        if change < WEIGHT_TOLERANCE and state.weights.settled:
+        if change < WEIGHT_TOLERANCE and state.weights.kernel.settled:
             break
 
 
@@ -233,8 +177,8 @@ def with_determined_offsets(
 ) -> tuple[Problem, dict[str, float]]:
     """The problem without the time offsets that the drive does not determine.
 
-    At constant speed on an arc an offset of a LiDAR is the same as its own x and yaw: to free it
-    would lose what the drive does tell of them (SPEC 4).
+    At constant speed on an arc an offset of a LiDAR has the same effect as its own x and yaw: with
+    the offset free the drive would not determine them.
 
     Args:
         state: of `solve_registered`, offsets free.
@@ -254,7 +198,7 @@ def with_determined_offsets(
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
-    """What registered clouds, motion and ground say of the extrinsics where the solve is.
+    """The problem of registered clouds, motion and ground, reduced to the extrinsics.
 
     Args:
         state: of `solve_registered`.
@@ -264,7 +208,7 @@ def reduced_registered(state: SolveState, registrations: Sequence[Registration])
 
 
 def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Callable[[], Reduced]:
-    """`reduced_registered` to be asked again as the values move, weights and noise as they are."""
+    """`reduced_registered` for values that move, weights and noise fixed."""
     problem, steady = state.problem, base_graph(state)
     H, measured = joint_information(state, registrations), measured_poses(registrations)[0]
 
@@ -286,13 +230,13 @@ def settle(
     Args:
         state: of `solve_registered`; its values are moved.
         registrations: what it was given.
-        step: (6 n,) of the extrinsics, vehicle axes, from what is said of them where they are.
+        step: (6 n,) of the extrinsics, vehicle axes, from the problem reduced to them.
 
     Returns:
         The last linearisation, the last step, and whether that was small.
 
     Raises:
-        SolveError: a pose or a target is tied to nothing.
+        SolveError: a pose or a target has no measurement.
     """
     prior = state.problem.guess_information()
     reduction = _reduction(state, registrations)
@@ -312,10 +256,10 @@ def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
 
 
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
-    """(6 J, 6 J) information of all registered poses, with what they share and their weights.
+    """(6 J, 6 J) joint information of all registered poses, with robust weights.
 
     Args:
-        state: weights, scale of the registration's sigmas, turns that are forgotten.
+        state: weights, scale of the registration's sigmas, symmetries that are marginalised.
         registrations: of the placements, in order.
     """
     turns = state.turns or [None] * len(registrations)
@@ -337,8 +281,8 @@ def measured_poses(
 
     Args:
         registrations: of the placements, in order.
-        turns: per placement the turn that its target looks the same after, and that the
-            information is to forget; empty: none.
+        turns: per placement the continuous symmetry of its target, to be marginalised; empty:
+            none.
     """
     poses = [T for r in registrations for T in r.T_target_lidar]
     information = []
@@ -368,18 +312,13 @@ def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) 
     )
 
 
-def _whitened(residuals: Array, information: Array) -> Array:
-    """Residuals (J, 6), whitened by the root of their (J, 6, 6) information."""
-    return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
-
-
 def explained_parts(registrations: Sequence[Registration]) -> Array:
     """Factors (J,) on the weights of all clouds by how much of each is target at all."""
     return np.concatenate([explained_part(r.inlier_ratio) for r in registrations])
 
 
-def base_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
-    """What stays the same while clouds are weighed anew: poses, ground and trusted extrinsics."""
+def base_graph(state: SolveState) -> CalibrationGraph:
+    """The graph without clouds and guesses: poses, ground, trusted extrinsics."""
     problem = state.problem
     return merged(
         pose_graph(problem, state.noise, state.motion),
@@ -389,46 +328,19 @@ def base_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
     )
 
 
-def guessed_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
-    """What stays the same, and the guesses of the extrinsics that are not trusted."""
+def guessed_graph(state: SolveState) -> CalibrationGraph:
+    """`base_graph`, and the guesses of the extrinsics that are estimated."""
     return merged(base_graph(state), _guess_graph(state.problem))
 
 
-def _guess_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """The guesses of the extrinsics that are not trusted."""
+def _guess_graph(problem: Problem) -> CalibrationGraph:
+    """The guesses of the extrinsics that are estimated."""
     return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
 
 
-def _ground_graph(state: SolveState) -> gtsam.NonlinearFactorGraph:
-    """What the ground says, as far as it is believed."""
+def _ground_graph(state: SolveState) -> CalibrationGraph:
+    """The ground's factors with their weights."""
     return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
-
-
-def reduce_to_extrinsics(
-    problem: Problem,
-    values: gtsam.Values,
-    graph: gtsam.NonlinearFactorGraph,
-    clouds: tuple[Array, Array],
-    lines: CloudLinearisation,
-) -> Reduced:
-    """Linearises a graph and the clouds' quadratic, and eliminates all but the extrinsics.
-
-    Args:
-        problem: what takes part.
-        values: where to linearise.
-        graph: everything but the clouds and the guesses.
-        clouds: (6 J, 6 J) and (6 J,) their quadratic in left perturbations of their poses.
-        lines: how these move with the variables.
-
-    Raises:
-        SolveError: a pose or a target is tied to nothing.
-    """
-    system = add_shape(dense_system(problem, graph, values), lines, *clouds)
-    D, c, G, g = system.schur()
-    Q = problem.to_vehicle_axes(values)
-    inverse = np.linalg.inv(Q)
-    D = inverse.T @ D @ inverse
-    return Reduced(0.5 * (D + D.T), inverse.T @ c, Q, system.keys, G, g, values, system)
 
 
 def offset_from_guesses(state: SolveState) -> Array:
@@ -440,82 +352,3 @@ def offset_from_guesses(state: SolveState) -> Array:
             for n in problem.lidars
         ]
     )
-
-
-def packed_solution(
-    state: SolveState,
-    registrations: Sequence[Registration],
-    steady: gtsam.NonlinearFactorGraph,
-    information: Array,
-    information_data: Array,
-    cov: Array,
-    held: tuple[str, ...],
-    iterations: int,
-    converged: bool,
-    time_offsets: Mapping[str, tuple[float, float]],
-    gradient_data: Array,
-) -> Solution:
-    """Packs the result, and the whole graph: what is steady, the guesses, the weighted clouds.
-
-    Args:
-        state: after its last step.
-        registrations: the clouds where they have come to lie.
-        steady: `base_graph` of the last step.
-        information: (J, 6, 6) of the graph's pose factors, without robust weights.
-        information_data: (6 n, 6 n) what the data say of the extrinsics, vehicle axes.
-        cov: (6 n, 6 n) of the result, vehicle axes.
-        held: axes of the reference LiDAR that were held at the guess.
-        iterations: of the loop.
-        converged: whether it came to rest.
-        time_offsets: LiDAR -> offset and sigma, seconds.
-        gradient_data: (6 n,) of the data at the result.
-
-    Raises:
-        SolveError: the covariance is not finite.
-    """
-    problem, measured = state.problem, measured_poses(registrations)[0]
-    graph = merged(
-        steady,
-        _guess_graph(problem),
-        cloud_graph(problem, measured, information * state.weights.values[:, None, None]),
-    )
-    if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
-        raise SolveError("the covariance of the extrinsics is not finite")
-    left = cloud_residuals(linearise_clouds(problem, state.values), measured)
-    white = _whitened(left, information)
-    cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
-    return Solution(
-        mode=state.config.solve.mode,
-        lidars=problem.lidars,
-        reference=problem.reference,
-        T_vehicle_lidar={n: problem.extrinsic(state.values, n) for n in problem.lidars},
-        T_map_vehicle={
-            pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
-            for i, pose in enumerate(problem.poses)
-        },
-        T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
-        registrations=tuple(registrations),
-        cloud_weights=tuple(np.split(state.weights.values, cuts)),
-        residuals=tuple(np.split(white, cuts)),
-        pose_noise=state.noise if problem.given().any() else None,
-        registration_scale=state.scale,
-        information_data=information_data,
-        information_prior=problem.guess_information(),
-        cov=cov,
-        held=held,
-        iterations=iterations,
-        converged=converged,
-        time_offsets=time_offsets,
-        graph=graph,
-        values=state.values,
-        gradient_data=gradient_data,
-    )
-
-
-def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:
-    """T_target_map of a placement in the map of its drive."""
-    problem = state.problem
-    cloud = int(np.flatnonzero(problem.cloud_placement == placement)[0])
-    drive = problem.poses[problem.cloud_pose[cloud]][0]
-    T_target_map = state.values.atPose3(key_target(placement))
-    return T_target_map.compose(gtsam.Pose3(gtsam.Rot3(), -problem.origins_map[drive]))

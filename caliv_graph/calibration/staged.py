@@ -1,22 +1,21 @@
-"""The paper's two stages on the registered clouds: sensor to sensor, then the rotation alone."""
+"""The paper's two stages on the registered clouds: sensor to sensor, then rotation to vehicle."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import (
     COUPLED_STEPS,
-    Reduced,
     SolveState,
-    base_graph,
     measured_poses,
-    packed_solution,
     reduced_registered,
     settle,
     step_of_all,
@@ -31,14 +30,15 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     Stage 1 estimates all S_a with E free under its prior. Stage 2 fixes S_a, holds the reference
     LiDAR's translation at its guess and solves its rotation.
 
-    The translation is reported as the guess has it, but the guess may be wrong by its sigma, and a
-    fit that denies this bends the rotation to make up for it: on an arc 50 mm of y become 10 mrad
-    of roll. So its error is *considered* (Schmidt 1966): it takes part with the guess's sigma
-    while the rotation is solved for, and is not reported.
+    The reported translation is the guess. The guess is wrong by its sigma, and a fit that ignores
+    this bends the rotation instead: on an arc 50 mm of y become 10 mrad of roll. So its error is
+    *considered* (Schmidt 1966): it is free under the guess's sigma while the rotation is solved
+    for, and is not reported.
 
-    Both stages take the registration's joint information. Its blocks, one pose factor per cloud,
-    say twice what the clouds share, since the shape was estimated from them: where two LiDARs saw
-    different skins of the target, blocks tie them together and the joint information does not.
+    Both stages use the registration's joint information. Its diagonal blocks, one pose factor per
+    cloud, count the common information twice, since the shape was estimated from the same clouds:
+    where two LiDARs saw different skins of the target, blocks tie them together and the joint
+    information does not.
 
     Args:
         state: of `solve_registered`; weights and noise are measured anew.
@@ -54,21 +54,7 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     reduced, last, converged = settle(state, registrations, step_of_all(state))
     first, information_data = state.values, reduced.D
 
-    guess = problem.guesses[problem.reference]
-    certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
-
-    def turn(reduced: Reduced) -> Array:
-        E = state.values.atPose3(key_extrinsic())
-        R = E.rotation().matrix()
-        Q = problem.to_vehicle_axes(state.values)[:, :6]
-        A, b = Q.T @ reduced.D @ Q, Q.T @ reduced.c
-        # The guess has a say in the translation alone: the paper's second stage minimises the
-        # data's error over the rotation.
-        A[3:, 3:] += R.T @ np.diag(certainty) @ R
-        b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
-        return np.asarray(Q @ np.linalg.solve(A, b))
-
-    reduced, second, turned = settle(state, registrations, turn)
+    reduced, second, turned = settle(state, registrations, _second_stage(state))
     if not (converged and turned):
         moved = np.abs((second if converged else last).reshape(-1, 6))
         step = float(moved[:, :3].max()), float(moved[:, 3:].max())
@@ -76,17 +62,17 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
             replace(r, converged=False, last_step=step, iterations=COUPLED_STEPS)
             for r in registrations
         ]
-    solved = state.values.atPose3(key_extrinsic())
+    solved, guess = state.values.atPose3(key_extrinsic()), problem.guesses[problem.reference]
     state.values = gtsam.Values(state.values)
     state.values.update(key_extrinsic(), gtsam.Pose3(solved.rotation(), guess.translation()))
     cov = _staged_covariance(state, information_data, prior, first)
     offsets = reduced.time_offsets(problem, cov)
-    gradient_data = reduced_registered(state, registrations).c
+    reduced = reduced_registered(state, registrations)
     state.graph_seconds += time.perf_counter() - begun
     return packed_solution(
         state,
         registrations,
-        base_graph(state),
+        reduced,
         measured_poses(registrations, state.turns)[1] / state.scale**2,
         information_data,
         cov,
@@ -94,8 +80,27 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
         iterations=1,
         converged=converged and turned,
         time_offsets=offsets,
-        gradient_data=gradient_data,
     )
+
+
+def _second_stage(state: SolveState) -> Callable[[Reduced], Array]:
+    """For `settle`: the step of E with all S_a fixed and the error of the held translation free."""
+    problem = state.problem
+    guess = problem.guesses[problem.reference]
+    certainty = problem.prior_sigmas[problem.reference][3:] ** -2.0
+
+    def step(reduced: Reduced) -> Array:
+        E = state.values.atPose3(key_extrinsic())
+        R = E.rotation().matrix()
+        Q = problem.to_vehicle_axes(state.values)[:, :6]
+        A, b = Q.T @ reduced.D @ Q, Q.T @ reduced.c
+        # The guess weighs on the translation alone: the paper's second stage minimises the data's
+        # error over the rotation.
+        A[3:, 3:] += R.T @ np.diag(certainty) @ R
+        b[3:] -= R.T @ (certainty * (E.translation() - guess.translation()))
+        return np.asarray(Q @ np.linalg.solve(A, b))
+
+    return step
 
 
 def _staged_covariance(
@@ -104,8 +109,8 @@ def _staged_covariance(
     """Covariance of the staged result, vehicle axes.
 
     S_a has the covariance of stage 1, the held translation that of the guess. The rotation is
-    solved with the translation considered: its error is the data's, and what a translation that
-    is off by its sigma pulls along (0.1 m turn the yaw by 0.1 m over the turning radius, SPEC 4).
+    solved with the translation considered: its error is that of the data and that of a
+    translation that is off by its sigma (0.1 m rotate the yaw by 0.1 m over the turning radius).
     """
     problem = state.problem
     n = len(problem.lidars)

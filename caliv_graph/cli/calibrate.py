@@ -43,15 +43,12 @@ def calibrate(
     from caliv_graph.batch.job import check_guesses, open_recordings, run_job
     from caliv_graph.common.exits import DONE, exit_code
     from caliv_graph.common.files import check_output_folder, output_folder
+    from caliv_graph.common.json_text import without_infinities
     from caliv_graph.config.load import load_config
     from caliv_graph.report.log import stage_documents
     from caliv_graph.report.tables import calibration_table
-    from caliv_graph.results.files import (
-        RESULT_FILES,
-        calibration_document,
-        read_calibration,
-        without_infinities,
-    )
+    from caliv_graph.results.calibration_file import calibration_document, read_calibration
+    from caliv_graph.results.names import RESULT_FILES
 
     start = time.monotonic()
     settings = load_config(config)

@@ -30,7 +30,7 @@ def compare(
     """
     from caliv_graph.fusion.compare import compare as compare_calibrations
     from caliv_graph.report.comparison import comparison_document, comparison_table
-    from caliv_graph.results.files import read_calibration
+    from caliv_graph.results.calibration_file import read_calibration
 
     labels = (str(first), str(second))
     calibrations = read_calibration(first), read_calibration(second)

@@ -30,7 +30,8 @@ def evaluate(
     """
     from caliv_graph.errors import ConfigError
     from caliv_graph.report.tables import evaluation_table
-    from caliv_graph.results.files import read_calibration_file, read_truth
+    from caliv_graph.results.calibration_file import read_calibration_file
+    from caliv_graph.results.truth_file import read_truth
     from caliv_graph.uncertainty.evaluation import evaluate as evaluate_calibration
 
     estimate = read_calibration_file(calibration)

@@ -33,13 +33,13 @@ def merge(
     Example: caliv-graph merge monday/calibration.yaml friday/calibration.yaml --out vehicle.yaml
     """
     from caliv_graph.common.files import check_output_file, each_once
+    from caliv_graph.common.json_text import without_infinities
     from caliv_graph.errors import ConfigError
     from caliv_graph.fusion.merge import merge as merge_calibrations
     from caliv_graph.report.comparison import agreement_document, merger_table
-    from caliv_graph.results.files import (
+    from caliv_graph.results.calibration_file import (
         calibration_document,
         read_calibration,
-        without_infinities,
         write_calibration,
     )
 

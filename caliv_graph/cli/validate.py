@@ -61,10 +61,11 @@ def validate(
     import json
 
     from caliv_graph.common.files import check_output_folder, output_folder
+    from caliv_graph.common.json_text import without_infinities
     from caliv_graph.config.load import load_config
     from caliv_graph.readers import open_recording
     from caliv_graph.report.validation import validation_document, validation_table
-    from caliv_graph.results.files import read_calibration, without_infinities
+    from caliv_graph.results.calibration_file import read_calibration
     from caliv_graph.validation import validate as validate_calibration
     from caliv_graph.workflows.repeatability import split_halves
 

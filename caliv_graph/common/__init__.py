@@ -1,1 +1,1 @@
-"""What every room uses and no field owns: files, YAML text, cores, progress, exit codes."""
+"""Used by every room, of no field: files, YAML and JSON text, cores, progress, exit codes."""

@@ -1,6 +1,6 @@
-"""How many cores the program uses, and how it shares out work on them.
+"""How many cores the program uses, and how it distributes work over them.
 
-No result depends on it: what runs at the same time writes to places of its own.
+No result depends on the number: parallel work writes to separate places.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 THREADS = 2
-"""That share out work on clouds and points, at most: numpy holds the interpreter's lock between its
-operations, and more threads mostly wait for it."""
+"""At most, for work on clouds and points: numpy holds the interpreter's lock between its
+operations, so more threads mostly wait."""
 
 _one_core = False
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """The number of cores that this process may use."""
     if _one_core:
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -30,7 +30,7 @@ def cores() -> int:
 
 @contextmanager
 def on_one_core() -> Iterator[None]:
-    """Inside, the program works in one thread: other processes have the other cores."""
+    """Inside, the program uses one thread: other processes use the other cores."""
     global _one_core
     before = _one_core
     _one_core = True
@@ -41,7 +41,7 @@ def on_one_core() -> Iterator[None]:
 
 
 def parts(count: int, number: int) -> list[slice]:
-    """`count` items in a row, cut into `number` parts of about the same size."""
+    """Cuts a row of `count` items into `number` parts of about the same size."""
     ends = [count * i // number for i in range(number + 1)]
     return [slice(first, last) for first, last in itertools.pairwise(ends) if first < last]
 
@@ -50,8 +50,8 @@ def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
     """Does `work` on all items, several at a time.
 
     Args:
-        work: spends its time where the interpreter's lock is released.
-        items: what to work on.
+        work: on one item; releases the interpreter's lock for most of its time.
+        items: any number of them.
 
     Raises:
         Whatever `work` raises.

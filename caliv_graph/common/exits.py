@@ -1,4 +1,7 @@
-"""Exit codes (SPEC 5), and that of a calibration."""
+"""The exit codes of the commands, and that of a calibration.
+
+UNMET: a requirement of the config is not met. INCONSISTENT: inputs contradict each other.
+"""
 
 from __future__ import annotations
 

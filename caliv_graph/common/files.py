@@ -1,4 +1,4 @@
-"""Output that is there whole or not at all, and never in the place of what is not ours."""
+"""Output files and folders: complete or absent, and never in the place of foreign files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from caliv_graph.errors import ConfigError, OutputError
 
 
 def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
-    """Writes a file in one step: a reader sees the old one or the new one.
+    """Writes a file in one step: a reader sees the old file or the new one.
 
     Args:
         path: the file; folders that it needs are made.
-        content: what is in it; text is written as UTF-8.
+        content: of the file; text is written as UTF-8.
         force: replace an older one.
 
     Raises:
@@ -42,7 +42,7 @@ def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
 
 
 def check_output_file(path: Path, force: bool = False) -> None:
-    """Says before long work what `atomic_write` would say after it.
+    """Checks before long work what `atomic_write` checks after it.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
@@ -62,16 +62,15 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
 
     Args:
         path: the folder. An empty one that exists is filled.
-        content: the files that a result of this kind consists of, relative to the folder; each
-            part of such a path is a pattern (`fnmatch`). The first is the name of its main file:
-            a folder without it is none of our results. With `force` only a result is replaced,
-            and only if all that it holds is known: what somebody else has put there, in a
-            subfolder too, is never deleted.
+        content: the files of a result of this kind, relative to the folder; each part of such a
+            path is a pattern (`fnmatch`). The first is the name of the main file: a folder without
+            it is not a result. With `force` only a result is replaced, and only if it holds no
+            other files: a foreign file, in a subfolder too, is never deleted.
         force: replace an older result.
 
     Yields:
-        An empty folder beside `path` to write to. It takes the place of `path` at the end, and is
-        removed if anything goes wrong; the older result then stays.
+        An empty folder beside `path` to write to. It takes the place of `path` at the end. After
+        an error it is removed, and the older result stays.
 
     Raises:
         OutputError: `path` exists and is not to be replaced, or something cannot be written.
@@ -96,7 +95,7 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
 
 
 def check_output_folder(path: Path, content: Sequence[str], force: bool = False) -> None:
-    """Says before long work what `output_folder` would say after it.
+    """Checks before long work what `output_folder` checks after it.
 
     Args:
         path: see `output_folder`.
@@ -128,8 +127,8 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
             )
         if not fnmatch.filter(names, content[0]):
             raise OutputError(
-                f"{path}: is not replaced, for it holds no {content[0]} and is none of our "
-                "results. Give another --out"
+                f"{path}: is not replaced: it holds no {content[0]} and is not a result of this "
+                "program. Give another --out"
             )
         foreign = sorted(
             str(entry.relative_to(target))
@@ -144,7 +143,7 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
 
 
 def _belongs(entry: Path, folder: Path, content: Sequence[str]) -> bool:
-    """Whether a file, or a folder on the way to one, is what `content` says is in `folder`."""
+    """Whether `content` names a file of `folder`, or a folder on the way to one."""
     parts = entry.relative_to(folder).parts
     for pattern in content:
         wanted = PurePath(pattern).parts
@@ -165,7 +164,7 @@ def _resolved(path: Path) -> Path:
 
 
 def _swap(fresh: Path, target: Path, old: Path) -> None:
-    """Puts `fresh` in the place of `target`, which goes to `old` unless it is empty."""
+    """Moves `fresh` to `target`, and `target` to `old` unless it is empty."""
     # A folder can be renamed onto an empty one, but not onto one with content.
     occupied = target.is_dir() and any(target.iterdir())
     if occupied:
@@ -186,12 +185,14 @@ def _beside(target: Path) -> Path:
 def _check_parent_writable(path: Path, target: Path) -> None:
     parent = next(folder for folder in target.parents if os.path.lexists(folder))
     if not parent.is_dir():
-        raise OutputError(f"{path}: cannot be written: {parent} is no folder. Give another --out")
+        raise OutputError(
+            f"{path}: cannot be written: {parent} is not a folder. Give another --out"
+        )
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(
             f"{path}: cannot be written: no permission to write in {parent}. Give another --out"
         )
-    # Not all file systems tell by permissions that they take nothing.
+    # Some file systems are read-only although the permissions allow writing.
     probe = _beside(parent / target.name)
     probe.mkdir()
     with _uninterrupted():
@@ -200,7 +201,7 @@ def _check_parent_writable(path: Path, target: Path) -> None:
 
 @contextmanager
 def _new_parents(target: Path) -> Iterator[None]:
-    """Makes the folders that `target` needs, and takes them away again if nothing came of it."""
+    """Makes the folders that `target` needs, and removes them again after an error."""
     made = []
     for folder in reversed(target.parents):
         if not folder.exists():
@@ -211,7 +212,7 @@ def _new_parents(target: Path) -> Iterator[None]:
     except BaseException:
         with _uninterrupted():
             for folder in reversed(made):
-                # Somebody else may have put something there meanwhile.
+                # Another program may have written there meanwhile.
                 if not any(folder.iterdir()):
                     folder.rmdir()
         raise
@@ -219,7 +220,7 @@ def _new_parents(target: Path) -> Iterator[None]:
 
 @contextmanager
 def _errors_named(path: Path) -> Iterator[None]:
-    """Turns what the system refuses (a full or read-only disk, no permission) into one line."""
+    """Turns an error of the system (a full or read-only disk, no permission) into one line."""
     try:
         yield
     except OSError as e:
@@ -231,16 +232,16 @@ def _errors_named(path: Path) -> Iterator[None]:
 
 
 def _flush_to_disk(file: Any) -> None:
-    """Some file systems find out only here that they are full."""
+    """Some file systems notice only here that they are full."""
     file.flush()
     os.fsync(file.fileno())
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Lets a swap or a clean-up, milliseconds each, end before an interrupt counts.
+    """Ignores interrupts during a swap or a clean-up, of milliseconds each.
 
-    One that comes here comes too late: what follows is done, or already fails.
+    The interrupt has no use there: the work is done, or already fails.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -251,7 +252,7 @@ def _uninterrupted() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            # None: it was not set from Python, and cannot be set back from here.
+            # None: the handler was not set from Python, and cannot be restored from Python.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
@@ -260,8 +261,8 @@ def each_once(paths: Sequence[Path], where: str, what: str) -> None:
 
     Args:
         paths: as given.
-        where: what the message begins with before the path: an option and a space, or nothing.
-        what: the paths are of, "a drive".
+        where: the beginning of the message, before the path: an option and a space, or nothing.
+        what: a path is of, such as "a drive".
 
     Raises:
         ConfigError: one is.

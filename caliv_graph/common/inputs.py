@@ -1,4 +1,4 @@
-"""Files that somebody gives us: read whole, of a size that fits, and never waited for."""
+"""Input files: read whole, of a limited size, and never waited for."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import stat
 from pathlib import Path
 
 MOST_BYTES = 4 * 1024**3
-"""Of a file that is read whole. No cloud is so large; a recording given by mistake may be."""
+"""Of a file that is read whole: no cloud is larger, but a recording given by mistake may be."""
 
 
 def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Reads a file whole.
 
-    A pipe without a writer would be waited for without end, a device read without end.
+    A pipe without a writer would block for ever, and a device has no end.
 
     Args:
         path: the file.

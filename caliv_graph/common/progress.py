@@ -1,4 +1,4 @@
-"""What long work says of itself while it runs, and how long each stage took.
+"""Progress of long work, and the duration of each stage.
 
 A stage is a context manager that yields `advance(n, note)`:
 
@@ -21,30 +21,30 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 SIGN_OF_LIFE_S = 10.0
-"""Seconds between two lines of a stage that goes on, where there is no bar."""
+"""Seconds between two lines of a running stage, where there is no bar."""
 
 
 class Advance(Protocol):
-    """Says that work was done."""
+    """Reports steps that are done."""
 
     def __call__(self, n: int = 1, note: str = "") -> None:
         """Adds to the count.
 
         Args:
             n: steps done since the last call.
-            note: what a person may want to know now; stays until the next one.
+            note: shown beside the count until the next note.
         """
 
 
 class Progress(Protocol):
-    """Where long work reports its stages."""
+    """Takes the reports of long work."""
 
     def stage(self, name: str, total: int | None = None) -> AbstractContextManager[Advance]:
         """A stage of the work.
 
         Args:
-            name: what is being done, in a word or two.
-            total: steps there will be; None if that is not known.
+            name: of the stage, a word or two.
+            total: steps of the stage; None if unknown.
         """
 
 
@@ -53,12 +53,12 @@ class StageRecord:
     """One stage.
 
     Attributes:
-        name: what was done.
+        name: of the stage.
         total: steps expected; None if unknown.
-        depth: 0, or one more than that of the stage around it.
+        depth: 0, or one more than the depth of the enclosing stage.
         done: steps done.
         note: the last note.
-        seconds: how long it took; None while it runs, or if it was left by an exception.
+        seconds: of wall time; None while it runs, or after an exception.
         cpu_seconds: of processor time, all threads of the process together; None likewise.
     """
 
@@ -115,7 +115,7 @@ class SilentProgress:
 
 
 class PlainProgress(SilentProgress):
-    """A line where a stage starts and ends, and now and then in between."""
+    """Writes a line at the start and the end of a stage, and every `SIGN_OF_LIFE_S` between."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         """Makes it.
@@ -137,7 +137,7 @@ class PlainProgress(SilentProgress):
 
     def _show(self, record: StageRecord) -> None:
         if time.monotonic() - self._last_line >= SIGN_OF_LIFE_S:
-            self._line(record, count_text(record) or "still going")
+            self._line(record, count_text(record) or "still running")
 
     def _show_end(self, record: StageRecord) -> None:
         count = count_text(record)
@@ -145,7 +145,7 @@ class PlainProgress(SilentProgress):
 
 
 class BarProgress(SilentProgress):
-    """A bar per stage on a terminal. A context manager: the terminal is its own inside."""
+    """Shows a bar per stage on a terminal. A context manager: inside, no one else writes there."""
 
     def __init__(self, console: Console) -> None:
         """Makes it.
@@ -153,7 +153,7 @@ class BarProgress(SilentProgress):
         Args:
             console: the terminal.
         """
-        # Rich takes a tenth of a second; whoever works in silence does without.
+        # Here, because importing rich takes a tenth of a second.
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -201,7 +201,7 @@ class BarProgress(SilentProgress):
 
 
 def count_text(record: StageRecord) -> str:
-    """Steps done, of how many: '12/136', '12', or nothing if none were counted."""
+    """Steps done, and the total if known: '12/136', '12', or '' if no step was counted."""
     if record.total is not None:
         return f"{record.done}/{record.total}"
     return str(record.done) if record.done else ""

@@ -1,8 +1,8 @@
-"""YAML from somebody else: safe tags only, each key once, no deeper or larger than a person means.
+"""YAML from outside: safe tags only, each key once, limited depth and size.
 
-A few hundred bytes of aliases can stand for gigabytes, and brackets in brackets overflow the stack
-of the parser's C code, which ends the program. Both are looked for in the parser's events, which
-needs no stack and a tenth of the time that reading takes.
+A few hundred bytes of aliases can expand to gigabytes, and nested brackets overflow the stack of
+the parser's C code, which ends the program. Both are checked in the parser's events: this needs no
+stack and a tenth of the time of reading.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ from typing import Any
 import yaml
 
 MOST_LEVELS = 50
-"""Of lists and keys in each other. A calibration has seven."""
+"""Of nested lists and keys. A calibration has seven."""
 
 MOST_VALUES_BY_ALIAS = 200_000
-"""That aliases stand for in one file, each counted as often as it is meant; and ten times what is
-written out: poses that two sensors share are an alias to some writers."""
+"""Values that the aliases of one file may expand to, beside ten times the values written out: some
+writers make an alias of poses that two sensors share."""
 
 MOST_DIGITS = 400
 """Of a whole number. Python itself refuses to write one of more than 4300."""
 
 _MOST_CHARACTERS = 200
-"""Of what the parser says, which quotes tags and keys whole."""
+"""Of a message of the parser, which quotes tags and keys whole."""
 
 
 class YamlProblemError(Exception):
-    """What is wrong with a text, with its line where that is known: `in line 3: ...`."""
+    """A problem of a text, with its line where that is known: `in line 3: ...`."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A safe loader to which a key that stands twice is an error, not the last one's victory."""
+    """A safe loader that refuses a repeated key, where others take the last one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         """Builds a dictionary."""
-        # What a tag says is a mapping need not be one.
+        # A tag can call a scalar a mapping.
         if isinstance(node, yaml.MappingNode):
             seen = set()
             for key_node, _ in node.value:
@@ -43,7 +43,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
                 if isinstance(key_node, yaml.ScalarNode):
                     if key_node.value in seen:
                         raise yaml.MarkedYAMLError(
-                            problem=f"key '{key_node.value}' stands twice",
+                            problem=f"key '{key_node.value}' is given twice",
                             problem_mark=key_node.start_mark,
                         )
                     seen.add(key_node.value)
@@ -65,7 +65,7 @@ def parse_yaml(text: str) -> Any:
     """Reads YAML.
 
     Raises:
-        YamlProblemError: it is not YAML, or not of a kind that is read.
+        YamlProblemError: it is not YAML, or exceeds a limit of this module.
     """
     try:
         _check_size(text)
@@ -78,17 +78,17 @@ def parse_yaml(text: str) -> Any:
         said = (str(e).splitlines() or ["cannot be read"])[0]
         raise YamlProblemError(said[:_MOST_CHARACTERS]) from None
     except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as e:
-        # The loader takes a tag at its word: !!int of nothing, !!timestamp of no time.
+        # The loader trusts a tag: !!int of nothing, !!timestamp of no time.
         said = str(e)[:_MOST_CHARACTERS]
-        raise YamlProblemError(f"a value is not what it seems to be ({said})") from None
+        raise YamlProblemError(f"a value does not fit its type ({said})") from None
 
 
 def _check_size(text: str) -> None:
-    """Raises MarkedYAMLError where nesting or aliases go too far."""
-    # Per open list or mapping its anchor, and the values in it.
+    """Raises MarkedYAMLError if nesting or aliases exceed their limit."""
+    # Of each open list or mapping: its anchor, and the number of values before it.
     open_nodes: list[tuple[str | None, int]] = []
     sizes: dict[str, int] = {}
-    values, aliased = 0, 0  # with what aliases stand for, and that alone
+    values, aliased = 0, 0  # all of them with the aliases expanded, and those of aliases
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.CollectionStartEvent):
             values += 1
@@ -105,12 +105,12 @@ def _check_size(text: str) -> None:
                 sizes[event.anchor] = 1
         elif isinstance(event, yaml.AliasEvent):
             if any(anchor == event.anchor for anchor, _ in open_nodes):
-                _refuse(event, f"'*{event.anchor}' stands for what it is part of")
+                _refuse(event, f"'*{event.anchor}' contains itself")
             size = sizes.get(event.anchor or "", 1)
             values += size
             aliased += size
             if aliased > MOST_VALUES_BY_ALIAS + 10 * (values - aliased):
-                _refuse(event, f"aliases stand for {aliased} values, far more than are written")
+                _refuse(event, f"aliases expand to {aliased} values, far more than are written")
 
 
 def _refuse(event: Any, problem: str) -> None:

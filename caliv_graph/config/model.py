@@ -24,7 +24,7 @@ from caliv_graph.config.sections import (
 )
 
 _LEAST_SIGMA = 1e-6
-"""Of a guess, metres or degrees: GTSAM takes much less for a constraint."""
+"""Of a guess, metres or degrees: GTSAM treats much smaller ones as constraints."""
 
 
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
 
 
 _MOST_CHARACTERS = 100
-"""Of a LiDAR's name, which stands in the columns of tables."""
+"""Of a LiDAR's name, a column of tables."""
 
 
 def name_problem(name: str) -> str:
-    """What is wrong with a name for a LiDAR; empty: nothing.
+    """The problem of a name for a LiDAR; empty: none.
 
-    Names go to tables, terminals and other programs' files, where a line end or an escape would do
-    what nobody asked for.
+    Names go to tables, terminals and files of other programs, where line ends and escape sequences
+    do damage.
     """
     if name.strip() == name != "" and name.isprintable() and len(name) <= _MOST_CHARACTERS:
         return ""
@@ -242,7 +242,7 @@ class SolveConfig(Section):
 
 
 class RobustConfig(Section):
-    """What stands in for the paper's percentile filter."""
+    """The robust kernel, in the place of the paper's percentile filter."""
 
     kernel: RobustKernel = "huber"
     huber_k: Positive = Field(1.5, description="whitened residual per sqrt(dof) where Huber bends")
@@ -267,7 +267,8 @@ class ExtractionConfig(Section):
         6, description="neighbours of the statistical outlier filter; 0: no filter"
     )
     outlier_ratio: Positive = Field(
-        3.0, description="a point this many standard deviations lonelier than the rest is dropped"
+        3.0,
+        description="standard deviations by which the neighbours of a dropped point are too far",
     )
     min_points: Annotated[int, Field(ge=10)] = Field(
         50, description="a scan with fewer target points does not see the target"
@@ -301,7 +302,7 @@ def check_limit_keys(keys: Iterable[str]) -> None:
     """Checks the names of limits on sigmas.
 
     Raises:
-        ValueError: one is no `LIMIT_KEY`; the message says what they look like.
+        ValueError: one is not a `LIMIT_KEY`; the message describes them.
     """
     for key in keys:
         if not LIMIT_KEY.match(key):
@@ -312,7 +313,7 @@ def check_limit_keys(keys: Iterable[str]) -> None:
 
 
 class Config(Section):
-    """The whole configuration. SPEC 6; every section but `lidars` has defaults."""
+    """The whole configuration; every section but `lidars` has defaults."""
 
     data: DataConfig = DataConfig()
     topics: TopicsConfig = TopicsConfig()
@@ -342,7 +343,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _empty_sections(cls, raw: Any) -> Any:
-        """`topics:` with nothing below it means its defaults, as a person would expect."""
+        """`topics:` with nothing below it means its defaults."""
         if not isinstance(raw, Mapping):
             return raw
         return {key: value for key, value in raw.items() if value is not None or key == "lidars"}
@@ -364,7 +365,7 @@ class Config(Section):
         limits: Any = {}
         for given in found:
             if not isinstance(given, Mapping):
-                limits = given  # what is wrong with it, the field's own check says
+                limits = given  # the check of the field reports it
                 break
             limits = {**limits, **given}
         return {**raw, "require": names, "limits": limits}

@@ -1,4 +1,4 @@
-"""What sections of YAML files are made of: number types, the base model, and its error messages."""
+"""Parts of YAML files: the number types, the base model, and the sentence about a problem."""
 
 from __future__ import annotations
 
@@ -16,6 +16,18 @@ _MOST_OF_A_VEHICLE_M = 100.0
 
 _SHOWN_CHARACTERS = 60
 """Of a wrong value, in a message."""
+
+_SENTENCES = {
+    "model_type": "must be keys with values",
+    "dict_type": "must be keys with values",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "too_short": "must have {min_length} or more items, has {actual_length}",
+    "too_long": "must have {max_length} or fewer items, has {actual_length}",
+}
+"""Instead of pydantic's, which speak of Python, by the type of the error."""
 
 
 def _finite(value: float) -> float:
@@ -66,7 +78,7 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
     """
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    # A key that is unknown stands in the file, whatever it looks like.
+    # An unknown key is a key of the file, even if it looks like the branch of a union.
     is_unknown = first["type"] == "extra_forbidden"
     unknown = first["loc"][-1:] if is_unknown else ()
     known = first["loc"][: len(first["loc"]) - len(unknown)]
@@ -82,21 +94,27 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
         return f"unknown key '{where}': {_nearest(str(keys[-1]), models[0])}{rest}"
     if first["type"] == "missing":
         return f"'{where}' is missing{rest}"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "model_type":  # pydantic names the class, which the user does not know
-        message = "must be keys with values"
+    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    if first["type"] in _SENTENCES:
+        message = _SENTENCES[first["type"]].format(**first.get("ctx", {}))
     if not keys:
         return f"{message}{rest}"
-    given = first["input"]
-    shown = "" if isinstance(given, Mapping) else f" (got {str(given)[:_SHOWN_CHARACTERS]!r})"
-    return f"'{where}': {message}{shown}{rest}"
+    return f"'{where}': {message}{_shown(first['input'])}{rest}"
+
+
+def _shown(value: Any) -> str:
+    """A wrong value for a message; a long list, or keys with values, would not help there."""
+    text = str(value)
+    if isinstance(value, Mapping) or (isinstance(value, list) and len(text) > _SHOWN_CHARACTERS):
+        return ""
+    return f" (got {text[:_SHOWN_CHARACTERS]!r})"
 
 
 def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], Any]:
     """Follows a location of pydantic, which names the branches of unions too.
 
     Returns:
-        The keys of the file in it, and the annotation of what stands there.
+        The keys of the file in it, and the annotation of the value at that place.
     """
     keys: list[int | str] = []
     annotation = root
@@ -117,7 +135,7 @@ def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], 
 
 
 def _tags(model: type[BaseModel]) -> set[Any]:
-    """What tells a model from the others of a union: the values of fields that have only one."""
+    """The tags of a model in a union: the values of fields that allow only one."""
     values = [get_args(field.annotation) for field in model.model_fields.values()]
     kinds = [get_origin(field.annotation) for field in model.model_fields.values()]
     return {v[0] for v, kind in zip(values, kinds, strict=True) if kind is Literal and len(v) == 1}

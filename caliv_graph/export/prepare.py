@@ -16,7 +16,7 @@ from caliv_graph.export.recording import RecordedFrames, read_frames
 from caliv_graph.export.request import ImuExtrinsic, Request
 from caliv_graph.products import Calibration
 from caliv_graph.readers.frames import FrameTree
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 
 CONFIG_FILE = "config.yaml"
 """Name of the effective config beside a calibration."""

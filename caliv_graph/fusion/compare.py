@@ -34,6 +34,7 @@ from caliv_graph.uncertainty.observability import (
     spectrum,
 )
 from caliv_graph.uncertainty.pairs import sensor_pairs
+from caliv_graph.wording.directions import named
 
 ALPHA = 0.01
 """Probability of a false alarm if no mount has moved, over all tests of one comparison."""
@@ -284,7 +285,7 @@ def _drive(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) -
         root_data=unit[:, None] * W / np.sqrt(information),
         root_prior=root_prior,
         null=U,
-        undetermined=tuple(d.text for d in assess(D, prior, poses).undetermined),
+        undetermined=tuple(d.text for d in named(assess(D, prior, poses), poses).undetermined),
     )
 
 

@@ -17,6 +17,7 @@ from caliv_graph.fusion.terms import Fused, fuse, guess_of, moved_to, own_term
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
+from caliv_graph.wording.directions import named
 
 _SAME_GUESS = 1e-6
 """Largest difference of two equal guesses that were rounded, rad and m."""
@@ -222,7 +223,7 @@ def _assembled(
     to_right = np.ascontiguousarray(joint_right_to_vehicle_axes(poses.values()).T)
     cov = to_right @ fused.cov @ to_right.T
     information = to_right @ data.information @ to_right.T
-    uncertainty = assess(fused.information + fused.trusted, fused.prior, poses)
+    uncertainty = named(assess(fused.information + fused.trusted, fused.prior, poses), poses)
     lidars = {}
     for i, (name, result) in enumerate(results.items()):
         block = slice(6 * i, 6 * i + 6)

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.calibration.ground import TILT_RAD, TOGETHER_NS
+from caliv_graph.calibration.ground import TOGETHER_NS
+from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config.model import PoseConfig
 from caliv_graph.geometry.se3 import skew
@@ -32,7 +33,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.targets.cloud.views import view_weights
-from caliv_graph.targets.ground.planes import MAX_APART_NS
+from caliv_graph.targets.ground.measure import MAX_APART_NS
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
 
 PLANE = 3

@@ -25,7 +25,7 @@ from caliv_graph.trajectory.chain import POSE, STATE
 from caliv_graph.trajectory.noise import DEFAULT_FORCE_WALK_M_S3, DEFAULT_GYRO_WALK_RAD_S2
 
 NODE_NS = NANOSECONDS_PER_SECOND // 10
-"""Largest distance of two nodes, as in `trajectory.smoothing`."""
+"""Largest distance of two nodes, as in `trajectory.nodes`."""
 
 MERGE_NS = 1_000_000
 """Stamps that are nearer to each other share a node."""

@@ -30,8 +30,9 @@ from caliv_graph.targets.cloud.views import view_weights
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
+from caliv_graph.wording.directions import named_prediction
+from caliv_graph.wording.offsets import undetermined_offset_sentences
 
 OPPOSITE_DEG = 120.0
 """LiDARs with a larger angle between their views of a target share little of its surface."""
@@ -145,13 +146,13 @@ def predict_drives(
     )
     return Prediction(
         names=tuple(scenario.name for scenario, _ in planned),
-        covariance=covariance,
+        covariance=named_prediction(covariance),
         sightings=tuple(seen),
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
             *_warnings(planned, seen, lidars, assumptions.time_offset),
-            *undetermined_offsets(offsets_s, OFFSET_DETERMINED_S),
+            *undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
 

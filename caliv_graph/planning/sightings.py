@@ -21,8 +21,7 @@ from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.shapes import object_mesh
 from caliv_graph.scenario.terrain import Terrain, make_terrain
 from caliv_graph.scenario.world_models import ObjectModel
-from caliv_graph.targets.cloud.extract import TOTAL_PER_LIDARS
-from caliv_graph.targets.cloud.views import evenly_spread
+from caliv_graph.targets.cloud.views import clouds_per_lidar, evenly_spread
 
 SEEN_PART = 0.87
 """Fraction of the surface facing a LiDAR that returns points; the target occludes the rest itself.
@@ -264,9 +263,7 @@ def thinned(weights: Array, seeing: int, extraction: ExtractionConfig) -> IntArr
     """
     if len(weights) < extraction.min_scans:
         return np.zeros(0, dtype=np.int64)
-    most = extraction.max_scans
-    most = min(most, max(round(TOTAL_PER_LIDARS * most / max(seeing, 1)), 10))
-    return evenly_spread(weights, most)
+    return evenly_spread(weights, clouds_per_lidar(extraction.max_scans, seeing))
 
 
 def sees_ground(model: LidarModel) -> bool:

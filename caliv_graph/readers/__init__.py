@@ -27,7 +27,7 @@ def open_recording(config: Config, path: Path | None = None) -> Recording:
     if path is None:
         raise ConfigError("no recording given: set data.path in the config, or give --data")
     if config.data.format == "rosbag":
-        # Here, for a CaLiV folder needs none of what reading bags takes.
+        # Here, because a CaLiV folder does not need the libraries for bags.
         from caliv_graph.readers.rosbag import RosbagRecording
 
         return RosbagRecording(path, config.lidars, config.topics)

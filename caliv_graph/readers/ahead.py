@@ -1,4 +1,4 @@
-"""Decoding the next clouds on another core while the last one is being looked at."""
+"""Decoding the next clouds on another core while the caller works on the last one."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 AHEAD = 2
-"""Results that wait to be taken, at most, or are being made: memory stays bounded."""
+"""Results that wait or are being made, at most: memory stays bounded."""
 
 
 def worked_ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """`map(work, items)`, the next `AHEAD` items being worked on in a thread meanwhile.
 
-    Results come in the order of the items and are the same whatever the number of cores, as long as
-    `work` depends on nothing but its item. Items are taken in the caller's thread, for readers of
+    Results come in the order of the items, and do not depend on the number of cores as long as
+    `work` depends on its item alone. Items are taken in the caller's thread, because readers of
     files may not leave the thread that opened them. On a single core nothing is done ahead.
 
     Args:
-        work: what to do with an item; spends its time where the interpreter's lock is released.
+        work: on an item; releases the interpreter's lock for most of its time.
         items: any number of them.
 
     Raises:
@@ -39,10 +39,10 @@ def worked_ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Itera
         for item in items:
             waiting.append(pool.submit(work, item))
             if len(waiting) > AHEAD:
-                # No name for the result here: it would keep it alive while the next one is made.
+                # No name for the result: a name would keep it in memory while the next one is made.
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
     finally:
-        # Who stops half-way does not wait for what nobody wants any more, but for what runs.
+        # After an early stop, wait for the running item and drop those that have not started.
         pool.shutdown(cancel_futures=True)

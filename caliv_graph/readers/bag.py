@@ -1,4 +1,16 @@
-"""ROS 1 and ROS 2 bags through `rosbags`: topics, raw messages, and one kind of error."""
+"""ROS 1 and ROS 2 bags through `rosbags`: topics, raw messages, and one kind of error.
+
+The readers of `rosbags` for one file (`rosbag1.Reader`, `rosbag2.Reader`) read here. Its
+`AnyReader`, for several files, does not:
+
+- It parses the message definitions of all topics when it opens a bag, and refuses the bag for one
+  that is damaged or does not fit its digest, also of a topic that nobody reads. Some drivers record
+  such definitions (rslidar_sdk of RoboSense, issue 38). Here a type is looked up when the first
+  message of it is decoded, and a standard type needs no definition.
+- It needs the metadata.yaml of a folder, and yields no message of a topic whose QoS differs between
+  metadata.yaml and the file.
+- It opens a small bag in 130 ms instead of 45 ms.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -20,12 +32,14 @@ from caliv_graph.config.load import read_yaml
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 
+_Reader = Reader1 | Reader2
+
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 _METADATA = "metadata.yaml"
 
 _LATEST_NS = 2**62
-"""Of a record time: the year 2116. The difference of two times up to here fits 64 bits."""
+"""Of a record time: the year 2116. The difference of two such times fits 64 bits."""
 
 _RECOVERY = {
     ".mcap": "Recover it with 'mcap recover', or record the drive again",
@@ -63,7 +77,7 @@ class Header:
 
 
 class DamagedMessageError(Exception):
-    """A message is not what its type says; the reader of the bag decides what becomes of that."""
+    """A message does not decode as its type. The caller decides what follows."""
 
 
 def is_bag(path: Path) -> bool:
@@ -78,8 +92,8 @@ def is_bag(path: Path) -> bool:
 class Bag:
     """A recorded bag: a ROS 2 folder (MCAP or sqlite3), a bare .mcap or .db3, ROS 1 .bag file(s).
 
-    Opening it reads its index only. Messages are handed out raw, one at a time: most are skipped,
-    and of clouds the stamp alone is wanted at first.
+    Opening a bag reads only its index. Messages come out raw, one at a time: most are skipped, and
+    at first only the stamp of a cloud is needed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -89,24 +103,24 @@ class Bag:
             path: a file; or the folder of a ROS 2 bag, or of the parts of a split bag.
 
         Raises:
-            RecordingError: it is missing, no bag, damaged, or in a form that is not supported.
+            RecordingError: it is missing, not a bag, damaged, or in a form that is not supported.
         """
         self._path = path
         self._files = _find_files(path)
         self._is_ros1 = self._files[0].suffix == ".bag"
         self._stores: dict[str, Typestore] = {}
-        # Readers between two passes. Opening one can mean to unpack or to scan the whole bag.
-        self._idle: list[_Readers] = []
+        # Readers between two passes: opening one may unpack or scan the whole bag.
+        self._idle: list[list[_Reader]] = []
         weakref.finalize(self, _close_all, self._idle)
         self._definitions: dict[str, MessageDefinition] = {}
         found: dict[str, Topic] = {}
         with self._readers() as readers:
-            filled = [reader for reader in readers.opened if reader.message_count]
+            filled = [reader for reader in readers if reader.message_count]
             self._span_ns = (
                 min((reader.start_time for reader in filled), default=0),
                 max((reader.end_time for reader in filled), default=0),
             )
-            for connection in readers.connections():
+            for connection in (c for reader in readers for c in reader.connections):
                 self._definitions.setdefault(connection.msgtype, connection.msgdef)
                 before = found.get(connection.topic)
                 if before and before.type != connection.msgtype:
@@ -157,7 +171,7 @@ class Bag:
         if not topics:
             return
         with self._readers() as readers:
-            for reader in readers.opened:
+            for reader in readers:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 if not wanted or (stop_ns is not None and reader.start_time >= stop_ns):
                     continue
@@ -166,16 +180,16 @@ class Bag:
                 with self._errors_named(reader.path):
                     source = reader.messages(wanted, start_ns, stop_ns)
                 while True:
-                    # Not around the yield: what the caller does wrong is not the bag's damage.
+                    # Not around the yield: an error of the caller is no damage of the bag.
                     with self._errors_named(reader.path):
                         message = next(source, None)
                         if message is None:
                             break
                         _check_time(message[1])
                         if message[0].topic not in topics:
-                            raise ValueError(f"{message[0].topic} goes by the number of another")
+                            raise ValueError(f"{message[0].topic} has the number of another topic")
                         if not isinstance(message[2], bytes | bytearray | memoryview):
-                            raise ValueError(f"a message of {message[0].topic} is no bytes")
+                            raise ValueError(f"a message of {message[0].topic} is not bytes")
                     yield message[0].topic, message[1], message[2]
 
     def first_message(self, topic: str) -> bytes | None:
@@ -192,7 +206,7 @@ class Bag:
         """A message as an object with the fields of its type. Arrays are views into `raw`.
 
         Raises:
-            DamagedMessageError: it is not what its type says.
+            DamagedMessageError: it does not decode as its type.
             RecordingError: its type is not known.
         """
         type_name = self._topics[topic].type
@@ -203,11 +217,13 @@ class Bag:
             if self._is_ros1:
                 return store.deserialize_ros1(raw, type_name)
             return store.deserialize_cdr(raw, type_name)
-        except Exception as e:  # whatever the generated decoder runs into
+        except Exception as e:  # the generated decoder may raise any
             raise DamagedMessageError(str(e)) from None
 
     def header(self, raw: bytes) -> Header:
-        """The header of a message whose type begins with one, without decoding the rest.
+        """The header of a message whose type begins with one.
+
+        By hand: a decoder of `rosbags` takes a whole message, and most clouds are only looked at.
 
         Raises:
             DamagedMessageError: the message is cut off.
@@ -232,7 +248,7 @@ class Bag:
         """Types of a topic: as the bag defines them, else as the current ROS does."""
         definition = self._definitions[type_name]
         store = get_typestore(Stores.EMPTY)
-        # A definition that cannot be parsed is no loss where the type is a standard one.
+        # A standard type does not need its definition: a damaged one is ignored.
         with suppress(Exception):
             if definition.format == MessageDefinitionFormat.MSG:
                 store.register(get_types_from_msg(definition.data, type_name))
@@ -249,37 +265,37 @@ class Bag:
         raise RecordingError(f"{self._path}: holds no definition of the type {type_name}")
 
     @contextmanager
-    def _readers(self) -> Iterator[_Readers]:
-        """Open readers that nobody else uses: two passes may run at the same time."""
+    def _readers(self) -> Iterator[list[_Reader]]:
+        """Open readers for one pass: each has a position in its file, and two passes may run."""
         readers = self._idle.pop() if self._idle else self._open()
         try:
             yield readers
         except RecordingError:
-            readers.close()
+            _close(readers)
             raise
         except BaseException:
             self._idle.append(readers)
             raise
         self._idle.append(readers)
 
-    def _open(self) -> _Readers:
-        readers = _Readers([])
+    def _open(self) -> list[_Reader]:
+        readers: list[_Reader] = []
         try:
             for file in self._files:
                 with self._errors_named(file):
                     reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
                     reader.open()
-                    readers.opened.append(reader)
+                    readers.append(reader)
                     _check_index(reader)
         except BaseException:
-            readers.close()
+            _close(readers)
             raise
-        readers.opened.sort(key=lambda reader: reader.start_time)
+        readers.sort(key=lambda reader: reader.start_time)
         return readers
 
     @contextmanager
     def _errors_named(self, file: Any) -> Iterator[None]:
-        """Turns whatever `rosbags` runs into in a damaged file into one line."""
+        """Turns any error of `rosbags` in a damaged file into one line."""
         try:
             yield
         except RecordingError:
@@ -299,23 +315,19 @@ class Bag:
             ) from None
 
 
-@dataclass(frozen=True)
-class _Readers:
-    """Open readers of all files of a bag."""
-
-    opened: list[Reader1 | Reader2]
-
-    def connections(self) -> list[Connection]:
-        return [connection for reader in self.opened for connection in reader.connections]
-
-    def close(self) -> None:
-        while self.opened:
-            with suppress(Exception):
-                self.opened.pop().close()
+def _close(readers: list[_Reader]) -> None:
+    while readers:
+        with suppress(Exception):
+            readers.pop().close()
 
 
-def _check_index(reader: Reader1 | Reader2) -> None:
-    """Raises ValueError where a damaged file led `rosbags` to values that cannot be.
+def _close_all(idle: list[list[_Reader]]) -> None:
+    for readers in idle:
+        _close(readers)
+
+
+def _check_index(reader: _Reader) -> None:
+    """Raises ValueError for values that `rosbags` reads from a damaged file without a check.
 
     SQLite keeps a value of any type in a column of any other.
     """
@@ -329,13 +341,13 @@ def _check_index(reader: Reader1 | Reader2) -> None:
 
 
 def _check_time(record_ns: Any) -> None:
-    """Raises ValueError if a record time is none, or so late that differences overflow."""
+    """Raises ValueError if a record time is not a time, or so late that differences overflow."""
     if not isinstance(record_ns, int) or not 0 <= record_ns < _LATEST_NS:
         raise ValueError(f"a message was recorded at {str(record_ns)[:40]} ns")
 
 
 def _has_all_fields(store: Typestore, standard: Typestore) -> bool:
-    """Whether types that go by the name of a standard one have its fields: code relies on them."""
+    """Whether types with the name of a standard one have its fields, which the code needs."""
     return all(
         {field for field, _ in standard.fielddefs[name][1]} <= {field for field, _ in fields}
         for name, (_, fields) in store.fielddefs.items()
@@ -343,13 +355,8 @@ def _has_all_fields(store: Typestore, standard: Typestore) -> bool:
     )
 
 
-def _close_all(idle: list[_Readers]) -> None:
-    for readers in idle:
-        readers.close()
-
-
 def _find_files(path: Path) -> list[Path]:
-    """What `rosbags` is to open: the files of a bag, or its folder."""
+    """The paths for `rosbags` to open: the files of a bag, or its folder."""
     try:
         if not path.exists():
             raise RecordingError(
@@ -365,8 +372,8 @@ def _find_files(path: Path) -> list[Path]:
         packed = path.suffix in (".zst", ".zstd", ".gz", ".lz4", ".active")
         hint = " Unpack it first" if packed else ""
         raise RecordingError(
-            f"{path}: is no bag by its name: expected {', '.join(BAG_SUFFIXES)}, or the folder of "
-            f"a ROS 2 bag.{hint}"
+            f"{path}: is not a bag by its name: expected {', '.join(BAG_SUFFIXES)}, or the "
+            f"folder of a ROS 2 bag.{hint}"
         )
     return [path]
 
@@ -375,7 +382,7 @@ def _find_files_in(folder: Path) -> list[Path]:
     metadata = folder / _METADATA
     if metadata.is_file():
         return _listed_files(metadata)
-    # A recorder that died leaves no metadata, but the files are there; so is a split ROS 1 bag.
+    # Without metadata: of a recorder that crashed, or a split ROS 1 bag.
     files = sorted(
         entry for entry in folder.iterdir() if entry.suffix in BAG_SUFFIXES and entry.is_file()
     )
@@ -408,7 +415,7 @@ def _listed_files(metadata: Path) -> list[Path]:
             "Copy the bag completely, or make the description anew with 'ros2 bag reindex'"
         )
     if packed:
-        return [metadata.parent]  # `rosbags` unpacks what is packed as a whole
-    # One by one: opened as a folder, topics whose QoS the description tells otherwise than the
-    # file come out empty.
+        return [metadata.parent]  # only as a folder does `rosbags` unpack it
+    # File by file: of a folder, `rosbags` yields no message of a topic whose QoS differs between
+    # the description and the file.
     return [metadata.parent / name for name in names]

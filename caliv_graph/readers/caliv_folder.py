@@ -33,14 +33,13 @@ run at 10 Hz. Frames that are missing keep their place, so that durations stay r
 POSES_FILE = "ego_poses.yaml"
 
 _CLOUD_NAME = re.compile(r"([0-9]{1,10})\.pcd")
-"""A frame number and nothing else, no folder either. Ten digits of frames fit the stamps' int64."""
+"""A frame number without a folder. Stamps of ten digits of frames fit int64."""
 
 _NORM_TOLERANCE = 1e-3
-"""Of a quaternion. Numbers rounded to three decimals are off by no more; beyond it they are no
-rotation that was rounded, but something else."""
+"""Of a quaternion: the effect of rounding to three decimals."""
 
 _MOST_M = 1e8
-"""No map is wider: the earth is 12,742 km wide."""
+"""Of a map: the earth is 12,742 km wide."""
 
 _AGREEMENT_M = 1e-4
 _AGREEMENT_RAD = 1e-5
@@ -64,8 +63,8 @@ class CalivFolder:
                 sensors are not looked at.
 
         Raises:
-            RecordingError: folder, poses or a LiDAR are missing; a pose is not one, stands twice or
-                contradicts that of another sensor; a cloud has no pose.
+            RecordingError: folder, poses or a LiDAR are missing; a pose is damaged, is given twice
+                or contradicts the pose of another sensor; a cloud has no pose.
         """
         self._name = str(path)
         self._lidars = dict(lidars)
@@ -120,7 +119,7 @@ class CalivFolder:
         Those whose stamp is not in `wanted` are not read, unless it is None.
 
         NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
-        than its `max_range`. A scan of which nothing is left is a scan: it sees nothing.
+        than its `max_range`. A scan without returns is still yielded.
 
         Raises:
             RecordingError: a cloud is missing, empty, cut off or damaged.
@@ -148,13 +147,13 @@ class CalivFolder:
         return MotionData(self._name, poses=self._poses)
 
     def warnings(self) -> Sequence[str]:
-        """What was left out, and why, a line each."""
+        """What was left out and why, one line each."""
         return self._warnings
 
 
 @contextmanager
 def _system_errors_named() -> Iterator[None]:
-    """Turns what the system refuses (no permission, a name too long) into a RecordingError."""
+    """Turns an error of the system (no permission, a name too long) into a RecordingError."""
     try:
         yield
     except OSError as e:
@@ -215,7 +214,7 @@ def _parse_poses(entries: Any, where: str) -> dict[int, gtsam.Pose3]:
         frame = int(name[1])
         if frame in poses:
             raise RecordingError(
-                f"{where}, entry {number}: frame {frame} stands twice. Remove one of the entries"
+                f"{where}, entry {number}: frame {frame} is given twice. Remove one of the entries"
             )
         poses[frame] = _parse_pose(values, f"{where}, entry {number} ({file})")
     return poses
@@ -251,7 +250,7 @@ def _parse_pose(values: Any, where: str) -> gtsam.Pose3:
 
 
 def _to_float(value: Any) -> float | None:
-    """A number, also as yaml-cpp writes it: 1e-05 is text to YAML 1.1, for want of a point."""
+    """A number, also as yaml-cpp writes it: 1e-05 has no point and is text to YAML 1.1."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return None
     try:
@@ -326,7 +325,7 @@ def _check_agreement(
 
 
 def _shorten(value: Any) -> str:
-    """A value of the file, in one short line; YAML's aliases can hide gigabytes in it."""
+    """A value of the file in one short line; with aliases of YAML it can expand to gigabytes."""
     shortener = reprlib.Repr()
     shortener.maxlist, shortener.maxlevel, shortener.maxstring = 8, 2, 80
     text = shortener.repr(value)

@@ -11,16 +11,17 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import IntArray
 
 _FAR_S = 1.0
-"""Seconds between header stamps and record times that are worth telling (SPEC, clock sanity)."""
+"""Seconds between header stamps and record times, from which there is a warning: in a drive of one
+computer they differ by the transport, which takes milliseconds."""
 
 _ALIKE_S = 0.5
-"""Seconds within which offsets of several topics count as the same one: transport takes less."""
+"""Seconds within which offsets of several topics count as equal: transport takes less."""
 
 _GAP_FACTOR = 1.75
-"""An interval longer than so many usual ones is a gap: one message lost makes it two."""
+"""An interval of more than so many usual ones is a gap: one lost message makes it two."""
 
 TAI_UTC_S = 37.0
-"""TAI is ahead of UTC by so much since 2017: what a LiDAR on PTP is off from a computer on NTP."""
+"""TAI minus UTC since 2017: the offset of a LiDAR on PTP from a computer on NTP."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Clock:
         last_ns: latest stamp; 0 if there are no messages.
         rate_hz: of the median interval; None if there are fewer than two different stamps.
         gaps: (before, after) stamps around each gap, nanoseconds.
-        unset: messages without a stamp, for which the record time is taken.
-        backwards: messages stamped before the one that was recorded before them.
-        duplicates: messages with the stamp of another.
+        unset: messages without a stamp; their record time is used.
+        backwards: messages with an earlier stamp than the message recorded before them.
+        duplicates: messages with the stamp of another message.
         offset_s: (min, median, max) of header stamp minus record time; None without stamps.
     """
 
@@ -87,7 +88,7 @@ def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
 
 
 def clock_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
-    """What is odd about the stamps of some topics, a line each.
+    """Warnings about the stamps of some topics, one line each.
 
     Args:
         name: of the bag.

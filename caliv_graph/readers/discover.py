@@ -1,4 +1,4 @@
-"""What a recording holds, without a config that says so."""
+"""The sensors of a recording, found without a config."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ if TYPE_CHECKING:
     from caliv_graph.readers.bag import Bag
 
 _ANY_RANGE_M = 1e6
-"""Farther than any return: nothing is dropped for its range."""
+"""Farther than any return: no point is dropped for its range."""
 
 _GENERIC = re.compile(
     r"lidars?|sensing|sensors?|points?|raw|clouds?|pointclouds?|pointcloud2|packets|driver\d?|scan|"
     r"data|ros"
 )
-"""Words in the names of topics that do not tell one LiDAR from another."""
+"""Words in the names of topics that do not distinguish LiDARs."""
 
 _DERIVED = re.compile(
     r"map|radar|camera|depth|ground|filter|crop|downsampl|concat|fused|merged|obstacle|cluster|"
     r"segment|deskew|undistort|rectif|corrected|aligned|registered|accumul|debug|freespace|free_space"
 )
-"""In the names of clouds that are not what one LiDAR measured."""
+"""Words in the names of clouds that are not the raw cloud of one LiDAR."""
 
 _SECONDARY = re.compile(r"raw|livox|ouster|os_cloud|os\d|velodyne|camera|realsense|zed|mag|cmd")
-"""In the names of topics that are unlikely to be the vehicle's own IMU, velocity or pose."""
+"""Words in the names of topics that are probably not the vehicle's own IMU, velocity or pose."""
 
 
 @dataclass(frozen=True)
 class MotionTopics:
-    """Topics of a bag that tell the vehicle's motion.
+    """Topics of a bag with the vehicle's motion.
 
     Attributes:
         chosen: by key of `topics` in the config: imu, gnss, twist, pose.
-        others: those that would do as well, by the same keys.
+        others: further topics that fit, by the same keys.
     """
 
     chosen: Mapping[str, str]
@@ -56,7 +56,7 @@ class LidarTopics:
     Attributes:
         chosen: topic by a name made from it.
         frame_ids: frame of the first cloud, by that name.
-        others: topics of clouds that seem to be no LiDAR's own, or another's once more, and why.
+        others: topics of clouds that are probably derived or repeated, and why.
     """
 
     chosen: Mapping[str, str]
@@ -73,7 +73,7 @@ def drive_folder(path: Path) -> Path:
     Raises:
         RecordingError: the path is missing, or no CaLiV folder.
     """
-    # Without LiDARs it opens nothing but the poses, and says what is wrong with them.
+    # Without LiDARs this checks the poses alone.
     CalivFolder(path, {})
     return path / "input" if (path / "input" / POSES_FILE).is_file() else path
 
@@ -101,7 +101,7 @@ def is_recorded_bag(path: Path) -> bool:
 def open_all(path: Path) -> Recording:
     """Opens a drive with all its LiDARs, each by its own name, and all ranges.
 
-    Of a bag, all topics that could tell the motion are looked at.
+    Of a bag, all topics of motion data are read.
 
     Raises:
         RecordingError: the path is missing, no recording, or incomplete.
@@ -126,7 +126,7 @@ def open_all(path: Path) -> Recording:
 
 
 def lidar_names(topics: Iterable[str]) -> dict[str, str]:
-    """Names LiDARs after what their topics do not have in common; topic by name.
+    """Names LiDARs after the parts of their topics that differ; topic by name.
 
     `/lidar/front/points` and `/lidar/rear/points` become `front` and `rear`.
     """
@@ -135,8 +135,8 @@ def lidar_names(topics: Iterable[str]) -> dict[str, str]:
     common = set.intersection(*map(set, words.values())) if len(words) > 1 else set()
     names: dict[str, str] = {}
     for topic in topics:
-        telling = [word for word in words[topic] if word not in common] or words[topic]
-        stem = "_".join(telling) or "lidar"
+        distinct = [word for word in words[topic] if word not in common] or words[topic]
+        stem = "_".join(distinct) or "lidar"
         name, number = stem, 2
         while name in names:
             name, number = f"{stem}_{number}", number + 1
@@ -173,8 +173,8 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
     others.update({topic: "by its name made from others" for topic in frames if topic not in own})
     if not own:
         own, others = list(frames), {}
-    # /points_without_body is /points once more, if the frame agrees. The frame alone proves
-    # nothing: drivers are often started twice with the same one.
+    # /points_without_body repeats /points if the frame is the same. An equal frame alone proves
+    # nothing: drivers are often started twice with the same frame.
     for name in list(own):
         plain = next(
             (p for p in own if p != name and name.startswith(p) and frames[p] == frames[name]), None
@@ -187,7 +187,7 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
 
 
 def choose_motion_topics(bag: Bag) -> MotionTopics:
-    """Topics of a bag that are likely to tell the vehicle's motion best.
+    """The topics of a bag that are probably the best for the vehicle's motion.
 
     IMU and GNSS with a velocity if there are both; else poses, with the IMU if there is one.
 
@@ -199,7 +199,7 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
     ranked = {}
     for kind, types in MOTION_TYPES.items():
         fitting = [t for t in bag.topics.values() if t.type in types and t.messages]
-        # A command is no measurement; links between static frames no pose.
+        # A command is not a measurement, and a static link is not a pose of the vehicle.
         fitting = [t for t in fitting if "cmd" not in t.name and not t.name.endswith("/tf_static")]
         fitting.sort(
             key=lambda t: (
@@ -210,8 +210,8 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
             )
         )
         ranked[kind] = [t.name for t in fitting]
-    # What names no vehicle frame is no pose of one.
-    ranked["pose"] = [name for name in ranked["pose"] if _tells_poses(bag, name)]
+    # Transforms without a vehicle frame hold no pose of the vehicle.
+    ranked["pose"] = [name for name in ranked["pose"] if _has_poses(bag, name)]
     if ranked["imu"] and ranked["gnss"]:
         keys = ["imu", "gnss", "twist"]
     elif ranked["pose"]:
@@ -226,8 +226,8 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
     return MotionTopics(chosen, others)
 
 
-def _tells_poses(bag: Bag, topic: str) -> bool:
-    """Whether a topic of transforms has one of the vehicle; others are taken at their word."""
+def _has_poses(bag: Bag, topic: str) -> bool:
+    """Whether a topic holds poses of the vehicle: a topic of transforms need not."""
     from caliv_graph.readers.bag import DamagedMessageError
     from caliv_graph.readers.frames import TF_TYPES, VEHICLE_FRAMES, message_transforms
 
@@ -240,7 +240,7 @@ def _tells_poses(bag: Bag, topic: str) -> bool:
             continue
         if any(link.child in VEHICLE_FRAMES for link in links):
             return True
-        if count > 200:  # a few seconds: who sends the vehicle's pose has begun by then
+        if count > 200:  # a few seconds: a sender of the vehicle's pose has begun by then
             break
     return False
 
@@ -255,7 +255,7 @@ def _any_lidar(topic: str) -> LidarConfig:
 
 
 def _words(topic: str) -> list[str]:
-    """The parts of a topic's name that may tell one LiDAR from another."""
+    """The parts of a topic's name that may distinguish LiDARs."""
     found = []
     for part in topic.split("/"):
         kept = [word for word in part.split("_") if word and not _GENERIC.fullmatch(word.lower())]

@@ -13,14 +13,14 @@ class ForwardingRecording:
     """Answers as another recording does (`products.Recording`).
 
     Attributes:
-        recording: what is passed on.
+        recording: the one that is passed on.
     """
 
     recording: Recording
 
     @property
     def name(self) -> str:
-        """What to call it in messages: the path."""
+        """The name in messages: the path."""
         return self.recording.name
 
     @property
@@ -37,9 +37,9 @@ class ForwardingRecording:
         return self.recording.scans(lidar, wanted)
 
     def motion(self) -> MotionData:
-        """What the recording tells of the vehicle's motion, read in one pass."""
+        """The motion data of the recording, read in one pass."""
         return self.recording.motion()
 
     def warnings(self) -> Sequence[str]:
-        """What was left out so far, and why, a line each."""
+        """What was left out so far and why, one line each."""
         return self.recording.warnings()

@@ -52,7 +52,7 @@ class FrameTree:
         """Builds the tree.
 
         Args:
-            transforms: where two tell the same child's parent, the later one counts, as for tf.
+            transforms: of two with the same child the later one counts, as in tf.
         """
         self._up = {link.child: link for link in transforms if link.child != link.parent}
         self._frames = dict.fromkeys(
@@ -61,7 +61,7 @@ class FrameTree:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """All frames, parents before their children where it was told in this order."""
+        """All frames in the order of the transforms, each parent before its child."""
         return tuple(self._frames)
 
     def vehicle_frame(self) -> str | None:
@@ -69,7 +69,7 @@ class FrameTree:
         return next((frame for frame in VEHICLE_FRAMES if frame in self._frames), None)
 
     def root(self, frame: str) -> str:
-        """The frame above which there is none."""
+        """The frame at the top of the chain of a frame."""
         return (self._chain(frame) or [frame])[-1]
 
     def transform(self, parent: str, child: str) -> gtsam.Pose3 | None:
@@ -104,7 +104,7 @@ def clean_frame(frame_id: str) -> str:
 
 
 def message_transforms(message: Any) -> Iterator[tuple[int, FrameTransform]]:
-    """Stamps and links of a `tf2_msgs/TFMessage`; those that are no pose are left out."""
+    """Stamps and links of a `tf2_msgs/TFMessage`; invalid poses are left out."""
     for transform in message.transforms:
         T = pose_from_ros(transform.transform.translation, transform.transform.rotation)
         if T is None:
@@ -116,7 +116,7 @@ def message_transforms(message: Any) -> Iterator[tuple[int, FrameTransform]]:
 
 
 def pose_from_ros(translation: Any, rotation: Any) -> gtsam.Pose3 | None:
-    """A pose from what has x, y, z and what has x, y, z, w; None if these are no pose."""
+    """A pose from a message with x, y, z and one with x, y, z, w; None if it is invalid."""
     q = np.array([rotation.w, rotation.x, rotation.y, rotation.z], dtype=np.float64)
     t = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     norm = float(np.linalg.norm(q))
@@ -126,7 +126,7 @@ def pose_from_ros(translation: Any, rotation: Any) -> gtsam.Pose3 | None:
 
 
 def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
-    """The fixed joints of a URDF. What hangs on a joint that moves has no mounting to tell.
+    """The fixed joints of a URDF. A link on a joint that moves has no fixed pose.
 
     Raises:
         ConfigError: the file is missing, not a URDF, or a xacro that was not expanded.
@@ -156,7 +156,7 @@ def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
 
 
 def _is_fixed(joint: ET.Element) -> bool:
-    # Transmissions name joints too, without telling how they are.
+    # Transmissions name joints too, without their poses.
     return joint.get("type") == "fixed"
 
 

@@ -1,7 +1,7 @@
-"""From messages to what tells the vehicle's motion (`products.MotionData`).
+"""From messages to the vehicle's motion (`products.MotionData`).
 
-A collector per topic takes messages as they come, in any order, and makes the product at the end:
-sorted by stamp, each stamp once, without what is no measurement. What it leaves out it counts.
+A collector per topic takes messages in any order and makes the product at the end: sorted by stamp,
+each stamp once, without invalid measurements, which it counts.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MOTION_TYPES: Mapping[str, tuple[str, ...]] = {
     "twist": (_TWIST_WITH_COVARIANCE, _TWIST, _ODOMETRY),
     "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES),
 }
-"""Types that will do for each key of `topics`, the most telling first."""
+"""Types that fit each key of `topics`, the most informative first."""
 
 _NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision is off by less."""
@@ -56,19 +56,19 @@ _NORM_TOLERANCE = 1e-2
 GRAVITY_M_S2 = 9.81
 
 _GRAVITY_TOLERANCE = 0.15
-"""Part of gravity by which the median specific force may be off: driving does less, and a unit
-that is not m/s^2 does more."""
+"""Part of gravity by which the median specific force may differ: driving causes less, a unit other
+than m/s^2 more."""
 
 _FAST_RAD_S = 6.0
-"""No road vehicle turns as fast for a twentieth of a drive; in degrees per second it seems to."""
+"""Degrees per second exceed it; no road vehicle turns as fast for a twentieth of a drive."""
 
 _MOST_RAD_S = 200.0
 _MOST_M_S2 = 2000.0
 _MOST_M_S = 1000.0
 _MOST_ALTITUDE_M = 1e5
 _MOST_M = 1e8
-"""Beyond what any sensor on a vehicle measures, and any map is wide: a value that is not a
-measurement. Its square may be more than a float holds."""
+"""Beyond the range of any sensor on a vehicle, and the width of any map: such values are invalid,
+and their squares may overflow."""
 
 _FIXED_AXES = ("map", "odom", "world", "earth", "enu", "utm")
 """Frames whose axes do not turn with the vehicle: a velocity stated in them is not in its axes."""
@@ -76,13 +76,13 @@ _FIXED_AXES = ("map", "odom", "world", "earth", "enu", "utm")
 
 @dataclass(frozen=True)
 class ImuCheck:
-    """Whether the units of an IMU are what the message type says.
+    """Whether the units of an IMU are those of its message type.
 
     Attributes:
         specific_force_m_s2: median of its norm, as if in m/s^2.
         angular_rate_rad_s: 95th percentile of its norm, as if in rad/s.
-        gravity_problem: what is wrong with the specific force; empty: nothing.
-        rate_problem: what is wrong with the angular rate; empty: nothing.
+        gravity_problem: a problem of the specific force; empty: none.
+        rate_problem: a problem of the angular rate; empty: none.
     """
 
     specific_force_m_s2: float
@@ -92,7 +92,7 @@ class ImuCheck:
 
 
 _Reason = tuple[str, Callable[[Array], Any]]
-"""Why rows are left out, and a test (n, k) -> (n,) that is true of those that stay."""
+"""Why rows are left out, and a test (n, k) -> (n,) that is true for the rows that are kept."""
 
 
 class Collector(Protocol):
@@ -102,7 +102,7 @@ class Collector(Protocol):
         """Takes one message; `stamp_ns` is its header's stamp, or else the time of recording."""
 
     def notes(self) -> list[str]:
-        """What was left out, or is odd, after the product was made: sentences without a subject."""
+        """What was left out or looks wrong, after `finish`: sentences without a subject."""
 
 
 class _Rows:
@@ -126,7 +126,7 @@ class _Rows:
 
     def ordered(self) -> tuple[IntArray, Array, IntArray]:
         """As `sorted`, and which of the rows that were added they are, (n,)."""
-        # Views of what was collected, for a moment: what is handed out is a copy.
+        # Views for a moment: the results are copies.
         stamps = np.frombuffer(self._stamps, dtype=np.int64)
         values = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
         stamps, first = np.unique(stamps, return_index=True)
@@ -134,10 +134,10 @@ class _Rows:
 
 
 class _Stated:
-    """Rows of numbers that mostly are those of the row before, as covariances in messages are.
+    """Rows of numbers that mostly repeat the row before, as covariances in messages do.
 
-    They are kept whenever they change: at 200 Hz, repeated, they would be most of what a long drive
-    takes in memory.
+    A row is kept only if it differs: at 200 Hz the repetitions would take most of the memory of a
+    long drive.
     """
 
     def __init__(self, width: int) -> None:
@@ -154,20 +154,20 @@ class _Stated:
         self._which.append(len(self._values) // self._width - 1)
 
     def distinct(self) -> tuple[Array, IntArray]:
-        """The rows that were kept (d, width), and for each that was added which of them it is."""
+        """The rows that were kept (d, width), and the index of the kept row of each added one."""
         values = np.array(self._values, dtype=np.float64).reshape(-1, self._width)
         return values, np.array(self._which, dtype=np.int64)
 
 
 class _Losses:
-    """Counts what is left out of a topic."""
+    """Counts the messages of a topic that are left out."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._others: list[str] = []
 
     def keep(self, kept: Any, why: str) -> BoolArray:
-        """Counts what is not kept; returns `kept`."""
+        """Counts the rows that are not kept; returns `kept`."""
         self._counts[why] += int(np.count_nonzero(~kept))
         return np.asarray(kept)
 
@@ -232,15 +232,15 @@ class ImuCollector:
         broken = int(np.count_nonzero(has_any & ~is_rotation))
         if broken:
             self._losses.say(
-                f"the orientation of {broken} of {len(q)} messages is no unit quaternion, and is "
-                "not used"
+                f"the orientation of {broken} of {len(q)} messages is not a unit quaternion, and "
+                "is not used"
             )
         good = has_any & is_rotation
         if not good.any():
             return None, None
         first = q[good][0]
         if np.count_nonzero(good) > 1 and abs(first[3]) == 1.0 and (q[good] == first).all():
-            # What a driver without a filter leaves in the message.
+            # A driver without a filter leaves the identity in the message.
             self._losses.say("the orientation is the identity in all messages, and is not used")
             return None, None
         q[good] /= norms[good, None]
@@ -254,7 +254,7 @@ class ImuCollector:
         return q, _or_none(cov)
 
     def notes(self) -> list[str]:
-        """What was left out."""
+        """What was left out, one line each."""
         return self._losses.notes(len(self._rows))
 
 
@@ -308,7 +308,7 @@ class GnssCollector:
         return 0 if found is None else len(found.stamps_ns)
 
     def notes(self) -> list[str]:
-        """What was left out."""
+        """What was left out, one line each."""
         return self._losses.notes(len(self._rows))
 
 
@@ -355,7 +355,7 @@ class TwistCollector:
         return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
 
     def notes(self) -> list[str]:
-        """What was left out."""
+        """What was left out, one line each."""
         return self._losses.notes(len(self._rows))
 
 
@@ -386,7 +386,7 @@ class PoseCollector:
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :7]).all(1)),
             (f"beyond {_MOST_M:g} m from the origin", lambda r: _below(r[:, :3], _MOST_M)),
             (
-                "whose orientation is no unit quaternion",
+                "whose orientation is not a unit quaternion",
                 lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
             ),
         )
@@ -403,7 +403,7 @@ class PoseCollector:
         return GivenPoses(stamps, poses, cov)
 
     def notes(self) -> list[str]:
-        """What was left out."""
+        """What was left out, one line each."""
         return self._losses.notes(len(self._rows))
 
 
@@ -482,12 +482,12 @@ class TfCollector:
         return GivenPoses(stamps, _poses(t, R.as_quat()))
 
     def notes(self) -> list[str]:
-        """What was left out, and which frames were taken."""
+        """What was left out, and the frames that were used."""
         return self._losses.notes(self._messages)
 
 
 def check_imu(samples: ImuSamples) -> ImuCheck:
-    """Looks whether the units are m/s^2 and rad/s, and gravity is in the specific force."""
+    """Checks that the units are m/s^2 and rad/s, and that the specific force contains gravity."""
     force = float(np.median(np.linalg.norm(samples.specific_force, axis=1)))
     rate = float(np.percentile(np.linalg.norm(samples.angular_velocity, axis=1), 95))
     gravity_problem = ""
@@ -532,8 +532,8 @@ def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
 def _covariances(flat: Array) -> Array:
     """(n, k, k) of (n, k * k), symmetric; NaN where a message states none.
 
-    All zeros is how ROS says unknown, a negative value what some drivers say. A single zero on the
-    diagonal cannot be meant either: nothing is measured without any error.
+    In ROS all zeros mean unknown; some drivers write a negative value instead. A single zero on the
+    diagonal also means unknown: no measurement is without error.
     """
     size = round(flat.shape[1] ** 0.5)
     cov = flat.reshape(-1, size, size)
@@ -585,7 +585,7 @@ def _interpolated(stamps: IntArray, rows: Array, at_ns: IntArray) -> tuple[Rotat
     """Rotation and translation (n, 3) of a link at other stamps, none outside its own."""
     if len(stamps) == 1:
         return Rotation.from_quat(rows[0, 3:]), rows[0, :3]
-    # Seconds from the first: floats cannot tell nanoseconds apart in numbers this large.
+    # Seconds from the first: a float cannot resolve nanoseconds in numbers this large.
     own_s, at_s = (stamps - stamps[0]) * 1e-9, (at_ns - stamps[0]) * 1e-9
     t = np.stack([np.interp(at_s, own_s, rows[:, axis]) for axis in range(3)], axis=1)
     return Slerp(own_s, Rotation.from_quat(rows[:, 3:]))(at_s), t

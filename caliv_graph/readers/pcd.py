@@ -33,16 +33,16 @@ _SCALAR_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 """Bytes that a number of each TYPE may have."""
 
 _COMPRESSED_SIZES = struct.Struct("<II")
-"""What stands before a compressed body: its size and that of what it unpacks to, in bytes."""
+"""Before a compressed body: its size and its size when unpacked, in bytes."""
 
 _ADVICE_EMPTY = "Record the cloud again, or remove the file"
 
 _PADDING = b"\0\t\n\r "
-"""What may follow the last point: writers end with a newline or fill up a page."""
+"""Bytes allowed after the last point: writers end with a newline or fill up a page."""
 
 
 class _Unreadable(Exception):
-    """What is wrong with a cloud, without its name, and what to do about it."""
+    """A problem of a cloud, without its name, and the way out."""
 
     def __init__(self, what: str, advice: str = "Copy or export the cloud again") -> None:
         super().__init__(f"{what}. {advice}")
@@ -76,7 +76,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Header:
-    """What the body must hold.
+    """The expected content of the body.
 
     Attributes:
         xyz: the three coordinates.
@@ -96,9 +96,9 @@ class _Header:
 
 
 def read_pcd(path: Path) -> Array:
-    """Reads the points of a PCD file as they stand in it, NaN and zero returns included.
+    """Reads all points of a PCD file, NaN and zero returns included.
 
-    VIEWPOINT is not applied: as in PCL and Open3D, it tells where the sensor stood and the points
+    VIEWPOINT is not applied: as in PCL and Open3D, it is the place of the sensor, and the points
     are the sensor's.
 
     Args:

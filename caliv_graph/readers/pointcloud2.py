@@ -1,7 +1,7 @@
 """Decoding clouds: `sensor_msgs/PointCloud2` and Livox `CustomMsg`, all points at once.
 
-Times of points come in several conventions. They are told apart by name, type and range: whatever
-the name, they must lie near the cloud's stamp, or they are not believed.
+Times of points come in several conventions, distinguished by name, type and range. Times far from
+the cloud's stamp are not used, whatever their name.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ _TIME_FIELDS = (
 """Names of per-point times: of Ouster, Velodyne, Hesai and Robosense, Autoware, Livox, others."""
 
 _MOST_S = 1.0
-"""Seconds. A sweep takes no longer, and its stamp is no farther from its points; what does not fit
-is not what it seems to be."""
+"""Seconds between a cloud's stamp and its points, at most: a sweep takes less. Other times follow a
+convention that is not known."""
 
 _ABSOLUTE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -59,7 +59,7 @@ class UnusableCloudsError(Exception):
 
 @dataclass(frozen=True)
 class TimeField:
-    """What the times of a cloud's points were taken from.
+    """The field with the times of a cloud's points.
 
     Attributes:
         name: of the field.
@@ -79,9 +79,8 @@ class DecodedCloud:
     Attributes:
         points_lidar: (N, 3) metres, all finite, none of them zero.
         times_s: (N,) seconds after the stamp, or None.
-        time_field: what `times_s` was taken from; None: there was nothing to take it from.
-        time_problem: why the times that the cloud has were not believed; empty: there are none, or
-            they were.
+        time_field: the source of `times_s`; None: the cloud has no times.
+        time_problem: why the times of the cloud are not used; empty: they are, or it has none.
     """
 
     points_lidar: Array
@@ -182,7 +181,7 @@ def _column(message: Any, field: Any) -> npt.NDArray[Any]:
     """The values of a field, (N,), in the order of the points."""
     order = ">" if message.is_bigendian else "<"
     width, height, step = message.width, message.height, message.point_step
-    # Unorganised clouds are sent with any row_step, 0 too; there is no second row.
+    # Senders of unorganised clouds set row_step to any number, also 0; there is only one row.
     row = message.row_step if height > 1 else width * step
     itemsize = np.dtype(_TYPES[field.datatype]).itemsize
     if field.offset + itemsize > step or (height > 1 and row < width * step):
@@ -221,7 +220,7 @@ def _with_times(
 def _readings(
     field: TimeField, values: npt.NDArray[Any], stamp_ns: int
 ) -> Iterable[tuple[str, Array]]:
-    """What the values may mean, the most common first: unit, and seconds after the stamp, (N,)."""
+    """Meanings of the values, the most common first: unit, and seconds after the stamp, (N,)."""
     if field.type in ("uint32", "int32"):
         yield "ns after the stamp", values * 1e-9
     elif field.type == "float32":

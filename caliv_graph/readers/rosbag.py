@@ -58,12 +58,12 @@ _COLLECTORS: Mapping[str, type[Collector]] = {
 _STATIC_TOPIC = "/tf_static"
 
 _JOIN_NS = NANOSECONDS_PER_SECOND // 2
-"""Clouds that are wanted and recorded no farther apart than this are read in one go: to read on
-costs less than to begin anew."""
-
+"""Wanted clouds recorded within this time of each other are read in one go: reading on costs less
+than starting again."""
 
 _LONG_GAP_S = {"imu": 0.1, "gnss": 2.0, "twist": 1.0, "pose": 1.0}
-"""Seconds without a message that are told. Integration over gaps of an IMU errs soon."""
+"""Seconds without a message from which there is a warning. Integration over a gap of an IMU soon
+drifts."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class TimesSeen:
     """The times of the points of one LiDAR, over the clouds decoded so far.
 
     Attributes:
-        field: what they were taken from; None: there are none.
+        field: their source; None: there are none.
         first_s: earliest, seconds after the stamp.
         last_s: latest, seconds after the stamp.
         clouds: clouds that have them.
-        problems: clouds whose times were not believed.
-        problem: why, of the first such cloud.
+        problems: clouds whose times are not used.
+        problem: the reason, of the first such cloud.
     """
 
     field: TimeField | None = None
@@ -89,14 +89,14 @@ class TimesSeen:
 
 @dataclass(frozen=True)
 class _Index:
-    """What the first pass over the bag found.
+    """The result of the first pass over the bag.
 
     Attributes:
         clocks: by topic.
         frame_ids: of the first message of each topic.
         scans: per LiDAR the record time by stamp, in the order of the stamps.
         collectors: by kind of motion data and topic.
-        damaged: messages that are not what their type says, by topic.
+        damaged: messages that do not decode as their type, by topic.
     """
 
     clocks: Mapping[str, Clock]
@@ -121,7 +121,7 @@ class RosbagRecording:
         Args:
             path: the bag.
             lidars: LiDARs of the config by the user's name.
-            topics: what tells the motion.
+            topics: of the motion data.
             also: further topics of motion data to look at, which `motion` does not use.
 
         Raises:
@@ -182,7 +182,7 @@ class RosbagRecording:
         return self._topics[lidar].name
 
     def clocks(self) -> Mapping[str, Clock]:
-        """What the stamps of each topic that was read are like."""
+        """The stamps of each topic that was read, summarised."""
         return self._index().clocks
 
     def frame_ids(self) -> Mapping[str, str]:
@@ -228,7 +228,7 @@ class RosbagRecording:
         Args:
             lidar: its name.
             wanted: stamps of the clouds that are asked for, None: all. The others are not decoded,
-                and parts of the bag without any of them are not read.
+                and parts of the bag without a wanted cloud are not read.
 
         Raises:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.
@@ -250,7 +250,7 @@ class RosbagRecording:
             del scan
 
     def _found(self, topic: str, queue: _Queue) -> Iterator[tuple[int, bytes]]:
-        """Stamps and clouds that a queue asks for, still serialised, in the order of the stamps."""
+        """Stamps and clouds of a queue, still serialised, in the order of the stamps."""
         for start_ns, stop_ns in _windows(queue.records_ns.values()):
             for _, record_ns, raw in self._bag.messages([topic], start_ns, stop_ns):
                 try:
@@ -260,7 +260,7 @@ class RosbagRecording:
                 yield from queue.take(stamp_ns, record_ns, raw)
 
     def motion(self) -> MotionData:
-        """What the bag tells of the vehicle's motion, of the topics that the config names.
+        """The motion data of the topics that the config names.
 
         Raises:
             RecordingError: the bag is damaged; the specific force of the IMU is not in m/s^2, or
@@ -271,20 +271,20 @@ class RosbagRecording:
         return self._motion
 
     def warnings(self) -> Sequence[str]:
-        """What was left out so far, and why, a line each."""
-        # Each once: what was asked for twice was read twice.
+        """What was left out so far and why, one line each."""
+        # Each once: a cloud that was requested twice was read twice.
         return list(dict.fromkeys([*self._warnings, *self._cloud_warnings()]))
 
     def _topic(self, name: str, key: str, what: str, types: Sequence[str]) -> Topic:
         """The topic of the bag that a key of the config names.
 
         Raises:
-            RecordingError: it is not there, or its type will not do.
+            RecordingError: it is missing, or of a type that does not fit.
         """
         there = self._bag.topics
         fitting = [topic.name for topic in there.values() if topic.type in types]
         topic = there.get(name) or there.get(f"/{name.strip('/')}")
-        will_do = f"Topics that would do: {_enumerate(fitting)}"
+        will_do = f"Topics that fit: {_enumerate(fitting)}"
         if topic is None:
             near = difflib.get_close_matches(name, fitting or list(there), n=1, cutoff=0.5)
             hint = f"Did you mean '{near[0]}'? " if near else ""
@@ -352,7 +352,7 @@ class RosbagRecording:
             for topic in topics
             if len(stamps[topic][0]) + damaged[topic] != self._bag.topics[topic].messages
         ]
-        # A message of /tf has no stamp of its own, and several senders in no order.
+        # A message of /tf has no stamp of its own, and its senders keep no common order.
         clocks = {t: c for t, c in index.clocks.items() if self._bag.topics[t].type not in TF_TYPES}
         self._warnings += clock_warnings(self._bag.name, clocks)
         self._warnings += [
@@ -386,7 +386,7 @@ class RosbagRecording:
                     f"{max(long_s):.3g} s"
                 )
             if found[kind] is None:
-                self._warnings.append(f"{where}: tells nothing that could be used")
+                self._warnings.append(f"{where}: holds nothing that can be used")
         motion = MotionData(
             self._bag.name,
             poses=found.get("pose"),
@@ -406,7 +406,7 @@ class RosbagRecording:
         return motion
 
     def _decoded(self, found: tuple[str, int, bytes]) -> tuple[int, DecodedCloud | str]:
-        """Stamp and cloud, or what is wrong with its message; changes nothing here: see `scans`."""
+        """Stamp and cloud, or the problem of its message. Changes no state: it runs in a thread."""
         lidar, stamp_ns, raw = found
         config = self._lidars[lidar]
         topic = self._topics[lidar]
@@ -427,7 +427,7 @@ class RosbagRecording:
         return f"{self._topics[lidar].name} at {_seconds(stamp_ns)} s"
 
     def _scan(self, lidar: str, stamp_ns: int, cloud: DecodedCloud | str) -> LidarScan | None:
-        """The scan of a decoded cloud; counts what is to be told of it."""
+        """The scan of a decoded cloud; counts what `warnings` reports of it."""
         source = self._source(lidar, stamp_ns)
         if isinstance(cloud, str):
             self._damage = self._damage or f"{source} {cloud}"
@@ -468,7 +468,7 @@ class RosbagRecording:
 
 
 class _Queue:
-    """The clouds that are asked for, and those of them that were read before their turn."""
+    """The wanted clouds, and those of them that were read before their turn."""
 
     def __init__(self, records_ns: Mapping[int, int]) -> None:
         """Takes the record time by stamp, in the order of the stamps."""
@@ -478,8 +478,8 @@ class _Queue:
         self._early: dict[int, bytes] = {}
 
     def take(self, stamp_ns: int, record_ns: int, raw: bytes) -> Iterator[tuple[int, bytes]]:
-        """Takes what was read; yields stamps and clouds whose turn has come."""
-        # Of two messages with one stamp, the other is none of ours.
+        """Takes a message; yields the stamps and clouds whose turn has come."""
+        # Of two messages with one stamp, only one is in the index.
         if self.records_ns.get(stamp_ns) != record_ns:
             return
         self._early[stamp_ns] = raw
@@ -499,7 +499,7 @@ def _by_stamp(header_ns: Any, record_ns: Any) -> dict[int, int]:
 
 
 def _windows(records_ns: Iterable[int]) -> list[tuple[int, int]]:
-    """Spans of record time, start and stop, that hold all of them and little else."""
+    """Spans of record time, start and stop, around all of these times and little else."""
     times = np.unique(np.fromiter(records_ns, np.int64))
     if not len(times):
         return []

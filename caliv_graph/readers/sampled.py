@@ -1,4 +1,4 @@
-"""A recording that remembers a little of what was read from it, for pictures."""
+"""A recording that keeps a few of the clouds that were read from it, for pictures."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from caliv_graph.products import IntArray, LidarScan
 from caliv_graph.readers.forwarding import ForwardingRecording
 
 SCANS = 12
-"""Of one LiDAR over a drive: enough to see whether a wall stands once or twice."""
+"""Of one LiDAR over a drive: enough to see whether a wall appears once or twice."""
 
 POINTS = 1500
 """Of one scan."""
 
 CELL_M = 0.25
-"""Of the grid that points are thinned on: most of them lie on the ground near the vehicle."""
+"""Of the grid for thinning: most points lie on the ground near the vehicle."""
 
 RANGE_M = 40.0
-"""Farther points would only make the picture small."""
+"""Farther points would make the picture small."""
 
 
 @dataclass(frozen=True)
 class SampledRecording(ForwardingRecording):
-    """Passes a recording on, and keeps a few thinned clouds of each LiDAR as they go by.
+    """Passes a recording on, and keeps a few thinned clouds of each LiDAR.
 
-    Nothing is read twice, and memory stays bounded: `SCANS` clouds of `POINTS` points per LiDAR.
+    No cloud is read twice, and memory stays bounded: `SCANS` clouds of `POINTS` points per LiDAR.
     """
 
     _kept: dict[tuple[str, int], LidarScan] = field(default_factory=dict, init=False, repr=False)
@@ -38,7 +38,7 @@ class SampledRecording(ForwardingRecording):
         stamps = self.scan_stamps_ns(lidar)
         begin, end = (stamps[0], stamps[-1]) if len(stamps) else (0, 0)
         for scan in self.recording.scans(lidar, wanted):
-            # One of each twelfth of the drive, the first that is read at all.
+            # The first cloud that is read of each twelfth of the drive.
             part = min(SCANS * (scan.stamp_ns - begin) // max(end - begin, 1), SCANS - 1)
             if (lidar, part) not in self._kept:
                 self._kept[lidar, part] = thinned(scan)

@@ -1,4 +1,7 @@
-"""The clouds of a placement, stacked for work in batches: points, beams and surface normals."""
+"""The clouds of a placement, stacked for work in batches: points, beams and surface normals.
+
+A cloud is what one scan shows of the target (`products.TargetCloud`).
+"""
 
 from __future__ import annotations
 
@@ -17,40 +20,40 @@ from caliv_graph.products import Array, IntArray, TargetObservation
 
 SINGLE_NEIGHBOURS = 16
 SINGLE_RADIUS_M = 0.15
-"""Neighbourhood of a normal in one cloud, across the beam: two rings of points, and in a sparse
-cloud no more than a part of a chair is flat."""
+"""Neighbourhood of a normal in one cloud, across the beam: two rings of points. In a sparse cloud
+it is no larger than the flat parts of a chair."""
 
 MERGED_NEIGHBOURS = 60
 MERGED_RADIUS_M = 0.03
-"""The same in aligned clouds: as wide as a chair's leg, and enough points to see a plane through
-the noise."""
+"""Neighbourhood in aligned clouds: as wide as the leg of a chair, with enough points for a plane at
+10 mm of noise."""
 
 WINDOW_RAD = math.radians(10.0)
 WINDOW_POINTS = 9000
-"""Clouds are merged with those of the same LiDAR that saw the target from about the same side, the
-nearest ones first, until there are so many points: from farther around, other surfaces hide behind
-the same beam."""
+"""Clouds are merged with those of the same LiDAR from about the same side, nearest direction first,
+up to this number of points. From other sides, other surfaces are along the same beam."""
 
 DEPTH_GATE_M = 0.06
-"""Neighbours farther than this from the first plane are of another surface."""
+"""Neighbours farther than this from the initial plane belong to another surface."""
 
 GATE_SIGMAS = 3.0
-"""The same of the last plane, in standard deviations along the beam."""
+"""Gate of the final plane, in standard deviations of the noise along the beam."""
 
 GATE_ROUNDS = 5
-"""Plane fits per normal, while the gate narrows."""
+"""Plane fits per normal, with narrowing gate."""
 
 RIDGE = 1e-6
-"""Keeps plane fits solvable."""
+"""Tikhonov term that keeps plane fits solvable."""
 
 FEWEST_NEIGHBOURS = 6
-"""Effective number of neighbours below which there is no normal."""
+"""Minimum effective number of neighbours (Kish) for a normal."""
 
 TRUSTED_ANGLE_RAD = 0.35
-"""Uncertainty of a normal at which it is no longer trusted at all."""
+"""Uncertainty of a normal, 1 sigma, at which its flatness is 0."""
 
 TRUSTED_FLATNESS = 0.2
-"""Flatness from which on a normal is taken as it is. To lean them all would bias every one."""
+"""Flatness above which a normal is used as it is. Below, it is blended with the direction to the
+sensor. Blending all would bias all."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +62,14 @@ class CloudStack:
 
     Attributes:
         points: (N, 3) metres, each in the frame of its own LiDAR at its own stamp.
-        cloud: (N,) index of the cloud that a point belongs to, ascending.
-        starts: (J,) index of each cloud's first point.
+        cloud: (N,) index of the cloud of each point, ascending.
+        starts: (J,) index of the first point of each cloud.
         beams: (N, 3) unit vectors from the sensor to the point, lidar frame.
         normals: (N, 3) unit vectors, lidar frame, towards the sensor.
-        flatness: (N,) 0 to 1, how far the normal can be trusted: 0 where the neighbourhood is
-            sparse or noisy (there the normal is the direction to the sensor).
-        whole: J clouds as they were before thinning, for the normals.
-        sigma_range_m: noise along the beams, metres.
+        flatness: (N,) reliability of the normal, 0 to 1. It is 0 where the neighbourhood is sparse
+            or noisy; there the normal is the direction to the sensor.
+        whole: J clouds before thinning, for the normals.
+        sigma_range_m: noise along the beams, 1 sigma, metres.
     """
 
     points: Array
@@ -83,17 +86,21 @@ class CloudStack:
         """Number of clouds."""
         return len(self.starts)
 
+    @property
+    def sizes(self) -> IntArray:
+        """(J,) number of points of each cloud."""
+        return np.diff(np.append(self.starts, len(self.points)))
+
     @cached_property
     def centres(self) -> Array:
         """(J, 3) mean of each cloud's points, lidar frame."""
-        sizes = np.diff(np.append(self.starts, len(self.points)))
-        return np.asarray(self.sum_per_cloud(self.points) / sizes[:, None])
+        return np.asarray(self.sum_per_cloud(self.points) / self.sizes[:, None])
 
     @cached_property
     def features(self) -> Array:
-        """(N, 13) what the mixture sums up, in the lidar frame.
+        """(N, 13) what `moments.cell_moments` sums over points, lidar frame.
 
-        `second_moments` of the points less their cloud's centre; and flatness times normal.
+        `second_moments` of the points less their cloud's centre, and flatness times normal.
         """
         return np.column_stack(
             [second_moments(self.centred), self.flatness[:, None] * self.normals]
@@ -129,11 +136,11 @@ def second_moments(points: Array) -> Array:
 
 
 def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
-    """A pseudo-random priority of each point, (N,), by which points are drawn.
+    """Pseudo-random priorities (N,) by which points (N, 3) are drawn.
 
-    A stride would alias with the scan lines. The priority depends on the point's own coordinates
-    in its own LiDAR's frame and on nothing else, so that another initial guess, or a point more
-    at the edge of the region, draws the same points: the result shall not depend on them.
+    A stride would alias with the scan lines. A priority is a hash of the point's coordinates in the
+    frame of its LiDAR. So the draw does not depend on the initial guess, nor on other points at the
+    edge of the region.
     """
     bits = np.ascontiguousarray(points, dtype=np.float64).view(np.uint64)
     state = np.zeros(len(points), dtype=np.uint64)
@@ -153,8 +160,8 @@ def surface_normals(
 
     Args:
         points: (N, 3) metres, lidar frame; where normals are wanted.
-        sigma_range_m: noise along the beam; a neighbourhood no larger than it has no normal.
-        around: (M, 3) the whole cloud; None: `points` are it.
+        sigma_range_m: noise along the beam, 1 sigma; it limits the flatness.
+        around: (M, 3) the whole cloud; None: `points`.
 
     Returns:
         (N, 3) unit normals and (N,) flatness between 0 and 1.
@@ -174,7 +181,7 @@ def stack_clouds(
         observation: the clouds, none of them empty.
         max_points: a larger cloud is thinned (`sampling_order`).
         sigma_range_m: noise along the beam, metres.
-        normals: False if `merged_normals` follows: all point to the sensor until then.
+        normals: False if `merged_normals` follows; until then all point to the sensor.
     """
     points, normal, flatness = [], [], []
     for cloud in observation.clouds:
@@ -205,16 +212,16 @@ def stack_clouds(
 
 
 def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> CloudStack:
-    """Normals again, from all clouds of a LiDAR together, once they are aligned.
+    """Surface normals from the aligned clouds of each LiDAR, merged.
 
-    One cloud has a column or two of points on a leg; a dozen of them show its faces.
+    One cloud has one or two columns of points on the leg of a chair; a dozen clouds show its faces.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of `T_target_lidar`, right to a few millimetres at the target.
-        t: (J, 3) translations of it.
-        lidar: (J,) which LiDAR each cloud is of. Clouds of different LiDARs are not merged: whether
-            they are aligned is the question.
+        t: (J, 3) translations of it, metres.
+        lidar: (J,) index of the LiDAR of each cloud. Clouds of different LiDARs are not merged:
+            their alignment is what is estimated.
 
     Returns:
         The same clouds with new normals and flatness.
@@ -246,9 +253,9 @@ def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> Cl
 
 
 def _towards_sensor(normals: Array, flatness: Array, beams: Array) -> Array:
-    """Normals; those that can hardly be trusted lean to the sensor.
+    """Normals, blended with the direction to the sensor where flatness is low.
 
-    Where the neighbourhood tells no normal, the surface at least faces the sensor.
+    Where a normal cannot be estimated, the surface still faces the sensor.
     """
     own = np.minimum(flatness / TRUSTED_FLATNESS, 1.0)[:, None]
     mixed = own * normals - (1.0 - own) * beams
@@ -265,18 +272,18 @@ def _normals_across(
 ) -> tuple[Array, Array]:
     """Normals by regression of the depth along the beam over the position across it.
 
-    The noise is in the depth and in nothing else. A plane through the points of a ball, the common
-    way, leans to the sensor by 10 degrees and more on slanted surfaces: the ball cuts off just the
-    points that the noise has moved far. Across the beam nothing is cut off, and neighbours that
-    are too far from the *plane* along the beam are so on either side alike.
+    The noise is in the depth alone. A plane through the points of a ball, the common way, is biased
+    towards the sensor by 10 degrees and more on slanted surfaces: the ball cuts off the points with
+    large noise. Across the beam nothing is cut off, and the gate on the distance from the *plane*
+    along the beam is symmetric.
 
     Args:
         points: (n, 3) where normals are wanted, seen from about the same side.
-        around: (N, 3) points of the same surface, seen from there too; `points` among them.
-        beams: (m, 3) directions from the sensor to these points, of any length: their mean counts.
+        around: (N, 3) points of the same surface, seen from that side too; `points` among them.
+        beams: (m, 3) directions from the sensor to these points, of any length; their mean is used.
         neighbours: of each point at most.
         radius_m: of the neighbourhood across the beam.
-        sigma_range_m: noise along the beam.
+        sigma_range_m: noise along the beam, 1 sigma.
 
     Returns:
         (n, 3) unit normals towards the sensor, (n,) flatness.
@@ -286,23 +293,46 @@ def _normals_across(
     plane = tangent_axes(along).T
     k = min(neighbours, len(around))
     there, here = around @ plane, points @ plane
-    # Built for a few hundred questions, the building counts.
+    # Few queries: the time to build the tree matters.
     tree = cKDTree(there, compact_nodes=False, balanced_tree=False)
     distance, near = tree.query(here, k, distance_upper_bound=radius_m)
     distance, near = np.reshape(distance, (-1, k)), np.reshape(near, (-1, k))
     inside = np.isfinite(distance)
     near = np.where(inside, near, 0)
-    # Two standard deviations fit in: nothing changes abruptly when a point comes in or drops out.
-    sigma_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius_m)
-    sigma_m = np.maximum(sigma_m, 1e-6)
-    kernel = np.where(inside, np.exp(-0.5 * (np.where(inside, distance, 0.0) / sigma_m) ** 2), 0.0)
+    # The neighbourhood ends at two standard deviations of the kernel: a point that enters or leaves
+    # changes nothing abruptly.
+    width_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius_m)
+    width_m = np.maximum(width_m, 1e-6)
+    kernel = np.where(inside, np.exp(-0.5 * (np.where(inside, distance, 0.0) / width_m) ** 2), 0.0)
     depth = (around @ along)[near] - (points @ along)[:, None]
-    u, v = ((there[:, axis][near] - here[:, axis, None]) / sigma_m for axis in range(2))
+    u, v = ((there[:, axis][near] - here[:, axis, None]) / width_m for axis in range(2))
     across = (np.ones_like(u), u, v, u * u, u * v, v * v)
+    slope, weight, normal_matrix = _gated_slope(kernel, depth, across, width_m, sigma_range_m)
+    normals = slope @ plane.T - along
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return normals, _flatness(slope, weight, normal_matrix, across, width_m, sigma_range_m)
+
+
+def _gated_slope(
+    kernel: Array, depth: Array, across: Sequence[Array], width_m: Array, sigma_range_m: float
+) -> tuple[Array, Array, Array]:
+    """Planes through the depths of the neighbours, by weighted least squares with narrowing gate.
+
+    Args:
+        kernel: (n, k) weight of the neighbours by their distance across the beam.
+        depth: (n, k) metres along the beam.
+        across: six (n, k): 1, u, v, u^2, u v, v^2 of the position across, in kernel widths.
+        width_m: (n, 1) of the kernels.
+        sigma_range_m: noise along the beam, 1 sigma.
+
+    Returns:
+        (n, 2) slopes of the depth, (n, k) last weights, (n, 3, 3) last normal matrices.
+    """
+    _, u, v, *_ = across
     depths = (depth, u * depth, v * depth)
     residual = depth
     # A wide neighbourhood on a slanted surface is deep.
-    first = np.maximum(DEPTH_GATE_M, GATE_SIGMAS * sigma_m)
+    first = np.maximum(DEPTH_GATE_M, GATE_SIGMAS * width_m)
     last = max(GATE_SIGMAS * sigma_range_m, 1e-3)
     for gate_m in first * (last / first) ** np.linspace(0.0, 1.0, GATE_ROUNDS)[:, None, None]:
         weight = kernel * np.maximum(1.0 - (residual / gate_m) ** 2, 0.0) ** 2
@@ -310,19 +340,28 @@ def _normals_across(
         right = _sums(weight, depths)
         fit = np.linalg.solve(normal_matrix, right[..., None])[..., 0]
         residual = depth - fit[:, :1] - fit[:, 1:2] * u - fit[:, 2:] * v
-    slope = fit[:, 1:] / sigma_m
-    normals = slope @ plane.T - along
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return fit[:, 1:] / width_m, weight, normal_matrix
+
+
+def _flatness(
+    slope: Array,
+    weight: Array,
+    normal_matrix: Array,
+    across: Sequence[Array],
+    width_m: Array,
+    sigma_range_m: float,
+) -> Array:
+    """(n,) reliability of the planes of `_gated_slope`, 0 to 1, by the covariance of the slopes."""
     inverse = np.linalg.inv(normal_matrix)
-    # The ridge is no observation: along a line of points the slope across it is unknown.
+    # The ridge is not an observation: across a line of points the slope is undetermined.
     cov = inverse @ _symmetric_sums(weight**2, across) @ inverse
-    sigma_slope = sigma_range_m / sigma_m[:, 0] * np.sqrt(np.maximum(cov[:, 1, 1], cov[:, 2, 2]))
+    sigma_slope = sigma_range_m / width_m[:, 0] * np.sqrt(np.maximum(cov[:, 1, 1], cov[:, 2, 2]))
     # An angle changes by less than its tangent where the surface is slanted.
     angle = sigma_slope / (1.0 + np.sum(slope**2, axis=1))
     flatness = np.clip(1.0 - angle / TRUSTED_ANGLE_RAD, 0.0, 1.0)
     total, square = weight.sum(axis=1), np.sum(weight**2, axis=1)
     enough = total**2 >= FEWEST_NEIGHBOURS * square
-    return normals, np.where(enough, flatness, 0.0)
+    return np.asarray(np.where(enough, flatness, 0.0))
 
 
 def _symmetric_sums(weight: Array, products: Sequence[Array]) -> Array:

@@ -1,9 +1,10 @@
-"""Joint registration: every cloud of a placement to the latent target frame (the paper's step).
+"""Joint registration of all clouds of a placement to the latent target frame (paper III-D.2).
 
 Variables: a pose `T_target_lidar` per cloud and the components of the mixture. Noise: the
-mixture's own variances. Gauge: moving all clouds and the shape together changes nothing; the mean
-motion of the clouds is taken out of each step, so that the frame stays where the pre-alignment
-put it: origin at the target's centre, axes of the map.
+variances of the components. Gauge: a common motion of all clouds and the shape changes no residual;
+the mean motion of the clouds is removed from each step. So the target frame stays where the
+pre-alignment put it: origin at the target's centre, axes of the map.
+`caliv_graph/registration/README.md` derives the estimating equations.
 """
 
 from __future__ import annotations
@@ -20,59 +21,59 @@ from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Mixture, Registration, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
-from caliv_graph.registration.mixture import (
-    ShapeQuadratic,
-    cell_moments,
-    expect,
-    maximise_shape,
-    seed_mixture,
-    shape_quadratic,
-)
+from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
+from caliv_graph.registration.moments import cell_moments
+from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 
 COARSE_SIGMA_M = 0.05
-"""First standard deviation of the components. 3 degrees at the rim of a chair are 2 cm."""
+"""Initial standard deviation of the components. 3 degrees at the rim of a chair are 2 cm."""
 
 FINE_SIGMA_M = 0.02
-"""The same where a solved graph has put the clouds: their poses move by millimetres."""
+"""The same from poses of a solved graph, which are right to some millimetres."""
 
 ROUGH_POINTS = 400
-"""Points of a cloud at most in a registration that another follows."""
+"""Points of a cloud at most in the coarse pass."""
 
 ANNEALING = 0.85
 """Factor on the floor of the standard deviation, per iteration."""
 
 FLOOR_PER_RANGE_SIGMA = 0.6
-"""Final floor of the standard deviation over the noise along the beam."""
+"""Final floor of the standard deviation, over the sigma of the noise along the beam."""
 
 DAMPING = 1e-3
-"""Levenberg-Marquardt, relative to each cloud's own information: what the shape does not tie
-together (two LiDARs that saw different skins) stays where the pre-alignment had it."""
+"""Levenberg-Marquardt damping, relative to the block of each cloud. Clouds that share no component
+(two LiDARs that saw different skins) keep the relative pose of the pre-alignment."""
 
 UNSEEN = 1e-6
-"""The same for directions in which a cloud has no information of its own, relative to the mean of
-all."""
+"""Damping of directions in which a cloud has no information, relative to the mean of all."""
 
 MAX_STEP = 0.1
-"""Largest step of a cloud in one iteration, radians and metres."""
+"""Largest step of a cloud in one iteration, rad and m."""
 
 STEP_TOLERANCE = (3e-4, 2e-4)
-"""Radians and metres: a registration whose clouds move less has converged."""
+"""Median step of a cloud, rad and m, below which a registration has converged."""
 
 ROUGH_TOLERANCE = (1e-3, 6e-4)
-"""The same of a registration that another follows."""
+"""Tolerance of the coarse pass."""
 
 
 def annealing_steps(sigma_m: float, sigma_range_m: float) -> int:
-    """E-steps until a mixture of width `sigma_m` is as fine as the noise along the beam lets it."""
-    left = FLOOR_PER_RANGE_SIGMA * sigma_range_m / sigma_m
-    return max(math.ceil(math.log(left) / math.log(ANNEALING)), 0)
+    """Number of E-steps from width `sigma_m` of the components to the final floor."""
+    factor = FLOOR_PER_RANGE_SIGMA * sigma_range_m / sigma_m
+    return max(math.ceil(math.log(factor) / math.log(ANNEALING)), 0)
 
 
 class JointRegistration:
-    """The state of one placement's registration: clouds, mixture, and how fine it has become.
+    """State of the registration of one placement: clouds, mixture, annealing.
 
-    The expectation and the two maximisations are separate, since the graph solve takes the place
-    of the free M-step of the poses in `calibration`.
+    E-step and M-step of the components are separate calls: in `calibration` the graph solve is the
+    M-step of the poses, in `register_jointly` it is `free_step`.
+
+    Attributes:
+        observation: the clouds as they were extracted.
+        clouds: the same, thinned and stacked.
+        tolerance: (rad, m) of `register_jointly`.
+        weights: (J,) robust weight of each cloud, set from outside.
     """
 
     def __init__(
@@ -81,17 +82,17 @@ class JointRegistration:
         config: Config,
         rough: bool = False,
         normals: bool = True,
-        shares: Array | None = None,
+        view_weights: Array | None = None,
     ) -> None:
         """Stacks the clouds of `observation`.
 
         Args:
             observation: the clouds.
             config: size of the mixture and of the clouds.
-            rough: fewer points, half the components and an earlier end, for a registration that
-                another follows.
+            rough: the coarse pass: fewer points, half the components, a wider tolerance.
             normals: False if `refine_normals` follows.
-            shares: (J,) what each cloud counts beside others that saw the same; None: all fully.
+            view_weights: (J,) weight of each cloud, below 1 where several have the same view
+                (`targets.cloud.views`); None: all 1.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -117,11 +118,11 @@ class JointRegistration:
         self._mixture: Mixture | None = None
         self._expected: tuple[Array, Array, Array] | None = None
         self._inlier_ratio: Array = np.ones(self.clouds.count)
-        self._shares = np.ones(self.clouds.count) if shares is None else shares
+        self._view_weights = np.ones(self.clouds.count) if view_weights is None else view_weights
         self.weights: Array = np.ones(self.clouds.count)
 
     def refine_normals(self, R: Array, t: Array) -> None:
-        """Surface normals anew, from the clouds of each LiDAR merged at (R, t)."""
+        """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
         names = [cloud.lidar for cloud in self.observation.clouds]
         index = {name: i for i, name in enumerate(dict.fromkeys(names))}
         lidar = np.array([index[name] for name in names])
@@ -136,7 +137,7 @@ class JointRegistration:
 
     @property
     def inlier_ratio(self) -> Array:
-        """(J,) part of each cloud's points that the mixture explains."""
+        """(J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step."""
         return self._inlier_ratio
 
     @property
@@ -145,7 +146,7 @@ class JointRegistration:
         return self._floor <= self._floor_end
 
     def seed(self, R: Array, t: Array, sigma_m: float) -> None:
-        """Starts a new mixture of width `sigma_m` at the given `T_target_lidar` (R, t)."""
+        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
         points = self.clouds.moved(R, t)
         low, high = np.percentile(points, [1, 99], axis=0)
         self._volume = float(np.prod(np.maximum(high - low, 0.05)))
@@ -153,19 +154,19 @@ class JointRegistration:
         self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor)
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
-        """E-step at (R, t), and the quadratic that it puts on the poses."""
+        """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         density = self._gamma / (self._volume * (self._gamma + 1.0))
-        who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._shares)
+        who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._view_weights)
         self._inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
         # Not the quadratic itself: it is as large as all the rest.
-        self._expected = cells, quadratic.turnable, quadratic.torque
+        self._expected = cells, quadratic.orientation_information, quadratic.torque
         return quadratic
 
     def maximise(self, R: Array, t: Array) -> None:
-        """M-step of the components at the new poses (R, t)."""
+        """M-step of the components at the new `T_target_lidar` (R, t)."""
         if self._expected is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
         self._mixture = maximise_shape(
@@ -182,8 +183,18 @@ class JointRegistration:
         converged: bool,
         last_step: tuple[float, float],
     ) -> Registration:
-        """The registration at (R, t), with information (J, 6, 6) of each cloud and of all."""
-        # A cloud that no component explains has no information, but a matrix that can be inverted.
+        """Packs the registration at `T_target_lidar` (R, t).
+
+        Args:
+            R: (J, 3, 3).
+            t: (J, 3) metres.
+            blocks: (J, 6, 6) information of each pose given the shape.
+            joint: (6 J, 6 J) information of all poses, the shape eliminated.
+            iterations: that were made.
+            converged: whether the last step was below the tolerance.
+            last_step: (rad, m).
+        """
+        # A cloud without inliers has no information; its matrix must be invertible nevertheless.
         trace = float(np.median(np.trace(blocks, axis1=1, axis2=2)))
         ridge = (1e-9 * trace + 1e-9) * np.eye(6)
         return Registration(
@@ -202,8 +213,8 @@ class JointRegistration:
 def centre_clouds(clouds: CloudStack, R: Array, t: Array) -> Array:
     """Translations that put the middle of every cloud's extent at the origin.
 
-    A wrong initial guess moves the target by up to a metre (3 degrees at 20 m), but all clouds of
-    a target have about the same extent, whatever the density of their points.
+    An initial guess displaces the target by up to 1 m (3 degrees at 20 m). All clouds of a target
+    have about the same extent, whatever the density of their points.
 
     Returns:
         (J, 3) new translations.
@@ -224,18 +235,18 @@ def left_step(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 
 
 def free_step(quadratic: ShapeQuadratic) -> Array:
-    """M-step of the poses when nothing else is known of them.
+    """M-step of the poses without a graph: damped Newton step on the joint quadratic.
 
     Returns:
-        (J, 6) left perturbations; NaN if there is no solution.
+        (J, 6) left perturbations, mean zero (the gauge); NaN if there is no solution.
     """
     count = len(quadratic.blocks)
     H = quadratic.joint(given_orientations=True)
     H4 = H.reshape(count, 6, count, 6)
     j = np.arange(count)
     H4[j, :, j, :] += DAMPING * quadratic.blocks
-    # A cloud that no component explains says nothing, and stays; so does one along the plane that
-    # is all it sees.
+    # A cloud without inliers has no information and stays. So does a cloud that sees one plane,
+    # along that plane.
     diagonal = np.arange(len(H))
     H[diagonal, diagonal] += UNSEEN * max(float(np.trace(H)) / len(H), 1.0)
     try:
@@ -254,18 +265,18 @@ def register_jointly(
     max_iterations: int,
     coarse: bool = True,
 ) -> Registration:
-    """Registers all clouds of a placement to one reconstructed target (SPEC 3, paper III-D.2).
+    """Registers all clouds of a placement to one reconstructed target (paper III-D.2).
 
-    Unlike GMMCalib's alternation, the poses of all clouds are solved for at once with the means
-    of the components eliminated: tens of iterations instead of hundreds, and clouds that share no
-    component do not pretend to be tied to each other.
+    GMMCalib alternates between poses and means. Here one step solves for the poses of all clouds
+    with the means eliminated: tens of iterations instead of hundreds, and no information between
+    clouds that share no component.
 
     Args:
         state: the clouds; its mixture is seeded here.
-        T_target_lidar: pre-alignment, a pose per cloud; right to about 10 degrees, any position.
+        T_target_lidar: pre-alignment, a pose per cloud; right to about 10 degrees, at any position.
         max_iterations: at most.
-        coarse: False if the pre-alignment is right to a centimetre or two: the clouds are then not
-            centred first, and annealing starts finer.
+        coarse: False if the pre-alignment is right to 1 or 2 cm: the clouds are then not centred,
+            and annealing begins finer.
 
     Returns:
         A pose and a 6x6 information per cloud, and the reconstructed target.
@@ -290,7 +301,7 @@ def register_jointly(
             )
         R, t = left_step(R, t, d)
         state.maximise(R, t)
-        # The median cloud: one sparse cloud that slides along a surface is no reason to go on.
+        # The median cloud: one sparse cloud that slides along a surface does not matter.
         step = (
             float(np.median(np.abs(d[:, :3]).max(axis=1))),
             float(np.median(np.abs(d[:, 3:]).max(axis=1))),

@@ -533,13 +533,14 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
     figure = make_subplots(
         len(titles), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.09
     )
-    sigma = np.sqrt(np.diagonal(trajectory.chain.covariances(), axis1=1, axis2=2))[some]
+    force_sigma, gyro_sigma = trajectory.bias_sigmas()
     dashes, axes = ("solid", "dash", "dot"), "xyz"
-    for row, (values, first) in enumerate(
-        ((trajectory.states.force_bias, 9), (trajectory.states.gyro_bias, 12)), start=1
+    states = trajectory.states
+    for row, (values, sigma) in enumerate(
+        ((states.force_bias, force_sigma), (states.gyro_bias, gyro_sigma)), start=1
     ):
         for axis, colour in enumerate((BLUE, VERMILLION, GREEN)):
-            value, spread = 1e3 * values[some, axis], 1e3 * sigma[:, first + axis]
+            value, spread = 1e3 * values[some, axis], 1e3 * sigma[some, axis]
             figure.add_scatter(
                 x=np.concatenate([seconds, seconds[::-1]]),
                 y=small(np.concatenate([value + spread, (value - spread)[::-1]])),

@@ -18,16 +18,12 @@ from caliv_graph.products import (
 
 if TYPE_CHECKING:
     from caliv_graph.results.run import RunRecord
+from caliv_graph.common.json_text import without_infinities
 from caliv_graph.report.html import render_report
 from caliv_graph.report.log import log_documents
-from caliv_graph.results.files import (
-    CALIBRATION_FILE,
-    GRAPH_FILE,
-    REPORT_FILE,
-    without_infinities,
-    write_calibration,
-    write_target,
-)
+from caliv_graph.results.calibration_file import write_calibration
+from caliv_graph.results.names import CALIBRATION_FILE, GRAPH_FILE, REPORT_FILE
+from caliv_graph.results.target_file import write_target
 
 
 def write_result(

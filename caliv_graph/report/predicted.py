@@ -11,11 +11,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from caliv_graph.common.json_text import without_infinities
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
 from caliv_graph.report.layout import SHOWN_AXES, axis_headings, new_table, sentences, titled
 from caliv_graph.report.tables import direction_texts
-from caliv_graph.results.files import calibration_document, without_infinities
+from caliv_graph.results.calibration_file import calibration_document
 
 if TYPE_CHECKING:
     from caliv_graph.planning.predict import Prediction

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.robust import DOF, explained_part
+from caliv_graph.calibration.kernels import DOF
+from caliv_graph.calibration.robust import explained_part
 from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array, IntArray, Solution
 from caliv_graph.results.run import RunRecord
@@ -22,16 +23,19 @@ NOTABLE_WEIGHT = 0.9
 _MRAD, _MM, _MM_S = ("mrad", 1e3), ("mm", 1e3), ("mm/s", 1e3)
 
 _SOLUTION_KINDS = {
-    "xd": ("given poses, white part", {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)}),
-    "dd": (
+    "given_pose": ("given poses, white part", {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)}),
+    "pose_error_step": (
         "given poses, change of the slow part",
         {"rotation": (_MRAD, 0, 3), "position": (_MM, 3, 6)},
     ),
-    "xeg": ("ground, as the LiDARs see it", {"tilt": (_MRAD, 0, 2), "distance": (_MM, 2, 3)}),
-    "xgh": ("ground, height of the vehicle above it", {"height": (_MM, 0, 1)}),
-    "xgp": ("ground, vehicle parallel to it", {"tilt": (_MRAD, 0, 2)}),
+    "ground_plane": (
+        "ground, as the LiDARs see it",
+        {"tilt": (_MRAD, 0, 2), "distance": (_MM, 2, 3)},
+    ),
+    "standing": ("ground, height of the vehicle above it", {"height": (_MM, 0, 1)}),
+    "parallel": ("ground, vehicle parallel to it", {"tilt": (_MRAD, 0, 2)}),
 }
-"""By the letters of a factor's keys: what it is called, and where its residual holds what."""
+"""Kind of factor -> what it is called, and where its residual holds what."""
 
 _TRAJECTORY_KINDS = {
     "gnss": ("GNSS fixes", {"position": (_MM, 0, 3)}),
@@ -111,17 +115,14 @@ def solution_residuals(solution: Solution) -> tuple[Residuals, ...]:
     Clouds that were dropped are left out; those that were weighed down are there, unweighed.
     """
     found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
-    for index in range(solution.graph.size()):
-        factor = solution.graph.at(index)
-        keys = factor.keys()
-        letters = "".join(chr(gtsam.symbolChr(key)) for key in keys).replace("s", "")
-        if letters in _SOLUTION_KINDS:
-            found[letters].append(factor)
+    for index, kind in enumerate(solution.factor_kinds):
+        if kind in _SOLUTION_KINDS:
+            found[kind].append(solution.graph.at(index))
     out = [_of_clouds(solution)]
     out += [
-        _of_factors(*_SOLUTION_KINDS[letters], found[letters], solution.values)
-        for letters in _SOLUTION_KINDS
-        if letters in found
+        _of_factors(*_SOLUTION_KINDS[kind], found[kind], solution.values)
+        for kind in _SOLUTION_KINDS
+        if kind in found
     ]
     return tuple(r for r in out if len(r.whitened))
 

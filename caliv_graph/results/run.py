@@ -1,4 +1,4 @@
-"""What a calibration was made from, as far as a report shows it."""
+"""A finished run: the result, and the inputs that the report shows."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Beside the result and the solved graph.
+    """The inputs of a run that the report shows, beside the result and the solved graph.
 
     Attributes:
-        drives: what to call each drive.
-        trajectories: one per drive, as they were before any LiDAR had a say.
-        grounds: the ground in the scans; empty where it was not used.
-        scene: per drive a few thinned clouds, as they were recorded: with the times of their
-            points, if the LiDAR tells them.
+        drives: the name of each drive.
+        trajectories: one per drive, smoothed without any LiDAR data.
+        grounds: the ground in the scans; empty if the ground was not used.
+        scene: per drive a few thinned clouds as recorded, with the times of their points if the
+            LiDAR records them.
     """
 
     drives: tuple[str, ...]
@@ -35,18 +35,18 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """What a run leaves: the result, and what it was made from.
+    """The result of a run, and its inputs.
 
     Attributes:
         calibration: the result to write.
         solution: the solved graph.
         observations: the target's clouds.
-        warnings: what a person should know, a line each.
-        evidence: what the report shows beside these; None: nothing was kept.
+        warnings: one line each.
+        record: further inputs for the report; None: none were kept.
     """
 
     calibration: Calibration
     solution: Solution
     observations: tuple[TargetObservation, ...]
     warnings: tuple[str, ...]
-    evidence: RunRecord | None = None
+    record: RunRecord | None = None

@@ -1,6 +1,8 @@
 """The vehicle's trajectory: smoothed from raw sensors, or from given poses; motion compensation.
 
-`select` decides which; `smoothing` builds and solves the graph, `smoothed` is what it offers. Below
-them: `imu`, `gnss`, `measurements` and `noise` make of raw data what `factors` take, `initial` is
-where the solution starts, `chain` its information. `deskew` and `heading` use the trajectory.
+`select` chooses between `smooth` and `given`. `smooth` calls one stage after the other: `inputs`
+(check), `nodes` (place, carry measurements), `initial` and `alignment` (initial guess), `build`
+(the graph, of `factors`), `solve`, `outliers`; `smoothed` is the result. `imu`, `gnss`,
+`measurements`, `noise`, `chain` and `marginals` are their parts. `deskew` and `heading` use a
+trajectory. `README.md` has the mathematics.
 """

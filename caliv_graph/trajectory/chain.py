@@ -1,9 +1,9 @@
-"""The information of a chain of states, and what is left of it when some are eliminated.
+"""The information of a chain of states, and its Schur complements.
 
-A trajectory's Hessian is block tridiagonal in time, with a narrow border for what belongs to the
-whole drive (a yaw bias). That makes marginal covariances linear in its length, and the joint
-information of some of its poses a matter of a banded solve: general sparse elimination would take
-seconds for what is done here in tenths.
+A trajectory's Hessian is block tridiagonal in time, with a narrow border for variables of the whole
+drive (a yaw bias). The joint information of some of its poses is then a banded solve: for hundreds
+of poses GTSAM's general elimination takes 2 to 8 times as long (`scripts/benchmark_trajectory.py
+--solvers`).
 """
 
 from __future__ import annotations
@@ -25,17 +25,19 @@ STATE = 15
 POSE = 6
 
 FACTORS_AT_A_TIME = 100
-"""Of a graph, while it becomes a chain."""
+"""Factors of a graph that are turned into a part of the chain at once."""
+
+UNDETERMINED = "the motion data do not determine the trajectory"
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Information of n states in a row and k coordinates that all of them may know.
+    """Information of n states in a row and k coordinates that all of them may share.
 
     Attributes:
         diagonal: (n, 15, 15).
         coupling: (n - 1, 15, 15) between a state (rows) and the next (columns).
-        border: (n, 15, k) between each state and the common coordinates.
+        border: (n, 15, k) between each state (rows) and the common coordinates.
         corner: (k, k).
     """
 
@@ -55,7 +57,7 @@ class Chain:
 
         Args:
             graph: whitened; every factor touches one state, two neighbours, or common variables.
-            state_keys: per state its keys, in the order in which they make it up.
+            state_keys: per state its keys, in the order of their coordinates in the state.
             state_dims: dimensions of these; they add up to 15.
             common_keys: of the common variables, one dimension each.
         """
@@ -72,7 +74,7 @@ class Chain:
         diagonal = np.zeros((n, STATE, STATE))
         coupling = np.zeros((max(n - 1, 0), STATE, STATE))
         border, corner = np.zeros((n, STATE, k)), np.zeros((k, k))
-        # In parts: triplets take ten times what they add up to, gigabytes on a drive of hours.
+        # In parts: the triplets take ten times the memory of the blocks, gigabytes on a long drive.
         for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
             some = gtsam.GaussianFactorGraph()
             for number in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
@@ -84,7 +86,7 @@ class Chain:
             state, other = row < STATE * n, column < STATE * n
             if (np.abs(b - a)[state & other] > 1).any():
                 raise ValueError("a factor touches states that are not neighbours")
-            # Each place of a matrix comes once.
+            # After summation each entry of a matrix occurs once.
             on, above = state & other & (b == a), state & other & (b == a + 1)
             diagonal[a[on], r[on], c[on]] += value[on]
             coupling[a[above], r[above], c[above]] += value[above]
@@ -92,58 +94,6 @@ class Chain:
             border[a[edge], r[edge], column[edge] - STATE * n] += value[edge]
             corner[row[common] - STATE * n, column[common] - STATE * n] += value[common]
         return Chain(diagonal, coupling, border, corner)
-
-    def _factored(self) -> list[Array]:
-        """Inverse of each state's information given all before it are eliminated.
-
-        Raises:
-            TrajectoryError: a state is not determined.
-        """
-        out: list[Array] = []
-        D = self.diagonal[0]
-        for i in range(len(self.diagonal)):
-            if i:
-                C = self.coupling[i - 1]
-                D = self.diagonal[i] - C.T @ out[-1] @ C
-            out.append(_inverse(D))
-        return out
-
-    def covariances(self) -> Array:
-        """(n, 15, 15) marginal covariance of each state.
-
-        Raises:
-            TrajectoryError: a state is not determined.
-        """
-        inverses = self._factored()
-        n = len(inverses)
-        out = np.zeros((n, STATE, STATE))
-        out[-1] = inverses[-1]
-        for i in range(n - 2, -1, -1):
-            gain = inverses[i] @ self.coupling[i]
-            out[i] = inverses[i] + gain @ out[i + 1] @ gain.T
-        if self.corner.size:
-            # The common coordinates are free as well: what they add is of their rank.
-            solved = self._solve_border(inverses)
-            left = self.corner - np.einsum("nik,nil->kl", self.border, solved)
-            out += np.einsum("nik,kl,njl->nij", solved, _inverse(left), solved)
-        return 0.5 * (out + np.swapaxes(out, 1, 2))
-
-    def common_covariance(self) -> Array:
-        """(k, k) marginal covariance of the common coordinates."""
-        solved = self._solve_border(self._factored())
-        return _inverse(self.corner - np.einsum("nik,nil->kl", self.border, solved))
-
-    def _solve_border(self, inverses: Sequence[Array]) -> Array:
-        """(n, 15, k) the chain's inverse times its border."""
-        n = len(inverses)
-        forward = [self.border[0]]
-        for i in range(1, n):
-            forward.append(self.border[i] - self.coupling[i - 1].T @ inverses[i - 1] @ forward[-1])
-        out = np.zeros_like(self.border)
-        out[-1] = inverses[-1] @ forward[-1]
-        for i in range(n - 2, -1, -1):
-            out[i] = inverses[i] @ (forward[i] - self.coupling[i] @ out[i + 1])
-        return out
 
     def only(self, wanted: IntArray) -> Chain:
         """The chain of some states, all others eliminated.
@@ -156,8 +106,8 @@ class Chain:
         diagonal, border = self.diagonal.copy(), self.border.copy()
         corner = self.corner.copy()
         coupling = np.zeros((max(len(wanted) - 1, 0), STATE, STATE))
-        last = -1  # the kept state before
-        link: Array | None = None  # of that one with state i
+        last = -1  # the last kept state
+        link: Array | None = None  # its coupling with state i
         kept = 0
         for i in range(n):
             next_link = self.coupling[i] if i + 1 < n else None
@@ -167,7 +117,7 @@ class Chain:
                 last, link = i, next_link
                 kept += 1
                 continue
-            inverse = _inverse(diagonal[i])
+            inverse = inverse_of(diagonal[i])
             to_border = inverse @ border[i]
             corner -= border[i].T @ to_border
             if next_link is not None:
@@ -202,13 +152,13 @@ class Chain:
         try:
             factor = scipy.linalg.cholesky_banded(banded, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
-            raise TrajectoryError(_UNDETERMINED) from None
+            raise TrajectoryError(UNDETERMINED) from None
         solved = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
         information = poses.toarray() - cross @ solved[:, : m * POSE]
         if k:
             edge = border_pose - cross @ solved[:, m * POSE :]
             left = chain.corner - border_other.T @ solved[:, m * POSE :]
-            information -= edge @ _inverse(left) @ edge.T
+            information -= edge @ inverse_of(left) @ edge.T
         return np.asarray(0.5 * (information + information.T))
 
 
@@ -234,18 +184,19 @@ def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
     return sorted(set(graph.keyVector()))
 
 
-_UNDETERMINED = "the motion data do not determine the trajectory"
+def inverse_of(A: Array) -> Array:
+    """Inverse of a positive definite matrix, scaled to a unit diagonal for the factorisation.
 
-
-def _inverse(A: Array) -> Array:
-    """Of a positive definite matrix, its units evened out first."""
+    Raises:
+        TrajectoryError: it is not positive definite.
+    """
     scale = np.sqrt(np.diagonal(A))
     if not (scale > 0.0).all():
-        raise TrajectoryError(_UNDETERMINED)
+        raise TrajectoryError(UNDETERMINED)
     try:
         L = np.linalg.cholesky(A / np.outer(scale, scale))
     except np.linalg.LinAlgError:
-        raise TrajectoryError(_UNDETERMINED) from None
+        raise TrajectoryError(UNDETERMINED) from None
     half = np.linalg.inv(L) / scale
     return np.asarray(half.T @ half)
 

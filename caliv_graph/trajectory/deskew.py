@@ -1,4 +1,4 @@
-"""Motion compensation of a sweep: all of its points as if taken at the stamp."""
+"""Motion compensation: moves all points of a sweep to the sweep's stamp."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from caliv_graph.products import Array, IntArray, LidarScan
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 KNOT_NS = 1_000_000
-"""Spacing of the poses between which a point's motion is linear. A vehicle at 1 rad/s and
-10 m/s^2 strays from that by 0.1 microradians and 1.3 micrometres."""
+"""Spacing of the poses between which a point's motion is taken as linear. At 1 rad/s and 10 m/s^2
+the error is 0.1 microradians and 1.3 micrometres."""
+
+MAX_OFFSET_S = 1.0
+"""Largest time of a point from the stamp. A sweep of any LiDAR takes at most 0.2 s; larger values
+are absolute times or the wrong unit."""
 
 
 def deskew(
@@ -23,20 +27,20 @@ def deskew(
 ) -> LidarScan:
     """Moves every point into the LiDAR's frame at the scan's stamp.
 
-    A point with time dt was measured at stamp + dt: `p' = (X(stamp) E)^-1 X(stamp + dt) E p`, X the
-    vehicle's pose, E its mounting. Points of the sweep that are outside the trajectory's span by
-    at most a sweep are moved as if the vehicle stood there: the first and last scan of a drive.
+    A point with time dt was measured at stamp + dt: `p' = (X(stamp) E)^-1 X(stamp + dt) E p`, X
+    T_map_vehicle, E T_vehicle_lidar. Before and after the trajectory's span the vehicle is taken to
+    stand: this concerns points of the first and last scan of a drive.
 
     Args:
         scan: with per-point times; one without is returned as it is.
-        T_vehicle_lidar: mounting, guess or estimate.
+        T_vehicle_lidar: the extrinsic, guess or estimate.
         trajectory: of the drive.
 
     Returns:
         The scan with `point_times_s` None.
 
     Raises:
-        TrajectoryError: the stamp is outside the trajectory's span, or the times are no times.
+        TrajectoryError: the stamp is outside the trajectory's span, or the times are unusable.
     """
     (points,) = deskewed(scan, [T_vehicle_lidar], trajectory)
     return replace(scan, points_lidar=points, point_times_s=None)
@@ -45,9 +49,9 @@ def deskew(
 def deskewed(
     scan: LidarScan, T_vehicle_lidar: Iterable[gtsam.Pose3], trajectory: VehicleTrajectory
 ) -> Iterator[Array]:
-    """Points (N, 3) of a scan moved as `deskew` does, for each of several extrinsics.
+    """Points (N, 3) of a scan moved as by `deskew`, for each of several extrinsics.
 
-    The vehicle's motion, which takes as long as all the rest, is asked for once.
+    The vehicle's poses, half of the cost, are computed once.
 
     Raises:
         TrajectoryError: as `deskew`, when the first is asked for.
@@ -55,7 +59,7 @@ def deskewed(
     if scan.point_times_s is None or not len(scan.points_lidar):
         yield from (scan.points_lidar for _ in T_vehicle_lidar)
         return
-    if not np.isfinite(scan.point_times_s).all() or np.abs(scan.point_times_s).max() > 1.0:
+    if not np.isfinite(scan.point_times_s).all() or np.abs(scan.point_times_s).max() > MAX_OFFSET_S:
         raise TrajectoryError(
             f"{scan.source}: per-point times from {scan.point_times_s.min():g} s to "
             f"{scan.point_times_s.max():g} s about the stamp: no sweep takes a second. Check its "
@@ -76,10 +80,10 @@ def deskewed(
         )
     at = np.clip(scan.stamp_ns + np.append(knots, 0), begin, end)
     R, t = trajectory.poses_at(at)
-    for mounting in T_vehicle_lidar:
-        R_mount, t_mount = stack([mounting])
-        R_lidar = R @ R_mount[0]
-        t_lidar = t + R @ t_mount[0]
+    for extrinsic in T_vehicle_lidar:
+        R_extrinsic, t_extrinsic = stack([extrinsic])
+        R_lidar = R @ R_extrinsic[0]
+        t_lidar = t + R @ t_extrinsic[0]
         back = R_lidar[-1].T
         R_knots = back @ R_lidar[:-1]
         t_knots = (t_lidar[:-1] - t_lidar[-1]) @ back.T
@@ -87,10 +91,10 @@ def deskewed(
 
 
 def _moved(points: Array, offsets_ns: IntArray, knots: IntArray, R: Array, t: Array) -> Array:
-    """Points between the two knots around their time, linear in time."""
+    """Points interpolated linearly in time between their two neighbouring knots."""
     k = np.clip(np.searchsorted(knots, offsets_ns, "right") - 1, 0, len(knots) - 2)
     span = np.maximum(np.diff(knots), 1)[k]
-    share = ((offsets_ns - knots[k]) / span)[:, None]
+    part = ((offsets_ns - knots[k]) / span)[:, None]
     before = np.einsum("nij,nj->ni", R[k], points) + t[k]
     after = np.einsum("nij,nj->ni", R[k + 1], points) + t[k + 1]
-    return np.asarray(before + share * (after - before))
+    return np.asarray(before + part * (after - before))

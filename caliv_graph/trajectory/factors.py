@@ -1,8 +1,8 @@
 """The measurement factors of the trajectory, one function per kind.
 
 Variables beside node i: I_i = T_map_imu (right perturbation), V_i velocity of the IMU's origin in
-the map. A measurement between two nodes is carried to the nearest by the IMU (`DeadReckoning`);
-over at most half a node spacing the IMU's own noise is far below the measurement's.
+the map. The IMU carries a measurement between two nodes to the nearest (`DeadReckoning`); over at
+most half a node spacing the IMU's own noise is far below the measurement's.
 All Jacobians are analytic; the tests check them numerically.
 """
 
@@ -32,15 +32,16 @@ def position_factor(
 ) -> gtsam.NoiseModelFactor:
     """A position of the GNSS antenna, `delay_s` after the node.
 
-    `r = p + V dt + g dt^2 / 2 + R q - z`, q what the IMU moved by since the node, plus the lever
-    arm as it is turned then, both in the IMU's frame at the node.
+    `r = p + V dt + g dt^2 / 2 + R q - z`; q is the IMU's displacement since the node plus the lever
+    arm, rotated to the time of the fix, both in the IMU's frame at the node.
 
     Args:
         key_imu: of I_i.
         key_velocity: of V_i.
         position_map: (3,) measured, metres.
         offset_imu: (3,) q, metres.
-        delay_s: of the measurement after the node; negative: before it; zero: GTSAM's own factor.
+        delay_s: of the measurement after the node, negative: before it. Zero gives GTSAM's own
+            factor.
         gravity_m_s2: along -z of the map.
         noise: of r, 3 dimensions, map axes.
     """
@@ -96,9 +97,9 @@ def velocity_factor(
 def biased_orientation_factor(
     key_imu: int, key_yaw_bias: int, R_map_imu: gtsam.Rot3, noise: NoiseModel
 ) -> gtsam.CustomFactor:
-    """An orientation whose source is turned about the map's z axis by a constant, b.
+    """An orientation whose source has a constant bias b about the map's z axis.
 
-    `r = Log(Z^T Rz(b) R)`: the source says the true orientation turned by b.
+    `r = Log(Z^T Rz(b) R)`: the source measures the true orientation rotated by b.
 
     Args:
         key_imu: of I_i.
@@ -149,14 +150,14 @@ def marginal_factor(
     m = len(keys)
     blocks = information.reshape(m, 6, m, 6).swapaxes(1, 2)
     zero, graph = np.zeros(6), gtsam.GaussianFactorGraph()
-    nothing = np.zeros((6, 6))
+    no_block = np.zeros((6, 6))
     # HessianFactor takes three keys at most from Python: a sum over pairs, merged by GTSAM.
     for i in range(m):
         graph.add(gtsam.HessianFactor(keys[i], blocks[i, i], zero, 0.0))
         for j in range(i + 1, m):
             graph.add(
                 gtsam.HessianFactor(
-                    keys[i], keys[j], nothing, blocks[i, j], zero, nothing, zero, 0.0
+                    keys[i], keys[j], no_block, blocks[i, j], zero, no_block, zero, 0.0
                 )
             )
     point = gtsam.Values()

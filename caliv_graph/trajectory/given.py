@@ -1,15 +1,17 @@
-"""Trajectories from poses that came with the recording."""
+"""A trajectory from the given poses of a recording, with the covariances of their messages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
 
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import MotionData, Recording, Trajectory
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.noise import stated
 
 
 def given_trajectory(motion: MotionData) -> Trajectory:
-    """The given vehicle poses of a drive, as a trajectory.
+    """The given vehicle poses of a drive, as a trajectory; `cov` as the messages state it.
 
     Raises:
         TrajectoryError: it has fewer than two poses.
@@ -21,14 +23,39 @@ def given_trajectory(motion: MotionData) -> Trajectory:
         raise TrajectoryError(
             f"{motion.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"
         )
-    return Trajectory(poses.stamps_ns, poses.T_map_vehicle)
+    return Trajectory(poses.stamps_ns, poses.T_map_vehicle, poses.cov)
 
 
-def given_trajectories(recordings: Sequence[Recording]) -> tuple[Trajectory, ...]:
-    """The given vehicle poses of each drive, as a trajectory.
+def error_covariances(trajectory: Trajectory, stamps_ns: IntArray) -> Array | None:
+    """Covariances of the errors of given poses, as their messages state them.
 
-    Raises:
-        TrajectoryError: a recording has fewer than two poses.
-        RecordingError: its poses could not be read.
+    Between two poses they are interpolated linearly (README, section 11).
+
+    Args:
+        trajectory: given poses; their covariances are right perturbations.
+        stamps_ns: (m,) within its span.
+
+    Returns:
+        (m, 6, 6) of the rotation in vehicle axes (rad), then the position in map axes (m); NaN
+        where unknown. None: no message states one.
     """
-    return tuple(given_trajectory(recording.motion()) for recording in recordings)
+    if trajectory.cov is None:
+        return None
+    known = stated(trajectory.cov)
+    if not known.any():
+        return None
+    R, _ = stack(trajectory.T_map_vehicle)
+    A = np.tile(np.eye(6), (len(R), 1, 1))
+    A[:, 3:, 3:] = R
+    cov = np.full_like(trajectory.cov, np.nan)
+    cov[known] = (A @ trajectory.cov @ np.swapaxes(A, 1, 2))[known]
+    after = np.clip(np.searchsorted(trajectory.stamps_ns, stamps_ns), 1, len(R) - 1)
+    before = after - 1
+    begin, end = trajectory.stamps_ns[before], trajectory.stamps_ns[after]
+    s = ((stamps_ns - begin) / (end - begin))[:, None, None]
+    # At a pose itself its neighbour does not matter, be it unknown.
+    return np.where(
+        s == 0.0,
+        cov[before],
+        np.where(s == 1.0, cov[after], (1.0 - s) * cov[before] + s * cov[after]),
+    )

@@ -23,7 +23,7 @@ class Positions:
         position_map: (n, 3) metres, ENU about the first fix.
         cov_map: (n, 3, 3) m^2.
         origin_deg_m: latitude, longitude (degrees) and altitude (m) of the map's origin.
-        source: where the covariances are from.
+        source: of the covariances: messages, config, or the paper's table.
     """
 
     stamps_ns: IntArray
@@ -36,7 +36,7 @@ class Positions:
 def positions_in_map(
     gnss: GnssFixes, config: Config, name: str
 ) -> tuple[Positions, tuple[str, ...]]:
-    """Converts fixes; those that are not finite or not on Earth are left out and told.
+    """Converts fixes; those that are not finite or out of range are left out, with a warning.
 
     Raises:
         TrajectoryError: no fix is usable.
@@ -70,7 +70,8 @@ def positions_in_map(
 def normal_gravity(latitude_deg: float, altitude_m: float) -> float:
     """Gravity on the WGS84 ellipsoid (Somigliana), less its decrease with height, in m/s^2.
 
-    True gravity differs by up to 0.001 m/s^2: less than any accelerometer's bias here.
+    True gravity differs by up to 0.001 m/s^2, which is below the bias of an accelerometer.
+    Coefficients: WGS84 (NIMA TR8350.2, equation 4-1), free-air gradient 3.086e-6 1/s^2.
     """
     s = math.sin(math.radians(latitude_deg)) ** 2
     surface = 9.7803253359 * (1.0 + 0.00193185265241 * s) / math.sqrt(1.0 - 0.00669437999013 * s)

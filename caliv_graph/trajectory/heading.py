@@ -1,9 +1,8 @@
-"""Does the vehicle go where it points? Heading against course over ground.
+"""Heading against course over ground: a check of the vehicle frame's yaw.
 
-Calibration to the vehicle is only as good as the vehicle's own axes: an orientation source that is
-turned about the vertical, or an IMU mounted a degree off what the config says, turns every LiDAR
-with it, and nothing else in the data tells. The vehicle's own motion does: it does not slip
-sideways at its rear axle.
+An orientation source with a yaw bias, or an IMU whose extrinsic is a degree off, rotates every
+LiDAR's extrinsic by the same angle. Only the vehicle's motion shows it: its rear axle does not slip
+sideways.
 """
 
 from __future__ import annotations
@@ -16,19 +15,24 @@ import numpy as np
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
-FASTER_THAN_M_S = 0.5
-"""Below, the direction of travel is noise."""
+MIN_SPEED_M_S = 0.5
+"""Below, velocity noise of 10 mm/s is more than 20 mrad of direction."""
 
-LEAST_SECONDS = 2.0
-"""Of driving, for the comparison to be one."""
+MIN_DRIVING_S = 2.0
+"""Of driving; less has fewer than two independent samples."""
 
 SIGMAS = 4.0
-"""Of disagreement that are told."""
+"""A larger disagreement is reported: probability 6e-5 without one."""
 
 FLOOR_RAD = math.radians(0.2)
-"""Tyres slip, and roads are banked: less is never told."""
+"""A smaller disagreement is never reported: slip of the tyres and banked roads cause as much."""
 
 SPACING_NS = 100_000_000
+"""Of the samples that are compared."""
+
+MIN_CURVATURE_RANGE_1_M = 0.02
+"""Range of curvatures (5th to 95th percentile) from which the axle is estimated, and the curvature
+above which an axle's place explains a yaw: a turning radius of 50 m."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +40,13 @@ class HeadingDisagreement:
     """How course over ground and heading differ.
 
     Attributes:
-        yaw_rad: by which the heading is turned against the motion, positive to the left.
+        yaw_rad: of the heading against the motion, positive to the left.
         sigma_rad: of it.
-        axle_m: x in the vehicle frame of the point that does not slip sideways, as the curves show
-            it; NaN on a straight drive.
-        duration_s: of driving looked at.
-        measured: whether the lateral velocity was measured (twist), not taken to be zero.
-        warning: a line for a person; empty if there is nothing to tell.
+        axle_m: x in the vehicle frame of the point that does not slip sideways; NaN where the
+            curves do not determine it.
+        duration_s: of driving that was compared.
+        measured: whether the lateral velocity was measured (twist), not assumed to be zero.
+        warning: a line for the user; empty without a significant disagreement.
     """
 
     yaw_rad: float
@@ -56,13 +60,12 @@ class HeadingDisagreement:
 def heading_disagreement(
     smoothed: SmoothedTrajectory, motion: MotionData
 ) -> HeadingDisagreement | None:
-    """Compares the direction in which the vehicle points and the one in which it goes.
+    """Compares the direction in which the vehicle points with the one in which it moves.
 
-    Where velocities with a lateral part are recorded, the direction of the GNSS's motion in vehicle
-    axes is compared with theirs. Else the rear axle is taken not to slip: `v_y = -psi v_x -
-    x_axle w_z`, psi the heading's error, x_axle the axle's place in the vehicle frame, which the
-    curves of the drive tell apart if they are not all alike. On a single arc they are not told
-    apart, and the frame is taken to be at the axle.
+    Where velocities with a lateral part are recorded, the motion in vehicle axes is compared with
+    them. Otherwise the rear axle is assumed not to slip: `v_y = -psi v_x - x_axle w_z`, psi the
+    error of the heading, x_axle the axle's place in the vehicle frame. Curves of different radius
+    separate the two. On a single arc they are not separable, and x_axle is taken as zero.
 
     Args:
         smoothed: of the drive.
@@ -74,43 +77,24 @@ def heading_disagreement(
     begin, end = smoothed.span_ns
     at = np.arange(begin, end, SPACING_NS, dtype=np.int64)
     velocity, rates = smoothed.velocities_at(at)
-    fast = np.hypot(velocity[:, 0], velocity[:, 1]) > FASTER_THAN_M_S
+    fast = np.hypot(velocity[:, 0], velocity[:, 1]) > MIN_SPEED_M_S
     duration_s = float(fast.sum()) * SPACING_NS * 1e-9
-    if duration_s < LEAST_SECONDS:
+    if duration_s < MIN_DRIVING_S:
         return None
-    turn = rates[fast, 2]
-    seconds = (at[fast] - begin) * 1e-9
-    measured = _measured(motion)
-    if measured is not None:
-        times, said = measured
-        along = np.stack([np.interp(seconds, (times - begin) * 1e-9, axis) for axis in said.T], 1)
-        coarse = _turn_between(velocity[fast, :2], along, axis_only=False)
-    else:
-        along = np.tile([1.0, 0.0], (len(turn), 1))
-        coarse = _turn_between(velocity[fast, :2], along, axis_only=True)
-    # The coarse part may be a right angle (north for east); what is left is small.
+    velocity, turn = velocity[fast, :2], rates[fast, 2]
+    measured = _measured_at(motion, at[fast], begin)
+    along = np.tile([1.0, 0.0], (len(turn), 1)) if measured is None else measured
+    # The coarse part may be a right angle (north instead of east); the rest is small.
+    coarse = _turn_between(velocity, along, axis_only=measured is None)
     c, s = math.cos(coarse), math.sin(coarse)
-    forward = c * velocity[fast, 0] - s * velocity[fast, 1]
-    sideways = s * velocity[fast, 0] + c * velocity[fast, 1]
+    forward = c * velocity[:, 0] - s * velocity[:, 1]
+    sideways = s * velocity[:, 0] + c * velocity[:, 1]
     if measured is not None:
         sideways = sideways - along[:, 1]
-    columns = [-forward]
-    # Rate of turn and speed, apart from each other by more than noise: then the axle shows.
-    separable = measured is None and _apart(forward, turn)
-    if separable:
-        columns.append(-turn)
-    A = np.stack(columns, axis=1)
-    solution, *_ = np.linalg.lstsq(A, sideways, rcond=None)
-    residual = sideways - A @ solution
-    # The smoothed velocity's error lasts about a second: so many samples are independent. That of
-    # measured velocities is white, and larger.
-    scale = 1.0 if measured is not None else 1.0 / (1e-9 * SPACING_NS)
-    spread = float(residual @ residual) / max(len(forward) - len(columns), 1) * scale
-    cov = spread * np.linalg.inv(A.T @ A)
-    heading_sigma = _heading_sigma(smoothed)
-    sigma = math.sqrt(float(cov[0, 0]) + heading_sigma**2)
+    separable = measured is None and _separable(forward, turn)
+    solution, variance = _fit(forward, turn if separable else None, sideways, measured is not None)
+    sigma = math.sqrt(variance + _heading_sigma(smoothed) ** 2)
     yaw = coarse + float(solution[0])
-    axle = float(solution[1]) if separable else math.nan
     warning = ""
     if abs(yaw) > max(SIGMAS * sigma, FLOOR_RAD):
         warning = (
@@ -119,35 +103,74 @@ def heading_disagreement(
             "yaw of every LiDAR to the vehicle is off by as much. Check imu.T_vehicle_imu, or set "
             f"imu.yaw_bias{_or_axle(yaw, forward, turn, separable or measured is not None)}"
         )
-    return HeadingDisagreement(yaw, sigma, axle, duration_s, measured is not None, warning)
-
-
-def _or_axle(yaw: float, forward: Array, turn: Array, told_apart: bool) -> str:
-    """On a single arc, a vehicle frame off the rear axle looks the same."""
-    rate = float(np.median(turn / forward))
-    if told_apart or abs(rate) < 0.02:
-        return ""
-    return (
-        f". Nothing is wrong if the vehicle frame is {-yaw / rate:.2f} m behind the rear axle: "
-        "a single arc does not tell"
+    return HeadingDisagreement(
+        yaw_rad=yaw,
+        sigma_rad=sigma,
+        axle_m=float(solution[1]) if separable else math.nan,
+        duration_s=duration_s,
+        measured=measured is not None,
+        warning=warning,
     )
 
 
-def _measured(motion: MotionData) -> tuple[IntArray, Array] | None:
-    """Stamps (n,) and velocities (n, 2), if the lateral one is measured: odometry says zero."""
+def _fit(
+    forward: Array, turn: Array | None, sideways: Array, measured: bool
+) -> tuple[Array, float]:
+    """Least squares of `sideways = -yaw forward - x_axle turn`.
+
+    Args:
+        forward: (n,) m/s.
+        turn: (n,) rad/s; None: the axle is not estimated.
+        sideways: (n,) m/s.
+        measured: whether it is the difference to a measured velocity.
+
+    Returns:
+        (1,) yaw or (2,) yaw and x_axle; variance of the yaw.
+    """
+    A = np.stack([-forward] if turn is None else [-forward, -turn], axis=1)
+    solution, *_ = np.linalg.lstsq(A, sideways, rcond=None)
+    residual = sideways - A @ solution
+    # Errors of the smoothed velocity are correlated over about a second: so many samples count as
+    # one. Errors of measured velocities are white, and larger.
+    scale = 1.0 if measured else 1.0 / (1e-9 * SPACING_NS)
+    spread = float(residual @ residual) / max(len(forward) - A.shape[1], 1) * scale
+    return np.asarray(solution), float((spread * np.linalg.inv(A.T @ A))[0, 0])
+
+
+def _or_axle(yaw: float, forward: Array, turn: Array, separated: bool) -> str:
+    """The other explanation: on a single arc, a vehicle frame off the rear axle looks the same."""
+    rate = float(np.median(turn / forward))
+    if separated or abs(rate) < MIN_CURVATURE_RANGE_1_M:
+        return ""
+    return (
+        f". Nothing is wrong if the vehicle frame is {-yaw / rate:.2f} m behind the rear axle: "
+        "a single arc does not distinguish the two"
+    )
+
+
+def _measured_at(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array | None:
+    """(n, 2) measured velocities; None if the lateral one is not measured: odometry sets it to 0.
+
+    Args:
+        motion: of the drive.
+        stamps_ns: (n,) instants.
+        begin_ns: origin of the interpolation's time axis.
+    """
     if motion.twist is None:
         return None
     finite = np.isfinite(motion.twist.velocity).all(axis=1)
     velocity = motion.twist.velocity[finite, :2]
     if len(velocity) < 2 or not np.abs(velocity[:, 1]).any():
         return None
-    return np.asarray(motion.twist.stamps_ns[finite]), velocity
+    times = np.asarray(motion.twist.stamps_ns[finite])
+    x, xp = (stamps_ns - begin_ns) * 1e-9, (times - begin_ns) * 1e-9
+    return np.stack([np.interp(x, xp, axis) for axis in velocity.T], 1)
 
 
 def _turn_between(seen: Array, expected: Array, axis_only: bool) -> float:
-    """The angle by which (n, 2) directions have to be turned to be those expected, on average.
+    """The angle of the least-squares rotation from (n, 2) directions to those expected.
 
-    With `axis_only` forward and backward are the same, and the angle is within a right angle.
+    With `axis_only` forward and backward are equivalent, and the angle is at most a right angle.
     """
     cross = seen[:, 0] * expected[:, 1] - seen[:, 1] * expected[:, 0]
     dot = (seen * expected).sum(axis=1)
@@ -157,14 +180,14 @@ def _turn_between(seen: Array, expected: Array, axis_only: bool) -> float:
     return 0.5 * double
 
 
-def _apart(forward: Array, turn: Array) -> bool:
-    """Whether the ratio of turn to speed varies: curves to both sides, or curves and straights."""
+def _separable(forward: Array, turn: Array) -> bool:
+    """Whether the curvature varies: curves to both sides, or curves and straights."""
     curvature = turn / forward
-    return float(np.ptp(np.percentile(curvature, [5, 95]))) > 0.02
+    return float(np.ptp(np.percentile(curvature, [5, 95]))) > MIN_CURVATURE_RANGE_1_M
 
 
 def _heading_sigma(smoothed: SmoothedTrajectory) -> float:
-    """Of the mean heading over the drive: its errors last about a second."""
+    """1 sigma of the mean heading, taken as that of a single one: errors common to all remain."""
     cov = smoothed.trajectory.cov
     if cov is None or not len(cov):
         return 0.0

@@ -1,9 +1,9 @@
 """The IMU between any two instants: cleaned samples, dead reckoning, preintegrated factors.
 
-A sample is the value at its stamp; between two samples both readings go over linearly into each
-other. Steps are integrated with the reading at their middle, and the specific force turned by half
-of the step's rotation: a zero-order hold would lag by half a sample, which in a turn is a heading
-error that no bias explains.
+A sample is the value at its stamp; between two samples the readings are linear in time. A step is
+integrated with the reading at its middle, the specific force rotated by half of the step's
+rotation. A zero-order hold would lag by half a sample, which in a turn is a heading error that no
+bias explains.
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from caliv_graph.products import Array, ImuSamples, IntArray
 from caliv_graph.trajectory.noise import ImuNoise
 
 GAP_S = 0.1
-"""A longer time without a sample is a gap."""
+"""A longer time without a sample is a gap, unless three median periods are longer still."""
 
-LONGEST_BRIDGE_S = 2.0
-"""A longer gap splits the recording: what the vehicle did in it is anyone's guess."""
+MAX_BRIDGE_S = 2.0
+"""A longer gap splits the recording: at the noise below, position is off by 3 m after it."""
 
-LEAST_FORCE_M_S2, MOST_FORCE_M_S2 = 5.0, 15.0
-"""Of the median specific force."""
+MIN_FORCE_M_S2, MAX_FORCE_M_S2 = 5.0, 15.0
+"""Bounds of the median specific force, 9.8 m/s^2 at rest; in units of g it is 1, without gravity
+near 0."""
 
-# What the readings may have done in a gap, off the straight line between its ends, 1 sigma: the
-# steering and braking of a calibration drive.
+# Deviation of the readings in a gap from the straight line between its ends, 1 sigma: steering and
+# braking of a calibration drive.
 BRIDGE_GYRO_RAD_S = 0.3
 BRIDGE_FORCE_M_S2 = 1.5
 
 BRIDGE_STEP_NS = 20_000_000
-"""Steps into which a gap is cut."""
+"""Integration step in a gap: 50 Hz, the slowest rate of a usual IMU."""
 
 INTEGRATION_DENSITY_M = 1e-5
-"""m/sqrt(s), of the position alone. GTSAM's covariance of a single step is singular without."""
+"""m/sqrt(s), noise of the position alone: 3 micrometres over 0.1 s. Without it GTSAM's covariance
+of one step is singular."""
 
 
 def exp_so3(rotation_vectors: Array) -> Array:
@@ -61,7 +63,7 @@ def interpolate(at_ns: IntArray, stamps_ns: IntArray, values: Array) -> Array:
 
 @dataclass(frozen=True)
 class Inertial:
-    """Finite samples without a gap that could not be bridged.
+    """Finite samples without a gap that is too long to bridge.
 
     Attributes:
         stamps_ns: (n,) strictly increasing.
@@ -87,7 +89,7 @@ class Inertial:
 
 
 def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...]]:
-    """Drops unusable samples and picks the longest piece without a long gap.
+    """Drops unusable samples and selects the longest piece without a long gap.
 
     Args:
         imu: as read.
@@ -97,7 +99,41 @@ def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...
         The samples, and what was left out or bridged, a line each.
 
     Raises:
-        TrajectoryError: too little is left.
+        TrajectoryError: too little is left, or the samples are not those of an IMU at all.
+    """
+    stamps, gyro, force, warnings = _finite_samples(imu, name)
+    steps = np.diff(stamps)
+    longest = max(GAP_S, 3e-9 * float(np.median(steps)))
+    split = max(MAX_BRIDGE_S, longest)
+    cuts = np.flatnonzero(steps > 1e9 * split) + 1
+    bounds = [0, *cuts.tolist(), len(stamps)]
+    pieces = [(int(stamps[b - 1] - stamps[a]), a, b) for a, b in itertools.pairwise(bounds)]
+    duration_ns, a, b = max(pieces)
+    if len(pieces) > 1:
+        warnings.append(
+            f"{name}: {len(cuts)} gap(s) of more than {split:g} s in the "
+            f"IMU, the longest {steps.max() * 1e-9:.1f} s: only the longest piece is used, "
+            f"{duration_ns * 1e-9:.1f} s of {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
+        )
+    stamps, gyro, force = stamps[a:b], gyro[a:b], force[a:b]
+    if b - a < 2:
+        raise TrajectoryError(f"{name}: the IMU's messages are all more than 2 s apart")
+    at_gap = np.flatnonzero(np.diff(stamps) > 1e9 * longest)
+    gaps = np.stack([stamps[at_gap], stamps[at_gap + 1]], axis=1).reshape(-1, 2)
+    if len(gaps):
+        lost_s = float((gaps[:, 1] - gaps[:, 0]).sum()) * 1e-9
+        warnings.append(
+            f"{name}: {len(gaps)} gap(s) in the IMU, {lost_s:.2f} s together: bridged, poses "
+            "there are less certain"
+        )
+    return Inertial(stamps, gyro, force, gaps), tuple(warnings)
+
+
+def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array, list[str]]:
+    """Stamps (n,), angular velocities and specific forces (n, 3) that are finite; warnings.
+
+    Raises:
+        TrajectoryError: fewer than two are, stamps do not increase, or gravity is missing.
     """
     finite = np.asarray(np.isfinite(imu.angular_velocity).all(axis=1))
     finite_force = np.asarray(np.isfinite(imu.specific_force).all(axis=1))
@@ -125,39 +161,18 @@ def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...
             f"{name}: IMU stamps do not increase: {stamps[at]} ns, then {stamps[at + 1]} ns"
         )
     gyro, force = imu.angular_velocity[finite], imu.specific_force[finite]
-    felt = float(np.median(np.linalg.norm(force, axis=1)))
-    if not LEAST_FORCE_M_S2 < felt < MOST_FORCE_M_S2:
+    median = float(np.median(np.linalg.norm(force, axis=1)))
+    if not MIN_FORCE_M_S2 < median < MAX_FORCE_M_S2:
         raise TrajectoryError(
-            f"{name}: the IMU's median linear acceleration is {felt:.2f} m/s^2, at rest it should "
-            "be 9.8: gravity is taken out, or the unit is not m/s^2. Choose another topics.imu"
+            f"{name}: the IMU's median linear acceleration is {median:.2f} m/s^2, at rest it "
+            "should be 9.8: gravity is taken out, or the unit is not m/s^2. Choose another "
+            "topics.imu"
         )
-    longest = max(GAP_S, 3e-9 * float(np.median(steps)))
-    cuts = np.flatnonzero(steps > 1e9 * max(LONGEST_BRIDGE_S, longest)) + 1
-    bounds = [0, *cuts.tolist(), len(stamps)]
-    pieces = [(int(stamps[b - 1] - stamps[a]), a, b) for a, b in itertools.pairwise(bounds)]
-    duration_ns, a, b = max(pieces)
-    if len(pieces) > 1:
-        warnings.append(
-            f"{name}: {len(cuts)} gap(s) of more than {max(LONGEST_BRIDGE_S, longest):g} s in the "
-            f"IMU, the longest {steps.max() * 1e-9:.1f} s: only the longest piece is used, "
-            f"{duration_ns * 1e-9:.1f} s of {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
-        )
-    stamps, gyro, force = stamps[a:b], gyro[a:b], force[a:b]
-    if b - a < 2:
-        raise TrajectoryError(f"{name}: the IMU's messages are all more than 2 s apart")
-    at_gap = np.flatnonzero(np.diff(stamps) > 1e9 * longest)
-    gaps = np.stack([stamps[at_gap], stamps[at_gap + 1]], axis=1).reshape(-1, 2)
-    if len(gaps):
-        lost_s = float((gaps[:, 1] - gaps[:, 0]).sum()) * 1e-9
-        warnings.append(
-            f"{name}: {len(gaps)} gap(s) in the IMU, {lost_s:.2f} s together: bridged, poses "
-            "there are less certain"
-        )
-    return Inertial(stamps, gyro, force, gaps), tuple(warnings)
+    return stamps, gyro, force, warnings
 
 
 def _prefix_products(R: Array) -> Array:
-    """(n + 1, 3, 3): identity, R_0, R_0 R_1, ...; by doubling, so that numpy does the loop."""
+    """(n + 1, 3, 3): identity, R_0, R_0 R_1, ...; by doubling, log2(n) calls of numpy."""
     out = np.concatenate([np.eye(3)[None], R])
     shift = 1
     while shift < len(out):
@@ -168,10 +183,10 @@ def _prefix_products(R: Array) -> Array:
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Motion by the IMU alone, in the frame that the IMU had at its first sample, without gravity.
+    """Motion by the IMU alone, in the IMU's frame at its first sample, gravity not included.
 
-    Relative motion between any two instants, forward or backward in time, is a difference of what
-    is kept here. With bias b removed: `R' = R skew(w)`, `v' = R f`, `p' = v`.
+    `R' = R skew(w)`, `v' = R f`, `p' = v`, with bias removed. The motion between any two instants,
+    forward or backward in time, follows from the states at the two.
 
     Attributes:
         stamps_ns: (n,) of the samples.
@@ -190,7 +205,7 @@ class DeadReckoning:
         w0, f0 = self.gyro[k], self.force[k]
         w_rate, f_rate = (self.gyro[k + 1] - w0) / dt, (self.force[k + 1] - f0) / dt
         turn = w0 * tau + 0.5 * w_rate * tau**2
-        # f(s) = f0 + f_rate s, turned by w s: to second order in the step.
+        # f(s) = f0 + f_rate s, rotated by w s, to second order in the step.
         bend = np.cross(w0 + 0.5 * w_rate * tau, f0 + 0.5 * f_rate * tau)
         velocity = f0 * tau + (0.5 * f_rate + 0.5 * bend) * tau**2
         displacement = 0.5 * f0 * tau**2 + (f_rate + bend) * tau**3 / 6.0
@@ -211,7 +226,7 @@ class DeadReckoning:
     def _at(self, stamps_ns: IntArray) -> tuple[Array, Array, Array]:
         R, v, p = self._cumulative
         k = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, "right") - 1, 0, len(R) - 2)
-        # Beyond the ends the first and last readings are extrapolated by their own line.
+        # Beyond the ends the line through the first or last two readings is extended.
         tau: Array = np.asarray(stamps_ns - self.stamps_ns[k], dtype=np.float64) * 1e-9
         dR, dv, dp = self._step(k, tau)
         v_at = v[k] + np.einsum("nij,nj->ni", R[k], dv)
@@ -240,7 +255,7 @@ class DeadReckoning:
         """(m, 3) rad/s in the IMU's frame, averaged over a window about each instant."""
         if half_window_ns == 0:
             return interpolate(stamps_ns, self.stamps_ns, self.gyro)
-        # The window shrinks on both sides alike at the ends: it stays about the instant.
+        # At the ends the window shrinks on both sides alike: it stays centred on the instant.
         room = np.minimum(stamps_ns - self.stamps_ns[0], self.stamps_ns[-1] - stamps_ns)
         half = np.minimum(np.maximum(room, 1_000_000), half_window_ns)
         R, _, _ = self.between(stamps_ns - half, stamps_ns + half)
@@ -297,7 +312,7 @@ def preintegrate(
 
 
 def _bridged(inertial: Inertial, nodes_ns: IntArray) -> Array:
-    """(n - 1,) length in seconds of the gap that an interval lies in, 0: none."""
+    """(n - 1,) length in seconds of the gap in which an interval lies, 0: none."""
     out = np.zeros(len(nodes_ns) - 1)
     for a, b in inertial.gaps_ns.tolist():
         inside = (nodes_ns[:-1] >= a) & (nodes_ns[1:] <= b)
@@ -308,7 +323,7 @@ def _bridged(inertial: Inertial, nodes_ns: IntArray) -> Array:
 def _parameters(
     noise: ImuNoise, gravity_m_s2: float, gap_s: float
 ) -> gtsam.PreintegrationCombinedParams:
-    """GTSAM wants squared densities. In a gap, an error that lasts as long as the gap does."""
+    """Squared densities; in a gap those of an error that is constant over the whole gap."""
     parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity_m_s2)
     gyro = noise.gyro_density + BRIDGE_GYRO_RAD_S**2 * gap_s * np.eye(3)
     force = noise.force_density + BRIDGE_FORCE_M_S2**2 * gap_s * np.eye(3)

@@ -1,28 +1,130 @@
-"""Where the optimisation starts: close enough that it ends in the right place.
+"""The initial guess of the smoother, within its basin of convergence.
 
-With an orientation source there is little to do. Without one, gravity levels the IMU, the
-gyroscope turns it along, and heading follows from laying the path that IMU or velocities give over
-that of the GNSS.
+With an orientation source the rotations are measured. Without one they start from `alignment` and
+follow the gyroscope, over the first part of the drive only.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.alignment import align, heading_window
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, interpolate
+from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodeVelocities
+from caliv_graph.trajectory.nodes import carry_to_nodes
+from caliv_graph.trajectory.smoothed import States, without_bias
 
 STANDSTILL_S = 1.0
-"""Length of the windows in which the vehicle is looked for standing."""
+"""Length of the windows that are tested for standstill."""
 
 STANDING_M = 0.1
-"""The antenna of a standing vehicle stays within this, noise aside."""
+"""The antenna of a standing vehicle moves by less from the first to the second half of a window,
+noise aside: 0.2 m/s, less than any vehicle drives steadily."""
 
-MOVED_M = 8.0
-"""A path of this extent tells heading."""
+STANDING_M_S = 0.3
+"""Median speed of a standing vehicle, noise of the velocities included."""
+
+MIN_FIXES = 3
+"""In a window that is tested for standstill."""
+
+FIRST_PART_S = 20.0
+"""Without orientations the drive is solved from its start over this time, then over twice as much,
+and so on. Over 20 s a gyroscope bias of 0.002 rad/s turns the guess by 2 degrees."""
+
+MAX_STANDING_BIAS_SIGMAS = 10.0
+"""A mean rate at standstill beyond so many sigmas of the bias is not a bias: the vehicle turns on
+the spot, or the confirmation is wrong."""
+
+SPEED_WINDOW_NS = 1_000_000_000
+"""Without velocities the initial speed is the difference of the fixes over this time."""
+
+
+def first_states(data: SmootherInput, nodes: IntArray) -> States:
+    """The initial guess of all nodes; without orientation, of those of the drive's first part.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+
+    Raises:
+        TrajectoryError: there is no orientation, and the fixes do not determine the heading.
+    """
+    gyro_bias = _gyro_bias(data)
+    inertial = data.inertial
+    dead = DeadReckoning(inertial.stamps_ns, inertial.gyro - gyro_bias, inertial.force)
+    carried = carry_to_nodes(data, nodes, dead)
+    if carried.orientations is not None:
+        R = rotations_by_orientation(carried.orientations, nodes, dead)
+    else:
+        until = heading_window(data.positions, inertial.begin_ns, inertial.end_ns, FIRST_PART_S)
+        velocities = None
+        if carried.velocities is not None:
+            velocities = nodes[carried.velocities.nodes], carried.velocities.velocity_imu
+        forward = data.T_vehicle_imu.rotation().matrix()[0]
+        R_start = align(
+            dead, until, data.positions, velocities, forward, data.gravity_m_s2, data.name
+        )
+        keep = max(int(np.searchsorted(nodes, until, "right")), 2)
+        nodes = nodes[:keep]
+        carried = carry_to_nodes(data, nodes, dead)
+        R = R_start @ dead.between(np.full(keep, nodes[0]), nodes)[0]
+    p, v = positions_and_velocities(R, nodes, data.positions, carried.velocities, data.arm_imu)
+    if data.positions is None:
+        p = p + R[0] @ data.T_vehicle_imu.inverse().translation() * -1.0
+    return States(R, p, v, np.zeros_like(p), np.broadcast_to(gyro_bias, p.shape).copy())
+
+
+def extended_states(data: SmootherInput, nodes: IntArray, states: States) -> States:
+    """The estimate of the first nodes, extended to all of them by dead reckoning.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+        states: of the first nodes.
+    """
+    done = len(states.p_map_imu)
+    fill = len(nodes) - done
+
+    def held(values: Array) -> Array:
+        return np.concatenate([values, np.repeat(values[-1:], fill, axis=0)])
+
+    force_bias, gyro_bias = held(states.force_bias), held(states.gyro_bias)
+    grown = replace(states, force_bias=force_bias, gyro_bias=gyro_bias)
+    dead = without_bias(data.inertial, nodes, grown)
+    later = nodes[done:]
+    dR, _, _ = dead.between(np.full(fill, nodes[done - 1]), later)
+    R = np.concatenate([states.R_map_imu, states.R_map_imu[-1] @ dR])
+    carried = carry_to_nodes(data, nodes, dead)
+    p, v = positions_and_velocities(R, nodes, data.positions, carried.velocities, data.arm_imu)
+    if data.positions is None:
+        p += states.p_map_imu[-1] - p[done - 1]
+    return replace(
+        grown,
+        R_map_imu=R,
+        p_map_imu=np.concatenate([states.p_map_imu, p[done:]]),
+        velocity_map=np.concatenate([states.velocity_map, v[done:]]),
+    )
+
+
+def _gyro_bias(data: SmootherInput) -> Array:
+    """(3,) rad/s, from standstill; zero if the vehicle does not stand.
+
+    The rate of the Earth, 7e-5 rad/s, is not removed: it is below the prior of the bias.
+    """
+    twist, speeds = data.motion.twist, None
+    if twist is not None:
+        finite = np.isfinite(twist.velocity).all(axis=1)
+        speeds = twist.stamps_ns[finite], np.linalg.norm(twist.velocity[finite], axis=1)
+    bias = standing_gyro(data.inertial, data.positions, speeds)
+    most = MAX_STANDING_BIAS_SIGMAS * data.noise.gyro_bias
+    if bias is None or np.linalg.norm(bias) > most:
+        return np.zeros(3)
+    return bias
 
 
 def standing_gyro(
@@ -30,8 +132,8 @@ def standing_gyro(
 ) -> Array | None:
     """(3,) mean angular rate in the first windows at standstill: the gyroscope's bias.
 
-    A gyroscope alone cannot tell standstill from a steady turn, so either GNSS or velocities must
-    confirm. None if the vehicle does not stand, or nothing can tell.
+    A gyroscope does not distinguish standstill from a steady turn, so GNSS or velocities must
+    confirm it. None if the vehicle does not stand, or nothing confirms it.
 
     Args:
         inertial: samples.
@@ -47,9 +149,9 @@ def standing_gyro(
         confirmed = False
         if positions is not None:
             inside = (positions.stamps_ns >= begin) & (positions.stamps_ns < begin + window)
-            if inside.sum() >= 3:
+            if inside.sum() >= MIN_FIXES:
                 sigma = float(np.sqrt(positions.cov_map[inside].diagonal(axis1=1, axis2=2).max()))
-                # A drift from one half to the other: noise averages out, motion does not.
+                # Means of the two halves: noise averages out, motion does not.
                 path = positions.position_map[inside, :2]
                 half = len(path) // 2
                 moved = float(np.linalg.norm(path[half:].mean(axis=0) - path[:half].mean(axis=0)))
@@ -59,7 +161,7 @@ def standing_gyro(
             inside = (speeds[0] >= begin) & (speeds[0] < begin + window)
             if inside.any():
                 confirmed = True
-                still &= float(np.median(speeds[1][inside])) < 0.3
+                still &= float(np.median(speeds[1][inside])) < STANDING_M_S
         if not (still and confirmed):
             if rates:
                 break
@@ -69,153 +171,10 @@ def standing_gyro(
     return np.mean(rates, axis=0) if rates else None
 
 
-def level(force_up: Array) -> Array:
-    """(3, 3) rotation that turns a vector (3,) upward, by the shortest way."""
-    up = force_up / np.linalg.norm(force_up)
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis / sine
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
-
-
-def _yaw_matrix(yaw: float) -> Array:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def heading_window(positions: Positions | None, begin_ns: int, end_ns: int, least_s: float) -> int:
-    """Stamp until which the recording has to be seen for its heading to show."""
-    until = begin_ns + int(1e9 * least_s)
-    if positions is not None and len(positions.stamps_ns):
-        start = positions.position_map[0, :2]
-        far = np.linalg.norm(positions.position_map[:, :2] - start, axis=1) > MOVED_M
-        if far.any():
-            until = max(until, int(positions.stamps_ns[np.argmax(far)]) + int(1e9 * 0.5 * least_s))
-    return min(until, end_ns)
-
-
-def align(
-    dead: DeadReckoning,
-    until_ns: int,
-    positions: Positions | None,
-    velocities: tuple[IntArray, Array] | None,
-    forward_imu: Array,
-    gravity_m_s2: float,
-    name: str,
-) -> Array:
-    """(3, 3) R_map_imu at the first sample, without an orientation source.
-
-    Args:
-        dead: the IMU, its gyroscope's bias removed.
-        until_ns: what comes later is not looked at.
-        positions: of the antenna; None: the heading at the start is the map's x axis.
-        velocities: stamps (n,) and velocities (n, 3) of the IMU's origin in its own axes, if known.
-        forward_imu: (3,) the vehicle's x axis in the imu frame.
-        gravity_m_s2: its magnitude.
-        name: of the recording, for messages.
-
-    Raises:
-        TrajectoryError: the fixes do not show which way it went.
-    """
-    begin = int(dead.stamps_ns[0])
-    ends = np.array([begin]), np.array([until_ns])
-    _, gained, _ = dead.between(*ends)
-    R_level = level(gained[0])
-    if positions is None:
-        x, y, _ = R_level @ forward_imu
-        return _yaw_matrix(-float(np.arctan2(y, x))) @ R_level
-    inside = (positions.stamps_ns >= begin) & (positions.stamps_ns <= until_ns)
-    if inside.sum() < 4:
-        raise TrajectoryError(
-            f"{name}: {int(inside.sum())} GNSS fixes and no orientation: heading is unknown. "
-            "Record orientation in the IMU's messages, or GNSS along the whole drive"
-        )
-    stamps = positions.stamps_ns[inside]
-    path_map = positions.position_map[inside]
-    start = np.full(len(stamps), begin)
-    if (
-        velocities is not None
-        and ((velocities[0] >= begin) & (velocities[0] <= until_ns)).sum() > 3
-    ):
-        yaw = _yaw_by_velocities(dead, R_level, velocities, stamps, path_map)
-    else:
-        _, _, dp = dead.between(start, stamps)
-        yaw = _yaw_by_accelerations(dead, R_level, stamps, dp, path_map, gravity_m_s2)
-    return _yaw_matrix(yaw) @ R_level
-
-
-def _yaw_by_velocities(
-    dead: DeadReckoning,
-    R_level: Array,
-    velocities: tuple[IntArray, Array],
-    stamps: IntArray,
-    path_map: Array,
-) -> float:
-    """The turn that lays the path by velocities over that of the fixes."""
-    times, values = velocities
-    dR, _, _ = dead.between(np.full(len(times), dead.stamps_ns[0]), times)
-    level_velocity = np.einsum("nij,nj->ni", R_level @ dR, values)
-    dt = np.diff(times)[:, None] * 1e-9
-    steps = 0.5 * (level_velocity[1:] + level_velocity[:-1]) * dt
-    path = interpolate(stamps, times, np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]))
-    a = (path - path.mean(axis=0))[:, :2]
-    b = (path_map - path_map.mean(axis=0))[:, :2]
-    cross = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    return float(np.arctan2(cross, float((a * b).sum())))
-
-
-def _yaw_by_accelerations(
-    dead: DeadReckoning,
-    R_level: Array,
-    stamps: IntArray,
-    displacement: Array,
-    path_map: Array,
-    gravity_m_s2: float,
-) -> float:
-    """Heading by least squares: linear in its cosine and sine, start, velocity and bias.
-
-    In the levelled frame at the start, `Rz(-yaw) z = p0 + v0 t + g t^2 / 2 + dp - A b`, where the
-    bias b also takes up what the levelling is off by.
-    """
-    begin = int(dead.stamps_ns[0])
-    t = (stamps - begin) * 1e-9
-    x, y, _ = (path_map - path_map[0]).T
-    known = displacement @ R_level.T
-    known[:, 2] -= 0.5 * gravity_m_s2 * t**2
-    # A(t): a constant bias in the turning frame, integrated twice.
-    step_s = 0.1
-    fine = np.arange(0.0, t[-1] + step_s, step_s)
-    R, _, _ = dead.between(np.full(len(fine), begin), begin + np.round(1e9 * fine).astype(np.int64))
-    R = R_level @ R
-    once = np.cumsum(R, axis=0) * step_s
-    twice = np.cumsum(once, axis=0) * step_s
-    A = twice[np.clip(np.round(t / step_s).astype(np.int64), 0, len(fine) - 1)]
-    n = len(t)
-    rows = []
-    right = []
-    for axis, (cosine, sine) in enumerate(((x, y), (y, -x))):
-        M = np.zeros((n, 9))
-        M[:, 0], M[:, 1] = cosine, sine
-        M[:, 2 + axis] = -1.0
-        M[:, 4 + axis] = -t
-        M[:, 6:9] = A[:, axis, :]
-        rows.append(M)
-        right.append(known[:, axis])
-    weak = np.zeros((3, 9))
-    weak[:, 6:9] = np.eye(3)  # 0.2 m/s^2 of bias weighs like 0.2 m of position
-    solution, *_ = np.linalg.lstsq(
-        np.vstack([*rows, weak]), np.concatenate([*right, np.zeros(3)]), rcond=None
-    )
-    return float(np.arctan2(solution[1], solution[0]))
-
-
 def rotations_by_orientation(
     orientations: NodeOrientations, nodes_ns: IntArray, dead: DeadReckoning
 ) -> Array:
-    """(n, 3, 3) R_map_imu: measured where it is, carried on by the gyroscope elsewhere."""
+    """(n, 3, 3) R_map_imu: the measured ones, and between them the gyroscope from the nearest."""
     known = orientations.nodes
     after = np.clip(np.searchsorted(known, np.arange(len(nodes_ns))), 0, len(known) - 1)
     before = np.clip(after - 1, 0, None)
@@ -244,7 +203,7 @@ def positions_and_velocities(
         return np.vstack([np.zeros(3), np.cumsum(0.5 * (v[1:] + v[:-1]) * dt, axis=0)]), v
     p = interpolate(nodes_ns, positions.stamps_ns, positions.position_map) - R_map_imu @ arm_imu
     if v is None:
-        half = 500_000_000
+        half = SPEED_WINDOW_NS // 2
         ahead = interpolate(nodes_ns + half, nodes_ns, p)
         behind = interpolate(nodes_ns - half, nodes_ns, p)
         span = np.minimum(nodes_ns + half, nodes_ns[-1]) - np.maximum(nodes_ns - half, nodes_ns[0])

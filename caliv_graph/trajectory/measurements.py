@@ -1,8 +1,8 @@
 """Measurements carried to the nearest node of the trajectory by the IMU.
 
-Orientations at 100 Hz are a measurement each: those around a node are turned to it by the
-gyroscope and averaged with their weights, which over half a node spacing loses nothing that could
-be measured. Velocities the same. GNSS fixes stay single, since each may be an outlier.
+Orientations around a node (at 100 Hz, ten of them) are rotated to it by the gyroscope and averaged
+with their weights; over half a node spacing the gyroscope adds less noise than could be measured.
+Velocities likewise. GNSS fixes are not averaged, since each may be an outlier.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_
 from caliv_graph.trajectory.noise import ImuNoise
 
 SAMPLES_AT_A_TIME = 16_384
-"""Of the IMU, while orientations are turned to their nodes."""
+"""Of the IMU, whose orientations are carried to their nodes at once: 16 MB."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class NodeVelocities:
 
 @dataclass(frozen=True)
 class NodePositions:
-    """Fixes and what the IMU says lies between each and its node; see `position_factor`.
+    """Fixes, and the IMU's motion between each and its node; see `position_factor`.
 
     Attributes:
         nodes: (m,) indices, one per fix.
@@ -81,7 +81,7 @@ def nearest_node(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     return np.asarray(np.searchsorted(middles, stamps_ns, "right"), dtype=np.int64)
 
 
-def _turned(R: Array, cov: Array) -> Array:
+def _rotated(R: Array, cov: Array) -> Array:
     """`R cov R^T` of (m, 3, 3) each."""
     return np.asarray(R @ cov @ np.swapaxes(R, 1, 2))
 
@@ -105,7 +105,7 @@ def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray
 def orientations_at_nodes(
     imu: ImuSamples, cov: Array, nodes_ns: IntArray, dead: DeadReckoning, noise: ImuNoise
 ) -> NodeOrientations | None:
-    """Fuses the IMU's orientations around each node; None if there are none.
+    """Averages the IMU's orientations around each node; None if there are none.
 
     Args:
         imu: as read; rows of NaN have no orientation.
@@ -122,7 +122,7 @@ def orientations_at_nodes(
     if not len(samples):
         return None
     node = nearest_node(nodes_ns, np.asarray(imu.stamps_ns, dtype=np.int64)[samples])
-    # Node by node, many at a time: a sample takes a kilobyte on the way, of a long drive too many.
+    # In parts of whole nodes: a sample takes a kilobyte here, too much on a long drive.
     starts = np.flatnonzero(np.diff(node, prepend=-1))
     some = np.unique(starts // SAMPLES_AT_A_TIME, return_index=True)[1]
     cuts = [*starts[some].tolist(), len(samples)]
@@ -146,7 +146,7 @@ def _oriented(
     samples: IntArray,
     node: IntArray,
 ) -> NodeOrientations:
-    """As `orientations_at_nodes`, from some samples (m,) that have one and their nodes (m,)."""
+    """`orientations_at_nodes` of some samples (m,) that carry one; `node` (m,) is theirs."""
     assert imu.orientation_xyzw is not None
     stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples]
     R = rotations_of(imu.orientation_xyzw[samples])
@@ -154,9 +154,9 @@ def _oriented(
     dR, _, _ = dead.between(stamps, at_node)
     R_node = R @ dR
     late_s = np.abs(stamps - at_node) * 1e-9
-    cov_node = _turned(np.swapaxes(dR, 1, 2), cov[samples])
+    cov_node = _rotated(np.swapaxes(dR, 1, 2), cov[samples])
     cov_node = cov_node + late_s[:, None, None] * noise.gyro_density
-    # Averaged about the sample nearest to the node: the differences are small.
+    # Averaged in the tangent space at the sample nearest to the node.
     order = np.lexsort((late_s, node))
     _, first = np.unique(node[order], return_index=True)
     reference = np.zeros(len(nodes_ns), dtype=np.int64)
@@ -197,10 +197,9 @@ def velocities_at_nodes(
     noise: ImuNoise,
     T_vehicle_imu: gtsam.Pose3,
 ) -> NodeVelocities | None:
-    """Fuses the velocities around each node; None if there are none.
+    """Averages the velocities around each node; None if there are none.
 
-    The vehicle's origin moves differently from the IMU's while the vehicle turns: its rate is
-    taken from the gyroscope, noise included.
+    The lever from the vehicle's origin to the IMU enters with the gyroscope's rate and its noise.
     """
     usable = np.isfinite(twist.velocity).all(axis=1)
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
@@ -221,7 +220,7 @@ def velocities_at_nodes(
     dR, dv, _ = dead.between(at_node, stamps)
     delay_s = (stamps - at_node) * 1e-9
     carried = np.einsum("nij,nj->ni", dR, at_imu) - dv
-    cov_node = _turned(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
+    cov_node = _rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
     weight = 1.0 / np.trace(cov_node, axis1=1, axis2=2)
     total = np.bincount(node, weight, len(nodes_ns))[nodes]

@@ -1,7 +1,7 @@
-"""How much each sensor is trusted: the config's figures, else the messages', else the paper's.
+"""The noise of each sensor: the config's figures, else the messages', else the paper's.
 
-A covariance of a message counts as stated if it is finite and its diagonal is positive: zeros and
-NaN are how drivers say that they do not know.
+A covariance of a message counts as stated if it is finite and positive definite: drivers write
+zeros or NaN where they do not know it.
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, TwistSamples
 
-# Table I of the paper, 1 sigma per sample.
+# Table I of the CaLiV paper, 1 sigma per sample.
 PAPER_FORCE_M_S2 = 0.05
 PAPER_GYRO_RAD_S = 0.005
 PAPER_GNSS_HORIZONTAL_M = 0.0167
-"""1.5e-7 degrees of latitude; along the parallel they would be shorter by its cosine."""
+"""1.5e-7 degrees of latitude."""
 PAPER_GNSS_VERTICAL_M = 0.02
 PAPER_ORIENTATION_RAD = 0.005
 PAPER_VELOCITY_M_S = 0.1
 
-# What the paper does not state: ordinary automotive MEMS.
+# Not in the paper: typical of automotive MEMS.
 DEFAULT_FORCE_WALK_M_S3 = 5e-4
 DEFAULT_GYRO_WALK_RAD_S2 = 1e-5
+
+MIN_POSE_ROTATION_RAD = 2e-5
+MIN_POSE_POSITION_M = 2e-4
+"""Smallest sigmas taken from a message of a given pose: below what any cloud of a target resolves.
+Some drivers state 1e-9 instead of an unknown covariance."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class ImuNoise:
 
 
 def stated(cov: Array) -> BoolArray:
-    """Which covariances of (n, d, d) state something; (n,) bool."""
+    """Which of (n, d, d) covariances are stated: finite and positive definite; (n,) bool."""
     finite = np.all(np.isfinite(cov), axis=(1, 2))
     with np.errstate(invalid="ignore"):
         positive = np.all(np.diagonal(cov, axis1=1, axis2=2) > 0.0, axis=1)
@@ -65,9 +70,9 @@ def stated(cov: Array) -> BoolArray:
 def _per_message(
     count: int, configured: Array | None, messages: Array | None, table: Array
 ) -> tuple[Array, str]:
-    """(n, d, d) covariances and where they are from; the first of the three that says something.
+    """(n, d, d) covariances and their source: the first of the three that is stated.
 
-    One that holds for all is a read-only view: a drive of hours has a million messages.
+    A covariance that holds for all is a read-only view: a drive of hours has a million messages.
     """
     d = len(table)
     if configured is not None:
@@ -76,19 +81,19 @@ def _per_message(
     if messages is None:
         return out, "the paper's table"
     if count and messages.strides[0] == 0:
-        # Likewise from the reader: what one says, all say.
+        # A view from the reader: the same covariance in all messages.
         if stated(messages[:1])[0]:
             return messages, "messages"
         return out, "the paper's table"
-    said = stated(messages)
+    known = stated(messages)
     out = out.copy()
-    out[said] = messages[said]
-    if said.all():
+    out[known] = messages[known]
+    if known.all():
         return out, "messages"
-    if not said.any():
+    if not known.any():
         return out, "the paper's table"
-    # A message that states nothing is no better than its fellows that do.
-    out[~said] = np.median(messages[said], axis=0)
+    # A message without one is taken to be as good as the others.
+    out[~known] = np.median(messages[known], axis=0)
     return out, "messages, their median where one states none"
 
 
@@ -138,6 +143,39 @@ def orientation_covariances(imu: ImuSamples, config: Config) -> tuple[Array, str
     return _per_message(
         len(imu.stamps_ns), configured, imu.orientation_cov, PAPER_ORIENTATION_RAD**2 * np.eye(3)
     )
+
+
+def given_pose_covariances(cov: Array | None, config: Config) -> Array | None:
+    """Covariances of the white errors of given poses; the config's figures before the messages'.
+
+    Args:
+        cov: (m, 6, 6) of the messages, rotation then position, NaN where unknown; None: no message
+            states one.
+        config: `noise.pose_rotation_deg` and `noise.pose_position_m`.
+
+    Returns:
+        (m, 6, 6) with no sigma below `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`, NaN where
+        unknown. None: all unknown, or the config gives both figures.
+    """
+    rotation_deg, position_m = config.noise.pose_rotation_deg, config.noise.pose_position_m
+    if cov is None or (rotation_deg is not None and position_m is not None):
+        return None
+    out, known = cov.copy(), stated(cov)
+    if not known.any():
+        return None
+    for block, sigma in (
+        (slice(0, 3), None if rotation_deg is None else math.radians(rotation_deg)),
+        (slice(3, 6), position_m),
+    ):
+        if sigma is not None:
+            out[:, block, :] = 0.0
+            out[:, :, block] = 0.0
+            out[:, block, block] = sigma**2 * np.eye(3)
+    least = np.array([MIN_POSE_ROTATION_RAD] * 3 + [MIN_POSE_POSITION_M] * 3) ** 2
+    at = np.arange(6)
+    out[:, at, at] = np.maximum(out[:, at, at], least)
+    out[~known] = np.nan
+    return out
 
 
 def gnss_covariances(gnss: GnssFixes, config: Config) -> tuple[Array, str]:

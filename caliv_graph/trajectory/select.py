@@ -1,4 +1,4 @@
-"""The trajectory of each drive: smoothed from raw sensors, or the poses that came with it."""
+"""The trajectory of each drive: smoothed from raw sensors, or the given poses."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
-from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.given import error_covariances, given_trajectory
+from caliv_graph.trajectory.noise import stated
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
-from caliv_graph.trajectory.smoothing import smooth_trajectory
 
 TWIST_WINDOW_NS = 50_000_000
-"""Half the time over which the vehicle's velocity is averaged."""
+"""Half the time over which the vehicle's velocity is averaged: that of a sweep at 10 Hz."""
 
 
 class VehicleTrajectory(Protocol):
-    """What a trajectory offers, wherever it is from."""
+    """The interface of every trajectory, smoothed or given."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -37,7 +38,7 @@ class VehicleTrajectory(Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know, a line each."""
+        """For the user, a line each."""
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -49,10 +50,10 @@ class VehicleTrajectory(Protocol):
 
 @dataclass(frozen=True)
 class GivenTrajectory:
-    """Given poses; between two of them the vehicle turns and moves evenly.
+    """Given poses; between two of them angular velocity and velocity are constant.
 
     Attributes:
-        trajectory: the poses, at their own stamps.
+        trajectory: the poses at their own stamps, and the covariances that their messages state.
         lost_ns: wanted stamps outside their span.
         warnings: a line each.
     """
@@ -91,6 +92,22 @@ class GivenTrajectory:
         position = np.stack([np.interp(s, seconds, axis) for axis in t.T], axis=1)
         return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
 
+    def error_covariances(self, stamps_ns: Sequence[int] | IntArray) -> Array | None:
+        """Covariances of the poses' errors as the messages state them.
+
+        Args:
+            stamps_ns: (m,) in any order.
+
+        Returns:
+            (m, 6, 6) rotation in vehicle axes (rad), then position in map axes (m); NaN where
+            unknown. None: no message states one.
+
+        Raises:
+            TrajectoryError: a stamp is outside the span.
+        """
+        stamps = within_span(stamps_ns, self.span_ns, "the given poses")
+        return error_covariances(self.trajectory, stamps)
+
 
 def wanted_stamps(recording: Recording) -> IntArray:
     """(m,) stamps of the clouds of all LiDARs, ascending."""
@@ -106,17 +123,17 @@ def smooth_trajectories(
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
     """The trajectory of each drive.
 
-    Given poses are taken if `topics.pose` asks for them or nothing else is there; otherwise raw
-    sensors are smoothed.
+    Given poses are used if `topics.pose` is set or there is no IMU; otherwise raw sensors are
+    smoothed.
 
     Args:
         recordings: opened drives.
         config: topics, extrinsics, noise.
         wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
-        motions: what the recordings hold, by their index, if it has been read already.
+        motions: motion data by the recording's index, if they have been read already.
 
     Raises:
-        TrajectoryError: the motion of a drive cannot be had from what was recorded.
+        TrajectoryError: the data of a drive do not determine its motion.
         RecordingError: it could not be read.
     """
     out: list[SmoothedTrajectory | GivenTrajectory] = []
@@ -131,17 +148,17 @@ def smooth_trajectories(
 
 
 def takes_given_poses(motion: MotionData, config: Config) -> bool:
-    """Whether a drive's given poses stand for its trajectory."""
+    """Whether the trajectory of a drive is its given poses."""
     return config.topics.pose is not None or (motion.poses is not None and motion.imu is None)
 
 
 def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
-    given = GivenTrajectory(trajectory)
-    begin, end = given.span_ns
+    begin, end = GivenTrajectory(trajectory).span_ns
     lost = stamps[(stamps < begin) | (stamps > end)]
+    warnings = _unknown_covariances(trajectory, motion.name)
     if not len(lost):
-        return given
+        return GivenTrajectory(trajectory, (), warnings)
     if len(lost) == len(stamps):
         raise TrajectoryError(
             f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
@@ -150,7 +167,20 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     line = (
         f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
     )
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line,))
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line, *warnings))
+
+
+def _unknown_covariances(trajectory: Trajectory, name: str) -> tuple[str, ...]:
+    """A line if some messages state a covariance and others do not."""
+    if trajectory.cov is None:
+        return ()
+    known = stated(trajectory.cov)
+    if known.all() or not known.any():
+        return ()
+    return (
+        f"{name}: {int((~known).sum())} of {len(known)} vehicle poses state no covariance: their "
+        "white error is estimated",
+    )
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:

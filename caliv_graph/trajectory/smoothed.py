@@ -1,23 +1,24 @@
-"""What a smoothed drive offers: poses at any time, and their joint information."""
+"""The smoothed trajectory: poses at any time, and their joint information."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
 import numpy as np
 
+from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain
-from caliv_graph.trajectory.factors import marginal_factor
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.marginals import Marginals, node_ordering
 
 MERGE_NS = 1_000
-"""Stamps nearer to each other share a node: a vehicle moves by less than 0.05 mm."""
+"""Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
 
 
 @dataclass(frozen=True)
@@ -40,20 +41,20 @@ class States:
     gyro_bias: Array
     yaw_bias_rad: float = 0.0
 
-    def first(self, n: int) -> States:
-        """The first n nodes."""
-        return replace(
-            self,
-            R_map_imu=self.R_map_imu[:n],
-            p_map_imu=self.p_map_imu[:n],
-            velocity_map=self.velocity_map[:n],
-            force_bias=self.force_bias[:n],
-            gyro_bias=self.gyro_bias[:n],
-        )
+
+def poses_of_vehicle(
+    states: States, nodes: IntArray, T_vehicle_imu: gtsam.Pose3
+) -> tuple[gtsam.Pose3, ...]:
+    """T_map_vehicle of some nodes, by their indices."""
+    T_imu_vehicle = T_vehicle_imu.inverse()
+    return tuple(
+        gtsam.Pose3(gtsam.Rot3(R), p).compose(T_imu_vehicle)
+        for R, p in zip(states.R_map_imu[nodes], states.p_map_imu[nodes], strict=True)
+    )
 
 
 def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> DeadReckoning:
-    """Dead reckoning with the biases found, linear between nodes."""
+    """Dead reckoning with the biases of an estimate, linear between nodes."""
     at = inertial.stamps_ns
     return DeadReckoning(
         at,
@@ -70,7 +71,7 @@ def within_span(
     Args:
         stamps_ns: (m,) in any order.
         span_ns: first and last that there may be.
-        whose: span it is, for the message.
+        whose: name of the span, for the message.
 
     Raises:
         TrajectoryError: a stamp is outside.
@@ -90,22 +91,22 @@ class SmoothedTrajectory:
 
     Attributes:
         trajectory: poses, covariances, velocities at the wanted stamps within the span.
-        lost_ns: wanted stamps outside the span: the IMU says nothing about them.
-        warnings: what was left out or looks wrong, a line each.
+        lost_ns: wanted stamps outside the span of the IMU.
+        warnings: about data that were left out or look wrong, a line each.
         noise_sources: sensor -> where its noise figures are from.
         nodes_ns: (n,) stamps of the nodes.
         states: estimates at the nodes.
-        T_vehicle_imu: mounting that was used.
-        gravity_m_s2: that was used, along -z of the map.
+        T_vehicle_imu: extrinsic that was used.
+        gravity_m_s2: magnitude that was used, along -z of the map.
         yaw_bias: (value, sigma) in radians of the orientation source, if estimated.
         gnss_rejected: (k,) stamps of fixes that were dropped as outliers.
         origin_deg_m: latitude, longitude and altitude of the map's origin, None without GNSS.
         graph: the factors, over T_map_imu (i), velocity (v), bias (b), yaw bias (y).
-        values: the estimate that belongs to it.
-        chain: its information at the estimate.
+        values: the estimate, as values of the graph.
+        chain: the graph's information at the estimate.
         inertial: the IMU samples used.
         factor_kinds: of each factor of the graph, in order: `imu`, `gnss`, `orientation`,
-            `velocity`, or `prior` for what is assumed.
+            `velocity`, or `prior`.
     """
 
     trajectory: Trajectory
@@ -135,7 +136,7 @@ class SmoothedTrajectory:
         return without_bias(self.inertial, self.nodes_ns, self.states)
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
-        """Vehicle poses at any times within the span: the estimate, carried on by the IMU.
+        """Vehicle poses at any times within the span: the IMU's motion from the node before.
 
         Args:
             stamps_ns: (m,) in any order.
@@ -155,8 +156,9 @@ class SmoothedTrajectory:
         i = np.clip(np.searchsorted(self.nodes_ns, stamps, "right") - 1, 0, len(self.nodes_ns) - 2)
         R, p, v = self._carried(i, stamps)
         miss_R, miss_p, miss_v = self._misses
-        # What the IMU misses the next node by is spread over the interval: linearly in rotation, a
-        # cubic in position, so that position and velocity agree at both nodes.
+        # Dead reckoning misses the next node. The difference is distributed over the interval:
+        # linearly in rotation, as a cubic in position, so that position and velocity agree at both
+        # nodes.
         T = (self.nodes_ns[i + 1] - self.nodes_ns[i])[:, None] * 1e-9
         s = (stamps - self.nodes_ns[i])[:, None] * 1e-9 / T
         R = R @ exp_so3(s * miss_R[i])
@@ -196,6 +198,15 @@ class SmoothedTrajectory:
         at_origin = np.einsum("nji,nj->ni", R, v) + np.cross(rates, arm)
         return at_origin @ R_vi.T, rates @ R_vi.T
 
+    def bias_sigmas(self) -> tuple[Array, Array]:
+        """1 sigma of the biases at the nodes: (n, 3) m/s^2 and (n, 3) rad/s, imu frame."""
+        n = len(self.nodes_ns)
+        linear = self.graph.linearize(self.values)
+        marginals = Marginals(linear, node_ordering(n, self.yaw_bias is not None))
+        cov = marginals.covariances([key_bias(i) for i in range(n)])
+        sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        return sigmas[:, :3], sigmas[:, 3:]
+
     def _node_indices(self, stamps_ns: Sequence[int] | IntArray) -> IntArray:
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         right = np.clip(np.searchsorted(self.nodes_ns, stamps), 1, len(self.nodes_ns) - 1)
@@ -211,10 +222,10 @@ class SmoothedTrajectory:
     def joint_information(
         self, stamps_ns: Sequence[int] | IntArray
     ) -> tuple[Array, tuple[gtsam.Pose3, ...]]:
-        """The Gaussian that all motion data put on the vehicle's poses at some stamps together.
+        """The joint Gaussian of the vehicle's poses at some stamps, given all motion data.
 
         Args:
-            stamps_ns: (m,) increasing, of those that the trajectory was asked for.
+            stamps_ns: (m,) increasing, among the wanted stamps.
 
         Returns:
             Information (6 m, 6 m), right perturbations, rotation then translation, rad and m,
@@ -229,21 +240,7 @@ class SmoothedTrajectory:
         # d_imu = Ad(T_imu_vehicle) d_vehicle, as T_map_vehicle = T_map_imu T_imu_vehicle.
         Ad = np.asarray(self.T_vehicle_imu.AdjointMap())
         inverse = np.linalg.inv(Ad)
-        turned = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
-        information = turned.reshape(POSE * m, POSE * m)
-        return 0.5 * (information + information.T), self.node_poses(i)
-
-    def joint_factor(
-        self, keys: Sequence[int], stamps_ns: Sequence[int] | IntArray
-    ) -> gtsam.LinearContainerFactor:
-        """`joint_information` as one native factor on `keys`, for another graph."""
-        information, poses = self.joint_information(stamps_ns)
-        return marginal_factor(list(keys), information, poses)
-
-    def node_poses(self, i: IntArray) -> tuple[gtsam.Pose3, ...]:
-        """T_map_vehicle of nodes by their indices."""
-        T_iv = self.T_vehicle_imu.inverse()
-        return tuple(
-            gtsam.Pose3(gtsam.Rot3(R), p).compose(T_iv)
-            for R, p in zip(self.states.R_map_imu[i], self.states.p_map_imu[i], strict=True)
-        )
+        rotated = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
+        information = rotated.reshape(POSE * m, POSE * m)
+        poses = poses_of_vehicle(self.states, i, self.T_vehicle_imu)
+        return 0.5 * (information + information.T), poses

@@ -1,1 +1,1 @@
-"""Covariance, observability and consistency: on matrices, without the graph."""
+"""Covariance, observability and consistency: numbers from matrices; no graph, no sentences."""

@@ -11,9 +11,9 @@ import numpy as np
 from caliv_graph.products import Array, Calibration
 from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
 
-_LEAST_EIGENVALUE = 1e-10
-"""Of a covariance scaled to ones on its diagonal. Below it there is no inverse worth the name:
-files keep twelve digits."""
+_MIN_EIGENVALUE = 1e-10
+"""Of a covariance scaled to ones on its diagonal. Below it an inverse has no correct digits: files
+keep twelve digits."""
 
 
 def evaluate(
@@ -21,12 +21,14 @@ def evaluate(
     truth: Mapping[str, gtsam.Pose3],
     cov_pairs: Mapping[tuple[str, str], Array] | None = None,
 ) -> dict[str, Any]:
-    """Errors in vehicle axes and their consistency with the covariance (SPEC 5 'Errors').
+    """Errors in vehicle axes and their consistency with the covariance.
+
+    The S2V error is the translation `t_est - t_true` and roll, pitch, yaw of `R_est R_true^T`.
 
     The error of a pair (from a, to b) is that of `T_vehicle_a` against
     `T_vehicle_b T_b_a(true)`, with both extrinsics as estimated: they share the error of
-    `T_vehicle_b`, so that what is left is the pair's own (the paper's Evaluation section). NEES is
-    `e^T C^-1 e` with `e = Log(T_est^-1 T_true)`, 6 degrees of freedom.
+    `T_vehicle_b`, so that the difference is the pair's own error (the paper's Evaluation section).
+    NEES is `e^T C^-1 e` with `e = Log(T_est^-1 T_true)`, 6 degrees of freedom.
 
     Args:
         calibration: the estimate.
@@ -37,7 +39,7 @@ def evaluate(
     Returns:
         Plain values: `{lidars: {<name>: {s2v: {translation_m: [3], rotation_rad: [3], nees}}},
         pairs: [{from, to, translation_m, rotation_rad, nees}]}`. A `nees` is None where the
-        covariance has no inverse (a LiDAR that is trusted to be where the config says).
+        covariance has no inverse.
     """
     if cov_pairs is None:
         cov_pairs = {
@@ -90,9 +92,9 @@ def _nees(error: Array, cov: Array) -> float | None:
     sigma = np.sqrt(np.diag(cov))
     if not np.all(sigma > 0.0):
         return None
-    # Radians and metres apart, the numbers differ by orders of magnitude; their ratios do not.
+    # Variances of radians and metres differ by orders of magnitude; correlations do not.
     correlation = cov / np.outer(sigma, sigma)
-    if np.linalg.eigvalsh(correlation)[0] < _LEAST_EIGENVALUE:
+    if np.linalg.eigvalsh(correlation)[0] < _MIN_EIGENVALUE:
         return None
     whitened = error / sigma
     return float(whitened @ np.linalg.solve(correlation, whitened))

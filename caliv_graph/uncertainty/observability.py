@@ -1,13 +1,14 @@
-"""What the data determine: directions, names for them, and a solve that respects them (SPEC 4).
+"""What the data determine: spectrum, the projection of `auto`, directions and verdicts per axis.
 
 Works on information matrices over the extrinsics, in vehicle axes, six coordinates per LiDAR; knows
-no graph. Directions are looked at in scaled coordinates, so that 1 mrad and 10 mm compare.
+no graph and makes no sentences (`caliv_graph.wording` does). Directions are looked at in scaled
+coordinates, so that 1 mrad and 10 mm compare. `caliv_graph/uncertainty/README.md` derives it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -18,31 +19,26 @@ from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, BoolArray, Direction, Uncertainty
 
 UNIT = np.array([1e-3] * 3 + [1e-2] * 3)
-"""One scaled unit: 1 mrad, 10 mm."""
+"""One scaled unit: 1 mrad, 10 mm. At 10 m from the target both move a point by 10 mm."""
 
 UNDETERMINED_RATIO = 0.5
-"""The data's sigma over the prior's from which a direction counts as undetermined (SPEC 4)."""
+"""Sigma of the data over sigma of the guesses above which a direction is undetermined (README,
+"The hard switch")."""
 
 WEAK_RATIO = 0.1
-"""The same for weak (SPEC 4)."""
-
-NOTABLE = 0.2
-"""Part of a direction's largest coordinate from which an axis is mentioned."""
+"""The same ratio above which a determined direction is weak."""
 
 RIGID_MISFIT = 0.2
 """Relative misfit up to which LiDARs count as moving together."""
 
-STOOD_TWISTS = 5
-"""Undetermined motions of all LiDARs as one from which nothing is known to the vehicle: driving
-straight ahead loses four."""
-
-STOOD_COSINE = 0.98
-"""Of the angle between the undetermined subspace and such a motion, up to which it is in it."""
+RIGID_COSINE = 0.98
+"""Of the angle between a rigid motion and the undetermined subspace, above which the motion is
+undetermined."""
 
 AXIS_SHARE = 0.05
 LIDAR_SHARE = 0.01
-"""An axis is undetermined if it has this share of its LiDAR's part of the undetermined subspace,
-and that part is not negligible (SPEC 4)."""
+"""An axis is undetermined if it has more than the first fraction of its LiDAR's part of the
+undetermined subspace, and that part exceeds the second (1 = one whole direction)."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +48,8 @@ class Spectrum:
     Attributes:
         vectors: (6n, 6n), columns orthonormal in scaled coordinates.
         information: (6n,) eigenvalues, at least zero.
-        sigma_data: (6n,) in scaled units; inf where the data say nothing.
-        sigma_prior: (6n,) of the guesses along the same directions.
+        sigma_data: (6n,) in scaled units; inf where the data have no information.
+        sigma_prior: (6n,) of the guesses along the same directions, scaled units: `(v^T P v)^-1/2`.
         undetermined: (6n,) bool.
         weak: (6n,) bool.
     """
@@ -72,10 +68,10 @@ def scaling(lidars: int) -> Array:
 
 
 def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectrum:
-    """Splits the space of all extrinsics by what the data say.
+    """Splits the space of all extrinsics into determined and undetermined directions.
 
     Args:
-        D: (6n, 6n) data information, vehicle axes.
+        D: (6n, 6n) data information, vehicle axes, all other variables eliminated.
         prior: (6n, 6n) information of the guesses, vehicle axes.
         undetermined: number of undetermined directions if it was decided before: those with the
             largest ratio of sigmas.
@@ -103,20 +99,20 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
 def step_with_prior_in_null_space(
     D: Array, c: Array, prior: Array, offset: Array, split: Spectrum
 ) -> Array:
-    """The step of `auto`: data alone where they can tell, the joint prior alone where not.
+    """The step of `auto`: the prior has weight in the undetermined subspace only.
 
-    Minimises `e^T D e / 2 - c^T e` over the determined directions; along the others the step is
-    the one at which the guesses of all LiDARs together are best met, `U^T prior (offset + e) = 0`.
+    With W the determined and U the undetermined directions, minimises `e^T D e / 2 - c^T e` over
+    W; along U the step minimises the prior's cost given that: `U^T P (offset + e) = 0`.
 
     Args:
-        D: quadratic of the data in a step e, vehicle axes.
-        c: its linear part.
-        prior: information of the guesses.
-        offset: (6n,) where the current estimate is from the guesses.
+        D: (6n, 6n) quadratic of the data in a step e, vehicle axes.
+        c: (6n,) its linear part.
+        prior: (6n, 6n) information P of the guesses.
+        offset: (6n,) current estimate less the guesses.
         split: of D.
 
     Returns:
-        (6n,) the step e.
+        (6n,) the step e, rad and m.
     """
     unit = scaling(len(D) // 6)
     W, U = split.vectors[:, ~split.undetermined], split.vectors[:, split.undetermined]
@@ -128,10 +124,10 @@ def step_with_prior_in_null_space(
 
 
 def covariance_with_prior_in_null_space(prior: Array, split: Spectrum) -> Array:
-    """Covariance of the estimate that `step_with_prior_in_null_space` arrives at.
+    """Covariance (6n, 6n) of the estimate at which `step_with_prior_in_null_space` converges.
 
-    The determined directions carry the data's covariance; along the others the joint prior's, and
-    what of the data's errors its condition drags along.
+    The data's covariance along W; along U that of the guesses given W, and the part of the data's
+    errors that the condition `U^T P (offset + e) = 0` transfers from W to U.
     """
     unit = scaling(len(prior) // 6)
     W, U = split.vectors[:, ~split.undetermined], split.vectors[:, split.undetermined]
@@ -139,8 +135,8 @@ def covariance_with_prior_in_null_space(prior: Array, split: Spectrum) -> Array:
     if U.shape[1]:
         P = prior * np.outer(unit, unit)
         inner = np.linalg.inv(U.T @ P @ U)
-        carry = np.eye(len(P)) - U @ inner @ U.T @ P
-        cov = carry @ cov @ carry.T + U @ inner @ U.T
+        transfer = np.eye(len(P)) - U @ inner @ U.T @ P
+        cov = transfer @ cov @ transfer.T + U @ inner @ U.T
     return np.asarray(0.5 * (cov + cov.T) * np.outer(unit, unit))
 
 
@@ -152,6 +148,8 @@ def assess(
 ) -> Uncertainty:
     """Verdicts per direction and per axis.
 
+    Directions come without text; `wording.directions.named` adds it.
+
     Args:
         D: (6n, 6n) data information, vehicle axes, LiDARs in the order of `T_vehicle_lidar`.
         prior: (6n, 6n) of the guesses.
@@ -160,9 +158,8 @@ def assess(
     """
     names = list(T_vehicle_lidar)
     split = spectrum(D, prior)
-    undetermined = _directions(split, split.undetermined, D, prior, T_vehicle_lidar)
-    weak = _directions(split, split.weak, D, prior, T_vehicle_lidar)
     U = split.vectors[:, split.undetermined]
+    # Diagonal of the projector U U^T.
     share = np.sum(U**2, axis=1).reshape(len(names), 6)
     determined = {}
     for name, part in zip(names, share, strict=True):
@@ -171,28 +168,24 @@ def assess(
         determined[name] = {
             axis: not (bool(lost[i]) or axis in held) for i, axis in enumerate(AXES)
         }
-    return Uncertainty(undetermined, weak, determined, np.sort(split.sigma_data))
+    return Uncertainty(
+        undetermined=_directions(U, D, prior, T_vehicle_lidar),
+        weak=_directions(split.vectors[:, split.weak], D, prior, T_vehicle_lidar),
+        determined=determined,
+        spectrum=np.sort(split.sigma_data),
+    )
 
 
 def _directions(
-    split: Spectrum,
-    mask: BoolArray,
-    D: Array,
-    prior: Array,
-    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    basis: Array, D: Array, prior: Array, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
 ) -> tuple[Direction, ...]:
-    """Named directions that span the masked subspace."""
-    if not mask.any():
+    """Directions with few coordinates that span a subspace, given by (6n, k) scaled columns."""
+    if not basis.shape[1]:
         return ()
     names = list(T_vehicle_lidar)
     unit = scaling(len(names))
-    stood = (
-        _standing_text(split.vectors[:, mask], T_vehicle_lidar)
-        if mask is split.undetermined
-        else ""
-    )
     out = []
-    for column in simplified(split.vectors[:, mask]).T:
+    for column in simplified(basis).T:
         vector = unit * column
         information = float(vector @ D @ vector)
         sigma_data = information**-0.5 if information > 0.0 else math.inf
@@ -201,28 +194,23 @@ def _directions(
         # The largest coordinate is one unit (1 rad or 1 m), so that numbers can be read.
         scale = 1.0 / float(np.abs(vector).max())
         sign = math.copysign(1.0, vector[int(np.abs(column).argmax())])
-        text, together = describe(parts, T_vehicle_lidar)
-        advice = remedy(parts, T_vehicle_lidar, weak=mask is split.weak)
-        if stood and together:
-            text, advice = stood, REMEDY_STOOD
         out.append(
             Direction(
                 {n: sign * scale * v for n, v in parts.items()},
                 sigma_data / scale,
                 sigma_prior / scale,
-                text,
-                together,
-                advice,
+                text="",
+                together=rigid_twist(parts, T_vehicle_lidar) is not None,
             )
         )
     return tuple(out)
 
 
 def simplified(basis: Array) -> Array:
-    """Turns a basis (6n, k) of a subspace so that each vector has few coordinates (varimax).
+    """Rotates a basis (6n, k) of a subspace so that each vector has few coordinates (varimax).
 
-    Eigenvectors of equal eigenvalues come out in any mixture; people say "height" and "rotation
-    about the turn centre", not 0.7 of one and 0.7 of the other.
+    Eigenvectors of equal eigenvalues are any mixture of each other; a reader wants "height" and
+    "rotation about the turn centre", not 0.7 of one and 0.7 of the other. (Kaiser 1958.)
     """
     k = basis.shape[1]
     turn = np.eye(k)
@@ -248,163 +236,52 @@ def rigid_twist(
 
     Args:
         parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: where the LiDARs sit.
+        T_vehicle_lidar: the extrinsics.
 
     Returns:
         Rotation about and shift at the vehicle's origin; None if the LiDARs move apart.
     """
-    rows, values = [], []
-    for name, part in parts.items():
-        arm = -skew(T_vehicle_lidar[name].translation())
-        rows.append(np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]]) / UNIT[:, None])
-        values.append(part / UNIT)
-    A, y = np.concatenate(rows), np.concatenate(values)
+    A = _by_twist(T_vehicle_lidar[name] for name in parts)
+    y = np.concatenate([part / UNIT for part in parts.values()])
     twist = np.linalg.lstsq(A, y, rcond=None)[0]
     misfit = np.linalg.norm(A @ twist - y) / np.linalg.norm(y)
     return np.asarray(twist) if misfit < RIGID_MISFIT else None
 
 
-def describe(
-    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
-) -> tuple[str, bool]:
-    """How a person says a direction, and whether all LiDARs move together in it.
+def undetermined_twists(
+    undetermined: Sequence[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> tuple[int, Array]:
+    """How many rigid motions of the whole sensor set against the vehicle are undetermined.
 
     Args:
-        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: where the LiDARs sit.
+        undetermined: the directions, of all LiDARs.
+        T_vehicle_lidar: the extrinsics.
+
+    Returns:
+        Their number, 0 to 6; and the best determined motion as a twist (6,), any scale.
     """
-    twist = rigid_twist(parts, T_vehicle_lidar)
-    names = list(parts)
-    if twist is None:
-        return _describe_apart(parts), False
-    whole = "all LiDARs" if len(names) > 1 else f"lidar '{names[0]}'"
-    return _describe_twist(twist, whole, len(names) > 1), True
+    if not undetermined:
+        return 0, np.zeros(6)
+    basis = undetermined_basis(undetermined, list(T_vehicle_lidar))
+    twists, back = np.linalg.qr(_by_twist(T_vehicle_lidar.values()))
+    _, cosines, within = np.linalg.svd(basis.T @ twists)
+    return int((cosines > RIGID_COSINE).sum()), np.linalg.solve(back, within[-1])
 
 
-REMEDY_STOOD = "drive past the target on a path whose curvature changes, such as a figure-eight"
-REMEDY_HEIGHT = (
-    "measure the height of the vehicle frame above the ground as well as you can and state it "
-    "(ground.vehicle_height, ground.sigma), or cross a ramp while the target is in view"
-)
-REMEDY_TURN_CENTRE = (
-    "change the curvature while the target is in view: drive an S-curve or a figure-eight, or add "
-    "a drive that turns the other way"
-)
-REMEDY_STRAIGHT = (
-    "turn while the target is in view: an arc adds y and roll, an S-curve or a figure-eight x as "
-    "well"
-)
-REMEDY_TILT = "turn while the target is in view, so that the heading changes; use the ground"
-REMEDY_APART = (
-    "let these LiDARs see the same side of the target, at any time: pass it in both directions, "
-    "as in a figure-eight, or add a second target"
-)
-REMEDY_MORE = (
-    "pass the target again, closer and at other places, so that each LiDAR sees it in more scans; "
-    "better poses of the vehicle (IMU, GNSS) help as well"
-)
-REMEDY_SYMMETRY = (
-    "take a target that no turn maps onto itself, such as a chair, and let these LiDARs see the "
-    "same side of it: pass it in both directions, or add a second target"
-)
+def undetermined_basis(undetermined: Sequence[Direction], lidars: Sequence[str]) -> Array:
+    """(6n, k) orthonormal basis, in scaled units, of what directions span over some LiDARs."""
+    vectors = [
+        np.concatenate([direction.vector.get(name, np.zeros(6)) for name in lidars])
+        for direction in undetermined
+    ]
+    basis, _ = np.linalg.qr((np.array(vectors) / scaling(len(lidars))).T)
+    return np.asarray(basis)
 
 
-def remedy(
-    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool = False
-) -> str:
-    """What would determine a direction: a manoeuvre, or a setting.
-
-    Args:
-        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: where the LiDARs sit.
-        weak: the data do tell it, but not well.
-    """
-    twist = rigid_twist(parts, T_vehicle_lidar)
-    if twist is None and weak:
-        return REMEDY_MORE
-    if twist is None:
-        size = np.max([np.abs(part / UNIT) for part in parts.values()], axis=0)
-        return REMEDY_SYMMETRY if size.argmax() == AXES.index("yaw") else REMEDY_APART
-    scaled = np.abs(twist / UNIT)
-    big = {a for a, s in zip(AXES, scaled / scaled.max(), strict=True) if s > NOTABLE}
-    if big == {"z"}:
-        return REMEDY_HEIGHT
-    if "yaw" in big and big <= {"yaw", "x", "y"}:
-        return REMEDY_TURN_CENTRE
-    if big & {"x", "y"}:
-        return REMEDY_STRAIGHT
-    return REMEDY_TILT if big <= {"roll", "pitch"} else REMEDY_STOOD
-
-
-def _standing_text(basis: Array, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> str:
-    """How to say that nothing is known to the vehicle; empty if something is.
-
-    Args:
-        basis: (6n, k) orthonormal, scaled, of what is undetermined.
-        T_vehicle_lidar: where the LiDARs sit.
-    """
+def _by_twist(poses: Iterable[gtsam.Pose3]) -> Array:
+    """(6n, 6) derivative of the extrinsics, scaled, by a twist at the vehicle's origin."""
     rows = []
-    for T in T_vehicle_lidar.values():
+    for T in poses:
         arm = -skew(T.translation())
         rows.append(np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]]) / UNIT[:, None])
-    twists, back = np.linalg.qr(np.concatenate(rows))
-    _, cosines, within = np.linalg.svd(basis.T @ twists)
-    lost = int((cosines > STOOD_COSINE).sum())
-    if lost < STOOD_TWISTS:
-        return ""
-    if lost == len(AXES):
-        return "everything to the vehicle: it never moved"
-    # What is told: the motion that is left, as a twist.
-    told = np.abs(np.linalg.solve(back, within[-1]) / UNIT)
-    height = told.argmax() == AXES.index("z")
-    return f"everything to the vehicle but {'its height' if height else 'one part'}: it never moved"
-
-
-def _describe_twist(twist: Array, whole: str, several: bool) -> str:
-    """A motion of the whole sensor set relative to the vehicle."""
-    scaled = np.abs(twist / UNIT)
-    together = " together" if several else ""
-    leading = scaled / scaled.max()
-    big = [axis for axis, size in zip(AXES, leading, strict=True) if size > NOTABLE]
-    if big == ["z"]:
-        return f"height of {whole}{together}"
-    if len(big) == 1 and big[0] in ("x", "y"):
-        way = "forward" if big[0] == "x" else "sideways"
-        return f"shift of {whole}{together} {way}: {big[0]}"
-    if "yaw" in big and set(big) <= {"yaw", "x", "y"}:
-        radius = float(np.hypot(twist[3], twist[4]) / abs(twist[2]))
-        shift = " and ".join(axis for axis in ("x", "y") if axis in big)
-        if not shift:
-            return f"rotation of {whole} about the vertical through the vehicle frame: yaw"
-        return (
-            f"rotation of {whole} about the turn centre: {shift} and yaw together, "
-            f"{radius:.2f} m per rad"
-        )
-    if len(big) == 1:
-        return f"{big[0]} of {whole}{together}"
-    return f"{' and '.join(big)} of {whole}, moving as one"
-
-
-def _describe_apart(parts: Mapping[str, Array]) -> str:
-    """A direction in which LiDARs move against each other."""
-    largest = max(float(np.abs(p / UNIT).max()) for p in parts.values())
-    said = {}
-    for name, part in parts.items():
-        size = part / UNIT / largest
-        axes = [
-            (axis, value) for axis, value in zip(AXES, size, strict=True) if abs(value) > NOTABLE
-        ]
-        if axes:
-            said[name] = axes
-    if len(said) == 1:
-        name, axes = next(iter(said.items()))
-        together = " together" if len(axes) > 1 else ""
-        return f"{' and '.join(a for a, _ in axes)} of lidar '{name}'{together}"
-    # Which way each one moves stands in the vector; a person wants to know what is affected.
-    largest_of = dict.fromkeys(AXES, 0.0)
-    for axes in said.values():
-        for axis, value in axes:
-            largest_of[axis] = max(largest_of[axis], abs(value))
-    affected = sorted((a for a in AXES if largest_of[a] > 0.0), key=lambda a: -largest_of[a])
-    names = " and ".join(f"'{name}'" for name in said)
-    return f"{', '.join(affected)} of lidars {names} against each other"
+    return np.concatenate(rows)

@@ -1,4 +1,4 @@
-"""Pairs of LiDARs: which there are, their covariance, and what the drive told about them."""
+"""Sigmas of LiDARs and of pairs of LiDARs, and which axes of a pair are determined."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from collections.abc import Iterable
 import numpy as np
 
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.covariance import relative_covariance, relative_jacobian
+from caliv_graph.geometry.covariance import (
+    parent_axes_covariance,
+    relative_covariance,
+    relative_jacobian,
+)
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration
-
-_SCALE = np.array([1e3, 1e3, 1e3, 1e2, 1e2, 1e2])
-"""Makes 1 mrad and 10 mm compare (SPEC 4)."""
-
-_LEAST_SHARE = 0.01
-_LEAST_SHARE_OF_AXIS = 0.05
-"""SPEC 4: what counts as a part of the undetermined subspace, and which axes it is seen on."""
+from caliv_graph.uncertainty.observability import (
+    AXIS_SHARE,
+    LIDAR_SHARE,
+    UNIT,
+    scaling,
+    undetermined_basis,
+)
 
 
 def sensor_pairs(lidars: Iterable[str], reference: str) -> tuple[tuple[str, str], ...]:
@@ -37,11 +41,24 @@ def pair_covariance(calibration: Calibration, source: str, to: str) -> Array:
     return relative_covariance(a, b, _block(calibration, calibration.cov_joint, source, to))
 
 
-def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
-    """Which axes of `T_to_from` the drive determined, by the rule of SPEC 4 for a LiDAR's axes.
+def sigmas_s2v(calibration: Calibration, name: str) -> Array:
+    """(6,) sigmas of a LiDAR's extrinsic in vehicle axes, rad and m."""
+    lidar = calibration.lidars[name]
+    return np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
 
-    The undetermined subspace is projected onto the pair: a direction in which both LiDARs move
-    together, such as the rotation about the turn centre, leaves the pair alone.
+
+def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
+    """(6,) sigmas of `source` against `to` in vehicle axes, rad and m."""
+    cov = pair_covariance(calibration, source, to)
+    T_vehicle_source = calibration.lidars[source].T_vehicle_lidar
+    return np.sqrt(np.diag(parent_axes_covariance(T_vehicle_source, cov)))
+
+
+def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
+    """Which axes of `T_to_from` the data determine, by the rule of `observability.assess`.
+
+    The undetermined subspace is mapped to the pair: a direction in which both LiDARs move
+    together, such as the rotation about the turn centre, does not change the pair.
 
     Returns:
         Per axis of `conventions.AXES`: rotation about, shift along the axes of `to`.
@@ -52,25 +69,18 @@ def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str,
     if not calibration.undetermined:
         return dict.fromkeys(AXES, True)
     names = list(calibration.lidars)
-    scale = np.tile(_SCALE, len(names))
-    directions = np.array(
-        [
-            np.concatenate([direction.vector.get(name, np.zeros(6)) for name in names])
-            for direction in calibration.undetermined
-        ]
-    )
-    basis, _ = np.linalg.qr((directions * scale).T)
+    basis = undetermined_basis(calibration.undetermined, names)
     T_from, T_to = (result.T_vehicle_lidar for result in results)
     J = relative_jacobian(T_from, T_to)
     J[:, :6] @= right_to_vehicle_axes(T_from).T
     J[:, 6:] @= right_to_vehicle_axes(T_to).T
     J = right_to_vehicle_axes(T_to.between(T_from)) @ J
     rows = _rows(calibration, source, to)
-    seen = (_SCALE[:, None] * J / scale[rows]) @ basis[rows]
+    seen = (J * scaling(2) / UNIT[:, None]) @ basis[rows]
     shares = np.sum(seen**2, axis=1)
     total = float(shares.sum())
     return {
-        axis: bool(total <= _LEAST_SHARE or share <= _LEAST_SHARE_OF_AXIS * total)
+        axis: bool(total <= LIDAR_SHARE or share <= AXIS_SHARE * total)
         for axis, share in zip(AXES, shares, strict=True)
     }
 

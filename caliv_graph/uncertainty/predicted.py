@@ -1,26 +1,24 @@
-"""What drives tell of extrinsics, without the extrinsics: from information alone.
+"""Covariance that a calibration will have, from the information of the data alone.
 
-Shared by what looks at a recorded drive before it is calibrated and by what plans one.
+Shared by `observability`, which looks at a recorded drive before it is calibrated, and by `plan`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
-from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, skew
-from caliv_graph.products import Array, Calibration, Direction, LidarResult, Uncertainty
+from caliv_graph.products import Array, Calibration, Direction, Guess, Uncertainty
+from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import (
     assess,
     covariance_with_prior_in_null_space,
     spectrum,
 )
-from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs, sigmas_s2s, sigmas_s2v
 
 
 @dataclass(frozen=True)
@@ -32,41 +30,56 @@ class PredictedCovariance:
 
     Attributes:
         lidars: those that take part.
-        unseeing: those that do not: they never see a target.
-        information_data: (6n, 6n) without any prior, all else eliminated.
+        information_data: (6n, 6n) without any prior, all other variables eliminated.
         information_prior: (6n, 6n) of the initial guesses.
-        cov: (6n, 6n) of what `solve.mode: auto` would arrive at.
+        cov: (6n, 6n) of the result of `solve.mode: auto`.
         uncertainty: directions and verdicts.
-        sigma_s2v: LiDAR -> (6,) 1 sigma of its mounting; that of its guess if it takes no part.
-        sigma_s2s: (from, to) -> (6,) 1 sigma of the one against the other, in vehicle axes at the
-            origin of `from`.
-        determined_s2s: (from, to) -> axis -> whether the drive tells it, in the axes of `to`.
         offsets_s: LiDAR -> 1 sigma of its time offset in seconds, where one was asked for.
-        calibration: the same as a result whose extrinsics are the assumed ones, to judge
-            `require` and `limits` by.
+        calibration: the same as a result whose extrinsics are the assumed ones, LiDARs that never
+            see a target with their guesses.
     """
 
     lidars: tuple[str, ...]
-    unseeing: tuple[str, ...]
     information_data: Array
     information_prior: Array
     cov: Array
     uncertainty: Uncertainty
-    sigma_s2v: Mapping[str, Array]
-    sigma_s2s: Mapping[tuple[str, str], Array]
-    determined_s2s: Mapping[tuple[str, str], Mapping[str, bool]]
     offsets_s: Mapping[str, float]
     calibration: Calibration
 
     @property
+    def unseeing(self) -> tuple[str, ...]:
+        """LiDARs that never see a target."""
+        return tuple(name for name in self.calibration.lidars if name not in self.lidars)
+
+    @property
+    def sigma_s2v(self) -> dict[str, Array]:
+        """LiDAR -> (6,) 1 sigma of its extrinsic, vehicle axes."""
+        return {name: sigmas_s2v(self.calibration, name) for name in self.calibration.lidars}
+
+    @property
+    def sigma_s2s(self) -> dict[tuple[str, str], Array]:
+        """(from, to) -> (6,) 1 sigma, vehicle axes at the origin of `from`."""
+        return {(a, b): sigmas_s2s(self.calibration, a, b) for a, b in self._pairs}
+
+    @property
+    def determined_s2s(self) -> dict[tuple[str, str], dict[str, bool]]:
+        """(from, to) -> axis -> whether the data determine it, in the axes of `to`."""
+        return {(a, b): pair_determined(self.calibration, a, b) for a, b in self._pairs}
+
+    @property
     def undetermined(self) -> tuple[Direction, ...]:
-        """Directions that the data will not tell."""
+        """Directions that the data will not determine."""
         return self.uncertainty.undetermined
 
     @property
     def weak(self) -> tuple[Direction, ...]:
-        """Directions that they tell only weakly."""
+        """Directions that the data determine only weakly."""
         return self.uncertainty.weak
+
+    @property
+    def _pairs(self) -> tuple[tuple[str, str], ...]:
+        return sensor_pairs(self.lidars, self.calibration.reference)
 
 
 def predict_covariance(
@@ -80,98 +93,30 @@ def predict_covariance(
 ) -> PredictedCovariance:
     """Verdicts and sigmas from the data's information.
 
+    Directions come without text; `wording.directions.named_prediction` adds it.
+
     Args:
         information_data: (6n, 6n) vehicle axes, LiDARs in the order of `lidars`.
         lidars: those that take part.
-        reference: the LiDAR that others are told against.
-        T_vehicle_lidar: where every LiDAR sits, about.
+        reference: the LiDAR that pairs are taken against.
+        T_vehicle_lidar: approximate extrinsic of every LiDAR.
         guess_sigmas: LiDAR -> (6,) of its initial guess, vehicle axes.
         scans: LiDAR -> number of clouds of a target; absent: none.
         offsets_s: LiDAR -> 1 sigma of its time offset.
     """
-    every = list(T_vehicle_lidar)
-    lidars = tuple(lidars)
+    solved = {name: T_vehicle_lidar[name] for name in lidars}
     prior = np.diag(np.concatenate([guess_sigmas[name] for name in lidars]) ** -2.0)
-    uncertainty = assess(information_data, prior, {n: T_vehicle_lidar[n] for n in lidars})
+    uncertainty = assess(information_data, prior, solved)
     cov = covariance_with_prior_in_null_space(prior, spectrum(information_data, prior))
-    # All of the config's LiDARs, those without data with their guesses.
-    rows = [6 * every.index(name) + axis for name in lidars for axis in range(6)]
-    whole = np.diag(np.concatenate([guess_sigmas[name] for name in every]) ** 2.0)
-    told = np.zeros_like(whole)
-    whole[np.ix_(rows, rows)] = cov
-    told[np.ix_(rows, rows)] = information_data
-    to_right = block_diag(*(right_to_vehicle_axes(T).T for T in T_vehicle_lidar.values()))
-    nothing = dict.fromkeys(AXES, False)
-    whole_right = to_right @ whole @ to_right.T
-    calibration = Calibration(
-        status="partial" if uncertainty.undetermined else "ok",
-        reference=reference,
-        lidars={
-            name: LidarResult(
-                T_vehicle_lidar=T,
-                cov=whole_right[6 * i : 6 * i + 6, 6 * i : 6 * i + 6],
-                determined=dict(uncertainty.determined.get(name, nothing)),
-                scans_used=scans.get(name, 0),
-                saw_target=scans.get(name, 0) > 0,
-            )
-            for i, (name, T) in enumerate(T_vehicle_lidar.items())
-        },
-        cov_joint=whole_right,
-        information_data=to_right @ told @ to_right.T,
-        undetermined=uncertainty.undetermined,
-        weak=uncertainty.weak,
-        unmet=(),
-        provenance={},
-    )
-    pairs = sensor_pairs(lidars, reference)
-    sigma = np.sqrt(np.diag(whole)).reshape(-1, 6)
+    guesses = {name: Guess(T, guess_sigmas[name]) for name, T in T_vehicle_lidar.items()}
     return PredictedCovariance(
-        lidars=lidars,
-        unseeing=tuple(name for name in every if name not in lidars),
+        lidars=tuple(lidars),
         information_data=information_data,
         information_prior=prior,
         cov=cov,
         uncertainty=uncertainty,
-        sigma_s2v=dict(zip(every, sigma, strict=True)),
-        sigma_s2s={(a, b): _pair_sigma(whole, T_vehicle_lidar, a, b) for a, b in pairs},
-        determined_s2s={(a, b): pair_determined(calibration, a, b) for a, b in pairs},
         offsets_s=dict(offsets_s),
-        calibration=calibration,
+        calibration=assemble_matrices(
+            solved, guesses, cov, information_data, uncertainty, reference, scans
+        ),
     )
-
-
-def undetermined_offsets(offsets_s: Mapping[str, float], limit_s: float) -> Iterator[str]:
-    """A line per LiDAR whose time offset was asked for and is not told.
-
-    Args:
-        offsets_s: LiDAR -> 1 sigma of its offset in seconds.
-        limit_s: sigma from which it is not.
-    """
-    for name, sigma in offsets_s.items():
-        if sigma >= limit_s:
-            yield (
-                f"lidar '{name}': the drive does not tell its time offset (it would have a sigma "
-                f"of {1e3 * sigma:.0f} ms): taken as 0. Drive a figure-eight, or vary the speed"
-            )
-
-
-def _pair_sigma(
-    cov: Array, T_vehicle_lidar: Mapping[str, gtsam.Pose3], source: str, to: str
-) -> Array:
-    """(6,) of T_vehicle_source against T_vehicle_to T_to_source (SPEC 5, "Errors").
-
-    Args:
-        cov: of all extrinsics, vehicle axes.
-        T_vehicle_lidar: where they sit, in the same order.
-        source: the one.
-        to: the other.
-    """
-    names = list(T_vehicle_lidar)
-    J = np.zeros((6, len(cov)))
-    at_source, at_to = (6 * names.index(name) for name in (source, to))
-    J[:, at_source : at_source + 6] = np.eye(6)
-    J[:, at_to : at_to + 6] = -np.eye(6)
-    # When `to` turns by w, what is fixed to it moves by w x arm at the origin of `source`.
-    arm = T_vehicle_lidar[source].translation() - T_vehicle_lidar[to].translation()
-    J[3:, at_to : at_to + 3] = skew(arm)
-    return np.asarray(np.sqrt(np.diag(J @ cov @ J.T)))

@@ -1,4 +1,4 @@
-"""The config that `init` writes: what can be known from a drive, and what a person must fill in."""
+"""The config that `init` writes: values from the drive, and keys that the user must fill in."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gtsam
 import yaml
+from pydantic import BaseModel, BeforeValidator, RootModel
 
-from caliv_graph.common.fields import Field
-from caliv_graph.config.load import parse_config, read_yaml
+from caliv_graph.config.load import parse_config, read_yaml, validated
+from caliv_graph.config.sections import Finite, Triple
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import rpy
 from caliv_graph.readers.bag import Bag, DamagedMessageError
@@ -44,13 +45,13 @@ _STILL_MESSAGES = 200
 
 @dataclass(frozen=True)
 class Draft:
-    """A config to be completed.
+    """A config for the user to complete.
 
     Attributes:
         text: YAML that `config.load_config` accepts.
         lidars: names of its LiDARs.
-        unknown: keys that a person must fill in before calibrating.
-        origin: a sentence on where the guesses were taken from; empty: nowhere.
+        unknown: keys that the user must fill in before calibrating.
+        origin: a sentence about the source of the guesses; empty: there are none.
     """
 
     text: str
@@ -59,14 +60,33 @@ class Draft:
     origin: str
 
 
+def _inner_list(raw: Any) -> Any:
+    """The numbers of a list, which the CaLiV authors' program writes inside another list."""
+    return raw[0] if isinstance(raw, list) and len(raw) == 1 else raw
+
+
+_Numbers6 = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+
+class _Transforms(RootModel[dict[str, Annotated[_Numbers6, BeforeValidator(_inner_list)]]]):
+    """`transform_sensor_N`: roll, pitch, yaw in degrees, then metres, of T_vehicle_lidar."""
+
+
+class _Bounds(BaseModel):
+    """The target's region in the map, metres."""
+
+    min_bound: Annotated[Triple, BeforeValidator(_inner_list)]
+    max_bound: Annotated[Triple, BeforeValidator(_inner_list)]
+
+
 @dataclass(frozen=True)
 class _Original:
-    """What a config of the CaLiV authors' program says.
+    """The values of a config of the CaLiV authors' program.
 
     Attributes:
         path: the file.
         extrinsics: per sensor, metres and roll, pitch, yaw in degrees of T_vehicle_lidar.
-        target: lower and upper corner in the map, metres; None if it says nothing.
+        target: lower and upper corner in the map, metres; None if absent.
     """
 
     path: Path
@@ -77,7 +97,7 @@ class _Original:
 def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
     """Drafts the config of a drive.
 
-    Of a bag: LiDARs and what tells the motion by the types of the topics, initial guesses from
+    Of a bag: LiDARs and motion data by the types of the topics, initial guesses from
     `/tf_static` or a URDF. Of a CaLiV folder: initial guesses and the target's region from a config
     of the CaLiV authors' program (`transform_sensor_N`, `min_bound`, `max_bound`) beside the data.
 
@@ -94,11 +114,11 @@ def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
         draft = _draft_of_bag(data, config, urdf)
     elif urdf is not None:
         raise ConfigError(
-            f"{data}: is no bag: its clouds name no frame that {urdf} could place. Leave out --urdf"
+            f"{data}: is not a bag: its clouds name no frame of {urdf}. Leave out --urdf"
         )
     else:
         draft = _draft_of_folder(data, config)
-    # A draft that does not load would be a defect of this module, not of the user's data.
+    # A draft that does not load is a defect of this module, not of the data.
     parse_config(yaml.safe_load(draft.text), str(config), config.parent)
     return draft
 
@@ -144,7 +164,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
     unknown: list[str] = [] if motion.chosen else ["topics"]
     lidars = []
     for name, topic in clouds.chosen.items():
-        guess = frames.mounting(clouds.frame_ids[name])
+        guess = frames.extrinsic(clouds.frame_ids[name])
         if guess.T_vehicle_sensor is None:
             unknown.append(f"lidars.{name}.initial")
         kind = bag.topics[topic].type.rpartition("/")[2]
@@ -157,7 +177,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
         ("gnss", "gnss.lever_arm", _GNSS_TEMPLATE),
     ):
         if kind in motion.chosen:
-            guess = frames.mounting(_frame_of(bag, motion.chosen[kind]))
+            guess = frames.extrinsic(_frame_of(bag, motion.chosen[kind]))
             if guess.T_vehicle_sensor is None:
                 unknown.append(key)
             xyz, rpy_deg = guess.numbers()
@@ -179,11 +199,11 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
 
 @dataclass(frozen=True)
 class _Guess:
-    """The mounting of a sensor, if it is known.
+    """The extrinsic of a sensor, if it is known.
 
     Attributes:
         T_vehicle_sensor: None if it is not.
-        origin: where it was taken from, or why it is not known.
+        origin: its source, or why it is not known.
     """
 
     T_vehicle_sensor: gtsam.Pose3 | None
@@ -194,26 +214,26 @@ class _Guess:
         if self.T_vehicle_sensor is None:
             return _NO_GUESS
         angles = rpy(self.T_vehicle_sensor.rotation().matrix())
-        # To the micrometre and microdegree: quaternions leave 1e-15 where zeros were meant.
+        # To the micrometre and microdegree: the zeros of a quaternion become 1e-15.
         xyz = [round(float(v), 6) + 0.0 for v in self.T_vehicle_sensor.translation()]
         return xyz, [round(math.degrees(v), 6) + 0.0 for v in angles]
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """Where sensors are mounted.
+    """The frames of the sensors.
 
     Attributes:
         tree: frames that are fixed to each other.
-        vehicle: the vehicle's; None if none of them is it.
-        source: what they were taken from.
+        vehicle: the frame of the vehicle; None if it is not among them.
+        source: of the transforms.
     """
 
     tree: FrameTree
     vehicle: str | None
     source: str
 
-    def mounting(self, frame: str) -> _Guess:
+    def extrinsic(self, frame: str) -> _Guess:
         """`T_vehicle_sensor` of the sensor with this frame."""
         if self.vehicle is None:
             why = f"{self.source} has no frame base_link"
@@ -241,7 +261,7 @@ def _read_frames(bag: Bag, urdf: Path | None) -> _Frames:
     if urdf is not None:
         fixed = read_urdf(urdf)
         tree = FrameTree(fixed)
-        # A URDF may name its root as it likes; a vehicle frame by a known name comes first.
+        # The root of a URDF may have any name; a known name of a vehicle frame comes first.
         root = tree.root(fixed[0].child) if fixed else None
         vehicle = tree.vehicle_frame() or vehicle or root
         source = f"{urdf.name} and /tf_static" if static else urdf.name
@@ -259,7 +279,7 @@ def _links(bag: Bag, topic: str, raw: bytes) -> list[FrameTransform]:
 
 
 def _still_links(bag: Bag, topic: str) -> Iterable[FrameTransform]:
-    """Links that are repeated without change, as senders did before there was /tf_static."""
+    """Links that repeat without change: before /tf_static, senders repeated static links."""
     first: dict[tuple[str, str], FrameTransform] = {}
     repeated: dict[tuple[str, str], bool] = {}
     for count, (_, _, raw) in enumerate(bag.messages([topic])):
@@ -283,13 +303,13 @@ def _frame_of(bag: Bag, topic: str) -> str:
 
 
 def _topics_text(bag: Bag, motion: MotionTopics) -> str:
-    lines = ["topics:\t# what tells the vehicle's motion: imu, gnss and twist; or pose"]
+    lines = ["topics:\t# of the vehicle's motion: imu, gnss and twist; or pose"]
     if not motion.chosen:
         lines[0] = "topics: {}\t# TODO: imu, gnss and twist, or pose: the bag has none by its types"
     for key, chosen in motion.chosen.items():
         lines.append(f"  {key}: {_scalar(chosen)}\t# {bag.topics[chosen].type}")
     for key, others in motion.others.items():
-        lines += [f"  # {key}: {_scalar(o)}\t# would do, too: {bag.topics[o].type}" for o in others]
+        lines += [f"  # {key}: {_scalar(o)}\t# fits, too: {bag.topics[o].type}" for o in others]
     return "\n".join(lines) + "\n\n"
 
 
@@ -312,23 +332,17 @@ def _read_original(path: Path) -> _Original | None:
         return None
     if not isinstance(raw, dict) or "transform_sensor_1" not in raw:
         return None
-    root = Field(raw, str(path))
-    extrinsics = {}
-    for name, field in root.names().items():
-        if name.startswith("transform_"):
-            values = _numbers(field, 6)
-            extrinsics[name.removeprefix("transform_")] = (values[3:], values[:3])
+    expected = "CaLiV config"
+    values = {key: value for key, value in raw.items() if str(key).startswith("transform_")}
+    transforms = validated(_Transforms, values, str(path), expected).root
+    extrinsics = {
+        name.removeprefix("transform_"): (numbers[3:], numbers[:3])
+        for name, numbers in transforms.items()
+    }
     if "min_bound" not in raw or "max_bound" not in raw:
         return _Original(path, extrinsics, None)
-    bounds = (_numbers(root.child("min_bound"), 3), _numbers(root.child("max_bound"), 3))
-    return _Original(path, extrinsics, bounds)
-
-
-def _numbers(field: Field, size: int) -> list[float]:
-    """The numbers of a list, which that program writes inside another list."""
-    items = field.items()
-    inner = items[0] if len(items) == 1 else field
-    return [float(v) for v in inner.vector(size)]
+    bounds = validated(_Bounds, raw, str(path), expected)
+    return _Original(path, extrinsics, (bounds.min_bound, bounds.max_bound))
 
 
 def _relative(data: Path, config: Path) -> str:
@@ -355,11 +369,11 @@ def _list(values: Sequence[float]) -> str:
 def _origin(source: str) -> str:
     if source:
         return f"taken from {source}"
-    return "TODO: these zeros are no guess; measure, or read it off a drawing"
+    return "TODO: these zeros are no guess; measure it, or take it from a drawing"
 
 
 def _comment(text: str) -> str:
-    """Text of the data, such as a frame's name, that cannot end the comment that it stands in."""
+    """Text of the data, such as a frame's name, without characters that would end a comment."""
     return re.sub(r"[^\S ]|[^ -~\u00a1-\uffff]", "?", text)
 
 
@@ -406,9 +420,9 @@ solve:
   mode: auto\t# auto (the guess decides only what the drive leaves open), staged, joint
 
 robust:
-  kernel: huber\t# what becomes of bad scans: huber, tls, trimmed, none
+  kernel: huber\t# treatment of outlier scans: huber, tls, trimmed, none
 
-require: [s2s]\t# what exit code 0 promises to have determined: s2s, s2v_rotation, s2v
+require: [s2s]\t# exit code 0 means that these are determined: s2s, s2v_rotation, s2v
 """
 
 _LIDAR_TEMPLATE = """\
@@ -424,22 +438,22 @@ _LIDAR_TEMPLATE = """\
     max_range: 200.0\t# metres; farther returns are dropped"""
 
 _TARGET_TEMPLATE = """\
-target:\t# a box in which the target, and nothing else above the ground, stands
+target:\t# a box around the target, with nothing else above the ground in it
   min: {min}\t# metres, taken from {source}
   max: {max}\t# metres
   frame: map\t# map (the frame of the poses) or start (the vehicle's first pose)"""
 
 _NO_TARGET_TEMPLATE = """\
-# TODO: a box in which the target, and nothing else above the ground, stands: metres, in the frame
-# of the poses (map) or of the vehicle's first pose (start). Without it the target is searched for.
+# TODO: a box around the target, with nothing else above the ground in it: metres, in the frame of
+# the poses (map) or of the vehicle's first pose (start). Without it the target is searched for.
 # target:
 #   min: [10.0, -14.0, -1.0]
 #   max: [20.0, -4.0, 3.0]
 #   frame: map"""
 
 _SEARCHED_TARGET_TEMPLATE = """\
-# The target is searched for. If that fails, or others stand near it, give a box in which it, and
-# nothing else above the ground, stands: metres, in the map, or from the vehicle's first pose.
+# The target is searched for. If that fails, or other objects are near it, give a box around it,
+# with nothing else above the ground in it: metres, in the map, or from the vehicle's first pose.
 # target:
 #   min: [10.0, -14.0, -1.0]
 #   max: [20.0, -4.0, 3.0]

@@ -13,15 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.estimate import prealigned, symmetries_of_targets
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.rough import RoughSolve, rough_solve
 from caliv_graph.calibration.solve import (
-    OFFSET_DETERMINED_S,
-    SolveState,
     reduced_registered,
-    solve_registered,
-    with_determined_offsets,
 )
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -32,13 +28,12 @@ from caliv_graph.products import (
     Recording,
     TargetObservation,
 )
-from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
+from caliv_graph.wording.directions import named_prediction
 
 ROUGH_ITERATIONS = 40
 """Of the registration at most: millimetres do not change what a drive determines."""
@@ -69,7 +64,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     Args:
         recordings: opened drives (`readers.open_recording`).
         config: as for `calibrate`.
-        progress: told of every stage.
+        progress: reports every stage.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -101,7 +96,7 @@ def survey_observations(
         trajectories: one per drive.
         grounds: the ground as the LiDARs saw it.
         config: modes, kernels, priors.
-        progress: told of every stage.
+        progress: reports every stage.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
@@ -109,35 +104,22 @@ def survey_observations(
     observations = usable(observations)
     problem = pose_problem(observations, trajectories, config)
     limit = min(config.registration.max_iterations, ROUGH_ITERATIONS)
-    registrations = []
-    with progress.stage("registering the clouds roughly", len(observations)) as advance:
-        for m, observation in enumerate(observations):
-            state = JointRegistration(
-                observation, config, rough=True, shares=problem.view_weights(m)
-            )
-            registrations.append(register_jointly(state, prealigned(problem, m), limit))
-            advance()
-    with progress.stage("reading the information off the graph", None):
-        turns, alike = symmetries_of_targets(registrations, config)
-        solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
-        problem, offsets_s = with_determined_offsets(solved, registrations)
-        if problem.offsets != solved.problem.offsets:
-            solved = solve_registered(problem, registrations, tuple(grounds), config, turns)
-        D = reduced_registered(solved, registrations).D
-    found = _verdict(solved, D, offsets_s, observations, config)
-    return replace(found, warnings=(*alike, *found.warnings))
+    solved = rough_solve(
+        problem, observations, tuple(grounds), config, progress, limit, look_for_symmetries=True
+    )
+    D = reduced_registered(solved.state, solved.registrations).D
+    return _verdict(solved, D, observations, config)
 
 
 def _verdict(
-    solved: SolveState,
+    solved: RoughSolve,
     D: Array,
-    offsets_s: Mapping[str, float],
     observations: Sequence[TargetObservation],
     config: Config,
 ) -> Survey:
-    problem = solved.problem
+    problem, weights = solved.state.problem, solved.state.weights.values
     scans: dict[tuple[str, str], int] = {}
-    for j in np.flatnonzero(solved.weights.values >= 0.5).tolist():
+    for j in np.flatnonzero(weights >= 0.5).tolist():
         target = observations[int(problem.cloud_placement[j])].name
         key = (target, problem.lidars[int(problem.cloud_lidar[j])])
         scans[key] = scans.get(key, 0) + 1
@@ -146,7 +128,7 @@ def _verdict(
         problem.lidars,
         problem.reference,
         {
-            name: problem.extrinsic(solved.values, name)
+            name: problem.extrinsic(solved.state.values, name)
             if name in problem.lidars
             else lidar.initial.pose()
             for name, lidar in config.lidars.items()
@@ -156,9 +138,7 @@ def _verdict(
             for name, lidar in config.lidars.items()
         },
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},
-        offsets_s,
+        solved.offsets_s,
     )
     unmet = unmet_requirements(outlook.calibration, config).unmet
-    return Survey(
-        (), outlook, scans, unmet, tuple(undetermined_offsets(offsets_s, OFFSET_DETERMINED_S))
-    )
+    return Survey((), named_prediction(outlook), scans, unmet, solved.warnings)

@@ -7,7 +7,7 @@ import pytest
 
 from caliv_graph.batch.folder import SUMMARY_SCHEMA, BatchFolder, JobRecord
 from caliv_graph.errors import OutputError
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from tests.samples import make_calibration
 
 SUMMARY = json.dumps({"schema": SUMMARY_SCHEMA})

@@ -13,7 +13,6 @@ import pytest
 
 from caliv_graph.calibration.graph import (
     cloud_graph,
-    dense_system,
     initial_values,
     merged,
     optimise,
@@ -23,16 +22,18 @@ from caliv_graph.calibration.graph import (
 from caliv_graph.calibration.ground import (
     GroundWeights,
     full_weights,
-    ground_anchor,
+    ground_centre,
     ground_graph,
-    ground_plane_factor,
-    ground_squares,
     ground_values,
-    ground_weights,
+)
+from caliv_graph.calibration.ground_factors import (
+    ground_plane_factor,
     parallel_factor,
     plane_normal,
     standing_factor,
 )
+from caliv_graph.calibration.ground_weights import ground_weights
+from caliv_graph.calibration.linear import dense_system
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, moved_map
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
@@ -60,11 +61,8 @@ from caliv_graph.products import (
     Trajectory,
 )
 from caliv_graph.simulation import load_scenario, simulate_drive
-from caliv_graph.targets.ground.planes import (
-    DISTANCE_FLOOR_M,
-    NORMAL_FLOOR_RAD,
-    measure_grounds,
-)
+from caliv_graph.targets.ground.measure import measure_grounds
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.uncertainty.observability import scaling
 from tests.calibration.problems import Case, make_case, moved, predictions
@@ -141,7 +139,7 @@ def observed(
                 seen_from(
                     T,
                     g,
-                    ground_anchor(problem, drive),
+                    ground_centre(problem, drive),
                     lidar=name,
                     drive=drive,
                     stamp_ns=stamp_ns,
@@ -226,6 +224,20 @@ def random_values(seed: int, offset_m: float) -> tuple[gtsam.Values, Array]:
 
 
 @pytest.mark.parametrize("offset_m", [1.0, 30.0, 2000.0])
+def plane_squares_of(
+    problem: Problem, observations: Sequence[GroundObservation], values: gtsam.Values
+) -> Array:
+    """Squared whitened residuals of the planes that the LiDARs saw, 3 degrees of freedom each."""
+    graph = ground_graph(problem, observations, PLANE_ALONE)
+    return np.array(
+        [
+            2.0 * graph.at(i).error(values)
+            for i, kind in enumerate(graph.kinds)
+            if kind == "ground_plane"
+        ]
+    )
+
+
 def test_jacobians(offset_m: float) -> None:
     for seed in range(4):
         values, anchor = random_values(seed, offset_m)
@@ -322,7 +334,7 @@ def test_plane_is_found_from_guesses_and_solved() -> None:
         start.erase(key)
     solved = optimise(graph, start, 50)
     assert solved.atVector(G) == pytest.approx(g, abs=1e-5)
-    assert np.nanmax(ground_squares(case.problem, observations, solved)) < 1e-2
+    assert np.nanmax(plane_squares_of(case.problem, observations, solved)) < 1e-2
     for name in case.problem.lidars:
         difference = case.problem.extrinsic(case.truth, name).between(
             case.problem.extrinsic(solved, name)
@@ -346,7 +358,6 @@ def test_switched_off_or_unseen_there_is_nothing() -> None:
     assert ground_graph(case.problem, strange, HEIGHT_KNOWN).size() == 0
     assert ground_values(case.problem, strange, case.truth, HEIGHT_KNOWN).size() == 0
     assert full_weights(case.problem, strange).planes.tolist() == [0.0, 0.0, 0.0]
-    assert np.isnan(ground_squares(case.problem, strange, case.truth)).all()
 
 
 def test_factors_by_role() -> None:
@@ -565,7 +576,7 @@ def test_solved_errors_are_what_the_graph_claims() -> None:
         )
         D = vehicle_information(case, graph, solved)
         squares.append((error / unit) @ D @ (error / unit))
-        plane_squares.append(ground_squares(case.problem, observations, solved).sum())
+        plane_squares.append(plane_squares_of(case.problem, observations, solved).sum())
     # 144 degrees of freedom: 110 to 181 in 95 of 100 cases. No heave is drawn, z claims too much.
     assert 95.0 < sum(squares) < 190.0
     # 96 residuals, less what the plane and the extrinsics take.
@@ -656,7 +667,7 @@ def test_a_pose_that_has_followed_a_wrong_plane_does_not_excuse_it() -> None:
     )
     values = with_planes(case.truth, g)
     values.update(key_vehicle(5), moved_map(values.atPose3(key_vehicle(5)), wrong))
-    assert ground_squares(case.problem, observations, values).max() < 1e-9
+    assert plane_squares_of(case.problem, observations, values).max() < 1e-9
     weights = ground_weights(case.problem, observations, values)
     assert np.flatnonzero(weights.planes < 1.0).tolist() == [5, 5 + COUNT]
     assert weights.stands[5] == 0.0
@@ -719,7 +730,7 @@ def test_heave_is_in_the_sigma_of_the_distance_and_in_nothing_else() -> None:
     case, observations = one_later(40_000_000, 0.0, count=2)
     g = np.array([0.0, 0.0, GROUND_Z])
     keys = (X, *case.problem.extrinsic_keys_of(observations[2].lidar))
-    anchor = ground_anchor(case.problem, 0)
+    anchor = ground_centre(case.problem, 0)
     factor = ground_plane_factor(keys, G, anchor, observations[2], 0.5, 0.007)
     plain = ground_plane_factor(keys, G, anchor, observations[2])
     values = with_planes(case.truth, g)

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.requirements import sigmas_s2s, sigmas_s2v, unmet_requirements
+from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Array, Calibration, Direction
+from caliv_graph.uncertainty.pairs import sigmas_s2s, sigmas_s2v
 from tests.samples import make_calibration, pose, unseen
 
 DEGREE = math.radians(1.0)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
+from caliv_graph.calibration.kernels import DOF, GNC_FACTOR, KERNELS
 from caliv_graph.calibration.robust import (
-    DOF,
-    GNC_FACTOR,
     MIN_WEIGHT,
     RobustWeights,
     deletion_squares,
     own_blocks,
     weighted_joint,
 )
-from caliv_graph.config.model import RobustConfig
+from caliv_graph.config.model import RobustConfig, RobustKernel
 from caliv_graph.products import Array
 
 SQUARED = np.array([0.0, 1.0, 6.0, 12.0, 54.0, 600.0])
@@ -28,7 +28,7 @@ def settle(weights: RobustWeights, squared: Array, rounds: int = 100) -> int:
     """Updates until the kernel has its final shape; the number of rounds it took."""
     for done in range(1, rounds + 1):
         change = weights.update(squared)
-        if weights.settled and change == 0.0:
+        if weights.kernel.settled and change == 0.0:
             return done
     raise AssertionError(f"not settled after {rounds} rounds")
 
@@ -42,7 +42,7 @@ def test_without_a_kernel_all_clouds_count() -> None:
     weights = RobustWeights(RobustConfig(kernel="none"), 6)
     assert weights.update(SQUARED) == 0.0
     assert weights.values.tolist() == [1.0] * 6
-    assert weights.settled
+    assert weights.kernel.settled
 
 
 def test_huber_by_hand() -> None:
@@ -52,7 +52,7 @@ def test_huber_by_hand() -> None:
     change = weights.update(SQUARED)
     assert weights.values == pytest.approx([1.0, 1.0, 1.0, 1.0, 0.5, 0.15])
     assert change == pytest.approx(0.85)
-    assert weights.settled
+    assert weights.kernel.settled
     assert weights.update(SQUARED) == 0.0
 
 
@@ -103,7 +103,7 @@ def test_tls_starts_by_the_formula_of_graduated_non_convexity() -> None:
     assert weights.values == pytest.approx([1.0, middle, last], abs=1e-4)
     # At first nobody is dropped: the surrogate is convex.
     assert 0.0 < last < middle < 1.0
-    assert not weights.settled
+    assert not weights.kernel.settled
     weights.update(np.array([1.0, 50.0, 100.0]))
     mu *= GNC_FACTOR
     middle = math.sqrt(22.458 / 50.0 * mu * (mu + 1.0)) - mu
@@ -125,7 +125,7 @@ def test_tls_is_graduated_over_many_rounds() -> None:
     squared = np.array([1.0, 22.6, 100.0])
     for _ in range(20):
         weights.update(squared)
-    assert not weights.settled
+    assert not weights.kernel.settled
     # By then the cut is hard but for what is right at it: r^2 / c^2 = 1.006.
     assert 0.1 < weights.values[1] < 0.9
     assert weights.values[2] == MIN_WEIGHT
@@ -143,7 +143,7 @@ def test_tls_takes_clouds_back_in_that_fit_in_the_end() -> None:
 def test_tls_without_outliers_is_over_at_once() -> None:
     weights = RobustWeights(RobustConfig(kernel="tls"), 3)
     assert weights.update(np.array([1.0, 6.0, 11.0])) == 0.0
-    assert weights.settled
+    assert weights.kernel.settled
     assert weights.values.tolist() == [1.0] * 3
 
 
@@ -355,3 +355,7 @@ def test_other_kernels_drop_what_they_say_they_drop(kernel: str, kept: int) -> N
     assert weights.values[found] == pytest.approx(
         np.broadcast_to(np.maximum(expected, MIN_WEIGHT), 20)[found]
     )
+
+
+def test_every_kernel_of_the_config_is_there() -> None:
+    assert set(KERNELS) == set(get_args(RobustKernel))

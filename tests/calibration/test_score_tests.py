@@ -12,13 +12,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.score_tests import cloud_counts, score_tests
+from caliv_graph.calibration.check import cloud_counts
+from caliv_graph.calibration.score_tests import score_tests
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import SolveConfig
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.uncertainty.consistency import chance, difference
+from caliv_graph.uncertainty.consistency import difference, p_value
 from tests.drives_with_chair import FIGURE_EIGHT, ChairDrive, paper_scenario, simulated
 
 
@@ -63,14 +64,14 @@ def test_a_clean_drive_contradicts_nothing() -> None:
     run = clean()
     assert run.calibration.contradictions == ()
     assert run.calibration.status != "inconsistent"
-    assert run.evidence is not None
-    found = score_tests(run.solution, run.evidence.trajectories)
+    assert run.record is not None
+    found = score_tests(run.solution, run.record.trajectories)
     assert {(c.lidar, c.kind) for c in found} == {
         (lidar, kind) for lidar in ("front", "rear") for kind in ("halves", "turns", "clock")
     }
-    assert all(chance(c) > 1e-4 for c in found)
+    assert all(p_value(c) > 1e-4 for c in found)
     assert all(np.linalg.eigvalsh(c.information).min() > 0.0 for c in found)
-    counts = cloud_counts(run.solution, run.evidence.trajectories)
+    counts = cloud_counts(run.solution, run.record.trajectories)
     assert [c.lidar for c in counts] == ["front", "rear"]
     for count in counts:
         assert count.early[0] + count.late[0] == count.clouds
@@ -90,8 +91,8 @@ def test_a_mount_that_slips_in_the_middle_shows_in_the_halves_by_as_much() -> No
     """40 mm, too little for a robust kernel to drop much."""
     drive = displaced(eight(), "front", (0.0, 0.04, 0.0), lambda k: 2 * k >= 116)
     run = run_on(drive)
-    assert run.evidence is not None
-    found = {(c.lidar, c.kind): c for c in score_tests(run.solution, run.evidence.trajectories)}
+    assert run.record is not None
+    found = {(c.lidar, c.kind): c for c in score_tests(run.solution, run.record.trajectories)}
     slipped, still = found["front", "halves"], found["rear", "halves"]
     d, cov, _ = difference(slipped)
     # Points farther left in the cloud: a LiDAR farther right, in the second half.
@@ -99,7 +100,7 @@ def test_a_mount_that_slips_in_the_middle_shows_in_the_halves_by_as_much() -> No
     # The slow error of the poses takes its part of so small a slip, but not the most of it.
     assert d[4] > 0.02
     assert d[4] > 2.5 * math.sqrt(cov[4, 4])
-    assert chance(slipped) < 0.5 * chance(still)
+    assert p_value(slipped) < 0.5 * p_value(still)
 
 
 def test_the_paper_s_stages_hold_the_translation_and_contradict_nothing() -> None:

@@ -18,7 +18,7 @@ from tests.samples import make_calibration, make_solution, unseen
 def run_of(calibration, warnings=()):
     return types.SimpleNamespace(
         calibration=calibration, solution=make_solution(), observations=(), warnings=warnings,
-        evidence=None,
+        record=None,
     )
 {pipeline}
 module = types.ModuleType("caliv_graph.pipeline")

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import yaml
 
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from tests.batch.tiny import tiny_drive
 from tests.cli.commands import ROOT, run
 

@@ -16,7 +16,7 @@ from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.products import Calibration, Recording
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from tests.cli.commands import write_config, write_drive
 from tests.samples import make_calibration, make_solution, unseen
 
@@ -45,7 +45,7 @@ class Pipeline:
             calibration=self.calibration,
             solution=make_solution(),
             warnings=self.warnings,
-            evidence=None,
+            record=None,
         )
 
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
 from caliv_graph.errors import ConfigError
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from tests.cli.commands import run
 from tests.fusion.drives import arc_information, drive, information, shift
 
@@ -118,5 +118,5 @@ def test_what_cannot_be_compared(files: tuple[Path, Path], tmp_path: Path) -> No
     refused = compare(*files)
     assert isinstance(refused.exception, ConfigError)
     assert str(refused.exception) == (
-        f"{files[1]}: joint.data_gradient: expected 12 numbers, got 13"
+        f"{files[1]}: 'joint.data_gradient': must be 12 numbers, has 13"
     )

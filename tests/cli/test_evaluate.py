@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
 from caliv_graph.errors import ConfigError
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from tests.samples import make_calibration
 
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from caliv_graph.cli.main import run as run_program
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from tests.cli.commands import write_config
 from tests.export.requests import T_VEHICLE_LIDAR, calibration_of, quaternion_xyzw
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from caliv_graph.results.files import read_calibration
+from caliv_graph.results.calibration_file import read_calibration
 from tests.cli.commands import run, write_config, write_drive
 
 SENTENCE = "lidar 'front': its stamps and the motion of the vehicle contradict each other"

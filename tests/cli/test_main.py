@@ -111,7 +111,7 @@ def test_help_imports_nothing_heavy() -> None:
 def test_calibrating_a_folder_imports_only_what_it_uses() -> None:
     code = (
         "import sys\n"
-        "import caliv_graph.pipeline, caliv_graph.readers, caliv_graph.results.files\n"
+        "import caliv_graph.pipeline, caliv_graph.readers, caliv_graph.results.calibration_file\n"
         "import caliv_graph.report.log, caliv_graph.report.tables\n"
         f"heavy = {LATE!r} & sys.modules.keys()\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)\n"

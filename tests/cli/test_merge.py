@@ -8,7 +8,7 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app
 from caliv_graph.errors import ConfigError, OutputError
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from tests.cli.commands import run
 from tests.fusion.drives import arc_information, drive, information, shift
 

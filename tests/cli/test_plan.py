@@ -140,7 +140,7 @@ def test_a_standing_vehicle() -> None:
 
     assert result.exit_code == 0
     # Six directions, one sentence.
-    assert result.stdout.count("everything to the vehicle: it never moved") == 1
+    assert result.stdout.count("all S2V axes: the vehicle did not move") == 1
     assert "figure-eight" in result.stdout
 
 

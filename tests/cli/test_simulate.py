@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 from caliv_graph.cli.main import app
 from caliv_graph.config.load import load_config
 from caliv_graph.errors import ConfigError, OutputError
-from caliv_graph.results.files import read_truth
+from caliv_graph.results.truth_file import read_truth
 from tests.cli.commands import run
 
 SCENARIO = """\

@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app, run
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.simulation.caliv_folder import write_ego_poses, write_pcd
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import FRAME_NS, GUESSES, Scene, calibration_of, make_recording

@@ -154,7 +154,9 @@ def test_a_folder_that_is_no_result_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home/log.jsonl").write_text("mine")
 
-    with pytest.raises(OutputError, match=r"holds no calibration\.yaml and is none of our results"):
+    with pytest.raises(
+        OutputError, match=r"holds no calibration\.yaml and is not a result of this"
+    ):
         write_result(tmp_path / "home", force=True)
 
     assert (tmp_path / "home/log.jsonl").read_text() == "mine"
@@ -318,7 +320,7 @@ def test_links_in_a_circle_and_files_on_the_way(tmp_path: Path) -> None:
     for check in (check_output_file, lambda path: check_output_folder(path, CONTENT)):
         with pytest.raises(OutputError, match="links in a circle"):
             check(tmp_path / "loop" / "result")
-        with pytest.raises(OutputError, match="file is no folder"):
+        with pytest.raises(OutputError, match="file is not a folder"):
             check(tmp_path / "file" / "a" / "result")
         with pytest.raises(OutputError, match=r"^/proc/result: cannot be written"):
             check(Path("/proc/result"))

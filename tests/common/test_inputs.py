@@ -15,7 +15,8 @@ from caliv_graph.export.edit import read_base
 from caliv_graph.readers.bag import Bag
 from caliv_graph.readers.frames import read_urdf
 from caliv_graph.readers.pcd import read_pcd
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.model import load_scenario
 
 READERS: dict[str, Callable[[Path], object]] = {

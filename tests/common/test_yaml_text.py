@@ -32,20 +32,20 @@ def bomb(levels: int) -> str:
         ("lidars: " + "[" * 100_000, "nested deeper than 50 levels"),
         ("lidars:\n" + "- " * 50_000 + "x\n", "nested deeper than 50 levels"),
         ("a: " + "{a: " * 51 + "}" * 51, "nested deeper than 50 levels"),
-        (bomb(12), "aliases stand for"),
-        ("a: &a {b: *a}\n", "'*a' stands for what it is part of"),
-        ("a: &a [*a]\n", "'*a' stands for what it is part of"),
+        (bomb(12), "aliases expand to"),
+        ("a: &a {b: *a}\n", "'*a' contains itself"),
+        ("a: &a [*a]\n", "'*a' contains itself"),
         ("a: 0x" + "f" * 5000, "a number of 5002 digits"),
         ("a: " + "9" * 5000, "a number of 5000 digits"),
         ("a: 1" + ":59" * 2000, "a number of 6001 digits"),
-        ("a: !!int ''", "not what it seems"),
-        ("a: !!timestamp now", "not what it seems"),
+        ("a: !!int ''", "does not fit its type"),
+        ("a: !!timestamp now", "does not fit its type"),
         ("a: !!map x", "expected a mapping node"),
         ("a: 2001-99-99", "month must be in 1..12"),
         ("a: !!python/object/apply:os.system [exit]", "could not determine a constructor"),
         ("? [a]\n: 1", "unhashable"),
-        ("? &a [*a]\n: 1", "stands for what it is part of"),
-        ("a: 1\na: 2\n", "'a' stands twice"),
+        ("? &a [*a]\n: 1", "contains itself"),
+        ("a: 1\na: 2\n", "'a' is given twice"),
         ("a: 1\n---\nb: 2\n", "another document"),
         ("a: *b", "undefined alias"),
         (f"a: !{'x' * 5000} b", "could not determine a constructor"),
@@ -91,5 +91,5 @@ def test_no_line_is_named_where_none_is_known(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML in line 3: did not find"):
         read_yaml(path)
     path.write_text("a: 2001-99-99\n")
-    with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML: a value is not"):
+    with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML: a value does not"):
         read_yaml(path)

@@ -315,10 +315,10 @@ def test_the_config_of_the_published_drive_shows_the_defaults() -> None:
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        ({"limits": 5, "require": ["s2s"]}, "'limits': Input should be a valid dictionary"),
-        ({"require": [{"limits": [1]}]}, "'limits': Input should be a valid dictionary"),
+        ({"limits": 5, "require": ["s2s"]}, "'limits': must be keys with values"),
+        ({"require": [{"limits": [1]}]}, "'limits': must be keys with values"),
         ({"target": {"min": [0, 0, 0], "mx": [1, 1, 1]}}, "unknown key 'target.0.mx'"),
-        ({"target": []}, "'target': Tuple should have at least 1 item"),
+        ({"target": []}, "'target': must have 1 or more items, has 0"),
         (
             {
                 "lidars": {
@@ -346,5 +346,5 @@ def test_a_key_that_stands_twice_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("lidars:\n  front: {topic: a}\n  front: {topic: b}\n")
 
-    with pytest.raises(ConfigError, match="in line 3: key 'front' stands twice"):
+    with pytest.raises(ConfigError, match="in line 3: key 'front' is given twice"):
         load_config(path)

@@ -13,7 +13,7 @@ from caliv_graph.errors import ExportError
 from caliv_graph.export.autoware import export as export_autoware
 from caliv_graph.export.prepare import Wishes, prepare
 from caliv_graph.export.tf import export as export_tf
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from tests.cli.commands import write_config
 from tests.export.requests import (
     T_HOUSING_LIDAR,

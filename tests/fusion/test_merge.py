@@ -13,7 +13,7 @@ from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.merge import Merger, merge, starting_from, with_earlier
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, Guess
-from caliv_graph.results.files import read_calibration, write_calibration
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from tests.fusion.drives import TRUTH, arc_information, draw, drive, information, shift
 
 NAMES = ("front", "rear")

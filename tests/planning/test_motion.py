@@ -26,7 +26,7 @@ from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.chain import Chain
-from caliv_graph.trajectory.smoothing import smooth_trajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from tests.drives_with_chair import paper_scenario
 
 STAMPS = np.arange(1, 9) * NANOSECONDS_PER_SECOND

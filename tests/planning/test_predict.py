@@ -116,8 +116,8 @@ def test_lower_bounds_of_an_ideal_estimator(name: str, ground: Ground) -> None:
 
 HEIGHT = "height of all LiDARs together"
 TURN = "rotation of all LiDARs about the turn centre: x and yaw together, 9.16 m per rad"
-STILL = "everything to the vehicle: it never moved"
-STILL_BUT_HEIGHT = "everything to the vehicle but its height: it never moved"
+STILL = "all S2V axes: the vehicle did not move"
+STILL_BUT_HEIGHT = "all S2V axes but the height: the vehicle did not move"
 
 RAMP = RampModel(xy_m=(8.0, -4.0), yaw_deg=-50.0, height_m=0.3, flank_m=3.0, top_m=1.0)
 
@@ -178,8 +178,7 @@ def planned(name: str, ground: Ground, **changes: Any) -> Prediction:
 def said(prediction: Prediction) -> set[str]:
     """The texts; roll about whichever axis along the way: any will do where y is lost too."""
     return {
-        d.text.replace("roll and y of all LiDARs, moving as one", ROLL)
-        for d in prediction.undetermined
+        d.text.replace("roll and y of all LiDARs together", ROLL) for d in prediction.undetermined
     }
 
 
@@ -383,7 +382,7 @@ def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
     eight = planned("figure-eight", "height", time_offset=True)
 
     assert min(freed.covariance.offsets_s.values()) > 0.03
-    assert sum("does not tell its time offset" in line for line in freed.warnings) == 2
+    assert sum("does not determine its time offset" in line for line in freed.warnings) == 2
     # So it is not freed.
     assert freed.sigma_s2s["front", "rear"] == pytest.approx(without.sigma_s2s["front", "rear"])
     assert max(eight.covariance.offsets_s.values()) < 0.0015

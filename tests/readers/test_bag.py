@@ -161,7 +161,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"nowhere: no such file or folder"):
         Bag(tmp_path / "nowhere")
     (tmp_path / "text.txt").touch()
-    with pytest.raises(RecordingError, match=r"text\.txt: is no bag by its name"):
+    with pytest.raises(RecordingError, match=r"text\.txt: is not a bag by its name"):
         Bag(tmp_path / "text.txt")
     (tmp_path / "drive.mcap.zst").touch()
     with pytest.raises(RecordingError, match="Unpack it first"):
@@ -269,6 +269,20 @@ def test_a_standard_type_with_a_damaged_definition(tmp_path: Path) -> None:
     assert bag.decode("/points", raw).point_step == 12
 
 
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_a_damaged_definition_of_another_topic(tmp_path: Path, kind: str) -> None:
+    """`rosbags.highlevel.AnyReader` refuses the whole bag."""
+    file = file_of(write_bag(tmp_path / "drive", messages(2), kind))
+    data = file.read_bytes()
+    assert data.count(b"uint32 point_step") >= 1
+    file.write_bytes(data.replace(b"uint32 point_step", b"uint32 point{step"))
+
+    bag = Bag(file)
+
+    for topic, _, raw in bag.messages(["/imu", "/points"]):
+        assert bag.decode(topic, raw).header.frame_id
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -278,7 +292,7 @@ def test_a_standard_type_with_a_damaged_definition(tmp_path: Path) -> None:
         ("UPDATE messages SET timestamp = 9223372036854775807", "recorded at 9223372036854775807"),
         ("UPDATE messages SET timestamp = -1", "was recorded at -1"),
         ("UPDATE messages SET timestamp = 1.5", "was recorded at 1.5"),
-        ("UPDATE messages SET data = 'text'", "a message of /imu is no bytes"),
+        ("UPDATE messages SET data = 'text'", "a message of /imu is not bytes"),
     ],
 )
 def test_values_that_no_bag_can_have(tmp_path: Path, change: str, said: str) -> None:
@@ -308,4 +322,4 @@ def test_two_topics_of_one_number(tmp_path: Path) -> None:
             assert {name for name, _, _ in Bag(path).messages([topic])} <= {topic}
         except RecordingError as e:
             said += str(e)
-    assert "goes by the number of another" in said
+    assert "has the number of another topic" in said

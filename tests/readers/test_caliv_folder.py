@@ -314,7 +314,7 @@ def test_cloud_that_is_no_frame(tmp_path: Path) -> None:
         ([["1.pcd", [[0.0], *IDENTITY[1:]]]], ["7 numbers of a pose"]),
         ([["1.pcd", [math.nan, *IDENTITY[1:]]]], ["entry 1 (1.pcd)", "not finite"]),
         ([["1.pcd", [*IDENTITY[:3], math.inf, 0, 0, 1]]], ["not finite"]),
-        ([entry(1), entry(2), entry(1)], ["entry 3", "frame 1 stands twice"]),
+        ([entry(1), entry(2), entry(1)], ["entry 3", "frame 1 is given twice"]),
         ([], ["holds no poses"]),
         ({"1.pcd": IDENTITY}, ["holds no poses", "[file, [x, y, z, qx, qy, qz, qw]]"]),
         (None, ["holds no poses"]),
@@ -357,7 +357,7 @@ def test_entry_that_unfolds_to_gigabytes(tmp_path: Path) -> None:
     (drive / "input/ego_poses.yaml").write_text(f"{bomb}sensor_1: [*a19]\n")
     message = error_of(drive)
     assert "not valid YAML in line" in message
-    assert "aliases stand for" in message
+    assert "aliases expand to" in message
 
 
 def break_nothing_there(drive: Path) -> Path:

@@ -136,7 +136,7 @@ def test_orientations_that_are_none() -> None:
     assert np.isnan(q[:4]).all()
     assert np.linalg.norm(q[4]) == pytest.approx(1.0, abs=1e-12)
     assert collector.notes() == [
-        "the orientation of 3 of 5 messages is no unit quaternion, and is not used"
+        "the orientation of 3 of 5 messages is not a unit quaternion, and is not used"
     ]
 
 
@@ -275,7 +275,8 @@ def test_poses_and_their_covariance() -> None:
     assert np.abs((np.cov(np.array(logs).T) - poses.cov[0]) / scale).max() < 0.1
     assert np.isnan(poses.cov[1]).all()
     assert collector.notes() == [
-        "of 4 messages not used: 1 with NaN or infinity, 1 whose orientation is no unit quaternion"
+        "of 4 messages not used: 1 with NaN or infinity, "
+        "1 whose orientation is not a unit quaternion"
     ]
 
 

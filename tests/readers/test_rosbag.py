@@ -332,16 +332,16 @@ def test_clouds_without_coordinates(tmp_path: Path) -> None:
     [
         ({}, {"front": "/lidar/frnt/points"}, r"no topic '/lidar/frnt/points' \(lidars\.front\.to"),
         ({}, {"front": "/lidar/frnt/points"}, r"Did you mean '/lidar/front/points'\? Topics that"),
-        ({}, {"front": "/nothing"}, r"Topics that would do: /lidar/front/points, /livox/lidar$"),
+        ({}, {"front": "/nothing"}, r"Topics that fit: /lidar/front/points, /livox/lidar$"),
         (
             {},
             {"front": "/imu/data"},
             r"'/imu/data' \(lidars\.front\.topic\) is of type sensor_msgs",
         ),
         ({"imu": "/gnss/fix"}, {}, r"for IMU it takes sensor_msgs/msg/Imu\. Topics .* /imu/data$"),
-        ({"gnss": "/fix"}, {}, r"no topic '/fix' \(topics\.gnss\).* Topics .* do: /gnss/fix$"),
-        ({"twist": FRONT}, {}, r"for velocity it takes .* Topics that would do: /vehicle/twist$"),
-        ({"pose": "/imu/data"}, {}, r"Topics that would do: none$"),
+        ({"gnss": "/fix"}, {}, r"no topic '/fix' \(topics\.gnss\).* Topics that fit: /gnss/fix$"),
+        ({"twist": FRONT}, {}, r"for velocity it takes .* Topics that fit: /vehicle/twist$"),
+        ({"pose": "/imu/data"}, {}, r"Topics that fit: none$"),
     ],
 )
 def test_missing_topics_and_wrong_types(
@@ -380,7 +380,7 @@ def test_a_topic_of_motion_without_anything_useful(tmp_path: Path) -> None:
     assert recording.motion().gnss is None
     assert [line.partition("'/fix': ")[2] for line in recording.warnings()] == [
         "of 1 messages not used: 1 without a fix (status < 0)",
-        "tells nothing that could be used",
+        "holds nothing that can be used",
     ]
 
 

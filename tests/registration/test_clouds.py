@@ -283,7 +283,7 @@ def test_clouds_of_another_lidar_are_not_merged() -> None:
     first = lidar[stack.cloud] == 0
     np.testing.assert_allclose(moved.normals[first], aligned.normals[first], atol=1e-12)
     np.testing.assert_allclose(moved.flatness[first], aligned.flatness[first], atol=1e-12)
-    # Merged, those of the other would have a say.
+    # Merged, those of the other change them.
     together = merged_normals(stack, R, off, one_lidar(stack))
     assert np.median(angle_deg(together.normals[first], aligned.normals[first])) > 1.0
 

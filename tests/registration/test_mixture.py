@@ -14,14 +14,12 @@ from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.mixture import (
     ALONG_SURFACE,
     MAX_TURN_RAD,
-    Responsibilities,
-    ShapeQuadratic,
-    cell_moments,
     expect,
     maximise_shape,
     seed_mixture,
-    shape_quadratic,
 )
+from caliv_graph.registration.moments import Responsibilities, cell_moments
+from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.register import left_step
 from tests.registration.scenes import (
     looking_at_target,
@@ -110,7 +108,7 @@ def maximised(
 ) -> Mixture:
     cells = cell_moments(stack, who, len(mixture.weights))
     quadratic = shape_quadratic(stack, R, t, mixture, cells, who)
-    expected = cells, quadratic.turnable, quadratic.torque
+    expected = cells, quadratic.orientation_information, quadratic.torque
     return maximise_shape(stack, R, t, mixture, floor_m, *expected)
 
 
@@ -283,12 +281,12 @@ def test_levers_do_not_grow_with_the_noise() -> None:
         found.append((stack, who, quadratic_of(stack, *IDENTITY, flat, who)))
     (_, _, still), (stack, who, noisy) = found
     for axis in (0, 1):
-        expected = still.turnable[0, axis, axis]
-        assert noisy.turnable[0, axis, axis] == pytest.approx(expected, rel=0.02)
+        expected = still.orientation_information[0, axis, axis]
+        assert noisy.orientation_information[0, axis, axis] == pytest.approx(expected, rel=0.02)
         assert noisy.blocks[0, axis, axis] == pytest.approx(still.blocks[0, axis, axis], rel=0.02)
     at_points = replace(who, slides_m=np.zeros(len(stack.points)))
     longer = quadratic_of(stack, *IDENTITY, flat, at_points)
-    assert longer.turnable[0, 1, 1] > 1.1 * still.turnable[0, 1, 1]
+    assert longer.orientation_information[0, 1, 1] > 1.1 * still.orientation_information[0, 1, 1]
     # Nor does the component become wider.
     after = maximised(stack, *IDENTITY, flat, who, 0.001)
     assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.08 / math.sqrt(12.0), rel=0.02)
@@ -506,7 +504,7 @@ def test_joint_is_the_square_of_the_numerical_jacobian(thick: bool) -> None:
 
 
 def test_blocks_are_the_information_given_the_shape() -> None:
-    # SPEC 3: the sum of alpha J^T W J, J = [-skew(y), I]; -skew(y) by the cross product.
+    # GMMCalib: the sum of alpha J^T W J, J = [-skew(y), I]; -skew(y) by the cross product.
     case = random_case(2)
     stack, R, t, _, _ = case
     W = weight_matrices(case).sum(axis=1)
@@ -613,16 +611,16 @@ def test_a_common_turn_is_in_the_null_space() -> None:
     assert common(quadratic)[:3] == pytest.approx(np.zeros(3), abs=1e-3)
 
 
-def test_clouds_of_disjoint_skins_say_nothing_of_each_other() -> None:
+def test_clouds_of_disjoint_skins_have_no_information_on_each_other() -> None:
     _, _, _, quadratic = skins()
     information = RELATIVE.T @ quadratic.joint() @ RELATIVE
     sigma = np.diag(information) ** -0.5
-    # Ten times the sigma of a guess (SPEC 6: 30 mrad, 58 mm).
+    # Ten times the sigma of a guess (the default config: 30 mrad, 58 mm).
     assert sigma[:3].min() > 0.3
     assert sigma[3:].min() > 0.6
 
 
-def test_clouds_of_disjoint_skins_know_less_of_each_other_than_the_blocks_claim() -> None:
+def test_clouds_of_disjoint_skins_have_less_relative_information_than_the_blocks() -> None:
     _, _, _, quadratic = skins()
     joint = np.diag(RELATIVE.T @ quadratic.joint() @ RELATIVE)
     claimed = 0.25 * np.diag(quadratic.blocks.sum(axis=0))

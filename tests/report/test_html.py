@@ -61,9 +61,9 @@ class Ran:
     def page(self, **changes: Any) -> str:
         run = self.run
         calibration = replace(run.calibration, **changes)
-        assert run.evidence is not None
+        assert run.record is not None
         return render_report(
-            calibration, run.solution, self.config, self.stages, run.warnings, run.evidence
+            calibration, run.solution, self.config, self.stages, run.warnings, run.record
         )
 
     def log(self) -> list[dict[str, Any]]:
@@ -75,7 +75,7 @@ class Ran:
                 self.config.robust,
                 self.stages,
                 run.warnings,
-                run.evidence,
+                run.record,
             )
         )
 
@@ -109,8 +109,8 @@ def ran(config: Config) -> Ran:
 
 
 def smoothed(bag: Ran) -> SmoothedTrajectory:
-    assert bag.run.evidence is not None
-    trajectory = bag.run.evidence.trajectories[0]
+    assert bag.run.record is not None
+    trajectory = bag.run.record.trajectories[0]
     assert isinstance(trajectory, SmoothedTrajectory)
     return trajectory
 
@@ -359,8 +359,8 @@ def test_staged_on_given_poses(staged: Ran) -> None:
 
 def test_several_recordings_and_targets_are_told_apart(bag: Ran) -> None:
     run = bag.run
-    assert run.evidence is not None
-    solution, evidence = run.solution, run.evidence
+    assert run.record is not None
+    solution, evidence = run.solution, run.record
     twice = replace(
         solution,
         registrations=solution.registrations * 3,
@@ -435,8 +435,8 @@ def test_a_line_per_stage_and_finding(bag: Ran) -> None:
     assert result["not_determined"][EVIL] == list(AXES)
     assert about.count("warning") == len(bag.run.warnings) > 0
     kinds = [line["residuals"] for line in lines if "residuals" in line]
-    assert bag.run.evidence is not None
-    assert kinds == [r.kind for r in all_residuals(bag.run.solution, bag.run.evidence)]
+    assert bag.run.record is not None
+    assert kinds == [r.kind for r in all_residuals(bag.run.solution, bag.run.record)]
 
 
 def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> None:
@@ -448,7 +448,7 @@ def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> No
         staged.config,
         staged.stages,
         run.warnings,
-        run.evidence,
+        run.record,
     )
 
     names = {path.name for path in tmp_path.iterdir()}
@@ -460,7 +460,8 @@ def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> No
 
 def test_plotly_waits_until_there_is_something_to_write() -> None:
     code = (
-        "import sys, caliv_graph.pipeline, caliv_graph.results.files, caliv_graph.report.tables\n"
+        "import sys, caliv_graph.pipeline, caliv_graph.report.tables\n"
+        "import caliv_graph.results.calibration_file\n"
         "print([m for m in ('plotly', 'jinja2') if m in sys.modules])"
     )
     done = subprocess.run(

@@ -14,12 +14,12 @@ import yaml
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from caliv_graph.calibration.requirements import sigmas_s2s
 from caliv_graph.cli.main import run
 from caliv_graph.conventions import AXES
-from caliv_graph.results.files import read_calibration, read_truth
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s
 
 FRONT, REAR = "/lidar/front/points", "/lidar/rear/points"
 IMU, GNSS, TWIST = "/imu/data", "/gnss/fix", "/vehicle/twist"

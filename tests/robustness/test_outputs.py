@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from caliv_graph.results.files import RESULT_FILES, read_calibration
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.names import RESULT_FILES
 from tests.cli.commands import ROOT
 from tests.robustness.hostile_drives import SCENARIO, Outcome, command
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from scripts import benchmark_compare
 from tests.fusion.drives import TRUTH, arc_information, drive, information
 

@@ -11,7 +11,7 @@ import pytest
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, LidarResult, LidarScan
-from caliv_graph.results.files import write_calibration
+from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive

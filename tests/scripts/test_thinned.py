@@ -27,7 +27,7 @@ from caliv_graph.scenario.world_models import (
 from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
-from caliv_graph.targets.ground.planes import measure_ground, measure_grounds
+from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.trajectory.select import smooth_trajectories
 from scripts._thinned import (
     BeamSelection,
@@ -37,6 +37,7 @@ from scripts._thinned import (
     scenario_digest,
     select_beams,
 )
+from tests.targets.ground.scans import plane_in
 
 FRONT = LidarModel(
     mounting=PoseConfig(xyz=(2.0, 0.2, 2.0), rpy_deg=(1.0, 10.0, -3.0)),
@@ -194,7 +195,7 @@ def test_the_ground_is_told_as_well_as_its_floors() -> None:
     for name in scenario.lidars:
         for scan in list(recording.scans(name))[::6]:
             up = level_up(recording, scan)
-            plane = measure_ground(scan, up, 0.01)
+            plane = plane_in(scan, up, 0.01)
             assert plane is not None
             off = plane.axes_lidar @ (plane.normal_lidar - up)
             found.append([*np.sqrt(np.diag(plane.cov)), *off])
@@ -316,10 +317,10 @@ def test_waves_of_the_ground_are_as_large_as_they_say_and_leave_the_target_alone
             np.testing.assert_array_equal(
                 a.scan.points_lidar[a.objects == 1], b.scan.points_lidar[b.objects == 1]
             )
-            plane = measure_ground(b.scan, level_up(level, b.scan), 0.01)
+            plane = plane_in(b.scan, level_up(level, b.scan), 0.01)
             assert plane is not None
             assert plane.scatter_m < 1e-4
-            truth = measure_ground(a.scan, level_up(level, a.scan), 0.01)
+            truth = plane_in(a.scan, level_up(level, a.scan), 0.01)
             assert truth is not None
             tilt = truth.axes_lidar @ (plane.normal_lidar - truth.normal_lidar)
             found.append([*tilt / 2e-3, (plane.distance_m - truth.distance_m) / 5e-3])

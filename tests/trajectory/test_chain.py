@@ -47,21 +47,6 @@ def marginal(H: Array, keep: list[int]) -> Array:
     return np.asarray(np.linalg.inv(np.linalg.inv(H)[np.ix_(keep, keep)]))
 
 
-@pytest.mark.parametrize("common", [0, 1, 2])
-def test_covariances_are_the_blocks_of_the_inverse(common: int) -> None:
-    chain, H = random_chain(6, common)
-    inverse = np.linalg.inv(H)
-
-    covariances = chain.covariances()
-
-    for i in range(6):
-        at = slice(STATE * i, STATE * (i + 1))
-        np.testing.assert_allclose(covariances[i], inverse[at, at], rtol=1e-6, atol=1e-12)
-    if common:
-        at = slice(STATE * 6, None)
-        np.testing.assert_allclose(chain.common_covariance(), inverse[at, at], rtol=1e-6)
-
-
 @pytest.mark.parametrize("common", [0, 1])
 @pytest.mark.parametrize(
     "wanted", [[0], [3], [6], [0, 6], [1, 2, 5], [0, 1, 2, 3, 4, 5, 6]], ids=str
@@ -83,7 +68,7 @@ def test_what_nothing_determines_is_an_error() -> None:
     chain.coupling[:] = 0.0
 
     with pytest.raises(TrajectoryError, match="do not determine"):
-        chain.covariances()
+        chain.pose_information(np.array([0, 2]))
 
 
 def linear_graph(states: int, seed: int = 5) -> gtsam.GaussianFactorGraph:

@@ -12,7 +12,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, LidarScan, Trajectory
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import GivenTrajectory
-from caliv_graph.trajectory.smoothing import smooth_trajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from tests.trajectory.motions import (
     START_NS,
     Course,

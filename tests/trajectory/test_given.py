@@ -1,81 +1,138 @@
-"""Given poses become a trajectory, unchanged."""
+"""Given poses become a trajectory, unchanged, with the covariances of their messages."""
 
 from __future__ import annotations
-
-from collections.abc import Container, Iterator, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.errors import RecordingError, TrajectoryError
-from caliv_graph.products import GivenPoses, LidarScan, MotionData
-from caliv_graph.trajectory.given import given_trajectories
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, GivenPoses, MotionData, Trajectory
+from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.noise import (
+    MIN_POSE_POSITION_M,
+    MIN_POSE_ROTATION_RAD,
+    given_pose_covariances,
+)
+from caliv_graph.trajectory.select import GivenTrajectory, smooth_trajectories
+from tests.trajectory.motions import Sensors, config_for
 
 
-@dataclass(frozen=True)
-class PosesOnly:
-    """A recording of which nothing but the poses is read."""
-
-    name: str
-    stamps_ns: tuple[int, ...]
-    readable: bool = True
-
-    @property
-    def lidars(self) -> tuple[str, ...]:
-        return ()
-
-    def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
-        raise AssertionError(f"clouds of {lidar} are not needed")
-
-    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        raise AssertionError(f"clouds of {lidar} are not needed")
-
-    def motion(self) -> MotionData:
-        if not self.readable:
-            raise RecordingError(f"{self.name}: damaged")
-        poses = GivenPoses(
-            np.array(self.stamps_ns, dtype=np.int64),
-            tuple(pose_of(self.name, stamp) for stamp in self.stamps_ns),
-        )
-        return MotionData(self.name, poses=poses)
-
-    def warnings(self) -> Sequence[str]:
-        return ()
+def recorded(*stamps_ns: int) -> MotionData:
+    """A drive of which nothing but the poses was recorded."""
+    poses = tuple(
+        gtsam.Pose3(gtsam.Rot3.Yaw(0.01 * stamp), np.array([1.0 * stamp, 0.1, 2.0]))
+        for stamp in stamps_ns
+    )
+    return MotionData("drive/", poses=GivenPoses(np.array(stamps_ns, dtype=np.int64), poses))
 
 
-def pose_of(name: str, stamp: int) -> gtsam.Pose3:
-    """A pose that tells drive and stamp apart."""
-    return gtsam.Pose3(gtsam.Rot3.Yaw(0.01 * stamp), np.array([1.0 * stamp, 0.1 * len(name), 2.0]))
+def test_the_poses_are_those_of_the_recording() -> None:
+    trajectory = given_trajectory(recorded(1, 5, 9))
 
-
-def test_every_drive_keeps_its_own_poses() -> None:
-    first, second = given_trajectories([PosesOnly("a", (1, 5, 9)), PosesOnly("longer", (5, 6))])
-
-    assert first.stamps_ns.tolist() == [1, 5, 9]
-    assert second.stamps_ns.tolist() == [5, 6]
-    assert first.pose_at(5).equals(pose_of("a", 5), 0.0)
-    assert second.pose_at(5).equals(pose_of("longer", 5), 0.0)
-    assert first.pose_at(9).translation() == pytest.approx([9.0, 0.1, 2.0])
-
-
-@pytest.mark.parametrize("stamp", [0, 4, 10])
-def test_there_is_no_pose_between_the_stamps(stamp: int) -> None:
-    (trajectory,) = given_trajectories([PosesOnly("a", (1, 5, 9))])
-
-    with pytest.raises(KeyError, match=str(stamp)):
-        trajectory.pose_at(stamp)
+    assert trajectory.stamps_ns.tolist() == [1, 5, 9]
+    assert trajectory.T_map_vehicle[2].rotation().yaw() == pytest.approx(0.09)
+    assert trajectory.T_map_vehicle[2].translation() == pytest.approx([9.0, 0.1, 2.0])
 
 
 @pytest.mark.parametrize("stamps", [(), (3,)])
 def test_one_pose_is_no_drive(stamps: tuple[int, ...]) -> None:
     with pytest.raises(TrajectoryError) as caught:
-        given_trajectories([PosesOnly("good", (1, 2)), PosesOnly("drive/", stamps)])
+        given_trajectory(recorded(*stamps))
 
     assert str(caught.value) == f"drive/: {len(stamps)} vehicle pose(s), needs at least 2"
 
 
-def test_an_unreadable_recording_says_so_itself() -> None:
-    with pytest.raises(RecordingError, match="drive/: damaged"):
-        given_trajectories([PosesOnly("drive/", (1, 2), readable=False)])
+def test_a_drive_without_poses_is_an_error() -> None:
+    with pytest.raises(TrajectoryError, match="drive/: has no vehicle poses"):
+        given_trajectory(MotionData("drive/"))
+
+
+SIGMAS = np.array([0.001, 0.002, 0.003, 0.01, 0.02, 0.03])
+UNKNOWN = np.full((6, 6), np.nan)
+
+
+def facing_north(*covs: Array) -> Trajectory:
+    """Poses a microsecond apart, the vehicle's x axis along the map's y."""
+    poses = tuple(gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.zeros(3)) for _ in covs)
+    return Trajectory(np.arange(len(covs), dtype=np.int64) * 1000, poses, np.array(covs))
+
+
+def test_covariances_are_turned_into_the_axes_of_the_errors() -> None:
+    given = GivenTrajectory(facing_north(np.diag(SIGMAS**2), 4.0 * np.diag(SIGMAS**2)))
+    cov = given.error_covariances([0, 1000, 250])
+    assert cov is not None
+    # Rotation stays in vehicle axes; forward (10 mm) is north, left (20 mm) is west.
+    expected = np.diag(SIGMAS[[0, 1, 2, 4, 3, 5]] ** 2)
+    np.testing.assert_allclose(cov[0], expected, atol=1e-15)
+    np.testing.assert_allclose(cov[1], 4.0 * expected, atol=1e-15)
+    np.testing.assert_allclose(cov[2], 1.75 * expected, atol=1e-15)
+
+
+def test_a_pose_next_to_one_of_unknown_covariance_keeps_its_own() -> None:
+    given = GivenTrajectory(facing_north(UNKNOWN, np.diag(SIGMAS**2), UNKNOWN))
+    cov = given.error_covariances([0, 999, 1000, 1001])
+    assert cov is not None
+    assert np.isfinite(cov).all(axis=(1, 2)).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    "cov", [np.zeros((6, 6)), UNKNOWN, -np.eye(6), np.diag([1.0, 1, 1, 1, 1, 0])], ids=str
+)
+def test_a_covariance_that_is_none_is_unknown(cov: Array) -> None:
+    assert GivenTrajectory(facing_north(cov, cov)).error_covariances([0, 10]) is None
+
+
+def test_the_config_goes_before_the_messages() -> None:
+    full = np.diag(SIGMAS**2)
+    full[0, 4] = full[4, 0] = 0.5 * SIGMAS[0] * SIGMAS[4]
+    position = config_for(Sensors(), noise={"pose_position_m": 0.5})
+    both = config_for(Sensors(), noise={"pose_position_m": 0.5, "pose_rotation_deg": 1.0})
+    silent = config_for(Sensors())
+
+    cov = given_pose_covariances(np.array([full, UNKNOWN]), position)
+    kept = given_pose_covariances(full[None], silent)
+
+    assert cov is not None
+    assert kept is not None
+    np.testing.assert_allclose(cov[0], np.diag([*SIGMAS[:3] ** 2, 0.25, 0.25, 0.25]))
+    assert np.isnan(cov[1]).all()
+    np.testing.assert_array_equal(kept[0], full)
+    assert given_pose_covariances(full[None], both) is None
+    assert given_pose_covariances(None, silent) is None
+
+
+def test_no_message_is_trusted_without_bound() -> None:
+    cov = given_pose_covariances(1e-18 * np.eye(6)[None], config_for(Sensors()))
+    assert cov is not None
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(cov[0])), [MIN_POSE_ROTATION_RAD] * 3 + [MIN_POSE_POSITION_M] * 3
+    )
+
+
+class PosesOnly:
+    """A recording of which nothing but the poses is read."""
+
+    name = "drive/"
+    lidars = ()
+
+    def __init__(self, *covs: Array) -> None:
+        given = facing_north(*covs)
+        self._poses = GivenPoses(given.stamps_ns, given.T_map_vehicle, given.cov)
+
+    def motion(self) -> MotionData:
+        return MotionData("drive/", poses=self._poses)
+
+
+def test_messages_that_state_none_among_others_are_reported() -> None:
+    known = np.diag(SIGMAS**2)
+    for covs, lines in (
+        ((known, known), ()),
+        ((UNKNOWN, UNKNOWN), ()),
+        (
+            (known, UNKNOWN, known),
+            ("drive/: 1 of 3 vehicle poses state no covariance: their white error is estimated",),
+        ),
+    ):
+        (given,) = smooth_trajectories([PosesOnly(*covs)], config_for(Sensors()), [[0]])  # type: ignore[list-item]
+        assert given.warnings == lines

@@ -9,7 +9,7 @@ import pytest
 
 from caliv_graph.products import MotionData
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
-from caliv_graph.trajectory.smoothing import smooth_trajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from tests.trajectory.motions import (
     Course,
     Sensors,

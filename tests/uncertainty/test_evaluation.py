@@ -1,4 +1,4 @@
-"""Numbers derived by hand from SPEC 5 'Errors' and the paper's Evaluation section."""
+"""Errors and NEES by hand, as the paper's Evaluation section defines them."""
 
 from __future__ import annotations
 

@@ -1,137 +1,23 @@
-"""Sigmas and verdicts from information alone, and what would determine a direction."""
+"""Sigmas and verdicts from information alone."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
-import yaml
 
-from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
+from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array
-from caliv_graph.results.files import read_calibration, write_calibration
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.observability import (
-    REMEDY_APART,
-    REMEDY_HEIGHT,
-    REMEDY_MORE,
-    REMEDY_STOOD,
-    REMEDY_STRAIGHT,
-    REMEDY_SYMMETRY,
-    REMEDY_TILT,
-    REMEDY_TURN_CENTRE,
-    UNIT,
-    remedy,
-)
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
     predict_covariance,
-    undetermined_offsets,
 )
 from tests.samples import MOUNTINGS, pose
 
 LIDARS = {name: pose(*MOUNTINGS[name]) for name in ("front", "rear")}
 SIGMAS = np.array([0.03] * 3 + [0.06] * 3)
-
-
-def parts_of(twist: list[float]) -> dict[str, Array]:
-    """What each LiDAR does if all are moved by a small twist of the vehicle."""
-    step = 1e-6
-    motion = gtsam.Pose3.Expmap(step * np.array(twist))
-    return {n: vehicle_axes_difference(motion.compose(T), T) / step for n, T in LIDARS.items()}
-
-
-@pytest.mark.parametrize(
-    ("twist", "expected"),
-    [
-        ([0, 0, 0, 0, 0, 1], REMEDY_HEIGHT),
-        ([0, 0, 1, -9.16, 0, 0], REMEDY_TURN_CENTRE),
-        ([0, 0, 1, 9.16, 1.0, 0], REMEDY_TURN_CENTRE),
-        ([0, 0, 0, 1, 0, 0], REMEDY_STRAIGHT),
-        ([0, 0, 0, 0, 1, 0], REMEDY_STRAIGHT),
-        ([1, 0, 0, 0, 3, 0], REMEDY_STRAIGHT),
-        ([1, 0, 0, 0, 0, 0], REMEDY_TILT),
-        ([0, 1, 0, 0, 0, 0], REMEDY_TILT),
-    ],
-)
-def test_every_direction_has_a_manoeuvre_that_fixes_it(twist: list[float], expected: str) -> None:
-    for scale in (1.0, -1e-3):
-        parts = {name: scale * part for name, part in parts_of(twist).items()}
-        assert remedy(parts, LIDARS) == expected
-
-
-@pytest.mark.parametrize(("axis", "expected"), [("x", REMEDY_APART), ("yaw", REMEDY_SYMMETRY)])
-def test_lidars_that_move_apart_have_to_see_the_same_side(axis: str, expected: str) -> None:
-    parts = {"front": np.eye(6)[AXES.index(axis)] * UNIT, "rear": np.zeros(6)}
-
-    assert remedy(parts, LIDARS) == expected
-    # Where they do see it, what helps is to see it more often.
-    assert remedy(parts, LIDARS, weak=True) == REMEDY_MORE
-
-
-def rigid_loss(*lost: int) -> Array:
-    """Information of two LiDARs that know all but some motions of both as one."""
-    rows = np.vstack(
-        [
-            np.array([p / UNIT for p in parts_of(np.eye(6)[i].tolist()).values()]).ravel()
-            for i in lost
-        ]
-    )
-    basis = np.linalg.qr(rows.T)[0]
-    kept = np.eye(12) - basis @ basis.T
-    unit = np.tile(UNIT, 2)
-    return np.asarray(1e4 * kept / np.outer(unit, unit))
-
-
-@pytest.mark.parametrize(
-    ("lost", "text"),
-    [
-        (range(6), "everything to the vehicle: it never moved"),
-        (range(5), "everything to the vehicle but its height: it never moved"),
-    ],
-)
-def test_a_vehicle_that_stood_is_told_so(lost: range, text: str) -> None:
-    outlook = predict_covariance(
-        rigid_loss(*lost), ("front", "rear"), "rear", LIDARS, dict.fromkeys(LIDARS, SIGMAS), {}, {}
-    )
-
-    assert [d.text for d in outlook.undetermined] == [text] * len(lost)
-    assert {d.remedy for d in outlook.undetermined} == {REMEDY_STOOD}
-    # The pair is told all the same.
-    assert set(outlook.determined_s2s) == {("front", "rear")}
-
-
-def test_remedies_stand_in_the_file_and_are_read_back(tmp_path: Path) -> None:
-    outlook = predict_covariance(
-        rigid_loss(5), ("front", "rear"), "rear", LIDARS, dict.fromkeys(LIDARS, SIGMAS), {}, {}
-    )
-    file = tmp_path / "calibration.yaml"
-
-    write_calibration(outlook.calibration, file)
-
-    written = yaml.safe_load(file.read_text())["observability"]["undetermined"]
-    assert [entry["remedy"] for entry in written] == [REMEDY_HEIGHT]
-    assert [d.remedy for d in read_calibration(file).undetermined] == [REMEDY_HEIGHT]
-
-
-def test_four_lost_motions_are_said_one_by_one() -> None:
-    outlook = predict_covariance(
-        rigid_loss(0, 3, 4, 5),
-        ("front", "rear"),
-        "rear",
-        LIDARS,
-        dict.fromkeys(LIDARS, SIGMAS),
-        {},
-        {},
-    )
-
-    texts = {d.text for d in outlook.undetermined}
-    assert len(texts) == 4
-    assert not any("never moved" in text for text in texts)
 
 
 def make_outlook() -> tuple[Array, PredictedCovariance]:
@@ -187,11 +73,3 @@ def test_a_lidar_without_data_keeps_its_guess() -> None:
     expected = math.hypot(1e-3, 1e-3)
     # x of the pair: both, and nothing of rotations for LiDARs in a row along x.
     assert outlook.sigma_s2s["front", "rear"][3] == pytest.approx(expected, rel=1e-6)
-
-
-def test_an_offset_is_told_below_the_limit_only() -> None:
-    lines = list(undetermined_offsets({"front": 0.004, "rear": 0.04}, 0.005))
-
-    assert len(lines) == 1
-    assert "'rear'" in lines[0]
-    assert "40 ms" in lines[0]

@@ -1,11 +1,11 @@
-"""When somebody moved the target while the vehicle stood.
+"""Places of a target that somebody moves while the vehicle stands.
 
-A vehicle that stands sees a target from one side only. Carried from place to place, the target is
-seen from many, and where two LiDARs see it at one place, that place tells how they are to each
-other. Every place is a placement of its own: nothing ties one to the next.
+A standing vehicle sees a target from one side. A target that is carried from place to place is seen
+from several, and a place that two LiDARs see makes S2S observable. Every place is a placement of
+its own: places are independent of each other.
 
-As long as the vehicle stands, what stands is at one place of the *LiDAR's* frame: no guess and no
-pose is needed to tell when it stood and when it did not.
+While the vehicle stands, a static object has one place in the *LiDAR's* frame. So neither guess nor
+pose is needed to find the times at which it stood.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 
 VEHICLE_STANDS_M = 0.15
 VEHICLE_STANDS_RAD = 0.02
-"""A vehicle within this of where it was stands: poses wander by centimetres and milliradians."""
+"""A vehicle that moved less than this stands: its poses drift by centimetres and milliradians."""
 
 STAYS_M = 0.15
-"""What stays within this of its mean place stands: the middle of what is seen of a target scatters
-by centimetres, and somebody who walks is past it in two scans."""
+"""An object within this of its mean place stands: the middle of a target's visible points scatters
+by centimetres, and somebody who walks has left in two scans."""
 
 STAYS_NS = 2_000_000_000
-"""For so long at least. Carrying a chair on, nobody stops for two seconds."""
+"""Minimum duration of a stay. Nobody who carries a chair stops for two seconds."""
 
 GAP_NS = 1_000_000_000
-"""Somebody who passes in front hides it for less."""
+"""Maximum gap in a stay: somebody who passes in front occludes the target for less."""
 
 SETTLES_NS = 300_000_000
-"""At either end of a stay somebody has a hand on it."""
+"""Time removed at either end of a stay, when somebody holds the target."""
 
 SAME_PLACE_M = 0.05
-"""What comes into sight again within this of where it was has not been moved."""
+"""An object that reappears within this of its place has not been moved."""
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """What one LiDAR saw in a region, scan by scan.
+class CandidateCentres:
+    """Centres of the candidates of one LiDAR in a region, scan by scan.
 
     Attributes:
-        stamps_ns: (n,) ascending, the scan of each object.
-        centres_lidar: (n, 3) metres, middle of each.
+        stamps_ns: (n,) ascending, the scan of each candidate.
+        centres_lidar: (n, 3) metres, middle of each, lidar frame.
     """
 
     stamps_ns: IntArray
@@ -60,8 +60,8 @@ class Stay:
     Attributes:
         begin_ns: stamp of the first of its scans.
         end_ns: stamp of the last.
-        place_lidar: (3,) metres, where it stood.
-        members: (m,) indices into the LiDAR's sightings, one per scan.
+        place_lidar: (3,) metres, its place in the lidar frame.
+        members: (m,) indices of the LiDAR's candidates, one per scan.
     """
 
     begin_ns: int
@@ -77,8 +77,8 @@ class Period:
     Attributes:
         begin_ns: it was put there after this.
         end_ns: it was picked up before this.
-        members: per LiDAR (m,) indices into its sightings: what may be the target, of the scans
-            that were taken while it stood, and all of the scans taken while the vehicle drove.
+        members: per LiDAR (m,) indices of its candidates: those that may be the target in scans
+            while the vehicle stood, all in scans while it drove.
         drove: whether the vehicle drove in this time.
     """
 
@@ -89,23 +89,23 @@ class Period:
 
 
 def periods(
-    sightings: Mapping[str, Sightings], trajectory: VehicleTrajectory, fewest: int
+    candidates: Mapping[str, CandidateCentres], trajectory: VehicleTrajectory, fewest: int
 ) -> list[Period]:
     """The times between moves of the target; empty if it was not moved.
 
     Args:
-        sightings: what each LiDAR saw in the target's region.
-        trajectory: of the vehicle; moves are looked for while it stands.
-        fewest: scans in which something has to be seen at a place to have stood there.
+        candidates: of each LiDAR in the target's region.
+        trajectory: of the vehicle; moves are searched while it stands.
+        fewest: minimum number of scans of a stay.
     """
-    stamps = np.unique(np.concatenate([s.stamps_ns for s in sightings.values()]))
+    stamps = np.unique(np.concatenate([s.stamps_ns for s in candidates.values()]))
     if not len(stamps):
         return []
     cuts: list[int] = []
-    stays: dict[str, list[Stay]] = {name: [] for name in sightings}
+    stays: dict[str, list[Stay]] = {name: [] for name in candidates}
     standing: list[tuple[int, int]] = []
     for begin, end in _standstills(stamps, trajectory):
-        of_spell = {name: _stays(seen, begin, end, fewest) for name, seen in sightings.items()}
+        of_spell = {name: _stays(seen, begin, end, fewest) for name, seen in candidates.items()}
         found = _cuts([stay for one in of_spell.values() for stay in one])
         if found:
             cuts += found
@@ -119,7 +119,7 @@ def periods(
         Period(
             begin,
             end,
-            {n: _members(s, stays[n], standing, begin, end) for n, s in sightings.items()},
+            {n: _members(s, stays[n], standing, begin, end) for n, s in candidates.items()},
             drove=_outside(stamps[(stamps > begin) & (stamps < end)], standing).any().item(),
         )
         for begin, end in itertools.pairwise(edges)
@@ -127,13 +127,13 @@ def periods(
 
 
 def _members(
-    seen: Sightings,
+    seen: CandidateCentres,
     stays: Sequence[Stay],
     standing: Sequence[tuple[int, int]],
     begin_ns: int,
     end_ns: int,
 ) -> IntArray:
-    """Sightings of a period: of stays while the vehicle stood, all while it drove."""
+    """CandidateCentres of a period: of stays while the vehicle stood, all while it drove."""
     within = (seen.stamps_ns > begin_ns) & (seen.stamps_ns < end_ns)
     kept = within & _outside(seen.stamps_ns, standing)
     for stay in stays:
@@ -178,8 +178,8 @@ class _Open:
         return np.asarray(self.total / len(self.members))
 
 
-def _stays(seen: Sightings, begin_ns: int, end_ns: int, fewest: int) -> list[Stay]:
-    """What stood within a time, in its order, no two at once: those that were seen the most."""
+def _stays(seen: CandidateCentres, begin_ns: int, end_ns: int, fewest: int) -> list[Stay]:
+    """Stays within a time, in order, no two at once: those that were seen the most."""
     of_spell = np.flatnonzero((seen.stamps_ns >= begin_ns) & (seen.stamps_ns <= end_ns))
     running: list[_Open] = []
     done: list[_Open] = []
@@ -188,7 +188,7 @@ def _stays(seen: Sightings, begin_ns: int, end_ns: int, fewest: int) -> list[Sta
         running = [stay for stay in running if stamp - stay.last_ns <= GAP_NS]
         first, last = np.searchsorted(seen.stamps_ns, [stamp, stamp + 1])
         free = list(range(int(first), int(last)))
-        # The oldest choose first: what has stood for long is not drawn off by who passes.
+        # The longest stay chooses first: somebody who passes does not draw it off.
         for stay in sorted(running, key=lambda stay: -len(stay.members)):
             off = [float(np.linalg.norm(seen.centres_lidar[i] - stay.place)) for i in free]
             if off and min(off) < STAYS_M:
@@ -218,7 +218,7 @@ def _one_at_a_time(stays: Sequence[Stay]) -> list[Stay]:
 
 
 def _seen_again(stays: Sequence[Stay]) -> list[Stay]:
-    """Stays at one place, one after the other, as one: something had hidden it."""
+    """Merges successive stays at one place: the target was occluded in between."""
     out: list[Stay] = []
     for stay in stays:
         if out and np.linalg.norm(stay.place_lidar - out[-1].place_lidar) < SAME_PLACE_M:
@@ -229,8 +229,8 @@ def _seen_again(stays: Sequence[Stay]) -> list[Stay]:
     return out
 
 
-def _settled(seen: Sightings, stay: Stay) -> Stay:
-    """A stay without its ends, when somebody may have had a hand on it."""
+def _settled(seen: CandidateCentres, stay: Stay) -> Stay:
+    """A stay without its ends, when somebody may hold the target."""
     begin, end = stay.begin_ns + SETTLES_NS, stay.end_ns - SETTLES_NS
     stamps = seen.stamps_ns[stay.members]
     members = stay.members[(stamps >= begin) & (stamps <= end)]
@@ -238,10 +238,10 @@ def _settled(seen: Sightings, stay: Stay) -> Stay:
 
 
 def _cuts(stays: Sequence[Stay]) -> list[int]:
-    """The fewest times such that of any two stays that are not at once, one is between them.
+    """The fewest times that separate all stays which do not overlap.
 
-    LiDARs that see the same place see it at once; what was seen before and what after, by whichever
-    LiDAR, is at two places.
+    LiDARs that see the same place see it at the same time. Stays that do not overlap, of whichever
+    LiDAR, are at two places.
     """
     between = [
         (before.end_ns, after.begin_ns)

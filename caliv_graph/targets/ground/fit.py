@@ -9,11 +9,12 @@ import numpy as np
 from caliv_graph.products import Array
 
 TRIALS = 100
-"""Triples tried. With half the points on the ground one in eight hits; 100 miss all with 2e-6."""
+"""Triples tried. With half the points on the ground, 1 in 8 hits; all 100 miss with probability
+2e-6."""
 
 MAX_TILT_RAD = math.radians(15.0)
-"""A plane steeper than this against the map's horizontal is a wall, even with 10 degrees of error
-in the initial guess. Constraining the search is why this is not a library's RANSAC."""
+"""A steeper plane in the map is a wall, even with 10 degrees of error of the guess. RANSAC of a
+library cannot be constrained so."""
 
 SCORED_POINTS = 1000
 """Points that a trial plane is scored on."""
@@ -22,7 +23,7 @@ FITTED_POINTS = 5000
 """Points that the winner is fitted to."""
 
 MIN_POINTS = 30
-"""Fewer points than this make no plane."""
+"""Minimum number of points on a plane."""
 
 
 def fit_ground(points: Array, distance: float) -> Array | None:

@@ -1,4 +1,4 @@
-"""The ground of a whole scan: a surface, because ramps and kerbs are no plane.
+"""The ground of a whole scan as a surface: it has ramps and kerbs.
 
 Heights on a grid of nodes, bilinear in between, fitted to the lowest point of every cell by
 asymmetric least squares: what stands above the surface is not ground, what lies below it is.
@@ -21,32 +21,31 @@ HALF_SIZE_M = 35.0
 """The surface reaches this far from the LiDAR along either axis."""
 
 CELL_M = 0.5
-"""One point, the lowest, of each cell of this size speaks for the ground."""
+"""The lowest point of each cell of this size is a candidate for the ground."""
 
 NODE_M = 2.5
-"""Spacing of the nodes: wide enough that no target of 1.5 m carries one of its own."""
+"""Spacing of the nodes: too wide for a target of 1.5 m to lift one."""
 
 PLANE_DISTANCE_M = 0.1
-"""Half thickness of the plane that the fit starts from."""
+"""Half thickness of the plane that the fit begins with."""
 
 MIN_LEVEL = math.cos(math.radians(25.0))
-"""Vertical part of the plane's normal: 10 degrees of guess and 15 of slope. The foot of a wall, a
-line, leaves the tilt of a plane open."""
+"""Minimum vertical component of the plane's normal: 10 degrees of guess and 15 of slope. The foot
+of a wall, a line, leaves the tilt undetermined."""
 
 TOLERANCES_M = (0.5, 0.3, 0.2, 0.12, 0.12)
-"""Cells higher than this above the surface are not ground; shrinking, so that hills are taken in
-from where the vehicle stands outwards."""
+"""Cells higher than this above the surface are not ground. The tolerance shrinks, so that hills are
+included from the vehicle outwards."""
 
 STIFFNESS = 1.0
-"""Weight of a second difference of the nodes against that of a cell: a cell is worth 10 cm, and so
-is a bend of 10 cm. A node with its share of 25 cells follows a ramp, one without follows the
-neighbours."""
+"""Weight of a second difference of the nodes over that of a cell. A node with 25 cells follows a
+ramp, a node without cells follows its neighbours."""
 
 GAUGE_PRIOR = 1e-6
-"""Weight that keeps nodes without any data at the plane."""
+"""Weight that holds nodes without data at the plane."""
 
 SUPPORT_M = 1.5
-"""Ground was seen at a place if a cell of it is within this distance."""
+"""Ground was seen at a place if one of its cells is within this distance."""
 
 _PER_AXIS = 2 * int(HALF_SIZE_M / NODE_M) + 1
 
@@ -83,16 +82,16 @@ def fit_surface(points: Array) -> GroundSurface | None:
     """The ground in a scan.
 
     Args:
-        points: (N, 3) metres about the LiDAR, z up but for what the mounting is off.
+        points: (N, 3) metres about the LiDAR, z up to the error of the initial guess.
 
     Returns:
-        The surface; None if there is no near-horizontal plane to begin with.
+        The surface; None if there is no near-horizontal plane.
     """
     lowest = points[_lowest_of_cells(points)]
     plane = fit_ground(lowest, PLANE_DISTANCE_M)
     if plane is None or plane[2] < MIN_LEVEL:
         return None
-    # The tilt goes first: the stiffness is about what remains.
+    # The tilt is removed first: the stiffness concerns deviations from the plane.
     above_plane = height_above(plane, lowest) / plane[2]
     interpolate = _bilinear(lowest[:, :2])
     stiffness = STIFFNESS * _BENDING + GAUGE_PRIOR * diags_array(np.ones(_PER_AXIS**2))

@@ -30,7 +30,8 @@ from caliv_graph.scenario.world import GROUND, World, make_world
 from caliv_graph.scenario.world_models import BoxModel, ChairModel, ObjectModel, WorldModel
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
-from caliv_graph.targets.cloud.extract import RegionExtractor, extract_targets, widened_margin_m
+from caliv_graph.targets.cloud.extract import extract_targets
+from caliv_graph.targets.cloud.region import RegionExtractor, widened_margin_m
 from caliv_graph.trajectory.select import GivenTrajectory
 
 FRONT = LidarModel(
@@ -107,13 +108,19 @@ def standing(T_map_vehicle: gtsam.Pose3 = T_MAP_VEHICLE, scans: int = 2) -> Give
     return GivenTrajectory(Trajectory(np.arange(scans, dtype=np.int64), (T_map_vehicle,) * scans))
 
 
+def cloud_in(extractor: RegionExtractor, scan: LidarScan) -> TargetCloud | None:
+    """The target in a single scan, or None."""
+    clouds = extractor.choose([extractor.candidates(scan, 0)], scan.lidar)
+    return clouds[0] if clouds else None
+
+
 def extracted(
     points_lidar: Array, config: Config, T_map_vehicle: gtsam.Pose3 = T_MAP_VEHICLE
 ) -> tuple[TargetCloud | None, Mapping[str, int]]:
     """The target in one scan, and what scans were rejected for."""
     assert config.target is not None
     extractor = RegionExtractor(config.target[0], config, standing(T_map_vehicle))
-    cloud = extractor.extract(LidarScan("front", 0, points_lidar, "0.pcd"), 0)
+    cloud = cloud_in(extractor, LidarScan("front", 0, points_lidar, "0.pcd"))
     return cloud, extractor.tallies["front"].rejected
 
 
@@ -170,7 +177,7 @@ def extracted_from(
 
 
 def wrong_by(rpy_deg: tuple[float, float, float], shift_m: float) -> LidarConfig:
-    """A guess that is off by R_true Rxyz and a shift of every axis (SPEC 7)."""
+    """A guess that is off by R_true Rxyz and a shift of every axis, as the simulation draws it."""
     true = FRONT.mounting.pose()
     R = true.rotation().compose(gtsam.Rot3.RzRyRx(*np.radians(rpy_deg)))
     x, y, z = true.translation() + shift_m
@@ -524,7 +531,7 @@ def test_region_in_the_frame_of_the_first_pose() -> None:
     trajectory = GivenTrajectory(Trajectory(np.array([0, 7], dtype=np.int64), (start, later)))
     extractor = RegionExtractor(region, config, trajectory)
 
-    cloud = extractor.extract(LidarScan("front", 7, seen.points_lidar, "7.pcd"), 0)
+    cloud = cloud_in(extractor, LidarScan("front", 7, seen.points_lidar, "7.pcd"))
 
     recall, strangers = recall_and_strangers(cloud, seen, "chair")
     assert recall > 0.9
@@ -532,7 +539,7 @@ def test_region_in_the_frame_of_the_first_pose() -> None:
     assert extractor.centre_map == pytest.approx([99.0, 62.0, 0.65])
     # The same numbers in the map are somewhere else.
     in_map = RegionExtractor(region.model_copy(update={"frame": "map"}), config, trajectory)
-    assert in_map.extract(LidarScan("front", 7, seen.points_lidar, "7.pcd"), 0) is None
+    assert cloud_in(in_map, LidarScan("front", 7, seen.points_lidar, "7.pcd")) is None
 
 
 def test_moving_the_whole_world_changes_nothing() -> None:

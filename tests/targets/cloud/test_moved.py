@@ -1,4 +1,4 @@
-"""When a target stood where: made-up sightings with known moves."""
+"""Places of a target: made-up candidates with known moves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, Trajectory
-from caliv_graph.targets.cloud.moved import Period, Sightings, periods
+from caliv_graph.targets.cloud.moved import CandidateCentres, Period, periods
 from caliv_graph.trajectory.select import GivenTrajectory
 
 Where = Callable[[float], Array | None]
@@ -29,9 +29,9 @@ def standing(seconds: float, drives_after_s: float = math.inf) -> GivenTrajector
     return GivenTrajectory(Trajectory((times * 1e9).round().astype(np.int64), poses))
 
 
-def sightings(
+def candidates(
     *things: Where, seconds: float = 30.0, rate_hz: float = 5.0, phase_s: float = 0.0, seed: int = 0
-) -> Sightings:
+) -> CandidateCentres:
     """What a LiDAR sees of things; their middles scatter by 15 mm."""
     rng = np.random.default_rng(seed)
     stamps, centres = [], []
@@ -41,7 +41,7 @@ def sightings(
             if place is not None:
                 stamps.append(round(1e9 * time))
                 centres.append(place + 0.015 * rng.normal(size=3))
-    return Sightings(np.array(stamps, np.int64), np.array(centres).reshape(-1, 3))
+    return CandidateCentres(np.array(stamps, np.int64), np.array(centres).reshape(-1, 3))
 
 
 def carried(time: float, begin: float, end: float, here: Array, there: Array) -> Array:
@@ -66,7 +66,7 @@ def cuts_s(found: list[Period]) -> list[float]:
     return [period.end_ns / 1e9 for period in found[:-1]]
 
 
-def places_of(found: list[Period], seen: Sightings, name: str) -> list[list[float]]:
+def places_of(found: list[Period], seen: CandidateCentres, name: str) -> list[list[float]]:
     """Mean place of what each period kept of a LiDAR, in decimetres."""
     out = []
     for period in found:
@@ -76,11 +76,11 @@ def places_of(found: list[Period], seen: Sightings, name: str) -> list[list[floa
 
 
 def test_what_stands_all_the_time_was_not_moved() -> None:
-    assert periods({"front": sightings(lambda _: A)}, standing(30.0), 8) == []
+    assert periods({"front": candidates(lambda _: A)}, standing(30.0), 8) == []
 
 
 def test_every_place_is_a_period_and_nothing_is_taken_on_the_way() -> None:
-    seen = sightings(three_places)
+    seen = candidates(three_places)
     found = periods({"front": seen}, standing(30.0), 8)
     assert len(found) == 3
     first, second = cuts_s(found)
@@ -95,7 +95,7 @@ def test_every_place_is_a_period_and_nothing_is_taken_on_the_way() -> None:
 
 
 def test_lidars_with_other_clocks_and_rates_agree() -> None:
-    front, left = sightings(three_places), sightings(three_places, rate_hz=9.7, phase_s=0.043)
+    front, left = candidates(three_places), candidates(three_places, rate_hz=9.7, phase_s=0.043)
     found = periods({"front": front, "left": left}, standing(30.0), 8)
     assert len(found) == 3
     assert places_of(found, left, "left") == [A.tolist(), B.tolist(), C.tolist()]
@@ -106,7 +106,7 @@ def test_a_place_that_one_lidar_does_not_see_is_a_period_of_the_others() -> None
         place = three_places(time)
         return place if np.linalg.norm(place - B) > 0.5 else None
 
-    front, left = sightings(three_places), sightings(not_b, phase_s=0.05)
+    front, left = candidates(three_places), candidates(not_b, phase_s=0.05)
     found = periods({"front": front, "left": left}, standing(30.0), 8)
     assert places_of(found, front, "front") == [A.tolist(), B.tolist(), C.tolist()]
     assert places_of(found, left, "left") == [A.tolist(), [], C.tolist()]
@@ -114,8 +114,8 @@ def test_a_place_that_one_lidar_does_not_see_is_a_period_of_the_others() -> None
 
 def test_lidars_that_never_see_it_at_once_see_it_at_two_places() -> None:
     # As one placement, these clouds would be laid over one another.
-    front = sightings(within(0.0, 10.0, lambda _: A))
-    left = sightings(within(13.0, 30.0, lambda _: B))
+    front = candidates(within(0.0, 10.0, lambda _: A))
+    left = candidates(within(13.0, 30.0, lambda _: B))
     found = periods({"front": front, "left": left}, standing(30.0), 8)
     assert len(found) == 2
     assert places_of(found, front, "front") == [A.tolist(), []]
@@ -133,12 +133,12 @@ def test_lidars_that_never_see_it_at_once_see_it_at_two_places() -> None:
     ids=["walks", "stops"],
 )
 def test_somebody_else_in_the_region_is_no_move(other: Where) -> None:
-    seen = sightings(lambda _: A, other)
+    seen = candidates(lambda _: A, other)
     assert periods({"front": seen}, standing(30.0), 8) == []
 
 
 def test_what_was_hidden_for_a_while_was_not_moved() -> None:
-    seen = sightings(lambda t: None if 12.0 < t < 16.0 else A)
+    seen = candidates(lambda t: None if 12.0 < t < 16.0 else A)
     assert periods({"front": seen}, standing(30.0), 8) == []
 
 
@@ -149,7 +149,7 @@ def test_a_short_stop_on_the_way_is_no_place() -> None:
             return carried(time, 10.0, 12.0, A, middle)
         return carried(time, 13.5, 15.5, middle, B)
 
-    found = periods({"front": sightings(pauses)}, standing(30.0), 8)
+    found = periods({"front": candidates(pauses)}, standing(30.0), 8)
     assert len(found) == 2
 
 
@@ -158,7 +158,7 @@ def test_while_the_vehicle_drives_nothing_is_taken_for_a_move() -> None:
     def approached(time: float) -> Array | None:
         return None if 9.0 < time < 12.0 else A - np.array([2.0 * time, 0.0, 0.0])
 
-    seen = sightings(approached)
+    seen = candidates(approached)
     assert periods({"front": seen}, standing(30.0, drives_after_s=0.0), 8) == []
 
 
@@ -168,7 +168,7 @@ def test_the_way_after_the_last_place_belongs_to_it() -> None:
         driven = np.array([2.0 * max(time - 20.0, 0.0), 0.0, 0.0])
         return np.asarray(a_then_b(time) - driven)
 
-    seen = sightings(seen_on_the_way, seconds=24.0)
+    seen = candidates(seen_on_the_way, seconds=24.0)
     found = periods({"front": seen}, standing(24.0, drives_after_s=20.0), 8)
     assert len(found) == 2
     last = seen.stamps_ns[found[1].members["front"]] / 1e9
@@ -180,10 +180,10 @@ def test_the_way_after_the_last_place_belongs_to_it() -> None:
 
 def test_too_few_scans_are_no_place() -> None:
     # Two scans a second: some 18 of them at A.
-    seen = sightings(a_then_b, rate_hz=2.0, seconds=20.0)
+    seen = candidates(a_then_b, rate_hz=2.0, seconds=20.0)
     assert periods({"front": seen}, standing(20.0), 18) == []
     assert len(periods({"front": seen}, standing(20.0), 8)) == 2
 
 
 def test_nothing_seen_is_no_move() -> None:
-    assert periods({"front": sightings()}, standing(30.0), 8) == []
+    assert periods({"front": candidates()}, standing(30.0), 8) == []

@@ -17,8 +17,8 @@ def test_scans_of_a_moving_vehicle_count_fully() -> None:
 
 @pytest.mark.parametrize("count", [10, 80, 300])
 def test_scans_from_one_place_are_worth_a_few_together(count: int) -> None:
-    shares = view_weights(np.tile([3.0, 1.0, -1.0], (count, 1)))
-    assert shares == pytest.approx(np.full(count, SCANS_OF_A_VIEW / count))
+    weights = view_weights(np.tile([3.0, 1.0, -1.0], (count, 1)))
+    assert weights == pytest.approx(np.full(count, SCANS_OF_A_VIEW / count))
     # Millimetres of noise in the poses make no new view.
     shaky = np.random.default_rng(1).normal(scale=0.002, size=(count, 3))
     assert view_weights(shaky).sum() == pytest.approx(SCANS_OF_A_VIEW, rel=0.02)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,138 +11,36 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.config.model import Config
-from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import tangent_axes
-from caliv_graph.products import (
-    Array,
-    GroundObservation,
-    LidarScan,
-    MotionData,
-    TargetCloud,
-    TargetObservation,
-    Trajectory,
-)
-from caliv_graph.readers.caliv_folder import CalivFolder
+from caliv_graph.products import Array, LidarScan
 from caliv_graph.simulation import load_scenario, simulate_drive
 from caliv_graph.targets.ground.planes import (
     CELL_POINTS,
     DISTANCE_FLOOR_M,
     NORMAL_FLOOR_RAD,
-    GroundMeter,
     GroundPlane,
-    measure_ground,
-    measure_grounds,
     near_points,
-    nearest_scans,
 )
-from caliv_graph.trajectory.given import given_trajectory
-from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
-
-ROOT = Path(__file__).parents[2]
-RELEASED = ROOT.parent / "shared" / "data" / "caliv_released"
-
-HEIGHT_M = 2.0
-NOSE_DOWN = gtsam.Rot3.Pitch(math.radians(10.0))
-UP_LIDAR = np.array([-math.sin(math.radians(10.0)), 0.0, math.cos(math.radians(10.0))])
-
-RING = np.array(
-    [
-        [math.cos(-0.2) * math.cos(a), math.cos(-0.2) * math.sin(a), math.sin(-0.2)]
-        for a in np.linspace(-1.0, 1.0, 1600)
-    ]
+from tests.targets.ground.scans import (
+    HEIGHT_M,
+    RING,
+    UP_LIDAR,
+    Depth,
+    beams,
+    level,
+    plane_in,
+    plateau,
+    scan_of,
+    terrain,
+    wall,
 )
-"""One ring of a LiDAR, of 0.07 degrees."""
 
-Depth = Callable[[Array], Array]
-
-
-def beams(columns: int = 120, channels: int = 26) -> Array:
-    """(n, 3) unit directions in the lidar frame, 120 by 25 degrees, column by column."""
-    azimuth = np.radians(np.linspace(-60.0, 60.0, columns))[:, None]
-    elevation = np.radians(np.linspace(-12.5, 12.5, channels))[None]
-    return np.stack(
-        np.broadcast_arrays(
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation) + 0.0 * azimuth,
-        ),
-        axis=-1,
-    ).reshape(-1, 3)
-
-
-def level(directions: Array) -> Array:
-    """How far it is to the level ground, directions with z up from 2 m above it."""
-    down = -directions[:, 2]
-    return np.where(down > 1e-6, HEIGHT_M / np.maximum(down, 1e-6), np.inf)
-
-
-def wall(x_m: float, height_m: float, half_width_m: float = 100.0) -> Depth:
-    """An upright wall ahead, on the ground."""
-
-    def depth(directions: Array) -> Array:
-        ahead = directions[:, 0] > 1e-6
-        distance = np.where(ahead, x_m / np.maximum(directions[:, 0], 1e-6), np.inf)
-        hit = np.where(ahead[:, None], distance[:, None] * directions, 0.0)
-        on = ahead & (hit[:, 2] + HEIGHT_M < height_m) & (np.abs(hit[:, 1]) < half_width_m)
-        return np.where(on, distance, np.inf)
-
-    return depth
-
-
-def plateau(x_m: float, end_m: float, half_width_m: float, height_m: float) -> Depth:
-    """A level surface between x and end, so far above the ground."""
-
-    def depth(directions: Array) -> Array:
-        down = np.maximum(-directions[:, 2], 1e-6)
-        distance = (HEIGHT_M - height_m) / down
-        hit = distance[:, None] * directions
-        on = (directions[:, 2] < 0.0) & (hit[:, 0] > x_m) & (hit[:, 0] < end_m)
-        return np.where(on & (np.abs(hit[:, 1]) < half_width_m), distance, np.inf)
-
-    return depth
-
-
-def terrain(height: Callable[[Array], Array]) -> Depth:
-    """Ground of a height over x, found by marching along the beams and then halving."""
-
-    def depth(directions: Array) -> Array:
-        def above(distance: Array) -> Array:
-            return HEIGHT_M + distance * directions[:, 2] - height(distance * directions[:, 0])
-
-        low, high = np.zeros(len(directions)), np.full(len(directions), np.inf)
-        for end in np.arange(0.25, 60.0, 0.25):
-            hit = np.isinf(high) & (above(np.full(len(directions), end)) < 0.0)
-            high[hit] = end
-            low[np.isinf(high)] = end
-        found = np.isfinite(high)
-        high[~found] = low[~found]
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            under = above(middle) < 0.0
-            high, low = np.where(under, middle, high), np.where(under, low, middle)
-        return np.where(found, high, np.inf)
-
-    return depth
-
-
-def scan_of(
-    *surfaces: Depth, sigma_m: float = 0.0, seed: int = 0, directions: Array | None = None
-) -> LidarScan:
-    """What is seen first along each beam, with noise along the beam."""
-    directions = beams() if directions is None else directions
-    level_directions = directions @ NOSE_DOWN.matrix().T
-    distance = np.min([surface(level_directions) for surface in surfaces], axis=0)
-    seen = np.isfinite(distance) & (distance < 100.0)
-    distance = distance + sigma_m * np.random.default_rng(seed).normal(size=len(distance))
-    return LidarScan("front", 0, (directions * distance[:, None])[seen], "made up")
+ROOT = Path(__file__).parents[3]
 
 
 def measured(scan: LidarScan, up_lidar: Array = UP_LIDAR, sigma_m: float = 0.01) -> GroundPlane:
-    plane = measure_ground(scan, up_lidar, sigma_m)
+    plane = plane_in(scan, up_lidar, sigma_m)
     assert plane is not None
     return plane
 
@@ -287,7 +184,7 @@ def test_grass_is_not_the_ground() -> None:
             scan.points_lidar * (1.0 - height / HEIGHT_M)[:, None],
             scan.points_lidar,
         )
-        plane = measure_ground(replace(scan, points_lidar=points), UP_LIDAR, 0.01)
+        plane = plane_in(replace(scan, points_lidar=points), UP_LIDAR, 0.01)
         if plane is not None:
             off.append(errors(plane))
     assert len(off) > 10
@@ -324,7 +221,7 @@ def rise(foot_m: float, x_m: Array) -> Array:
 def test_ramp_ahead_leaves_the_near_part_or_nothing() -> None:
     for foot_m in (6.0, 7.0, 8.0, 9.0, 11.0, 13.0):
         rises = terrain(partial(rise, foot_m))
-        plane = measure_ground(scan_of(rises, sigma_m=0.01), UP_LIDAR, 0.01)
+        plane = plane_in(scan_of(rises, sigma_m=0.01), UP_LIDAR, 0.01)
         if plane is not None:
             # Level, or the ramp: never the mean of both. 0.15 is 8.5 degrees.
             tilt = math.asin(float(np.cross(UP_LIDAR, plane.normal_lidar)[1]))
@@ -336,7 +233,7 @@ def test_ramp_ahead_leaves_the_near_part_or_nothing() -> None:
 
 def test_stairs_are_refused() -> None:
     stairs = terrain(lambda x: 0.1 * np.floor(np.maximum(x - 5.0, 0.0) / 1.5))
-    assert measure_ground(scan_of(stairs, sigma_m=0.01), UP_LIDAR, 0.01) is None
+    assert plane_in(scan_of(stairs, sigma_m=0.01), UP_LIDAR, 0.01) is None
 
 
 def test_a_step_leaves_the_level_that_the_vehicle_is_on() -> None:
@@ -347,15 +244,15 @@ def test_a_step_leaves_the_level_that_the_vehicle_is_on() -> None:
     assert abs(errors(plane)[2]) < 2.0 * DISTANCE_FLOOR_M
     # With the step so near, both levels could be the vehicle's.
     near = terrain(lambda x: np.where(x > 6.5, -0.2, 0.0))
-    assert measure_ground(scan_of(near, sigma_m=0.01), UP_LIDAR, 0.01) is None
+    assert plane_in(scan_of(near, sigma_m=0.01), UP_LIDAR, 0.01) is None
 
 
 def test_a_roof_larger_than_the_ground_is_refused() -> None:
     roof = plateau(1.0, 30.0, 100.0, 1.2)
     beside = plateau(1.0, 12.0, 2.6, 1.2)
     # A lorry's: of the ground less is seen than of the roof; alone it could be the ground.
-    assert measure_ground(scan_of(level, beside, sigma_m=0.01), UP_LIDAR, 0.01) is None
-    assert measure_ground(scan_of(roof, sigma_m=0.01), UP_LIDAR, 0.01) is not None
+    assert plane_in(scan_of(level, beside, sigma_m=0.01), UP_LIDAR, 0.01) is None
+    assert plane_in(scan_of(roof, sigma_m=0.01), UP_LIDAR, 0.01) is not None
 
 
 def test_what_is_bent_over_15_m_may_be_a_plane_over_10() -> None:
@@ -384,13 +281,13 @@ def test_a_crest_or_a_dip_is_owned_up_to(radius_m: float) -> None:
 @pytest.mark.parametrize("radius_m", [100.0, -100.0, 300.0])
 def test_bent_ground_is_refused(radius_m: float) -> None:
     bent = terrain(lambda x: x**2 / (2.0 * radius_m))
-    assert measure_ground(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is None
+    assert plane_in(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is None
 
 
 def test_hardly_bent_ground_is_not() -> None:
     # 5 mm over the half of 15 m.
     bent = terrain(lambda x: x**2 / (2.0 * 10_000.0))
-    assert measure_ground(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is not None
+    assert plane_in(scan_of(bent, sigma_m=0.01), UP_LIDAR, 0.01) is not None
 
 
 @pytest.mark.parametrize(
@@ -404,12 +301,12 @@ def test_hardly_bent_ground_is_not() -> None:
     ids=["empty", "few", "wall", "one ring"],
 )
 def test_no_ground_is_no_plane(scan: LidarScan) -> None:
-    assert measure_ground(scan, UP_LIDAR, 0.01) is None
+    assert plane_in(scan, UP_LIDAR, 0.01) is None
 
 
 def test_ceiling_is_not_the_ground() -> None:
     scan = scan_of(level, sigma_m=0.01)
-    assert measure_ground(replace(scan, points_lidar=-scan.points_lidar), UP_LIDAR, 0.01) is None
+    assert plane_in(replace(scan, points_lidar=-scan.points_lidar), UP_LIDAR, 0.01) is None
 
 
 def test_no_place_has_more_than_its_share() -> None:
@@ -431,201 +328,7 @@ def test_axes_are_at_right_angles() -> None:
         assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-# ------------------------------------------------------------------ drives
-
-CONFIG = parse_config(
-    {
-        "lidars": {
-            "front": {"topic": "a", "initial": {"xyz": [1.0, 0.0, 2.0], "rpy_deg": [1.0, 8.0, 0]}}
-        }
-    },
-    "made up",
-    Path(),
-)
-
-SECOND_NS = 1_000_000_000
-
-
-def pitching(rate_rad_s: float) -> GivenTrajectory:
-    """A vehicle that stands and pitches evenly about its frame's origin."""
-    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
-    poses = tuple(
-        gtsam.Pose3(gtsam.Rot3.Pitch(rate_rad_s * (t - SECOND_NS // 2) / SECOND_NS), np.zeros(3))
-        for t in stamps
-    )
-    return GivenTrajectory(Trajectory(stamps.astype(np.int64), poses))
-
-
-def test_meter_compensates_the_motion() -> None:
-    # A sweep of 0.1 s, during which the vehicle noses down by 20 mrad; the LiDAR at its origin.
-    rate = 0.2
-    trajectory = pitching(rate)
-    columns, channels = 120, 26
-    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
-    points = []
-    for direction, time_s in zip(beams(columns, channels), times_s, strict=True):
-        R = gtsam.Rot3.Pitch(math.radians(8.0) + rate * time_s).matrix()
-        down = float((R @ direction)[2])
-        points.append(direction * (HEIGHT_M / -down if down < -1e-3 else np.nan))
-    cloud = np.array(points)
-    seen = np.isfinite(cloud[:, 0])
-    scan = LidarScan("front", SECOND_NS // 2, cloud[seen], "sweep", times_s[seen])
-    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 8.0, 0]}}}
-    config = parse_config({"lidars": mounted}, "made up", Path())
-
-    observation = GroundMeter(config, trajectory, 3).measure(scan)
-    assert observation is not None
-    eight = math.radians(8.0)
-    expected = [-math.sin(eight), 0.0, math.cos(eight)]
-    assert observation.normal_lidar == pytest.approx(expected, abs=1e-5)
-    assert observation.distance_m == pytest.approx(HEIGHT_M, abs=1e-4)
-    assert (observation.lidar, observation.drive, observation.stamp_ns) == (
-        "front",
-        3,
-        SECOND_NS // 2,
-    )
-    assert np.sqrt(np.diag(observation.cov)) == pytest.approx(
-        [NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M], rel=0.05
-    )
-    # Without the times it would be off by milliradians.
-    naive = GroundMeter(config, trajectory, 3).measure(replace(scan, point_times_s=None))
-    assert naive is None or np.abs(naive.normal_lidar - expected).max() > 2e-3
-
-
-def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
-    # 2 m/s ahead while turning by 0.3 rad/s: with a pitch that is 2 degrees off, the ground seems
-    # to rise by 7 mm from the first column of the sweep to the last.
-    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
-    moving = tuple(
-        gtsam.Pose3.Expmap((t / SECOND_NS - 0.5) * np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0]))
-        for t in stamps
-    )
-    trajectory = GivenTrajectory(Trajectory(stamps.astype(np.int64), moving))
-    true = pose((1.0, 0.2, HEIGHT_M), (1.0, 8.0, -2.0))
-    guess = pose((1.05, 0.15, 1.9), (2.5, 6.0, 1.0))
-    columns, channels = 120, 26
-    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
-    directions = beams(columns, channels)
-    # The vehicle stays level: all columns see the ground as if it stood.
-    down = -(directions @ true.rotation().matrix().T)[:, 2]
-    seen = down > 0.02
-    points = directions[seen] * (HEIGHT_M / down[seen])[:, None]
-    scan = LidarScan("front", SECOND_NS // 2, points, "sweep", times_s[seen])
-    lidar = {"topic": "a", "initial": {"xyz": [1.05, 0.15, 1.9], "rpy_deg": [2.5, 6.0, 1.0]}}
-    config = parse_config({"lidars": {"front": lidar}}, "made up", Path())
-
-    found = GroundMeter(config, trajectory, 0).measure(scan)
-    assert found is not None
-    assert found.R_vehicle_lidar == pytest.approx(guess.rotation().matrix(), abs=1e-12)
-    assert found.by_extrinsic is not None
-    normal = true.rotation().matrix()[2]
-    off = np.append(found.axes_lidar @ (found.normal_lidar - normal), found.distance_m - HEIGHT_M)
-    w = gtsam.Rot3.Logmap(guess.rotation().between(true.rotation()))
-    corrected = off + found.by_extrinsic @ w
-    assert np.abs(off[:2]).max() > 4e-4
-    assert abs(off[2]) > 4e-4
-    assert np.abs(corrected[:2]).max() < 4e-5
-    assert abs(corrected[2]) < 2e-4
-    # Clouds of one instant have nothing to be corrected.
-    at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
-    assert at_once is not None
-    assert at_once.by_extrinsic is None
-
-
-def test_meter_says_why_there_is_no_ground() -> None:
-    meter = GroundMeter(CONFIG, pitching(0.0), 1)
-    empty = LidarScan("front", 5, np.zeros((0, 3)), "empty")
-    assert meter.measure(empty) is None
-    assert meter.measure(replace(scan_of(level), stamp_ns=6)) is not None
-    assert meter.warnings() == ()
-    assert meter.measure(empty) is None
-    assert meter.warnings() == (
-        "ground: lidar 'front' has it in 1 of 3 scans of drive 2: "
-        "2 under 60 points near the ground",
-    )
-
-
-def test_meter_refuses_stamps_outside_the_trajectory() -> None:
-    meter = GroundMeter(CONFIG, pitching(0.0), 0)
-    with pytest.raises(TrajectoryError, match="outside the given poses"):
-        meter.measure(replace(scan_of(level), stamp_ns=2 * SECOND_NS))
-
-
-def test_ground_as_of_another_stamp() -> None:
-    # The vehicle noses down by 0.2 rad/s; the scan is taken 50 ms before the pose it speaks for.
-    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 10.0, 0]}}}
-    config = parse_config({"lidars": mounted}, "made up", Path())
-    meter = GroundMeter(config, pitching(0.2), 0)
-    scan = replace(scan_of(level), stamp_ns=SECOND_NS // 2)
-    at_ns = SECOND_NS // 2 + 50_000_000
-    found = meter.measure(scan, at_ns)
-    assert found is not None
-    assert found.stamp_ns == at_ns
-    tilt = math.radians(10.0) + 0.2 * 0.05
-    assert found.normal_lidar == pytest.approx([-math.sin(tilt), 0.0, math.cos(tilt)], abs=1e-6)
-    assert found.distance_m == pytest.approx(HEIGHT_M, abs=1e-6)
-
-
-def test_nearest_scans() -> None:
-    ms = 1_000_000
-    scans = [0, 100 * ms, 200 * ms, 500 * ms]
-    # To the nearest, unless another pose is nearer to it, or it is more than 60 ms away.
-    poses = [20 * ms, 40 * ms, 149 * ms, 200 * ms, 439 * ms, 561 * ms]
-    assert nearest_scans(poses, scans) == {0: 20 * ms, 100 * ms: 149 * ms, 200 * ms: 200 * ms}
-    assert nearest_scans([440 * ms], scans) == {500 * ms: 440 * ms}
-    assert nearest_scans([], scans) == {}
-    assert nearest_scans(poses, []) == {}
-
-
-class TwoLidars:
-    """A recording in memory: `front` at 0.2, 0.4, ... s, `rear` 30 ms later."""
-
-    name = "made up"
-    lidars = ("front", "rear")
-
-    def __init__(self) -> None:
-        self.read: list[tuple[str, int]] = []
-
-    def scan_stamps_ns(self, lidar: str) -> list[int]:
-        return [200_000_000 * i + 30_000_000 * (lidar == "rear") for i in range(1, 5)]
-
-    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        for stamp_ns in self.scan_stamps_ns(lidar):
-            if wanted is None or stamp_ns in wanted:
-                self.read.append((lidar, stamp_ns))
-                yield replace(scan_of(level), lidar=lidar, stamp_ns=stamp_ns)
-
-    def motion(self) -> MotionData:
-        return MotionData("made up")
-
-    def warnings(self) -> tuple[str, ...]:
-        return ()
-
-
-def test_all_lidars_see_the_ground_when_one_sees_the_target() -> None:
-    lidar = {"topic": "a", "initial": {"xyz": [0, 0, 2], "rpy_deg": [0, 10.0, 0]}}
-    lidars = {name: lidar | {"topic": name} for name in ("front", "rear", "blind")}
-    config = parse_config({"lidars": lidars}, "made up", Path())
-    # The front LiDAR sees the target twice, the rear one once.
-    seen = [("front", 400_000_000), ("front", 600_000_000), ("rear", 830_000_000)]
-    clouds = tuple(TargetCloud(name, 0, t, np.zeros((1, 3)), "cloud") for name, t in seen)
-    targets = [TargetObservation(0, "target", np.zeros(3), clouds)]
-    recording, progress = TwoLidars(), SilentProgress()
-    found, warnings = measure_grounds([recording], [pitching(0.0)], targets, config, progress)
-    assert [(o.lidar, o.stamp_ns // 1_000_000) for o in found] == [
-        ("front", 400),
-        ("front", 600),
-        ("front", 830),
-        ("rear", 400),
-        ("rear", 600),
-        ("rear", 830),
-    ]
-    assert len(recording.read) == 6
-    assert warnings == ()
-    assert all(o.distance_m == pytest.approx(HEIGHT_M, abs=1e-6) for o in found)
-    off = config.model_copy(update={"ground": config.ground.model_copy(update={"use": False})})
-    assert measure_grounds([recording], [pitching(0.0)], targets, off, progress) == ((), ())
-    assert len(recording.read) == 6
+# ------------------------------------------------------------------ simulated drives
 
 
 def simulated(name: str, every: int) -> dict[str, list[tuple[GroundPlane | None, Array, float]]]:
@@ -645,7 +348,7 @@ def simulated(name: str, every: int) -> dict[str, list[tuple[GroundPlane | None,
             up = (X.rotation().matrix() @ R_guess)[2]
             normal = T.rotation().matrix()[2]
             height = float(T.translation()[2] - recording.world.ground_z_map)
-            out.setdefault(lidar, []).append((measure_ground(scan, up, 0.01), normal, height))
+            out.setdefault(lidar, []).append((plane_in(scan, up, 0.01), normal, height))
     return out
 
 
@@ -674,28 +377,3 @@ def test_simulated_ramp_is_the_level_ground_or_nothing() -> None:
         assert np.abs(off[:, 2]).max() < 3.0 * DISTANCE_FLOOR_M
         assert np.abs(off[:, :2].mean(axis=0)).max() < 1e-4
         assert abs(off[:, 2].mean()) < 5e-4
-
-
-@pytest.mark.skipif(not RELEASED.is_dir(), reason="the authors' drive is not there")
-def test_authors_drive_agrees_with_their_extrinsics() -> None:
-    config: Config = load_config(ROOT / "configs" / "caliv_released.yaml")
-    recording = CalivFolder(RELEASED, config.lidars)
-    trajectory = GivenTrajectory(given_trajectory(recording.motion()))
-    meter = GroundMeter(config, trajectory, 0)
-    published = {
-        "sensor_1": pose((2.259, 0.0, 1.938), (0.0, 10.0, 0.0)),
-        "sensor_2": pose((-0.3987347, 0.002735673, 2.098425312), (0.0, 10.0, 180.0)),
-    }
-    for name, T in published.items():
-        stamps = set(recording.scan_stamps_ns(name)[::3])
-        found: list[GroundObservation] = []
-        for scan in recording.scans(name, stamps):
-            observation = meter.measure(scan)
-            assert observation is not None
-            found.append(observation)
-        normals = np.array([T.rotation().matrix() @ o.normal_lidar for o in found])
-        heights = [o.distance_m - n @ T.translation() for o, n in zip(found, normals, strict=True)]
-        # Their vehicle frame is on the ground; it leans out of the turn by a little over 1 mrad.
-        assert np.mean(heights) == pytest.approx(0.0, abs=1e-3)
-        assert normals.mean(axis=0)[:2] == pytest.approx([0.0, -1.2e-3], abs=5e-4)
-    assert meter.warnings() == ()

@@ -7,8 +7,8 @@ import pytest
 
 from caliv_graph.products import Array
 from caliv_graph.targets.ground.surface import fit_surface
-from caliv_graph.targets.objects import CLEARANCE_M
-from caliv_graph.targets.search import MIN_HEIGHT_M
+from caliv_graph.targets.search.objects import CLEARANCE_M
+from caliv_graph.targets.search.tracks import MIN_HEIGHT_M
 
 LIDAR_HEIGHT_M = 2.0
 

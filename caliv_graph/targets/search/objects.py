@@ -1,4 +1,4 @@
-"""What stands on the ground in one scan: without the ground, in clusters, each described."""
+"""Segmentation of one scan: the ground removed, the rest clustered, each cluster described."""
 
 from __future__ import annotations
 
@@ -15,59 +15,63 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.targets.ground.surface import GroundSurface, fit_surface
 
 MAX_RANGE_M = 30.0
-"""Objects farther away are not looked at: few points, and far from where the guess puts them."""
+"""Maximum range of an object: farther ones have few points, and the guess displaces them far."""
 
 BEYOND_M = 4.0
-"""Points up to this much farther are clustered too, to know what goes on beyond MAX_RANGE_M."""
+"""Points up to this much farther are clustered too: an object that reaches beyond MAX_RANGE_M is
+recognised."""
 
 CLEARANCE_M = 0.12
 """Points nearer to the ground surface than this are ground."""
 
 CEILING_M = 4.0
-"""Points higher above the ground than this hang over things; they belong to none."""
+"""Points higher above the ground than this belong to no object."""
 
 VOXEL_M = 0.1
 """Clustering looks at one point per voxel of this size."""
 
 LINK_M = 0.3
-"""Points nearer than this belong to one object, at least (as in `extract`)."""
+"""Points nearer than this belong to one object (as in `cloud.region`)."""
 
 MAX_LINK_M = 1.0
-"""Points farther apart than this do not, however far the beams are apart."""
+"""Points farther apart than this do not, whatever the spacing of the beams."""
 
 LINK_BEAMS = 2.5
-"""Neighbours are linked across one beam that came back from elsewhere."""
+"""Points are linked up to this many beam spacings: across one beam that hit something else."""
 
 VERTICAL = 0.4
-"""Distances along z count by this: rings of a LiDAR are farther apart than its columns."""
+"""Factor on distances along z: rings of a LiDAR are farther apart than its columns."""
+
+AZIMUTH_BIN_RAD = math.radians(0.5)
+"""Size of the bins of azimuth in which returns are counted."""
 
 BIN_RAD = math.radians(2.0)
 """Size of the bins of direction in which beams are counted."""
 
 MIN_POINTS = 6
-"""Fewer points are no object."""
+"""Minimum number of points of an object."""
 
 WIDE_M = 1.75
-"""Wider than a target by what noise and mixed returns add."""
+"""Maximum width of a target, 1.5 m, with noise and mixed returns."""
 
 DIRECTIONS = np.linspace(0.0, math.pi, 12, endpoint=False)
-"""In which widths are measured: the largest is at most 1% larger than what they find."""
+"""Directions in which widths are measured: the largest width is at most 1 % larger."""
 
 TRIM = 0.02
-"""Part of the points at each end that a width leaves out: mixed returns trail behind edges."""
+"""Part of the points trimmed at each end of a width: mixed returns trail behind edges."""
 
 OCCLUDED_M = 0.4
-"""What is nearer than the object by this is another object, in front of it."""
+"""A return nearer than the object by more than this is an occluder."""
 
 BESIDE_RAD = math.radians(0.8)
-"""How far beside an object one looks for what may hide the rest of it."""
+"""Angle beside an object within which occluders are searched."""
 
 
 @dataclass(frozen=True)
-class SeenObject:
+class ScanObject:
     """A cluster of points above the ground in one scan.
 
-    Lengths in metres, in level axes about the LiDAR: the map's, as far as the guess is right.
+    Lengths in metres, in level axes about the LiDAR: the axes of the map, as good as the guess.
 
     Attributes:
         centre: (3,) middle of the points, lidar frame.
@@ -79,8 +83,8 @@ class SeenObject:
         points: how many.
         azimuth: (2,) radians, from and to, lidar frame; from is in (-pi, pi].
         highest_rad: elevation of its highest beam, lidar frame.
-        hidden: something nearer hides what is beside it, or it reaches beyond MAX_RANGE_M: it may
-            be larger than it looks.
+        hidden: it may be larger than it appears, since an occluder is beside it or it reaches
+            beyond MAX_RANGE_M.
         outline: (m, 3) some of its points, lidar frame.
     """
 
@@ -98,30 +102,27 @@ class SeenObject:
 
 
 @dataclass(frozen=True)
-class SeenScan:
-    """What one scan shows.
+class ScanObjects:
+    """The objects of one scan.
 
     Attributes:
-        objects: above the ground.
+        objects: clusters above the ground.
         azimuths: (n,) bins of 0.5 degrees in which there are returns, ascending.
         highest_rad: elevation of the highest beam that returned anything.
         has_ground: whether ground was found.
     """
 
-    objects: tuple[SeenObject, ...]
+    objects: tuple[ScanObject, ...]
     azimuths: IntArray
     highest_rad: float
     has_ground: bool
 
 
-AZIMUTH_BIN_RAD = math.radians(0.5)
-
-
-def see_objects(points_lidar: Array, R_map_lidar: Array) -> SeenScan:
-    """Takes a scan apart.
+def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
+    """Segments a scan into ground and objects.
 
     Args:
-        points_lidar: (N, 3) metres, lidar frame, all as of one time.
+        points_lidar: (N, 3) metres, lidar frame, motion compensated.
         R_map_lidar: (3, 3) attitude of the LiDAR, as good as the guess.
     """
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
@@ -134,7 +135,7 @@ def see_objects(points_lidar: Array, R_map_lidar: Array) -> SeenScan:
     level = points_lidar[near] @ R_map_lidar.T
     surface = fit_surface(level)
     if surface is None:
-        return SeenScan((), bins, highest, False)
+        return ScanObjects((), bins, highest, False)
     height = level[:, 2] - surface.height_at(level[:, :2])
     above = (height > CLEARANCE_M) & (height < CEILING_M)
     stands = _Standing(
@@ -148,12 +149,21 @@ def see_objects(points_lidar: Array, R_map_lidar: Array) -> SeenScan:
     spacing = _beam_spacing(azimuth, elevation)(stands.azimuth, stands.elevation)
     labels = _clusters(stands, spacing)
     objects = _describe(stands, labels, points_lidar, R_map_lidar, surface, spacing)
-    return SeenScan(tuple(objects), bins, highest, True)
+    return ScanObjects(tuple(objects), bins, highest, True)
 
 
 @dataclass(frozen=True)
 class _Standing:
-    """Points above the ground: index in the scan, and what is known of each."""
+    """Points above the ground.
+
+    Attributes:
+        index: (n,) in the scan.
+        level: (n, 3) metres, level axes about the LiDAR.
+        height: (n,) metres above the ground.
+        azimuth: (n,) rad, lidar frame.
+        elevation: (n,) rad, lidar frame.
+        range_m: (n,) metres.
+    """
 
     index: IntArray
     level: Array
@@ -164,7 +174,7 @@ class _Standing:
 
 
 class _BeamSpacing:
-    """Angle between neighbouring beams, by direction: a LiDAR's rings may be uneven."""
+    """Angle between neighbouring beams by direction: rings may be unevenly spaced."""
 
     def __init__(self, spacing: Array) -> None:
         self._spacing = spacing
@@ -179,7 +189,7 @@ def _direction_bin(angle: Array) -> IntArray:
 
 
 def _beam_spacing(azimuth: Array, elevation: Array) -> _BeamSpacing:
-    """Counts returns per direction. A bin half in the sky takes the count of its neighbours."""
+    """Spacing from the density of returns. A bin half in the sky takes that of its neighbours."""
     n = round(2.0 * math.pi / BIN_RAD)
     key = _direction_bin(elevation) * n + _direction_bin(azimuth)
     count = np.bincount(key, minlength=n * n).reshape(n, n).astype(np.float64)
@@ -222,7 +232,7 @@ def _describe(
     R_map_lidar: Array,
     surface: GroundSurface,
     spacing: Array,
-) -> list[SeenObject]:
+) -> list[ScanObject]:
     """The clusters of at least MIN_POINTS points within MAX_RANGE_M."""
     order = np.argsort(labels, kind="stable")
     splits = np.flatnonzero(np.diff(labels[order])) + 1
@@ -234,8 +244,8 @@ def _describe(
             continue
         level = stands.level[member]
         middle, extent = _middle_and_extent(level[:, :2])
-        turned = _unwrapped(stands.azimuth[member])
-        low, high = float(turned.min()), float(turned.max())
+        azimuth = _unwrapped(stands.azimuth[member])
+        low, high = float(azimuth.min()), float(azimuth.max())
         range_m = float(np.quantile(np.hypot(level[:, 0], level[:, 1]), 0.1))
         hidden = bool(stands.range_m[member].max() > MAX_RANGE_M)
         if not hidden and extent < WIDE_M:
@@ -254,7 +264,7 @@ def _describe(
         centre = np.array([*middle, ground_z + 0.5 * float(stands.height[member].max())])
         step = max(1, len(member) // 100)
         out.append(
-            SeenObject(
+            ScanObject(
                 centre=R_map_lidar.T @ centre,
                 base=R_map_lidar.T @ np.array([*middle, ground_z]),
                 range_m=range_m,
@@ -281,7 +291,7 @@ def _middle_and_extent(xy: Array) -> tuple[Array, float]:
 
 
 def _unwrapped(azimuth: Array) -> Array:
-    """Azimuths without the jump at pi, counted on from the first of them."""
+    """Azimuths within pi of the first of them."""
     reference = float(azimuth[0])
     return np.asarray(reference + (azimuth - reference + math.pi) % (2.0 * math.pi) - math.pi)
 
@@ -289,7 +299,7 @@ def _unwrapped(azimuth: Array) -> Array:
 def _within(sorted_azimuth: Array, begin: float, end: float) -> IntArray:
     """Indices of the sorted azimuths in [begin, end], across the jump at pi too."""
     out = []
-    for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi):
-        first, last = np.searchsorted(sorted_azimuth, [begin + turn, end + turn])
+    for circle in (-2.0 * math.pi, 0.0, 2.0 * math.pi):
+        first, last = np.searchsorted(sorted_azimuth, [begin + circle, end + circle])
         out.append(np.arange(first, last))
     return np.concatenate(out)

@@ -15,8 +15,9 @@ from scipy.stats import chi2
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, MotionData
+from caliv_graph.trajectory.factors import marginal_factor
+from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.smoothing import smooth_trajectory
 from tests.trajectory.motions import (
     GRAVITY,
     START_NS,
@@ -136,11 +137,9 @@ def test_velocities_are_those_of_the_vehicle() -> None:
     _, smoothed, wanted = awkward()
     truth = ROUGH.at(seconds(wanted))
     velocity = np.einsum("nji,nj->ni", truth.R_map_vehicle, truth.velocity_map)
-    trajectory = smoothed.trajectory
-    assert trajectory.velocity_vehicle is not None
-    assert trajectory.angular_velocity_vehicle is not None
-    assert np.sqrt(np.mean((trajectory.velocity_vehicle - velocity) ** 2)) < 0.01
-    assert np.sqrt(np.mean((trajectory.angular_velocity_vehicle - truth.rates) ** 2)) < 3e-3
+    found, rates = smoothed.velocities_at(wanted)
+    assert np.sqrt(np.mean((found - velocity) ** 2)) < 0.01
+    assert np.sqrt(np.mean((rates - truth.rates) ** 2)) < 3e-3
 
 
 def test_a_stamp_outside_the_span_is_an_error() -> None:
@@ -182,8 +181,8 @@ def test_joint_information_is_that_of_gtsam() -> None:
     sigma = np.sqrt(cov.diagonal())
     product = (sigma[:, None] * information) @ (cov / sigma)
     np.testing.assert_allclose(product, np.eye(24), atol=1e-4)
-    for pose, stamp in zip(poses, some.tolist(), strict=True):
-        assert pose.equals(smoothed.trajectory.pose_at(stamp), 1e-9)
+    for pose, at in zip(poses, [3, 4, 9, 20], strict=True):
+        assert pose.equals(smoothed.trajectory.T_map_vehicle[at], 1e-9)
     marginal = smoothed.trajectory.cov
     assert marginal is not None
     np.testing.assert_allclose(cov[6:12, 6:12], marginal[4], rtol=1e-5, atol=1e-12)
@@ -196,12 +195,12 @@ def test_another_measurement_weighs_the_same_on_the_marginal_as_on_the_whole() -
     smoothed = smooth_trajectory(motion, config_for(sensors), wanted)
     some = wanted[4:16:3]
     keys = list(range(100, 104))
-    poses = [smoothed.trajectory.pose_at(s) for s in some.tolist()]
+    information, poses = smoothed.joint_information(some)
     moved = poses[1].retract(np.array([0.001, -0.0005, 0.001, 0.01, -0.008, 0.005]))
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([3e-4] * 3 + [3e-3] * 3))
 
     small = gtsam.NonlinearFactorGraph()
-    small.add(smoothed.joint_factor(keys, some))
+    small.add(marginal_factor(keys, information, poses))
     small.add(gtsam.PriorFactorPose3(keys[1], moved, noise))
     start = gtsam.Values()
     for key, pose in zip(keys, poses, strict=True):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -22,7 +22,14 @@ from caliv_graph.config.model import (
 )
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
-from caliv_graph.products import Array, GivenPoses, IntArray, Trajectory
+from caliv_graph.products import (
+    Array,
+    GivenPoses,
+    IntArray,
+    LidarScan,
+    MotionData,
+    Trajectory,
+)
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, StandstillDrive
 from caliv_graph.scenario.model import InitialGuessModel, Scenario
 from caliv_graph.scenario.sensor_models import LidarModel, SweepModel
@@ -39,9 +46,9 @@ from caliv_graph.scenario.world_models import (
 )
 from caliv_graph.simulation import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.noise import perturbed_extrinsic
-from caliv_graph.targets import search
-from caliv_graph.targets.cloud.extract import RegionExtractor
+from caliv_graph.targets.cloud.region import RegionExtractor
 from caliv_graph.targets.search import FoundTarget, find_target
+from caliv_graph.targets.search.find import MAX_SCANS, REGION_MARGIN_M
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.drives_with_chair import Memory
 
@@ -262,12 +269,11 @@ class TestFindsTheChair:
         extractor = RegionExtractor(found.region, drive.config, drive.trajectory)
         off = []
         for name in drive.config.lidars:
-            for scan in drive.recording.scans(name):
-                cloud = extractor.extract(scan, 0)
-                if cloud is not None:
-                    T = drive.trajectory.poses_at([scan.stamp_ns])
-                    at = drive.truth[name].transformFrom(cloud.points_lidar.mean(axis=0))
-                    off.append(np.linalg.norm((T[0][0] @ at + T[1][0])[:2] - CHAIR_XY_M))
+            scans = drive.recording.scans(name)
+            for cloud in extractor.choose([extractor.candidates(s, 0) for s in scans], name):
+                T = drive.trajectory.poses_at([cloud.stamp_ns])
+                at = drive.truth[name].transformFrom(cloud.points_lidar.mean(axis=0))
+                off.append(np.linalg.norm((T[0][0] @ at + T[1][0])[:2] - CHAIR_XY_M))
         assert len(off) >= sum(found.scans.values()) > 20
         assert max(off) < 0.5
 
@@ -275,9 +281,9 @@ class TestFindsTheChair:
         found = found_in("street", 0)
         low, high = np.array(found.region.min), np.array(found.region.max)
         assert found.region.frame == "map"
-        size = found.extent_m + 2 * search.REGION_MARGIN_M
+        size = found.extent_m + 2 * REGION_MARGIN_M
         assert high - low == pytest.approx(
-            [size, size, found.height_m + 2 * search.REGION_MARGIN_M], abs=0.01
+            [size, size, found.height_m + 2 * REGION_MARGIN_M], abs=0.01
         )
         assert 0.5 * (low + high) == pytest.approx(found.centre_map, abs=0.01)
 
@@ -432,49 +438,57 @@ class _Straight:
         return np.tile(np.eye(3), (len(s), 1, 1)), t
 
 
-def ten_hertz(duration_s: float) -> list[int]:
-    return [i * 100_000_000 for i in range(int(10 * duration_s) + 1)]
+@dataclass
+class _TenHertz:
+    """A drive of empty scans, which notes the stamps that are read."""
+
+    duration_s: float
+    name: str = "empty"
+    lidars: tuple[str, ...] = ("front",)
+    read_ns: list[int] = field(default_factory=list)
+
+    def scan_stamps_ns(self, lidar: str) -> list[int]:
+        return [i * 100_000_000 for i in range(int(10 * self.duration_s) + 1)]
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        for stamp in self.scan_stamps_ns(lidar):
+            if wanted is None or stamp in wanted:
+                self.read_ns.append(stamp)
+                yield LidarScan(lidar, stamp, np.zeros((0, 3)), f"{stamp}")
+
+    def motion(self) -> MotionData:
+        raise AssertionError("poses come with the trajectory")
+
+    def warnings(self) -> Sequence[str]:
+        return ()
 
 
-class TestChosenScans:
+def read_of(duration_s: float, trajectory: _Straight) -> IntArray:
+    """Stamps of the scans that are read in a search for a target that is not there."""
+    recording = _TenHertz(duration_s)
+    config = Config(lidars={"front": LidarConfig(topic="front", initial=PAIR["front"].mounting)})
+    with pytest.raises(TargetError, match=r"none found in \d+ of 'front'"):
+        find_target([recording], [trajectory], config, SilentProgress())
+    return np.array(recording.read_ns, np.int64)
+
+
+class TestScansThatAreRead:
     @pytest.mark.parametrize(("duration_s", "count"), [(3.0, 21), (15.0, 51), (60.0, 61)])
     def test_about_sixty(self, duration_s: float, count: int) -> None:
-        chosen = search._chosen_stamps(ten_hertz(duration_s), _Straight(duration_s, 0.0))
+        read = read_of(duration_s, _Straight(duration_s, 0.0))
         # 3 s: those 0.1 s apart show nothing new. 15 s: in steps of 0.2 and 0.3 s.
-        assert count <= len(chosen) <= count + 10
-        assert set(chosen) <= set(ten_hertz(duration_s))
+        assert count <= len(read) <= count + 10
 
     def test_a_long_drive_is_bounded(self) -> None:
-        chosen = search._chosen_stamps(ten_hertz(1800.0), _Straight(1800.0, 0.0))
-        assert len(chosen) == search.MAX_SCANS + 1
+        assert len(read_of(1800.0, _Straight(1800.0, 0.0))) == MAX_SCANS + 1
 
     def test_fewer_while_the_vehicle_stands(self) -> None:
-        chosen = search._chosen_stamps(ten_hertz(60.0), _Straight(60.0, 40.0))
-        assert np.diff(chosen[chosen < 40e9]) == pytest.approx(4e9)
-        assert np.diff(chosen[chosen > 41e9]) == pytest.approx(1e9)
+        read = read_of(60.0, _Straight(60.0, 40.0))
+        assert np.diff(read[read < 40e9]) == pytest.approx(4e9)
+        assert np.diff(read[read > 41e9]) == pytest.approx(1e9)
 
     def test_only_those_with_a_pose(self) -> None:
-        trajectory = _Straight(20.0, 0.0, lost_ns=(0, 5_000_000_000))
-        chosen = search._chosen_stamps(ten_hertz(30.0), trajectory)
-        assert chosen.min() > 0
-        assert 5_000_000_000 not in chosen
-        assert chosen.max() <= 20e9
-
-    def test_none(self) -> None:
-        assert len(search._chosen_stamps([], _Straight(1.0, 0.0))) == 0
-
-
-class TestFieldOfView:
-    def test_gaps_between_columns_are_inside(self) -> None:
-        # A column every 1.5 degrees from -30 to 30, bins of half a degree.
-        seen = search._field_of_view([np.arange(-60, 61, 3)])
-        assert seen.sum() == 121
-        assert seen[-60 % 720]
-        assert seen[60]
-        assert not seen[61]
-
-    def test_all_around(self) -> None:
-        assert search._field_of_view([np.arange(-360, 360, 2)]).all()
-
-    def test_nothing(self) -> None:
-        assert not search._field_of_view([]).any()
+        read = read_of(30.0, _Straight(20.0, 0.0, lost_ns=(0, 5_000_000_000)))
+        assert read.min() > 0
+        assert 5_000_000_000 not in read
+        assert read.max() <= 20e9

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array
-from caliv_graph.targets.objects import SeenObject, SeenScan, see_objects
+from caliv_graph.targets.search.objects import ScanObject, ScanObjects, segment_scan
 
 HEIGHT_M = 2.0
 """Of the LiDAR above the ground."""
@@ -58,11 +58,11 @@ def box_at(x: float, y: float, size_m: float, height_m: float) -> Box:
     return (x - half, y - half, 0.0), (x + half, y + half, height_m)
 
 
-def seen(boxes: Sequence[Box], beams: Array | None = None) -> SeenScan:
-    return see_objects(cast(directions() if beams is None else beams, boxes), np.eye(3))
+def seen(boxes: Sequence[Box], beams: Array | None = None) -> ScanObjects:
+    return segment_scan(cast(directions() if beams is None else beams, boxes), np.eye(3))
 
 
-def only(scan: SeenScan) -> SeenObject:
+def only(scan: ScanObjects) -> ScanObject:
     [found] = scan.objects
     return found
 
@@ -89,8 +89,8 @@ class TestOneObject:
     def test_seen_with_a_mounting_that_is_off(self) -> None:
         R = gtsam.Rot3.RzRyRx(0.1, -0.12, 0.3).matrix()
         points = cast(directions(), [box_at(9.0, 1.0, 0.6, 1.1)])
-        straight = only(see_objects(points, np.eye(3)))
-        tilted = only(see_objects(points, R))
+        straight = only(segment_scan(points, np.eye(3)))
+        tilted = only(segment_scan(points, R))
         # Described in the LiDAR's frame, from which the map is as far as the guess is off.
         assert tilted.base == pytest.approx(straight.base, abs=0.2)
         assert tilted.top_m == pytest.approx(straight.top_m, abs=0.1)
@@ -119,7 +119,7 @@ class TestOneObject:
         assert scan.objects == ()
 
     def test_nothing_at_all(self) -> None:
-        scan = see_objects(np.zeros((0, 3)), np.eye(3))
+        scan = segment_scan(np.zeros((0, 3)), np.eye(3))
         assert not scan.has_ground
         assert scan.objects == ()
         assert len(scan.azimuths) == 0

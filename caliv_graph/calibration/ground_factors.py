@@ -1,0 +1,207 @@
+"""Factors of the ground: the plane as a LiDAR sees it, and the vehicle standing on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M
+from caliv_graph.geometry.se3 import skew
+from caliv_graph.products import Array, GroundObservation
+
+SWAY_SIGMA_RAD = 1e-3
+"""Sway: tilt of the body on its springs at each stamp from its mean over the drive, per axis. It
+leans by 1.3 mrad in a turn at walking pace (measured on the drive of the CaLiV authors)."""
+
+
+def plane_normal(g: Array) -> Array:
+    """(3,) upward unit normal in the map of a plane g."""
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    return np.array([-a * inverse, -b * inverse, inverse])
+
+
+def _normal_jacobian(g: Array) -> Array:
+    """(3, 3) derivative of `plane_normal` by g."""
+    # Written out, like the functions below: a graph calls this for hundreds of factors some fifty
+    # times, and numpy takes microseconds for every small array.
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    cube = inverse**3
+    return np.array(
+        [
+            [a * a * cube - inverse, a * b * cube, 0.0],
+            [a * b * cube, b * b * cube - inverse, 0.0],
+            [-a * cube, -b * cube, 0.0],
+        ]
+    )
+
+
+def height_over(g: Array, centre: Array, place_map: Array) -> tuple[float, Array, Array]:
+    """Distance of a place from the plane along its normal, with derivatives.
+
+    Returns:
+        metres; (3,) by g; (3,) by the place.
+    """
+    a, b = float(g[0]), float(g[1])
+    inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
+    x, y = float(place_map[0] - centre[0]), float(place_map[1] - centre[1])
+    height = inverse * (float(place_map[2] - g[2]) - a * x - b * y)
+    bend = -height * inverse**2
+    by_plane = np.array([bend * a - inverse * x, bend * b - inverse * y, -inverse])
+    return height, by_plane, np.array([-a * inverse, -b * inverse, inverse])
+
+
+def _chain(
+    values: gtsam.Values, keys: Sequence[int], derivatives: bool
+) -> tuple[gtsam.Pose3, list[Array]]:
+    """The product of poses, and per pose what a right perturbation of it does to the product's.
+
+    Only the poses after it matter: no number here grows with the distance from the map's origin.
+    """
+    after = gtsam.Pose3()
+    moves: list[Array] = []
+    for key in reversed(keys):
+        if derivatives:
+            moves.append(np.asarray(after.inverse().AdjointMap()))
+        after = values.atPose3(key).compose(after)
+    return after, moves[::-1]
+
+
+def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> tuple[Array, Array]:
+    """An observation, its motion compensated with another extrinsic.
+
+    Returns:
+        (3,) tilts along its axes and distance; (3, 3) by a right perturbation of the rotation.
+    """
+    said = np.array([0.0, 0.0, observation.distance_m])
+    if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
+        return said, np.zeros((3, 3))
+    turn = gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar)
+    w = gtsam.Rot3.Logmap(turn)
+    by_turn = observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(w)
+    return said + observation.by_extrinsic @ w, np.asarray(by_turn)
+
+
+def ground_plane_factor(
+    pose_keys: Sequence[int],
+    key_plane: int,
+    centre: Array,
+    observation: GroundObservation,
+    weight: float = 1.0,
+    heave_m: float = 0.0,
+) -> gtsam.CustomFactor:
+    """Role a: the plane as a LiDAR sees it.
+
+    `r = [u . n, v . n, d] - [a, b, distance]`, n the plane's normal in the lidar frame and d the
+    LiDAR's distance from it, both predicted from `X E S_a`; u and v are the observation's axes;
+    a, b (zero at first) and distance are its values, corrected for the motion compensation that the
+    present extrinsic `E S_a` would have made.
+
+    Args:
+        pose_keys: of X_i, E and, unless the LiDAR is the reference, S_a.
+        key_plane: of the drive's plane.
+        centre: (2,) metres, where the plane's height is defined.
+        observation: the measurement.
+        weight: on its information.
+        heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
+    """
+    poses = list(pose_keys)
+    axes = observation.axes_lidar
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        T, moves = _chain(values, poses, jacobians is not None)
+        g = values.atVector(key_plane)
+        d, by_plane, n = height_over(g, centre, T.translation())
+        R_lidar_map = T.rotation().matrix().T
+        n_lidar = R_lidar_map @ n
+        said, by_turn = compensated(
+            observation, values.atPose3(poses[0]).rotation().between(T.rotation()).matrix()
+        )
+        if jacobians is not None:
+            J = np.zeros((3, 6))
+            J[:2, :3] = axes @ skew(n_lidar)
+            J[2, 3:] = n_lidar
+            jacobians[0] = J @ moves[0]
+            J[:, :3] -= by_turn
+            for i, move in enumerate(moves[1:], start=1):
+                jacobians[i] = J @ move
+            jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ _normal_jacobian(g), by_plane])
+        return np.asarray(np.append(axes @ n_lidar, d) - said)
+
+    noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
+    return gtsam.CustomFactor(noise, [*poses, key_plane], error)
+
+
+def with_heave(observation: GroundObservation, heave_m: float) -> Array:
+    """(3, 3) of an observation, with the heave between scan and pose."""
+    cov = observation.cov.copy()
+    cov[2, 2] += heave_m**2
+    return cov
+
+
+def standing_factor(
+    key_pose: int,
+    key_plane: int,
+    key_error: int,
+    centre: Array,
+    vehicle_height_m: float,
+    weight: float = 1.0,
+) -> gtsam.CustomFactor:
+    """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
+
+    Its sigma is the heave of one scan; the error is common to the drive.
+
+    Args:
+        key_pose: of X_i.
+        key_plane: of the drive's plane.
+        key_error: of the error of the vehicle's height in the drive.
+        centre: (2,) metres, where the plane's height is defined.
+        vehicle_height_m: height of the vehicle frame above ground.
+        weight: on its information.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        X = values.atPose3(key_pose)
+        height, by_plane, n = height_over(values.atVector(key_plane), centre, X.translation())
+        if jacobians is not None:
+            J = np.zeros((1, 6))
+            J[0, 3:] = n @ X.rotation().matrix()
+            jacobians[0] = J
+            jacobians[1] = by_plane[None]
+            jacobians[2] = -np.ones((1, 1))
+        return np.asarray(height - vehicle_height_m - values.atVector(key_error))
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, HEAVE_SIGMA_M / math.sqrt(weight))
+    return gtsam.CustomFactor(noise, [key_pose, key_plane, key_error], error)
+
+
+def parallel_factor(
+    key_pose: int, key_plane: int, key_tilt: int, weight: float = 1.0
+) -> gtsam.CustomFactor:
+    """Role c: `r` = x and y of the plane's normal in the vehicle frame, less those of the drive.
+
+    Args:
+        key_pose: of X_i.
+        key_plane: of the drive's plane.
+        key_tilt: of the tilt common to the drive.
+        weight: on its information.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R_vehicle_map = values.atPose3(key_pose).rotation().matrix().T
+        g = values.atVector(key_plane)
+        n_vehicle = R_vehicle_map @ plane_normal(g)
+        if jacobians is not None:
+            J = np.zeros((2, 6))
+            J[:, :3] = skew(n_vehicle)[:2]
+            jacobians[0] = J
+            jacobians[1] = R_vehicle_map[:2] @ _normal_jacobian(g)
+            jacobians[2] = -np.eye(2)
+        return np.asarray(n_vehicle[:2] - values.atVector(key_tilt))
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, SWAY_SIGMA_RAD / math.sqrt(weight))
+    return gtsam.CustomFactor(noise, [key_pose, key_plane, key_tilt], error)

@@ -1,0 +1,114 @@
+"""Packing the result: estimates, residuals, covariance, the graph and its linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import (
+    cloud_graph,
+    merged,
+)
+from caliv_graph.calibration.problem import moved_map
+from caliv_graph.calibration.reduced import Reduced
+from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
+from caliv_graph.conventions import key_target, key_vehicle
+from caliv_graph.errors import SolveError
+from caliv_graph.products import (
+    Array,
+    Registration,
+    Solution,
+)
+
+
+def _whitened(residuals: Array, information: Array) -> Array:
+    """Residuals (J, 6), whitened by the root of their (J, 6, 6) information."""
+    return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
+
+
+def _check_finite(*matrices: Array) -> None:
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        raise SolveError("the covariance of the extrinsics is not finite")
+
+
+def packed_solution(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    reduced: Reduced,
+    information: Array,
+    information_data: Array,
+    cov: Array,
+    held: tuple[str, ...],
+    iterations: int,
+    converged: bool,
+    time_offsets: Mapping[str, tuple[float, float]],
+) -> Solution:
+    """Packs the result, the whole graph and its linearisation.
+
+    Args:
+        state: after its last step.
+        registrations: the registered clouds.
+        reduced: linearisation at the result.
+        information: (J, 6, 6) of the graph's pose factors, without robust weights.
+        information_data: (6 n, 6 n) of the extrinsics by the data alone, vehicle axes.
+        cov: (6 n, 6 n) of the result, vehicle axes.
+        held: axes of the reference LiDAR that were held at the guess.
+        iterations: of the loop.
+        converged: whether its last step was below its tolerance.
+        time_offsets: LiDAR -> offset and sigma, seconds.
+
+    Raises:
+        SolveError: the covariance is not finite.
+    """
+    _check_finite(cov, information_data)
+    problem, measured = state.problem, measured_poses(registrations)[0]
+    weights = state.weights.values
+    clouds = cloud_graph(problem, measured, information * weights[:, None, None])
+    graph = merged(guessed_graph(state), clouds)
+    residuals = _whitened(cloud_residuals(reduced.lines, measured), information)
+    cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
+    return Solution(
+        mode=state.config.solve.mode,
+        lidars=problem.lidars,
+        reference=problem.reference,
+        T_vehicle_lidar={n: problem.extrinsic(state.values, n) for n in problem.lidars},
+        T_map_vehicle=_poses_in_their_maps(state),
+        T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
+        registrations=tuple(registrations),
+        cloud_weights=tuple(np.split(weights, cuts)),
+        residuals=tuple(np.split(residuals, cuts)),
+        pose_noise=state.noise if problem.given().any() else None,
+        registration_scale=state.scale,
+        information_data=information_data,
+        information_prior=problem.guess_information(),
+        cov=cov,
+        held=held,
+        iterations=iterations,
+        converged=converged,
+        graph=graph,
+        factor_kinds=tuple(graph.kinds),
+        values=state.values,
+        linearised=reduced.linearised(problem),
+        time_offsets=time_offsets,
+        gradient_data=reduced.c,
+    )
+
+
+def _poses_in_their_maps(state: SolveState) -> dict[tuple[int, int], gtsam.Pose3]:
+    """T_map_vehicle of every pose in the map of its drive."""
+    problem = state.problem
+    return {
+        pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
+        for i, pose in enumerate(problem.poses)
+    }
+
+
+def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:
+    """T_target_map of a placement in the map of its drive."""
+    problem = state.problem
+    cloud = int(np.flatnonzero(problem.cloud_placement == placement)[0])
+    drive = problem.poses[problem.cloud_pose[cloud]][0]
+    T_target_map = state.values.atPose3(key_target(placement))
+    return T_target_map.compose(gtsam.Pose3(gtsam.Rot3(), -problem.origins_map[drive]))

@@ -1,0 +1,136 @@
+"""The problem reduced to the extrinsics: all other variables eliminated, in vehicle axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import (
+    CalibrationGraph,
+)
+from caliv_graph.calibration.linear import (
+    CloudLinearisation,
+    DenseSystem,
+    add_shape,
+    cloud_rows,
+    dense_system,
+    retract,
+)
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.conventions import key_offset
+from caliv_graph.products import (
+    Array,
+    LinearisedGraph,
+)
+
+
+@dataclass
+class Reduced:
+    """The linearised problem with everything but the extrinsics eliminated, in vehicle axes.
+
+    Attributes:
+        D: (6n, 6n) and
+        c: (6n,) of the data's quadratic `e^T D e / 2 - c^T e` in a step e of the extrinsics.
+        system: the linearised graph with the clouds' quadratic in it.
+        clouds: (6 J, 6 J) and (6 J,) that quadratic, in left perturbations of the clouds' poses.
+        lines: derivatives of these poses with respect to the variables.
+    """
+
+    D: Array
+    c: Array
+    system: DenseSystem
+    clouds: tuple[Array, Array]
+    lines: CloudLinearisation
+    _to_axes: Array
+    _G: Array
+    _g: Array
+    _values: gtsam.Values
+
+    def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
+        """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
+
+        Args:
+            problem: which they are.
+            cov: (6n, 6n) of the extrinsics, vehicle axes.
+        """
+        inverse = np.linalg.inv(self._to_axes)
+        tangent = inverse @ cov @ inverse.T
+        out = {}
+        for i, name in enumerate(problem.lidars):
+            if name in problem.offsets:
+                variance = self.system.covariance_of(key_offset(i), tangent)[0, 0]
+                value = float(self._values.atVector(key_offset(i))[0])
+                out[name] = (value, float(np.sqrt(variance)))
+        return out
+
+    def step_with(self, prior: Array, offset: Array) -> Array:
+        """The step (6n,) that data and guesses together call for.
+
+        Args:
+            prior: (6n, 6n) information of the guesses.
+            offset: (6n,) where the estimate is from them.
+        """
+        return np.asarray(np.linalg.solve(self.D + prior, self.c - prior @ offset), np.float64)
+
+    def move(self, step: Array) -> gtsam.Values:
+        """All values after a step (6n,) of the extrinsics, the rest following."""
+        tangent = np.linalg.solve(self._to_axes, step)
+        rest = self._g - self._G @ tangent
+        return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
+
+    def linearised(self, problem: Problem) -> LinearisedGraph:
+        """The same as numbers, with the guesses' information, for score tests."""
+        H, gradient = self.clouds
+        guesses = np.zeros_like(self.system.H)
+        of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
+        prior = self._to_axes.T @ problem.guess_information() @ self._to_axes
+        guesses[of_extrinsics, of_extrinsics] = prior
+        return LinearisedGraph(
+            information=self.system.H,
+            gradient=self.system.b,
+            information_guesses=guesses,
+            cloud_jacobian=cloud_rows(self.system, self.lines),
+            cloud_information=H,
+            cloud_gradient=gradient,
+            by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
+            by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
+        )
+
+
+def reduce_to_extrinsics(
+    problem: Problem,
+    values: gtsam.Values,
+    graph: CalibrationGraph,
+    clouds: tuple[Array, Array],
+    lines: CloudLinearisation,
+) -> Reduced:
+    """Linearises a graph and the clouds' quadratic, and eliminates all but the extrinsics.
+
+    Args:
+        problem: LiDARs, poses and clouds.
+        values: where to linearise.
+        graph: everything but the clouds and the guesses.
+        clouds: (6 J, 6 J) and (6 J,) their quadratic in left perturbations of their poses.
+        lines: how these move with the variables.
+
+    Raises:
+        SolveError: a pose or a target has no measurement.
+    """
+    system = add_shape(dense_system(problem, graph, values), lines, *clouds)
+    D, c, G, g = system.schur()
+    Q = problem.to_vehicle_axes(values)
+    inverse = np.linalg.inv(Q)
+    D = inverse.T @ D @ inverse
+    return Reduced(
+        D=0.5 * (D + D.T),
+        c=inverse.T @ c,
+        system=system,
+        clouds=clouds,
+        lines=lines,
+        _to_axes=Q,
+        _G=G,
+        _g=g,
+        _values=values,
+    )

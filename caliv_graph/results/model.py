@@ -1,0 +1,267 @@
+"""calibration.yaml and truth.yaml as they are read: the keys, and what they become.
+
+The models list the keys that are read, in the order in which problems are reported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, Self, get_args
+
+import gtsam
+import numpy as np
+from pydantic import Field, StrictBool, ValidationInfo, field_validator, model_validator
+from scipy.linalg import block_diag
+
+from caliv_graph.config.model import name_problem
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
+from caliv_graph.products import Array, Calibration, DataTerm, Direction, Guess, LidarResult
+from caliv_graph.results.values import (
+    Count,
+    Finite,
+    Matrix,
+    Number,
+    Part,
+    PoseMatrix,
+    PosePart,
+    Sigma,
+    Text,
+    Vector6,
+    check_matrix,
+    symmetric,
+)
+from caliv_graph.uncertainty.observability import rigid_twist
+from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
+
+Schema = Literal["caliv-graph/calibration/1"]
+(SCHEMA,) = get_args(Schema)
+
+Status = Literal["ok", "partial", "inconsistent"]
+
+
+class _SigmaPart(Part):
+    rpy_deg: tuple[Sigma, Sigma, Sigma]
+    xyz: tuple[Sigma, Sigma, Sigma]
+
+
+class _GuessPart(PosePart):
+    """The initial guess of a LiDAR: its pose, and its sigmas in vehicle axes."""
+
+    sigma_vehicle_axes: _SigmaPart
+    fixed: StrictBool = False
+
+    def guess(self) -> Guess:
+        sigma = self.sigma_vehicle_axes
+        sigmas = np.concatenate([np.radians(np.array(sigma.rpy_deg)), np.array(sigma.xyz)])
+        return Guess(T_vehicle_lidar=self.pose(), sigmas=sigmas, fixed=self.fixed)
+
+
+class _DeterminedPart(Part):
+    roll: StrictBool
+    pitch: StrictBool
+    yaw: StrictBool
+    x: StrictBool
+    y: StrictBool
+    z: StrictBool
+
+
+class _OffsetPart(Part):
+    value: Finite
+    sigma: Finite
+
+
+class _LidarPart(Part):
+    T_vehicle_lidar: PosePart
+    covariance: PoseMatrix
+    determined: _DeterminedPart
+    time_offset: _OffsetPart | None = None
+    guess: _GuessPart | None = None
+    scans_used: Count = 0
+    saw_target: StrictBool | None = None
+
+    def result(self, has_data: bool) -> LidarResult:
+        """The result of the LiDAR; one whose data has information saw the target."""
+        offset = self.time_offset
+        return LidarResult(
+            T_vehicle_lidar=self.T_vehicle_lidar.pose(),
+            cov=symmetric(self.covariance),
+            determined={axis: getattr(self.determined, axis) for axis in AXES},
+            scans_used=self.scans_used,
+            saw_target=has_data if self.saw_target is None else self.saw_target,
+            time_offset=None if offset is None else (offset.value, offset.sigma),
+            guess=None if self.guess is None else self.guess.guess(),
+        )
+
+
+class _OrderedPart(Part):
+    """Vectors and matrices over several LiDARs: six numbers per LiDAR, in this order."""
+
+    order: list[Text] = Field(min_length=1)
+
+    @field_validator("*")
+    @classmethod
+    def _of_all_lidars(cls, value: Any, info: ValidationInfo) -> Any:
+        if info.field_name == "order" and len(set(value)) < len(value):
+            raise ValueError("names a LiDAR twice")
+        # An order with a problem is missing here, and is reported itself.
+        order = info.data.get("order", ())
+        size = 6 * len(order)
+        if size and info.field_name in ("covariance", "data_information"):
+            check_matrix(value, size)
+        if size and info.field_name == "data_gradient" and value is not None and len(value) != size:
+            raise ValueError(f"must be {size} numbers, has {len(value)}")
+        if info.field_name == "T_vehicle_lidar" and not set(order) <= value.keys():
+            raise ValueError(f"must have a pose of each of {', '.join(order)}")
+        return value
+
+
+class _EarlierPart(_OrderedPart):
+    """What an earlier drive measured."""
+
+    drive_sha256: list[Text]
+    T_vehicle_lidar: dict[Text, PosePart]
+    data_information: Matrix
+    data_gradient: list[Finite]
+
+    def term(self) -> DataTerm:
+        """The same in vehicle axes."""
+        poses = {name: self.T_vehicle_lidar[name].pose() for name in self.order}
+        axes = block_diag(*(right_to_vehicle_axes(T) for T in poses.values()))
+        return DataTerm(
+            sources=tuple(self.drive_sha256),
+            T_vehicle_lidar=poses,
+            information=axes @ symmetric(self.data_information) @ axes.T,
+            gradient=axes @ np.array(self.data_gradient),
+        )
+
+
+class _JointPart(_OrderedPart):
+    covariance: Matrix
+    data_information: Matrix
+    data_gradient: list[Finite] | None = None
+    earlier: tuple[_EarlierPart, ...] = ()
+
+
+class _DirectionPart(Part):
+    direction: dict[Text, Vector6]
+    text: Text
+    remedy: Text = ""
+    together: StrictBool | None = None
+    # Other writers leave these out: unknown.
+    sigma_data: Number = math.nan
+    sigma_prior: Number = math.nan
+
+    def read(self, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Direction:
+        """The direction; whether all LiDARs move as one is worked out where the file is silent."""
+        vector = {name: np.array(numbers) for name, numbers in self.direction.items()}
+        together = self.together
+        if together is None:
+            together = rigid_twist(vector, T_vehicle_lidar) is not None
+        return Direction(
+            vector=vector,
+            sigma_data=self.sigma_data,
+            sigma_prior=self.sigma_prior,
+            together=together,
+            text=self.text,
+            remedy=self.remedy,
+        )
+
+
+class _ObservabilityPart(Part):
+    undetermined: list[_DirectionPart]
+    weak: list[_DirectionPart]
+
+
+class _PairPart(Part):
+    from_: Text = Field(alias="from")
+    to: Text
+    # Not used, for it follows from the extrinsics; but a damaged file is to be noticed.
+    T_to_from: PosePart
+    covariance: PoseMatrix
+
+
+class CalibrationModel(Part):
+    """A calibration.yaml."""
+
+    schema_: Schema = Field(alias="schema")
+    lidars: dict[Text, _LidarPart] = Field(min_length=1)
+    joint: _JointPart
+    status: Status
+    reference: Text
+    observability: _ObservabilityPart
+    sensor_to_sensor: list[_PairPart] | None = None
+    unmet: tuple[Text, ...] = ()
+    contradictions: tuple[Text, ...] = ()
+    provenance: dict[Text, Any] = Field({})
+
+    @field_validator("lidars")
+    @classmethod
+    def _names_can_be_shown(cls, lidars: dict[str, _LidarPart]) -> dict[str, _LidarPart]:
+        for problem in filter(None, map(name_problem, lidars)):
+            raise ValueError(problem)
+        return lidars
+
+    @model_validator(mode="after")
+    def _knows_all_names(self) -> Self:
+        if sorted(self.joint.order) != sorted(self.lidars):
+            raise ValueError(
+                f"'joint.order': {self.joint.order} must be the LiDARs of the file, "
+                f"{list(self.lidars)}"
+            )
+        directions = (*self.observability.undetermined, *self.observability.weak)
+        pairs = self.sensor_to_sensor or ()
+        named = {
+            "reference": [self.reference],
+            "observability": [name for part in directions for name in part.direction],
+            "sensor_to_sensor": [name for pair in pairs for name in (pair.from_, pair.to)],
+        }
+        for place, names in named.items():
+            for name in names:
+                if name not in self.lidars:
+                    known = ", ".join(self.lidars)
+                    raise ValueError(f"'{place}': '{name}' is not a LiDAR of the file: {known}")
+        return self
+
+    def calibration(self) -> Calibration:
+        """The calibration. The LiDARs are in the order of the matrices."""
+        joint = self.joint
+        information = symmetric(joint.data_information)
+        lidars = {
+            name: self.lidars[name].result(bool(np.any(information[6 * i : 6 * i + 6])))
+            for i, name in enumerate(joint.order)
+        }
+        poses = {name: lidar.T_vehicle_lidar for name, lidar in lidars.items()}
+        gradient = joint.data_gradient
+        return Calibration(
+            status=self.status,
+            reference=self.reference,
+            lidars=lidars,
+            cov_joint=symmetric(joint.covariance),
+            information_data=information,
+            undetermined=tuple(d.read(poses) for d in self.observability.undetermined),
+            weak=tuple(d.read(poses) for d in self.observability.weak),
+            unmet=self.unmet,
+            contradictions=self.contradictions,
+            provenance=self.provenance,
+            gradient_data=None if gradient is None else np.array(gradient),
+            earlier=tuple(part.term() for part in joint.earlier),
+        )
+
+    def cov_pairs(self, calibration: Calibration) -> dict[tuple[str, str], Array]:
+        """Covariances of the pairs as the file states them, else of the joint covariance."""
+        if self.sensor_to_sensor is None:
+            pairs = sensor_pairs(calibration.lidars, calibration.reference)
+            return {pair: pair_covariance(calibration, *pair) for pair in pairs}
+        return {(pair.from_, pair.to): symmetric(pair.covariance) for pair in self.sensor_to_sensor}
+
+
+class _TrueLidarPart(Part):
+    T_vehicle_lidar: PosePart
+
+
+class TruthModel(Part):
+    """A truth.yaml; a calibration.yaml is one, too."""
+
+    lidars: dict[Text, _TrueLidarPart] = Field(min_length=1)

@@ -1,0 +1,312 @@
+"""Candidates for the target in one scan: pre-alignment, region, ground, clusters, outlier filter.
+
+Paper III-D.2 and, for the voxel and outlier filters, its real-world section. The region is widened
+by the error that the initial guess may have: 3 degrees at 20 m displace the target by 1 m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
+from caliv_graph.products import Array, IntArray, LidarScan, TargetCloud
+from caliv_graph.targets.cloud.field_of_view import azimuth_edges, is_cut
+from caliv_graph.targets.cloud.track import CandidateSet
+from caliv_graph.targets.ground.fit import fit_ground, height_above
+from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+GUESS_SIGMAS = 2.0
+"""Standard deviations of the initial guess that the region is widened by; a uniform error ends at
+1.7 of them."""
+
+TRUSTED_MARGIN_M = 0.1
+"""Margin for an extrinsic that is fixed: the error of the vehicle's poses."""
+
+MAX_HEIGHT_M = 2.5
+"""Maximum height of a candidate: targets are at most 2 m high, and a ground plane has errors at the
+rim."""
+
+MIN_EXTENT_M = 0.2
+MAX_EXTENT_M = 2.0
+"""Bounds of the largest horizontal extent of a candidate. Targets are 0.3 to 1.5 m wide; partial
+views are smaller, tilt errors of the ground and noise make them larger."""
+
+LINK_M = 0.3
+"""Points nearer than this belong to one object; in sparse clouds the distance is larger."""
+
+OUTSIDE_M = 0.2
+"""Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
+
+MOST_CANDIDATES = 4
+"""Objects of one scan that are kept until the static one is known."""
+
+
+@dataclass
+class Tally:
+    """Counts of the scans of one LiDAR, and how near its returns came to the region."""
+
+    scans: int = 0
+    kept: int = 0
+    nearest_m: float = math.inf
+    most_points: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An object in a scan that may be the target.
+
+    Attributes:
+        cloud: its points.
+        centre_lidar: (3,) metres, middle of its extent.
+        R_region_lidar: (3, 3) at the guess.
+        t_region_lidar: (3,) metres, at the guess.
+        cut: whether the edge of the field of view may cut it off.
+    """
+
+    cloud: TargetCloud
+    centre_lidar: Array
+    R_region_lidar: Array
+    t_region_lidar: Array
+    cut: bool
+
+
+def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
+    """Displacement of a target at `range_m` that the guess of a LiDAR may cause, metres."""
+    sigma = config.lidars[lidar].sigma
+    if config.lidars[lidar].fixed:
+        return TRUSTED_MARGIN_M
+    return GUESS_SIGMAS * (max(sigma.xyz_m()) + max(sigma.rpy_rad()) * range_m)
+
+
+def _clusters(points: Array, link_m: float) -> IntArray:
+    """Labels (N,) of connected components: points nearer than `link_m` are connected."""
+    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
+    graph = coo_array(
+        (np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])),
+        shape=(len(points), len(points)),
+    )
+    _, labels = connected_components(graph, directed=False)
+    return np.asarray(labels, dtype=np.int64)
+
+
+def _filtered(points: Array, extraction: ExtractionConfig) -> IntArray:
+    """Indices of the points that survive the voxel and the statistical outlier filter."""
+    keep = np.arange(len(points))
+    if extraction.voxel > 0.0:
+        cells = np.floor(points / extraction.voxel).astype(np.int64)
+        keep = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    k = extraction.outlier_neighbours
+    if k and len(keep) > k + 1:
+        distances, _ = cKDTree(points[keep]).query(points[keep], k + 1)
+        distance = np.asarray(distances)[:, 1:].mean(axis=1)
+        limit = distance.mean() + extraction.outlier_ratio * distance.std()
+        keep = keep[distance <= limit]
+    return keep
+
+
+class RegionExtractor:
+    """Finds the target of one region in the scans of a drive.
+
+    Attributes:
+        centre: (3,) metres, middle of the region in its own frame.
+        tallies: counts of each LiDAR, for messages.
+    """
+
+    def __init__(self, region: TargetRegion, config: Config, trajectory: VehicleTrajectory) -> None:
+        """Binds the region to a drive."""
+        self._region = region
+        self._config = config
+        self._trajectory = trajectory
+        self._low = np.array(region.min)
+        self._high = np.array(region.max)
+        self.centre = 0.5 * (self._low + self._high)
+        R, t = np.eye(3), np.zeros(3)
+        if region.frame == "start":
+            begin, _ = trajectory.span_ns
+            R, t = (part[0] for part in trajectory.poses_at([begin]))
+        self._R_map_region, self._t_map_region = R, t
+        self._guess = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+        self.tallies: dict[str, Tally] = {name: Tally() for name in config.lidars}
+
+    @property
+    def trajectory(self) -> VehicleTrajectory:
+        """The vehicle's poses in the drive."""
+        return self._trajectory
+
+    def fresh(self) -> RegionExtractor:
+        """The same extractor with empty tallies."""
+        return RegionExtractor(self._region, self._config, self._trajectory)
+
+    @property
+    def centre_map(self) -> Array:
+        """(3,) metres, middle of the region in the map."""
+        return np.asarray(self._R_map_region @ self.centre + self._t_map_region)
+
+    def accept(self, candidate: Candidate) -> TargetCloud | None:
+        """The cloud of a candidate, unless the edge of the field of view cuts it off."""
+        tally = self.tallies[candidate.cloud.lidar]
+        if candidate.cut:
+            tally.rejected["cut off by the edge of the field of view"] += 1
+            return None
+        tally.kept += 1
+        return candidate.cloud
+
+    def candidates(self, scan: LidarScan, drive: int) -> list[Candidate]:
+        """The objects in a scan that may be the target, at most `MOST_CANDIDATES`, best first."""
+        tally = self.tallies[scan.lidar]
+        tally.scans += 1
+        extraction = self._config.extraction
+        T_vehicle_lidar = self._guess[scan.lidar]
+        rotations, translations = self._lidar_poses(scan.lidar, [scan.stamp_ns])
+        R, t = rotations[0], translations[0]
+        if len(scan.points_lidar) == 0:
+            tally.rejected["empty within the range limits"] += 1
+            return []
+        range_m = float(np.linalg.norm(self.centre - t))
+        margin = widened_margin_m(self._config, scan.lidar, range_m)
+        points, near = self._near_region(scan.points_lidar, R, t, margin, tally)
+        if len(near) < extraction.min_points:
+            tally.rejected["outside the region"] += 1
+            return []
+        plane = fit_ground(points, extraction.ground_distance)
+        if plane is None:
+            # No ground inside the region: all points are candidates.
+            height = np.full(len(near), extraction.ground_distance * 2.0)
+        else:
+            height = height_above(plane, points)
+        above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
+        points, near = points[above], near[above]
+        objects = self._objects(points, range_m)
+        if not objects:
+            tally.rejected["nothing above the ground that is 0.2 to 2 m wide"] += 1
+            return []
+        edges = azimuth_edges(scan.points_lidar)
+        out = []
+        for chosen in objects:
+            kept = near[chosen][_filtered(points[chosen], extraction)]
+            tally.most_points = max(tally.most_points, len(kept))
+            if len(kept) < extraction.min_points:
+                continue
+            times = None if scan.point_times_s is None else scan.point_times_s[kept]
+            compact = replace(scan, points_lidar=scan.points_lidar[kept], point_times_s=times)
+            target = deskew(compact, T_vehicle_lidar, self._trajectory).points_lidar
+            low, high = np.percentile(target, [2, 98], axis=0)
+            out.append(
+                Candidate(
+                    cloud=TargetCloud(
+                        scan.lidar,
+                        drive,
+                        scan.stamp_ns,
+                        target,
+                        scan.source,
+                        swept=None if times is None else compact,
+                    ),
+                    centre_lidar=0.5 * (low + high),
+                    R_region_lidar=R,
+                    t_region_lidar=t,
+                    cut=is_cut(target, edges, len(scan.points_lidar)),
+                )
+            )
+        if not out:
+            tally.rejected[f"under {extraction.min_points} points"] += 1
+        return out
+
+    def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int]) -> tuple[Array, Array]:
+        """Rotations (m, 3, 3) and translations (m, 3) of T_region_lidar, at the guess."""
+        R_map_vehicle, t_map_vehicle = self._trajectory.poses_at(stamps_ns)
+        guess = self._guess[lidar]
+        R = self._R_map_region.T @ R_map_vehicle @ guess.rotation().matrix()
+        t = t_map_vehicle + R_map_vehicle @ guess.translation() - self._t_map_region
+        return R, t @ self._R_map_region
+
+    def directions(self, lidar: str, stamps_ns: Sequence[int]) -> Array:
+        """(m, 3) metres, lidar frame: middle of the region at the stamps, at the guess."""
+        R, t = self._lidar_poses(lidar, stamps_ns)
+        return np.asarray(np.einsum("mji,mj->mi", R, self.centre - t))
+
+    def reach_m(self) -> float:
+        """Half the diagonal of the region, metres."""
+        return 0.5 * float(np.linalg.norm(self._high - self._low))
+
+    def _near_region(
+        self, points_lidar: Array, R: Array, t: Array, margin: float, tally: Tally
+    ) -> tuple[Array, IntArray]:
+        """Points within `margin` of the region, in its frame, and their indices.
+
+        A ball around the region is tested first: most of a scan is far away.
+        """
+        centre_lidar = R.T @ (self.centre - t)
+        offset = points_lidar - centre_lidar
+        distance2 = np.einsum("ni,ni->n", offset, offset)
+        radius = self.reach_m() + margin
+        near = np.flatnonzero(distance2 < radius**2)
+        if len(near) == 0:
+            near = np.array([distance2.argmin()])
+        points = points_lidar[near] @ R.T + t
+        outside = np.maximum(np.maximum(self._low - points, points - self._high), 0.0)
+        distance = np.sqrt(np.einsum("ni,ni->n", outside, outside))
+        tally.nearest_m = min(tally.nearest_m, float(distance.min()))
+        inside = distance <= margin
+        return points[inside], near[inside]
+
+    def _objects(self, points: Array, range_m: float) -> list[IntArray]:
+        """Indices of the objects of the right size, the best inside the region first."""
+        if len(points) < 3:
+            return []
+        # Beams diverge: gaps within one object at 20 m separate two objects at 5 m.
+        labels = _clusters(points, max(LINK_M, 0.02 * range_m))
+        scored = []
+        for label in np.unique(labels):
+            member = np.flatnonzero(labels == label)
+            extent = np.ptp(points[member, :2], axis=0).max()
+            if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
+                continue
+            centre = points[member].mean(axis=0)
+            off = np.maximum(np.maximum(self._low - centre, centre - self._high), 0.0)
+            scored.append((len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M), member))
+        scored.sort(key=lambda pair: -pair[0])
+        return [member for _, member in scored[:MOST_CANDIDATES]]
+
+    def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
+        """The clouds of the static object among the candidates, one per scan at most.
+
+        With a wrong guess even a static object moves in the map; but one error of the extrinsic,
+        small by its sigma, must explain that motion (`track`). Somebody who walks past does not
+        fit, nor does another object in some of the scans.
+
+        Args:
+            found: the candidates of each scan, best first.
+            lidar: its name.
+        """
+        scans = [candidates for candidates in found if candidates]
+        if not scans:
+            return []
+        sigma = self._config.lidars[lidar].sigma
+        prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
+        if self._config.lidars[lidar].fixed:
+            prior = np.full(6, 1e-3)
+        flat = [(i, c) for i, candidates in enumerate(scans) for c in candidates]
+        index = np.array([i for i, _ in flat])
+        members = [c for _, c in flat]
+        best = CandidateSet.of(
+            np.array([c.centre_lidar for c in members]),
+            np.array([c.R_region_lidar for c in members]),
+            np.array([c.t_region_lidar for c in members]),
+            index,
+            prior,
+        ).longest_track()
+        lost = len(scans) - len(best)
+        if lost:
+            self.tallies[lidar].rejected["something else stood there"] += lost
+        clouds = [self.accept(flat[n][1]) for n in best.tolist()]
+        return [cloud for cloud in clouds if cloud is not None]

@@ -1,0 +1,93 @@
+"""The static object among the candidates of a LiDAR's scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.geometry.se3 import skew
+from caliv_graph.products import Array, IntArray
+
+SEEDS = 24
+"""Candidates from which a track is begun."""
+
+STANDS_STILL_M = 0.35
+"""Final gate of a track: the middle of a target's visible points moves by this as one passes it."""
+
+GATE_STEPS = (1.0, 0.5, 0.2, 0.05, 0.0)
+"""Factors on the possible error of the guess in the gate, while the error is estimated."""
+
+PLACE_SIGMA_M = 0.1
+"""Scatter of the middle of a target's visible points, 1 sigma."""
+
+
+@dataclass(frozen=True)
+class CandidateSet:
+    """The candidates of all scans of a LiDAR, and how its extrinsic moves them.
+
+    Attributes:
+        scan: (n,) index of the scan of each candidate.
+        places: (n, 3) metres, region frame, at the guess.
+        moves: (n, 3, 6) derivative of the place by a right perturbation of the extrinsic.
+        reach_m: (n,) displacement that the guess may cause there.
+        prior: (6,) sigmas of the guess, rad and m.
+    """
+
+    scan: IntArray
+    places: Array
+    moves: Array
+    reach_m: Array
+    prior: Array
+
+    @classmethod
+    def of(
+        cls, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array
+    ) -> CandidateSet:
+        """The candidates of a LiDAR.
+
+        Args:
+            centres_lidar: (n, 3) metres, middle of each.
+            R: (n, 3, 3) of T_region_lidar at the guess.
+            t: (n, 3) of it, metres.
+            scan: (n,) index of the scan of each.
+            prior: (6,) sigmas of the guess, rad and m.
+        """
+        places = np.einsum("nij,nj->ni", R, centres_lidar) + t
+        moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)
+        reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
+        return cls(scan, places, moves, reach_m, prior)
+
+    def longest_track(self) -> IntArray:
+        """Indices of the candidates of the object that is static in most scans, one per scan."""
+        count = len(self.scan)
+        seeds = np.linspace(0, count - 1, min(count, SEEDS)).round().astype(int)
+        # The best candidates of a scan come first: among equal tracks the larger object wins.
+        best: IntArray = max((self.track(int(seed)) for seed in seeds), key=len)
+        return best
+
+    def track(self, seed: int) -> IntArray:
+        """Indices of the candidates of the same object as candidate `seed`, one per scan."""
+        place, error = self.places[seed], np.zeros(6)
+        gates = STANDS_STILL_M + np.outer(GATE_STEPS, self.reach_m + self.reach_m[seed])
+        members = np.array([seed])
+        for gate_m in gates:
+            off = np.linalg.norm(self.places + self.moves @ error - place, axis=1)
+            order = np.lexsort([off, self.scan])
+            first = order[np.unique(self.scan[order], return_index=True)[1]]
+            members = first[off[first] < gate_m[first]]
+            if len(members) < 2:
+                return np.asarray(members, np.int64)
+            place, error = self._fit(members)
+        return np.asarray(members, np.int64)
+
+    def _fit(self, members: IntArray) -> tuple[Array, Array]:
+        """Least squares of the object's place (3,) and the error (6,) of the guess."""
+        A = np.concatenate(
+            [np.tile(np.eye(3), (len(members), 1, 1)), -self.moves[members]], axis=2
+        ).reshape(-1, 9)
+        prior = np.hstack([np.zeros((6, 3)), np.diag(PLACE_SIGMA_M / self.prior)])
+        rows = np.vstack([A, prior])
+        right = np.concatenate([self.places[members].ravel(), np.zeros(6)])
+        x = np.linalg.lstsq(rows, right, rcond=None)[0]
+        return x[:3], x[3:]

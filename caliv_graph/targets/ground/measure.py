@@ -1,0 +1,189 @@
+"""The ground in the scans of a drive, wherever a LiDAR sees a target."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import (
+    GroundObservation,
+    IntArray,
+    LidarScan,
+    Recording,
+    TargetObservation,
+)
+from caliv_graph.targets.ground.planes import fit_plane, near_points, response
+from caliv_graph.trajectory.deskew import deskewed
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+EXTRINSIC_STEP_RAD = 1e-3
+"""Step of the numerical derivative with respect to the extrinsic's rotation: the displacement of
+points during a sweep is linear far beyond it."""
+
+MAX_APART_NS = 60_000_000
+"""Maximum time between a scan and the pose that it is used for. Every LiDAR of 10 Hz has a scan
+within half its period, over which any trajectory is right to 1 mm."""
+
+
+class GroundMeter:
+    """Measures the ground in the scans of one drive, one at a time."""
+
+    def __init__(self, config: Config, trajectory: VehicleTrajectory, drive: int) -> None:
+        """Binds the initial guesses to the trajectory of a drive."""
+        self._sigma_range_m = config.noise.lidar_range_m
+        self._trajectory = trajectory
+        self._drive = drive
+        self._guess: Mapping[str, gtsam.Pose3] = {
+            name: lidar.initial.pose() for name, lidar in config.lidars.items()
+        }
+        self._scans: Counter[str] = Counter()
+        self._without: dict[str, Counter[str]] = {name: Counter() for name in config.lidars}
+
+    def measure(self, scan: LidarScan, at_ns: int | None = None) -> GroundObservation | None:
+        """The ground's plane in a scan as it was read; None if there is none.
+
+        Args:
+            scan: not motion compensated; its stamp within the trajectory's span.
+            at_ns: a stamp near the scan's, at which the ground is wanted; None: the scan's own. The
+                plane is relative to the LiDAR's pose at that time, by the trajectory.
+
+        Raises:
+            TrajectoryError: the stamp is outside the trajectory's span, or point times are invalid.
+        """
+        self._scans[scan.lidar] += 1
+        at_ns = scan.stamp_ns if at_ns is None else at_ns
+        R_map_vehicle, _ = self._trajectory.poses_at([at_ns])
+        guess = self._guess[scan.lidar]
+        up_lidar = (R_map_vehicle[0] @ guess.rotation().matrix())[2]
+        # Before the motion compensation, which takes most of the time.
+        near = near_points(scan.points_lidar, up_lidar)
+        times_s = np.full(len(near), (scan.stamp_ns - at_ns) / NANOSECONDS_PER_SECOND)
+        if scan.point_times_s is not None:
+            times_s += scan.point_times_s[near]
+        part = replace(
+            scan, stamp_ns=at_ns, points_lidar=scan.points_lidar[near], point_times_s=times_s
+        )
+        rotated = [guess.retract(d) for d in EXTRINSIC_STEP_RAD * np.eye(3, 6)]
+        by_guess = deskewed(part, [guess, *rotated], self._trajectory)
+        points = next(by_guess)
+        plane, reason = fit_plane(points, up_lidar, self._sigma_range_m)
+        if plane is None:
+            self._without[scan.lidar][reason] += 1
+            return None
+        by_extrinsic = None
+        if times_s.any():
+            moved = [of_rotated - points for of_rotated in by_guess]
+            by_extrinsic = (
+                response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
+                / EXTRINSIC_STEP_RAD
+            )
+        return GroundObservation(
+            lidar=scan.lidar,
+            drive=self._drive,
+            stamp_ns=at_ns,
+            normal_lidar=plane.normal_lidar,
+            distance_m=plane.distance_m,
+            axes_lidar=plane.axes_lidar,
+            cov=plane.cov_with_floors,
+            centre_lidar=plane.centre_lidar,
+            points=plane.points,
+            R_vehicle_lidar=None if by_extrinsic is None else guess.rotation().matrix(),
+            by_extrinsic=by_extrinsic,
+            apart_ns=scan.stamp_ns - at_ns,
+        )
+
+    def warnings(self) -> tuple[str, ...]:
+        """LiDARs that have no ground in most of their scans, and the reasons, a line each."""
+        lines = []
+        for name, reasons in self._without.items():
+            lost, scans = sum(reasons.values()), self._scans[name]
+            if 2 * lost > scans:
+                why = ", ".join(f"{n} {text}" for text, n in reasons.most_common(3))
+                lines.append(
+                    f"ground: lidar '{name}' has it in {scans - lost} of {scans} scans of drive "
+                    f"{self._drive + 1}: {why}"
+                )
+        return tuple(lines)
+
+
+def nearest_scans(
+    poses_ns: Sequence[int] | IntArray, scans_ns: Sequence[int] | IntArray
+) -> dict[int, int]:
+    """For each pose the nearest scan, if one is near enough.
+
+    Args:
+        poses_ns: stamps of the poses.
+        scans_ns: stamps of the scans of one LiDAR, ascending.
+
+    Returns:
+        Stamp of the pose by stamp of the scan. No scan is used twice.
+    """
+    scans = np.asarray(scans_ns, dtype=np.int64)
+    out: dict[int, int] = {}
+    if not len(scans):
+        return out
+    for pose_ns in map(int, poses_ns):
+        after = int(np.searchsorted(scans, pose_ns))
+        near = scans[max(after - 1, 0) : after + 1]
+        scan_ns = int(near[np.abs(near - pose_ns).argmin()])
+        apart = abs(scan_ns - pose_ns)
+        if apart <= MAX_APART_NS and (scan_ns not in out or apart < abs(scan_ns - out[scan_ns])):
+            out[scan_ns] = pose_ns
+    return out
+
+
+def measure_grounds(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    targets: Sequence[TargetObservation],
+    config: Config,
+    progress: Progress,
+) -> tuple[tuple[GroundObservation, ...], tuple[str, ...]]:
+    """The ground in the scans of all LiDARs, whenever one of them sees a target.
+
+    All LiDARs at the same poses: heave of the body and error of the trajectory are then common to
+    them, and the ground determines S2S to the 2 mm of a plane.
+
+    Args:
+        recordings: the drives.
+        trajectories: one per drive.
+        targets: the stamps of their clouds are the poses of the graph.
+        config: initial guesses, noise, and whether the ground is to be used.
+        progress: advances with every scan.
+
+    Returns:
+        Observations by drive, LiDAR and stamp, each at the stamp of a pose; and warnings.
+
+    Raises:
+        RecordingError: a cloud could not be read.
+    """
+    if not config.ground.use:
+        return (), ()
+    poses = sorted({(c.drive, c.stamp_ns) for o in targets for c in o.clouds})
+    seeing = {c.lidar for o in targets for c in o.clouds}
+    names = [n for n, lidar in config.lidars.items() if n in seeing or lidar.fixed]
+    wanted: list[tuple[int, str, dict[int, int]]] = []
+    for drive, recording in enumerate(recordings):
+        begin, end = trajectories[drive].span_ns
+        of_drive = [stamp for d, stamp in poses if d == drive]
+        for name in names:
+            scans = [t for t in recording.scan_stamps_ns(name) if begin <= t <= end]
+            wanted.append((drive, name, nearest_scans(of_drive, scans)))
+    found: list[GroundObservation] = []
+    meters = [GroundMeter(config, t, drive) for drive, t in enumerate(trajectories)]
+    total = sum(len(pairs) for _, _, pairs in wanted)
+    with progress.stage("reading the ground", total) as advance:
+        for drive, name, pairs in wanted:
+            for scan in recordings[drive].scans(name, pairs) if pairs else ():
+                observation = meters[drive].measure(scan, pairs[scan.stamp_ns])
+                if observation is not None:
+                    found.append(observation)
+                advance()
+    return tuple(found), tuple(line for meter in meters for line in meter.warnings())

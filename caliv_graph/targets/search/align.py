@@ -1,0 +1,120 @@
+"""The error of a LiDAR's guess in yaw and shift, from the objects that stand still."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Array, IntArray
+from caliv_graph.targets.search.history import Alignment, LidarHistory
+from caliv_graph.targets.search.objects import WIDE_M
+
+MIN_VIEWS = 3
+"""Minimum number of scans of a track."""
+
+GATE_M = 0.5
+"""Distance from its place within which an object is associated with a track: half the change of its
+visible side, and the effect of roll and pitch of the guess on objects lower than the LiDAR."""
+
+ALIGN_STEP_M = 0.2
+ALIGN_RANGE_M = 20.0
+"""The yaw of a LiDAR is searched in steps that displace objects at `ALIGN_RANGE_M` by
+`ALIGN_STEP_M`."""
+
+GUESS_SIGMAS = 2.5
+"""Bound of the error of the guess, in sigmas; a uniform error ends at 1.7."""
+
+PLACE_SIGMA_M = 0.2
+"""Scatter of the middle of an object's visible points, 1 sigma."""
+
+
+def align(history: LidarHistory, config: Config) -> Alignment:
+    """The yaw and shift of a LiDAR that minimise the motion of its objects in the map.
+
+    Yaw is searched, then both are refined. On an arc they are correlated: then the smallest
+    correction is taken.
+    """
+    lidar = config.lidars[history.name]
+    usable = history.whole & (history.extent_m < WIDE_M)
+    if lidar.fixed or usable.sum() < MIN_VIEWS:
+        return Alignment()
+    sigma_yaw = lidar.sigma.rpy_rad()[2]
+    limit = GUESS_SIGMAS * sigma_yaw
+    steps = math.ceil(limit * ALIGN_RANGE_M / ALIGN_STEP_M)
+    best, best_score = Alignment(), -math.inf
+    for yaw in limit * np.arange(-steps, steps + 1) / max(steps, 1):
+        tree = cKDTree(history.bases(Alignment(float(yaw)))[usable, :2])
+        pairs = tree.count_neighbors(tree, np.array([0.5, 1.0]) * GATE_M).sum() - 2 * usable.sum()
+        # Among equal scores the guess decides.
+        score = float(pairs) * (1.0 - 0.02 * (yaw / sigma_yaw) ** 2)
+        if score > best_score:
+            best, best_score = Alignment(float(yaw)), score
+    for _ in range(3):
+        best = _refined(history, best, config)
+    return best
+
+
+def _refined(history: LidarHistory, alignment: Alignment, config: Config) -> Alignment:
+    """Least squares of yaw and shift: one place per track, the guess as a prior."""
+    sigma = config.lidars[history.name].sigma
+    prior = np.array([sigma.rpy_rad()[2], *sigma.xyz_m()[:2]])
+    gate = gate_m(history, config)
+    bases = history.bases(alignment)[:, :2]
+    J = np.zeros((len(bases), 2, 3))
+    J[:, :, 0] = history.levers(alignment)
+    J[:, :, 1:] = history.R_map_vehicle[history.scan_of][:, :2, :2]
+    now = np.array([alignment.yaw_rad, *alignment.shift_m])
+    H, g = np.diag(prior**-2.0), -now / prior**2
+    for members in tracks_at_places(history, bases, gate):
+        if len(members) < 2 * MIN_VIEWS:
+            continue
+        # The place is unknown too: its elimination subtracts the means.
+        Jc = (J[members] - J[members].mean(axis=0)).reshape(-1, 3)
+        r = (bases[members] - bases[members].mean(axis=0)).ravel()
+        H += Jc.T @ Jc / PLACE_SIGMA_M**2
+        g -= Jc.T @ r / PLACE_SIGMA_M**2
+    now = np.clip(now + np.linalg.solve(H, g), -GUESS_SIGMAS * prior, GUESS_SIGMAS * prior)
+    return Alignment(float(now[0]), now[1:])
+
+
+def gate_m(history: LidarHistory, config: Config) -> float:
+    """Distance within which an object of an aligned LiDAR is associated with a track, metres."""
+    lidar = config.lidars[history.name]
+    return GATE_M + (0.0 if lidar.fixed else max(lidar.sigma.xyz_m()))
+
+
+def tracks_at_places(history: LidarHistory, bases: Array, radius_m: float) -> list[IntArray]:
+    """Indices of the objects of each track, one per scan; the place with most scans first.
+
+    Args:
+        history: of the LiDAR.
+        bases: (n, 2) metres, places of its objects.
+        radius_m: of a place.
+    """
+    left = history.whole & (history.extent_m < WIDE_M)
+    out = []
+    while left.sum() >= MIN_VIEWS:
+        index = np.flatnonzero(left)
+        tree = cKDTree(bases[index])
+        near = tree.query_ball_point(bases[index], radius_m)
+        views = [len(np.unique(history.scan_of[index[n]])) for n in near]
+        centre = bases[index[int(np.argmax(views))]]
+        for _ in range(3):
+            members = index[tree.query_ball_point(centre, radius_m)]
+            if not len(members):
+                break
+            centre = np.average(bases[members], axis=0, weights=1.0 / history.range_m[members])
+        if not len(members):
+            members = index[near[int(np.argmax(views))]]
+        # Of two objects in one scan, the one with more points.
+        order = np.lexsort((-history.points[members], history.scan_of[members]))
+        _, first = np.unique(history.scan_of[members[order]], return_index=True)
+        if len(first) < MIN_VIEWS and max(views) < MIN_VIEWS:
+            break
+        if len(first) >= MIN_VIEWS:
+            out.append(np.asarray(members[order[first]]))
+        left[members] = False
+    return out

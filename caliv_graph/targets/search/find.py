@@ -1,0 +1,227 @@
+"""The search itself: which scans are read, and which object of a drive is its target."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.common.progress import Advance, Progress
+from caliv_graph.config.model import Config, TargetRegion
+from caliv_graph.errors import TargetError
+from caliv_graph.products import Array, IntArray, Recording
+from caliv_graph.targets.search.align import align
+from caliv_graph.targets.search.history import LidarHistory
+from caliv_graph.targets.search.objects import WIDE_M, segment_scan
+from caliv_graph.targets.search.tracks import (
+    MAX_EXTENT_M,
+    Proposal,
+    Track,
+    judged_tracks,
+    matched,
+)
+from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+SCANS = 60
+"""Scans of one LiDAR that are read in a short drive."""
+
+PERIOD_S = 1.0
+"""Longest time between two of them: a vehicle at 10 m/s passes a target in a few seconds."""
+
+MAX_SCANS = 240
+"""Scans of one LiDAR that are read at most, however long the drive is."""
+
+STANDS_M = 0.2
+STANDS_RAD = math.radians(2.0)
+"""Motion of the vehicle since the last scan below which a scan shows nothing new."""
+
+STANDING_PERIODS = 4
+"""While the vehicle stands, every fourth scan is read: other objects move."""
+
+REGION_MARGIN_M = 0.3
+"""Margin of the region about the object on each side."""
+
+
+@dataclass(frozen=True)
+class FoundTarget:
+    """The target of one drive.
+
+    Attributes:
+        drive: index of the drive.
+        region: a tight box in the map about the object. The extraction allows for the errors of the
+            guesses: a box that held the object as each guess places it would hold its neighbours.
+        centre_map: (3,) metres, about its middle; as good as the guesses.
+        extent_m: largest horizontal extent.
+        height_m: above the ground.
+        scans: per LiDAR, the number of read scans in which it was seen well; 0 for a LiDAR that
+            does not see it.
+        looked_at: per LiDAR, the number of scans that were read.
+        aligned: per LiDAR, T_vehicle_lidar with corrected yaw and shift (`align`): better than the
+            guess for associating objects, but no estimate.
+        others: other proposals, a phrase each.
+    """
+
+    drive: int
+    region: TargetRegion
+    centre_map: Array
+    extent_m: float
+    height_m: float
+    scans: Mapping[str, int]
+    looked_at: Mapping[str, int]
+    aligned: Mapping[str, gtsam.Pose3]
+    others: tuple[str, ...]
+
+
+def find_target(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+) -> list[FoundTarget]:
+    """Finds the target of each drive.
+
+    Args:
+        recordings: the drives.
+        trajectories: one per drive.
+        config: initial guesses and their sigmas, ranges, minimum points and scans.
+        progress: advances with every scan.
+
+    Returns:
+        One target per drive, in their order.
+
+    Raises:
+        TargetError: a drive shows no object that could be a target.
+        RecordingError: a cloud could not be read.
+    """
+    stamps = [
+        {name: _scans_to_read(recording.scan_stamps_ns(name), trajectory) for name in config.lidars}
+        for recording, trajectory in zip(recordings, trajectories, strict=True)
+    ]
+    total = sum(len(s) for drive in stamps for s in drive.values())
+    out = []
+    with progress.stage("finding the target", total) as advance:
+        for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
+            histories = [
+                _read_history(recording, trajectory, config, name, chosen, advance)
+                for name, chosen in stamps[drive].items()
+            ]
+            out.append(_target_of_drive(drive, recording.name, histories, config))
+    return out
+
+
+def _scans_to_read(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> IntArray:
+    """Stamps of the scans of a LiDAR to read: evenly in time, fewer while the vehicle stands."""
+    begin, end = trajectory.span_ns
+    lost = set(trajectory.lost_ns)
+    stamps = np.array([s for s in stamps_ns if begin <= s <= end and s not in lost], np.int64)
+    if len(stamps) < 2:
+        return stamps
+    duration_s = 1e-9 * float(stamps[-1] - stamps[0])
+    period_s = max(min(PERIOD_S, duration_s / SCANS), duration_s / MAX_SCANS)
+    slots = np.arange(0.0, duration_s + 0.5 * period_s, period_s)
+    # A slot takes the next scan, with 1 ms for stamps that jitter about the slot.
+    at = np.searchsorted(stamps, stamps[0] + ((slots - 1e-3) * 1e9).astype(np.int64))
+    stamps = stamps[np.unique(at[at < len(stamps)])]
+    R, t = trajectory.poses_at(stamps)
+    chosen = [0]
+    for i in range(1, len(stamps)):
+        last = chosen[-1]
+        cosine = 0.5 * (float(np.trace(R[last].T @ R[i])) - 1.0)
+        moved = float(np.linalg.norm(t[i] - t[last])) > STANDS_M or cosine < math.cos(STANDS_RAD)
+        if moved or i - last >= STANDING_PERIODS:
+            chosen.append(i)
+    taken: IntArray = stamps[chosen]
+    return taken
+
+
+def _read_history(
+    recording: Recording,
+    trajectory: VehicleTrajectory,
+    config: Config,
+    name: str,
+    chosen: IntArray,
+    advance: Advance,
+) -> LidarHistory:
+    """Reads and segments the chosen scans of one LiDAR."""
+    lidar = config.lidars[name]
+    guess = lidar.initial.pose()
+    scans, stamps = [], []
+    for scan in recording.scans(name, wanted=set(chosen.tolist())):
+        range_m = np.linalg.norm(scan.points_lidar, axis=1)
+        points = deskew(scan, guess, trajectory).points_lidar
+        points = points[(range_m >= lidar.min_range) & (range_m <= lidar.max_range)]
+        R, _ = trajectory.poses_at([scan.stamp_ns])
+        scans.append(segment_scan(points, R[0] @ guess.rotation().matrix()))
+        stamps.append(scan.stamp_ns)
+        advance()
+    poses = trajectory.poses_at(stamps) if stamps else (np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    stride = len(recording.scan_stamps_ns(name)) / max(len(scans), 1)
+    return LidarHistory(name, guess, scans, poses, stride)
+
+
+def _target_of_drive(
+    drive: int, name: str, histories: Sequence[LidarHistory], config: Config
+) -> FoundTarget:
+    """The best proposal of a drive."""
+    alignments = {history.name: align(history, config) for history in histories}
+    tracks = [t for h in histories for t in judged_tracks(h, alignments[h.name], config)]
+    usable = matched([track for track in tracks if not track.verdict])
+    proposals = [c for c in usable if math.isfinite(c.height_m)]
+    if not proposals:
+        raise TargetError(_why_none(name, histories, tracks, len(usable)))
+    proposals.sort(key=Proposal.rank, reverse=True)
+    best = proposals[0]
+    return FoundTarget(
+        drive=drive,
+        region=_region(best),
+        centre_map=best.place + np.array([0.0, 0.0, 0.5 * best.height_m]),
+        extent_m=best.extent_m,
+        height_m=best.height_m,
+        scans={h.name: best.tracks[h.name].good if h.name in best.tracks else 0 for h in histories},
+        looked_at={h.name: len(h.scans) for h in histories},
+        aligned={h.name: h.aligned(alignments[h.name]) for h in histories},
+        others=tuple(str(proposal) for proposal in proposals[1:]),
+    )
+
+
+def _region(target: Proposal) -> TargetRegion:
+    """A box around the target, map frame."""
+    around = 0.5 * target.extent_m + REGION_MARGIN_M
+    reach = np.array([around, around, REGION_MARGIN_M])
+    top = target.place + np.array([0.0, 0.0, target.height_m])
+    return TargetRegion(min=_triple(target.place - reach), max=_triple(top + reach))
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 3) for value in values)
+    return x, y, z
+
+
+def _why_none(
+    name: str, histories: Sequence[LidarHistory], tracks: Sequence[Track], without_top: int
+) -> str:
+    """Why a drive shows no target, in one line."""
+    scans = ", ".join(f"{len(h.scans)} of '{h.name}'" for h in histories)
+    blind = [f"'{h.name}'" for h in histories if not any(s.has_ground for s in h.scans)]
+    found = []
+    reasons = Counter(track.verdict for track in tracks if track.verdict)
+    for verdict, count in reasons.most_common():
+        widths = [track.extent_m for track in tracks if track.verdict == verdict]
+        found.append(f"{count} {verdict} ({min(widths):.1f} to {max(widths):.1f} m wide)")
+    if without_top:
+        found.append(f"{without_top} whose top is never in view")
+    wide = sum(int((h.extent_m >= WIDE_M).sum()) for h in histories)
+    if wide:
+        found.append(f"wider ones {wide} times")
+    sight = f"; no ground in any scan of {', '.join(blind)}" if blind else ""
+    return (
+        f"{name}: target: none found in {scans} scans: needs a static object on the ground, "
+        f"0.3 to {MAX_EXTENT_M} m wide, at most 2 m high, seen well in several scans. Seen: "
+        f"{', '.join(found) or 'nothing above the ground'}{sight}. "
+        "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
+    )

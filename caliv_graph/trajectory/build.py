@@ -1,0 +1,215 @@
+"""The smoother's factor graph, and the conversion of estimates to GTSAM's values and back.
+
+Variables of node i:
+    I_i  `T_map_imu`, right perturbation, rotation then translation
+    V_i  velocity of the IMU's origin in the map, m/s
+    B_i  `imuBias.ConstantBias` of accelerometer and gyroscope, imu frame
+and, where the config asks for it, one yaw bias of the orientation source for the whole drive.
+`README.md` of this folder derives every factor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import IntArray
+from caliv_graph.trajectory.factors import (
+    biased_orientation_factor,
+    orientation_factor,
+    position_factor,
+    velocity_factor,
+)
+from caliv_graph.trajectory.imu import preintegrate
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
+from caliv_graph.trajectory.nodes import carry_to_nodes
+from caliv_graph.trajectory.smoothed import States, without_bias
+
+GAUGE_M = 1e-4
+GAUGE_RAD = 1e-4
+"""1 sigma of the gauge prior on the first pose, without GNSS: far below what any sensor resolves,
+and large enough that the graph stays well conditioned."""
+
+
+@dataclass
+class TrajectoryGraph:
+    """The factors, and the kind of each.
+
+    Attributes:
+        factors: the nonlinear graph.
+        kinds: of each factor, in order: `imu`, `gnss`, `orientation`, `velocity`, or `prior`.
+    """
+
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    kinds: list[str] = field(default_factory=list)
+
+    def add(self, kind: str, factor: gtsam.NonlinearFactor) -> None:
+        """Appends a factor."""
+        self.factors.add(factor)
+        self.kinds.append(kind)
+
+
+def build_graph(
+    data: SmootherInput, nodes: IntArray, states: States, dropped: IntArray, kernel: str
+) -> TrajectoryGraph:
+    """All factors; the measurements are integrated and carried with the biases of an estimate.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+        states: the estimate.
+        dropped: (k,) indices of the GNSS fixes that are left out.
+        kernel: robust kernel of the fixes; only `huber` changes the noise model.
+    """
+    graph = TrajectoryGraph()
+    carried = carry_to_nodes(data, nodes, without_bias(data.inertial, nodes, states))
+    _add_imu(graph, data, nodes, states)
+    if carried.positions is not None:
+        _add_positions(graph, data, carried.positions, dropped, kernel)
+    if carried.orientations is not None:
+        _add_orientations(graph, data, carried.orientations)
+    if carried.velocities is not None:
+        _add_velocities(graph, data, carried.velocities)
+    if data.positions is None:
+        _add_gauge_prior(graph, data, states)
+    return graph
+
+
+def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, states: States) -> None:
+    """Preintegrated factors between neighbours, and the prior on the first bias."""
+    noise = data.noise
+    biases = [
+        gtsam.imuBias.ConstantBias(f, w)
+        for f, w in zip(states.force_bias, states.gyro_bias, strict=True)
+    ]
+    measurements = preintegrate(data.inertial, nodes, biases, noise, data.gravity_m_s2)
+    for i, measured in enumerate(measurements):
+        graph.add(
+            "imu",
+            gtsam.CombinedImuFactor(
+                key_imu(i),
+                key_velocity(i),
+                key_imu(i + 1),
+                key_velocity(i + 1),
+                key_bias(i),
+                key_bias(i + 1),
+                measured,
+            ),
+        )
+    bias_sigmas = np.array([noise.force_bias] * 3 + [noise.gyro_bias] * 3)
+    graph.add(
+        "prior",
+        gtsam.PriorFactorConstantBias(
+            key_bias(0),
+            gtsam.imuBias.ConstantBias(),
+            gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas),
+        ),
+    )
+
+
+def _add_positions(
+    graph: TrajectoryGraph,
+    data: SmootherInput,
+    positions: NodePositions,
+    dropped: IntArray,
+    kernel: str,
+) -> None:
+    keep = ~np.isin(positions.fixes, dropped)
+    threshold = data.config.robust.huber_k * math.sqrt(3.0)
+    for k in np.flatnonzero(keep).tolist():
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(positions.cov_map[k])
+        if kernel == "huber":
+            estimator = gtsam.noiseModel.mEstimator.Huber.Create(threshold)
+            noise = gtsam.noiseModel.Robust.Create(estimator, noise)
+        i = int(positions.nodes[k])
+        graph.add(
+            "gnss",
+            position_factor(
+                key_imu(i),
+                key_velocity(i),
+                positions.position_map[k],
+                positions.offset_imu[k],
+                float(positions.delay_s[k]),
+                data.gravity_m_s2,
+                noise,
+            ),
+        )
+
+
+def _add_orientations(
+    graph: TrajectoryGraph, data: SmootherInput, orientations: NodeOrientations
+) -> None:
+    estimated = data.config.imu.yaw_bias
+    for k, i in enumerate(orientations.nodes.tolist()):
+        noise = gtsam.noiseModel.Gaussian.Covariance(orientations.cov[k])
+        R = gtsam.Rot3(orientations.R_map_imu[k])
+        if estimated:
+            graph.add(
+                "orientation", biased_orientation_factor(key_imu(i), key_yaw_bias(), R, noise)
+            )
+        else:
+            graph.add("orientation", orientation_factor(key_imu(i), R, noise))
+    if estimated:
+        sigma = math.radians(data.config.imu.yaw_bias_sigma_deg)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+        graph.add("prior", gtsam.PriorFactorVector(key_yaw_bias(), np.zeros(1), noise))
+
+
+def _add_velocities(
+    graph: TrajectoryGraph, data: SmootherInput, velocities: NodeVelocities
+) -> None:
+    for k, i in enumerate(velocities.nodes.tolist()):
+        gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
+        noise = gtsam.noiseModel.Gaussian.Covariance(velocities.cov[k])
+        factor = velocity_factor(
+            key_imu(i), key_velocity(i), velocities.velocity_imu[k], gained, noise
+        )
+        graph.add("velocity", factor)
+
+
+def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States) -> None:
+    """Without GNSS the start is the map's origin; without orientation it also fixes the yaw."""
+    start = gtsam.Pose3(gtsam.Rot3(states.R_map_imu[0]), states.p_map_imu[0])
+    position_noise = gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_M)
+    graph.add("prior", gtsam.PoseTranslationPrior3D(key_imu(0), start, position_noise))
+    if not data.orientation:
+        R = states.R_map_imu[0]
+        # 1 rad in roll and pitch, which gravity determines; rotated into the imu's axes, in which
+        # the residual is.
+        cov = R.T @ np.diag([1.0, 1.0, GAUGE_RAD**2]) @ R
+        noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+        graph.add("prior", orientation_factor(key_imu(0), gtsam.Rot3(R), noise))
+
+
+def to_values(states: States, data: SmootherInput) -> gtsam.Values:
+    """An estimate as GTSAM's values."""
+    out = gtsam.Values()
+    for i in range(len(states.p_map_imu)):
+        out.insert(key_imu(i), gtsam.Pose3(gtsam.Rot3(states.R_map_imu[i]), states.p_map_imu[i]))
+        out.insert(key_velocity(i), states.velocity_map[i])
+        out.insert(
+            key_bias(i), gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
+        )
+    if data.yaw_bias:
+        out.insert(key_yaw_bias(), np.array([states.yaw_bias_rad]))
+    return out
+
+
+def from_values(values: gtsam.Values, n: int, data: SmootherInput) -> States:
+    """The estimate of n nodes in GTSAM's values."""
+    R, p = stack([values.atPose3(key_imu(i)) for i in range(n)])
+    biases = [values.atConstantBias(key_bias(i)) for i in range(n)]
+    return States(
+        R,
+        p,
+        np.array([values.atVector(key_velocity(i)) for i in range(n)]),
+        np.array([b.accelerometer() for b in biases]),
+        np.array([b.gyroscope() for b in biases]),
+        float(values.atVector(key_yaw_bias())[0]) if data.yaw_bias else 0.0,
+    )

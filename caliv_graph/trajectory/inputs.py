@@ -1,0 +1,179 @@
+"""The input of the smoother: the drive's sensor data, checked, with the noise of each sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, ImuSamples, MotionData
+from caliv_graph.trajectory.gnss import Positions, normal_gravity, positions_in_map
+from caliv_graph.trajectory.imu import Inertial, clean_inertial
+from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
+from caliv_graph.trajectory.noise import (
+    ImuNoise,
+    imu_noise,
+    orientation_covariances,
+    velocity_covariances,
+)
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+"""Conventional value, used without GNSS. It differs from gravity on Earth by at most 0.03 m/s^2,
+which the accelerometer's bias absorbs."""
+
+MAX_TILT_DISAGREEMENT_RAD = math.radians(20.0)
+"""Mean angle between the vertical of the accelerometer and that of the orientation. A vehicle's
+accelerations average to a few degrees; a wrong axis convention is 90 or 180."""
+
+
+@dataclass(frozen=True)
+class SmootherInput:
+    """The sensor data of one drive, checked.
+
+    Attributes:
+        name: of the recording, for messages.
+        config: extrinsics, noise, robust kernel.
+        motion: the data as read.
+        inertial: cleaned IMU samples.
+        noise: of the IMU.
+        positions: of the GNSS antenna in the map; None: GNSS is not used.
+        orientation: whether the IMU's messages carry orientations.
+        T_vehicle_imu: the IMU's extrinsic.
+        gravity_m_s2: along -z of the map.
+    """
+
+    name: str
+    config: Config
+    motion: MotionData
+    inertial: Inertial
+    noise: ImuNoise
+    positions: Positions | None
+    orientation: bool
+    T_vehicle_imu: gtsam.Pose3
+    gravity_m_s2: float
+
+    @property
+    def arm_imu(self) -> Array:
+        """(3,) the GNSS antenna in the imu frame, metres."""
+        arm = np.array(self.config.gnss.lever_arm)
+        return np.asarray(self.T_vehicle_imu.transformTo(arm))
+
+    @property
+    def yaw_bias(self) -> bool:
+        """Whether a yaw bias of the orientation source is estimated."""
+        return self.config.imu.yaw_bias and self.orientation
+
+
+def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list[str]]:
+    """Checks that the data suffice, cleans them, and finds the noise of each sensor.
+
+    Returns:
+        The input, and warnings, a line each.
+
+    Raises:
+        TrajectoryError: a sensor that is needed is missing, or its data contradict themselves.
+    """
+    name = motion.name
+    if motion.imu is None:
+        raise TrajectoryError(
+            f"{name}: no IMU: set topics.imu to a topic of sensor_msgs/Imu, or topics.pose to one "
+            "with the vehicle's poses"
+        )
+    no_twist = motion.twist is None or not np.isfinite(motion.twist.velocity).all(axis=1).any()
+    no_gnss = motion.gnss is None or not len(motion.gnss.stamps_ns)
+    if no_twist and no_gnss:
+        raise TrajectoryError(
+            f"{name}: neither GNSS fixes nor velocities: an IMU alone drifts away within seconds. "
+            "Set topics.gnss (sensor_msgs/NavSatFix), topics.twist "
+            "(geometry_msgs/TwistStamped or nav_msgs/Odometry), or topics.pose"
+        )
+    inertial, lines = clean_inertial(motion.imu, name)
+    warnings = list(lines)
+    positions, gravity = None, config.imu.gravity_m_s2
+    if not no_gnss:
+        positions, normal, notes = _positions(motion, config, inertial, no_twist)
+        gravity = gravity or normal
+        warnings += notes
+    if positions is None and not no_twist:
+        warnings.append(
+            f"{name}: no GNSS: the map's origin is the vehicle's start, and positions drift with "
+            "the velocities"
+        )
+    data = SmootherInput(
+        name=name,
+        config=config,
+        motion=motion,
+        inertial=inertial,
+        noise=imu_noise(motion.imu, config),
+        positions=positions,
+        orientation=_has_orientation(motion.imu, inertial, name),
+        T_vehicle_imu=config.imu.T_vehicle_imu.pose(),
+        gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
+    )
+    return data, warnings
+
+
+def _positions(
+    motion: MotionData, config: Config, inertial: Inertial, needed: bool
+) -> tuple[Positions | None, float, list[str]]:
+    """The fixes in the map, None if none lies within the IMU's span; normal gravity; warnings.
+
+    Raises:
+        TrajectoryError: the fixes are needed, and none lies within the span.
+    """
+    assert motion.gnss is not None
+    positions, lines = positions_in_map(motion.gnss, config, motion.name)
+    gravity = normal_gravity(positions.origin_deg_m[0], positions.origin_deg_m[2])
+    stamps = positions.stamps_ns
+    begin, end = inertial.begin_ns, inertial.end_ns
+    if ((stamps >= begin) & (stamps <= end)).any():
+        return positions, gravity, list(lines)
+    if needed:
+        raise TrajectoryError(
+            f"{motion.name}: no GNSS fix lies within the IMU's span, {begin * 1e-9:.3f} s to "
+            f"{end * 1e-9:.3f} s; fixes from {stamps[0] * 1e-9:.3f} s to {stamps[-1] * 1e-9:.3f} "
+            "s. Do their clocks agree?"
+        )
+    unused = f"{motion.name}: no GNSS fix lies within the IMU's span: GNSS is not used"
+    return None, gravity, [*lines, unused]
+
+
+def _has_orientation(imu: ImuSamples, inertial: Inertial, name: str) -> bool:
+    """Whether messages carry an orientation; its vertical must agree with the accelerometer's.
+
+    Raises:
+        TrajectoryError: the two verticals disagree.
+    """
+    usable = usable_orientations(imu) & np.isfinite(imu.specific_force).all(axis=1)
+    stamps = imu.stamps_ns
+    usable &= (stamps >= inertial.begin_ns) & (stamps <= inertial.end_ns)
+    if imu.orientation_xyzw is None or not usable.any():
+        return False
+    R = rotations_of(imu.orientation_xyzw[usable])
+    up = np.einsum("nij,nj->ni", R, imu.specific_force[usable]).mean(axis=0)
+    tilt = math.acos(float(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0)))
+    if tilt > MAX_TILT_DISAGREEMENT_RAD:
+        raise TrajectoryError(
+            f"{name}: the IMU's orientation and its accelerometer disagree by "
+            f"{math.degrees(tilt):.0f} degrees on where up is: the orientation has to be that of "
+            "the IMU's own frame in ENU axes, z up. Choose another topics.imu, or set its "
+            "orientation_covariance[0] to -1"
+        )
+    return True
+
+
+def noise_sources(data: SmootherInput) -> dict[str, str]:
+    """Sensor in use -> where its noise figures are from."""
+    out = dict(data.noise.sources)
+    if data.orientation:
+        assert data.motion.imu is not None
+        out["orientation"] = orientation_covariances(data.motion.imu, data.config)[1]
+    if data.positions is not None:
+        out["gnss"] = data.positions.source
+    if data.motion.twist is not None:
+        out["velocity"] = velocity_covariances(data.motion.twist, data.config)[1]
+    return out

@@ -1,0 +1,90 @@
+"""The nodes of the graph, and all measurements carried to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.products import IntArray
+from caliv_graph.trajectory.imu import DeadReckoning, Inertial
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.measurements import (
+    NodeOrientations,
+    NodePositions,
+    NodeVelocities,
+    orientations_at_nodes,
+    positions_at_nodes,
+    velocities_at_nodes,
+)
+from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
+from caliv_graph.trajectory.smoothed import MERGE_NS
+
+NODE_SPACING_S = 0.1
+"""Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
+by at most 0.05 s: the noise of the IMU over it, 0.03 mm at the paper's figures, is far below that
+of the fix."""
+
+FINE_NODES = 1200
+"""Two minutes. On longer drives the spacing grows with the length, up to `COARSE_SPACING_S`, so
+that time and memory stay bounded."""
+
+COARSE_SPACING_S = 0.5
+"""Largest distance of two nodes on any drive."""
+
+
+@dataclass(frozen=True)
+class NodeMeasurements:
+    """All measurements at the nodes; None: the drive has none of the kind."""
+
+    positions: NodePositions | None
+    orientations: NodeOrientations | None
+    velocities: NodeVelocities | None
+
+
+def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
+    """Stamps (n,) of the nodes.
+
+    A node is at every wanted stamp, at both ends, and at the ends of gaps; further nodes lie evenly
+    between them.
+
+    Args:
+        inertial: the IMU samples.
+        wanted: (m,) stamps at which poses are wanted, ascending, within the samples.
+    """
+    begin, end = inertial.begin_ns, inertial.end_ns
+    fixed = np.unique(np.concatenate([wanted, [begin, end], inertial.gaps_ns.ravel()]))
+    fixed = fixed[np.concatenate([[True], np.diff(fixed) > MERGE_NS])]
+    if end - fixed[-1] <= MERGE_NS:
+        fixed[-1] = end  # the span must not end before a stamp that lies within it
+    duration_s = (end - begin) * 1e-9
+    spacing_s = min(max(NODE_SPACING_S, duration_s / FINE_NODES), COARSE_SPACING_S)
+    parts = np.maximum(np.ceil(np.diff(fixed) * 1e-9 / spacing_s - 1e-3), 1).astype(np.int64)
+    pieces = [
+        a + (np.arange(n) * (b - a)) // n
+        for a, b, n in zip(fixed[:-1].tolist(), fixed[1:].tolist(), parts.tolist(), strict=True)
+    ]
+    return np.concatenate([*pieces, fixed[-1:]]).astype(np.int64)
+
+
+def carry_to_nodes(data: SmootherInput, nodes: IntArray, dead: DeadReckoning) -> NodeMeasurements:
+    """Carries every measurement to its nearest node.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+        dead: the IMU, bias removed.
+    """
+    assert data.motion.imu is not None
+    positions = orientations = velocities = None
+    if data.positions is not None:
+        positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
+    if data.orientation:
+        cov, _ = orientation_covariances(data.motion.imu, data.config)
+        orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
+    if data.motion.twist is not None:
+        cov, _ = velocity_covariances(data.motion.twist, data.config)
+        velocities = velocities_at_nodes(
+            data.motion.twist, cov, nodes, dead, data.noise, data.T_vehicle_imu
+        )
+    return NodeMeasurements(positions, orientations, velocities)

@@ -1,0 +1,161 @@
+"""GNSS fixes that the motion contradicts: rejection, and a noise level that fits the others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.measurements import positions_at_nodes
+from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.solve import ERROR_TOLERANCE, ROUGH_TOLERANCE, Estimate, solve
+
+OUTLIER_P_VALUE = 1e-6
+"""Probability of a larger squared residual under white noise, at which a fix is an outlier: less
+than one false rejection in 2000 drives of 500 fixes."""
+
+MAX_REJECTED = 0.4
+"""Part of the fixes. If more exceed the limit, the stated noise is wrong, not the fixes: the median
+of the residuals is then no longer that of sound fixes."""
+
+LIMIT_STEP = 9.0
+"""Squared residuals down to a ninth of the largest (a third of its residual) are dropped at once.
+Larger steps drop sound fixes beside a jump; smaller ones cost rounds."""
+
+MAX_ROUNDS = 12
+"""Of rejection; a jump by a kilometre takes nine."""
+
+NOISE_ROUNDS = 3
+"""Of scaling the stated noise; the second changes it by a few percent."""
+
+
+@dataclass(frozen=True)
+class Robust:
+    """The estimate after rejection.
+
+    Attributes:
+        data: the input, the fixes with the noise that was used.
+        estimate: the solved graph.
+        dropped: (k,) indices of the fixes that were dropped.
+        warnings: a line each.
+    """
+
+    data: SmootherInput
+    estimate: Estimate
+    dropped: IntArray
+    warnings: tuple[str, ...] = ()
+
+
+def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States) -> Robust:
+    """Solves for all nodes; drops GNSS fixes that white noise does not explain, worst first.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+        states: initial guess of all nodes.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    kernel = data.config.robust.kernel
+    if data.positions is None or kernel == "none":
+        return Robust(data, solve(data, nodes, states, none, kernel), none)
+    estimate = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)
+    data, states, warnings = _with_fitting_noise(data, nodes, estimate.states)
+    dropped, solved_with = none, "roughly"
+    final = _final_limit(data.config)
+    limit: float | None = None
+    for _ in range(MAX_ROUNDS):
+        found, limit = _outliers(_squared_residuals(data, nodes, states), data.config, limit)
+        if np.array_equal(found, dropped) and solved_with == kernel:
+            if limit == final:
+                break
+            continue
+        dropped = found
+        rough = limit > final
+        solved_with = "roughly" if rough else kernel
+        tolerance = ROUGH_TOLERANCE if rough else ERROR_TOLERANCE
+        estimate = solve(data, nodes, states, dropped, kernel, tolerance)
+        states = estimate.states
+    if solved_with != kernel:
+        estimate = solve(data, nodes, states, dropped, kernel)
+    if len(dropped):
+        assert data.positions is not None
+        warnings.append(
+            f"{data.name}: {len(dropped)} of {len(data.positions.stamps_ns)} GNSS fixes disagree "
+            "with the motion, dropped"
+        )
+    return Robust(data, estimate, dropped, tuple(warnings))
+
+
+def _with_fitting_noise(
+    data: SmootherInput, nodes: IntArray, states: States
+) -> tuple[SmootherInput, States, list[str]]:
+    """Scales the covariance of the fixes where more than `MAX_REJECTED` of them exceed the limit.
+
+    A receiver that states no covariance gets the paper's 17 mm and may be good to a metre. The
+    scale is the median of the squared residuals over its expectation (chi-square, 3 degrees of
+    freedom).
+    """
+    assert data.positions is not None
+    none, stated_by = np.zeros(0, dtype=np.int64), data.positions.source
+    total = 1.0
+    for _ in range(NOISE_ROUNDS):
+        squares = _squared_residuals(data, nodes, states)
+        if (squares > _final_limit(data.config)).mean() <= MAX_REJECTED:
+            break
+        factor = float(np.median(squares) / chdtri(3, 0.5))
+        total *= factor
+        assert data.positions is not None
+        positions = replace(data.positions, cov_map=data.positions.cov_map * factor)
+        data = replace(data, positions=positions)
+        states = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE).states
+    if total <= 1.0:
+        return data, states, []
+    warning = (
+        f"{data.name}: most GNSS fixes disagree with the motion by more than their noise "
+        f"({stated_by}): taken as {math.sqrt(total):.1f} times as much. Set "
+        "noise.gnss_horizontal_m and noise.gnss_vertical_m"
+    )
+    return data, states, [warning]
+
+
+def _final_limit(config: Config) -> float:
+    """Squared whitened residual of a fix beyond which it is dropped."""
+    p = config.robust.tls_p_value if config.robust.kernel == "tls" else OUTLIER_P_VALUE
+    return float(chdtri(3, p))
+
+
+def _outliers(squares: Array, config: Config, limit: float | None) -> tuple[IntArray, float]:
+    """Fixes to drop now, and the limit that they exceed.
+
+    The limit decreases from round to round: a jump pulls the first solution towards itself, so that
+    sound fixes beside it exceed the final limit until the worst ones are dropped.
+    """
+    final = _final_limit(config)
+    if config.robust.kernel == "trimmed":
+        count = int(len(squares) * config.robust.trim_percent / 100.0)
+        return np.sort(np.argsort(squares)[len(squares) - count :]), final
+    worst = float(squares.max(initial=0.0)) if limit is None else limit
+    limit = max(final, worst / LIMIT_STEP)
+    return np.flatnonzero(squares > limit), limit
+
+
+def _squared_residuals(data: SmootherInput, nodes: IntArray, states: States) -> Array:
+    """(k,) squared whitened residual of each fix at an estimate; 0 outside the nodes' span."""
+    assert data.positions is not None
+    dead = without_bias(data.inertial, nodes, states)
+    carried = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
+    out = np.zeros(len(data.positions.stamps_ns))
+    if carried is None:
+        return out
+    i, dt = carried.nodes, carried.delay_s[:, None]
+    g = np.array([0.0, 0.0, -data.gravity_m_s2])
+    predicted = states.p_map_imu[i] + states.velocity_map[i] * dt + 0.5 * g * dt**2
+    predicted += np.einsum("nij,nj->ni", states.R_map_imu[i], carried.offset_imu)
+    r = predicted - carried.position_map
+    out[carried.fixes] = np.einsum("ni,nij,nj->n", r, np.linalg.inv(carried.cov_map), r)
+    return out

@@ -1,0 +1,141 @@
+"""One smoothed trajectory with covariance from IMU, GNSS, velocity and orientation, in GTSAM.
+
+The pose of the IMU is the variable, not that of the vehicle. Off the vehicle's origin an
+accelerometer measures a term of the angular acceleration, which GTSAM's `body_P_sensor` leaves out:
+at a steering transition, 1 m of lever is an error of 0.2 m/s in velocity. T_vehicle_imu is
+constant, so results carry over to the vehicle by its adjoint, without approximation.
+
+The map is ENU, gravity along -z, its origin the first GNSS fix. Without GNSS the start of the
+vehicle is the origin, and without an orientation source its heading is the x axis.
+
+`README.md` of this folder derives the factors and lists the constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.initial import first_states
+from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources
+from caliv_graph.trajectory.measurements import nearest_node
+from caliv_graph.trajectory.nodes import place_nodes
+from caliv_graph.trajectory.outliers import solve_without_outliers
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
+from caliv_graph.trajectory.solve import chain_of, covariances_of, solve_from_the_start
+
+BIAS_SIGMAS = 5.0
+"""Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
+
+
+def smooth_trajectory(
+    motion: MotionData, config: Config, stamps_ns: Sequence[int] | IntArray
+) -> SmoothedTrajectory:
+    """Smooths one drive.
+
+    Args:
+        motion: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
+        config: extrinsics, noise, robust kernel.
+        stamps_ns: stamps at which poses are wanted (of LiDAR scans), in any order.
+
+    Returns:
+        The trajectory. Stamps outside the span of the IMU are in `lost_ns`.
+
+    Raises:
+        TrajectoryError: what was recorded does not determine the motion; says what is missing.
+    """
+    data, warnings = check_input(motion, config)
+    wanted, lost, lines = _within_span(data, stamps_ns)
+    nodes = place_nodes(data.inertial, wanted)
+    states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    robust = solve_without_outliers(data, nodes, states)
+    data, estimate = robust.data, robust.estimate
+    linear = estimate.graph.factors.linearize(estimate.values)
+    cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
+    warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
+    return SmoothedTrajectory(
+        trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov_imu),
+        lost_ns=tuple(lost.tolist()),
+        warnings=tuple(warnings),
+        noise_sources=noise_sources(data),
+        nodes_ns=nodes,
+        states=estimate.states,
+        T_vehicle_imu=data.T_vehicle_imu,
+        gravity_m_s2=data.gravity_m_s2,
+        yaw_bias=None if yaw_sigma is None else (estimate.states.yaw_bias_rad, yaw_sigma),
+        gnss_rejected=_rejected_stamps(data, robust.dropped),
+        origin_deg_m=None if data.positions is None else data.positions.origin_deg_m,
+        graph=estimate.graph.factors,
+        values=estimate.values,
+        chain=chain_of(linear, len(nodes), data.yaw_bias),
+        inertial=data.inertial,
+        factor_kinds=tuple(estimate.graph.kinds),
+    )
+
+
+def _within_span(
+    data: SmootherInput, stamps_ns: Sequence[int] | IntArray
+) -> tuple[IntArray, IntArray, list[str]]:
+    """Wanted stamps within the IMU's span, those outside, and a warning about the latter.
+
+    Raises:
+        TrajectoryError: all are outside.
+    """
+    inertial = data.inertial
+    wanted = np.unique(np.asarray(stamps_ns, dtype=np.int64))
+    inside = (wanted >= inertial.begin_ns) & (wanted <= inertial.end_ns)
+    lost = wanted[~inside]
+    if not len(lost):
+        return wanted, lost, []
+    if not inside.any():
+        raise TrajectoryError(
+            f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: IMU from "
+            f"{inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
+            f"{wanted[0] * 1e-9:.3f} s to {wanted[-1] * 1e-9:.3f} s. Do their clocks agree?"
+        )
+    line = (
+        f"{data.name}: {len(lost)} of {len(wanted)} scans are outside the trajectory's span, lost"
+    )
+    return wanted[inside], lost, [line]
+
+
+def _at_wanted(
+    data: SmootherInput, wanted: IntArray, nodes: IntArray, states: States, cov_imu: Array
+) -> Trajectory:
+    """The vehicle's poses and covariances at the wanted stamps."""
+    i = nearest_node(nodes, wanted)
+    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+    return Trajectory(
+        stamps_ns=wanted,
+        T_map_vehicle=poses_of_vehicle(states, i, data.T_vehicle_imu),
+        cov=np.asarray(Ad @ cov_imu[i] @ Ad.T),
+    )
+
+
+def _rejected_stamps(data: SmootherInput, dropped: IntArray) -> IntArray:
+    """(k,) stamps of the dropped fixes."""
+    if data.positions is None:
+        return np.zeros(0, dtype=np.int64)
+    return data.positions.stamps_ns[dropped]
+
+
+def _bias_warnings(data: SmootherInput, states: States) -> list[str]:
+    """A line for each sensor whose bias its prior does not explain."""
+    noise = data.noise
+    sensors = (
+        ("accelerometer", states.force_bias, noise.force_bias, "accelerometer_bias_m_s2", "m/s^2"),
+        ("gyroscope", states.gyro_bias, noise.gyro_bias, "gyroscope_bias_rad_s", "rad/s"),
+    )
+    out = []
+    for sensor, bias, sigma, key, unit in sensors:
+        largest = float(np.abs(np.median(bias, axis=0)).max())
+        if largest > BIAS_SIGMAS * sigma:
+            out.append(
+                f"{data.name}: the {sensor}'s bias comes out as {largest:.3g} {unit}, noise.{key} "
+                f"is {sigma:.3g}: a wrong unit, or axes that are not those of the orientation"
+            )
+    return out

@@ -1,0 +1,238 @@
+"""Solving the smoother's graph, and the covariance of what comes out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
+from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.initial import extended_states
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.smoothed import States
+
+MAX_PASSES = 4
+"""Preintegration and carrying are repeated with the new biases at most this often. Two passes do
+on every drive simulated here; the later ones are for biases far from zero."""
+
+GYRO_BIAS_CHANGE_RAD_S = 2e-4
+FORCE_BIAS_CHANGE_M_S2 = 5e-3
+"""Biases may differ by this from those that the measurements were integrated with. Preintegrated
+factors correct for the difference to first order; measurements carried by 0.05 s are off by at most
+0.01 mrad and 0.006 mm."""
+
+MAX_STEPS = 60
+"""Of Levenberg-Marquardt; about four do from an initial guess with orientation."""
+
+ERROR_TOLERANCE = 1e-7
+"""Relative decrease of the error at which the solver stops: the remaining step is below a hundredth
+of a sigma in every variable."""
+
+ROUGH_TOLERANCE = 1e-3
+"""The same while outliers are still in the graph: the Huber weights of gross outliers settle in
+many small steps, which no later stage uses."""
+
+MIN_DAMPING, MAX_DAMPING = 1e-2, 1e8
+"""Of Levenberg-Marquardt: 1 sigma of the damping is 10 m and 1 rad at the smallest, and 0.1 mm and
+0.01 mrad at the largest, where the solver stops."""
+
+# 1 sigma of the damping where it is 1; that of positions and velocities is 1 m and 1 m/s.
+STEP_RAD = 0.1
+STEP_FORCE_BIAS_M_S2 = 0.1
+STEP_GYRO_BIAS_RAD_S = 0.01
+
+# Medians of sigma over the drive beyond which the trajectory counts as undetermined: ten times what
+# any sensor set in use leaves, and too much for the target to be found in the map.
+MAX_TILT_SIGMA_RAD = 0.1
+MAX_YAW_SIGMA_RAD = 0.2
+MAX_POSITION_SIGMA_M = 10.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A solved graph.
+
+    Attributes:
+        states: the estimate.
+        graph: its factors, built with the biases of the estimate before.
+        values: the estimate as GTSAM's values.
+    """
+
+    states: States
+    graph: TrajectoryGraph
+    values: gtsam.Values
+
+
+def solve_from_the_start(data: SmootherInput, nodes: IntArray, states: States) -> States:
+    """Extends an estimate of the first nodes to all nodes.
+
+    The part that is estimated is solved, then doubled in length by dead reckoning, and so on: the
+    initial guess without an orientation source holds for a short time only.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    while len(states.p_map_imu) < len(nodes):
+        done = len(states.p_map_imu)
+        states = solve(data, nodes[:done], states, none, "huber", ROUGH_TOLERANCE).states
+        until = nodes[0] + 2 * (nodes[done - 1] - nodes[0])
+        more = min(max(int(np.searchsorted(nodes, until)), done + 1), len(nodes))
+        states = extended_states(data, nodes[:more], states)
+    return states
+
+
+def solve(
+    data: SmootherInput,
+    nodes: IntArray,
+    states: States,
+    dropped: IntArray,
+    kernel: str,
+    tolerance: float = ERROR_TOLERANCE,
+) -> Estimate:
+    """Builds and solves the graph until its biases are those it was built with.
+
+    Args:
+        data: the measurements.
+        nodes: (n,) stamps of the nodes.
+        states: initial guess.
+        dropped: (k,) indices of the GNSS fixes that are left out.
+        kernel: robust kernel of the fixes.
+        tolerance: relative decrease of the error at which a solve stops.
+    """
+    for _ in range(MAX_PASSES):
+        graph = build_graph(data, nodes, states, dropped, kernel)
+        values = optimise(graph.factors, to_values(states, data), len(nodes), tolerance)
+        found = from_values(values, len(nodes), data)
+        gyro_change = np.abs(found.gyro_bias - states.gyro_bias).max()
+        force_change = np.abs(found.force_bias - states.force_bias).max()
+        states = found
+        if gyro_change < GYRO_BIAS_CHANGE_RAD_S and force_change < FORCE_BIAS_CHANGE_M_S2:
+            break
+    return Estimate(states, graph, values)
+
+
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, n: int, tolerance: float
+) -> gtsam.Values:
+    """Gauss-Newton, with Levenberg-Marquardt damping where a full step does not descend.
+
+    GTSAM's optimisers end in the same place (1e-13 m) and take 6 to 14 times as long on a graph
+    with factors in Python (`scripts/benchmark_trajectory.py --solvers`).
+
+    Args:
+        graph: over n nodes.
+        values: initial guess.
+        n: number of nodes.
+        tolerance: relative decrease of the error at which to stop.
+    """
+    ordering = node_ordering(n, values.exists(key_yaw_bias()))
+    error = graph.error(values)
+    damping = 0.0
+    for _ in range(MAX_STEPS):
+        linear = graph.linearize(values)
+        moved, error_moved = values, math.inf
+        while not error_moved <= error and damping < MAX_DAMPING:
+            moved = _step(linear, values, ordering, n, damping)
+            error_moved = graph.error(moved)
+            if error_moved <= error:
+                damping = damping / 10.0 if damping > MIN_DAMPING else 0.0
+            elif error_moved - error < tolerance * (1.0 + error):
+                return values  # the increase is rounding: the minimum is reached
+            else:
+                damping = max(10.0 * damping, MIN_DAMPING)
+        if not error_moved <= error:
+            return values
+        gained = error - error_moved
+        values, error = moved, error_moved
+        if gained <= tolerance * (1.0 + error) and damping == 0.0:
+            break
+    return values
+
+
+def _step(
+    linear: gtsam.GaussianFactorGraph,
+    values: gtsam.Values,
+    ordering: gtsam.Ordering,
+    n: int,
+    damping: float,
+) -> gtsam.Values:
+    """The values after one damped step; unchanged if the damped system is singular."""
+    if damping == 0.0:
+        try:
+            return values.retract(linear.optimize(ordering))
+        except RuntimeError:  # GTSAM's report of a singular system
+            damping = MIN_DAMPING
+    damped = linear.clone()
+    root = math.sqrt(damping)
+    pose = np.diag([root / STEP_RAD] * 3 + [root] * 3)
+    bias = np.diag([root / STEP_FORCE_BIAS_M_S2] * 3 + [root / STEP_GYRO_BIAS_RAD_S] * 3)
+    unit3, unit6 = gtsam.noiseModel.Unit.Create(3), gtsam.noiseModel.Unit.Create(6)
+    for i in range(n):
+        damped.add(gtsam.JacobianFactor(key_imu(i), pose, np.zeros(6), unit6))
+        damped.add(gtsam.JacobianFactor(key_velocity(i), root * np.eye(3), np.zeros(3), unit3))
+        damped.add(gtsam.JacobianFactor(key_bias(i), bias, np.zeros(6), unit6))
+    try:
+        return values.retract(damped.optimize(ordering))
+    except RuntimeError:
+        return values
+
+
+def chain_of(linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool) -> Chain:
+    """The information of a linearised graph over n nodes, as a chain of states."""
+    return Chain.from_graph(
+        linear,
+        [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(n)],
+        (6, 3, 6),
+        [key_yaw_bias()] if yaw_bias else [],
+    )
+
+
+def covariances_of(
+    linear: gtsam.GaussianFactorGraph, data: SmootherInput, states: States
+) -> tuple[Array, float | None]:
+    """Marginal covariances of the IMU's poses, and the sigma of the yaw bias if it is estimated.
+
+    Args:
+        linear: the graph, linearised at the estimate.
+        data: its input.
+        states: the estimate.
+
+    Returns:
+        (n, 6, 6) right perturbations, rotation then translation, rad and m; radians.
+
+    Raises:
+        TrajectoryError: the poses are undetermined, or far less certain than is of use.
+    """
+    wanting = f"{data.name}: the motion data do not determine "
+    advice = (
+        "orientation in the IMU's messages, GNSS, or velocities, or a drive with curves"
+        if not data.orientation
+        else "GNSS or velocities along the whole drive"
+    )
+    try:
+        marginals = Marginals(linear, node_ordering(len(states.p_map_imu), data.yaw_bias))
+        cov = marginals.covariances([key_imu(i) for i in range(len(states.p_map_imu))])
+        yaw_cov = marginals.covariances([key_yaw_bias()]) if data.yaw_bias else None
+    except TrajectoryError:
+        raise TrajectoryError(f"{wanting}the trajectory: record {advice}") from None
+    R = states.R_map_imu
+    cov_map = R @ cov[:, :3, :3] @ np.swapaxes(R, 1, 2)
+    sigma = np.median(np.sqrt(np.diagonal(cov_map, axis1=1, axis2=2)), axis=0)
+    if sigma[2] > MAX_YAW_SIGMA_RAD:
+        raise TrajectoryError(
+            f"{wanting}heading: its sigma is {math.degrees(sigma[2]):.1f} degrees. Record {advice}"
+        )
+    if max(sigma[:2]) > MAX_TILT_SIGMA_RAD:
+        raise TrajectoryError(
+            f"{wanting}roll and pitch: sigma {math.degrees(max(sigma[:2])):.1f} degrees. Record "
+            f"{advice}"
+        )
+    position = float(np.sqrt(np.median(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))
+    if position > MAX_POSITION_SIGMA_M:
+        raise TrajectoryError(f"{wanting}position: its sigma is {position:.1f} m. Record {advice}")
+    return cov, None if yaw_cov is None else math.sqrt(float(yaw_cov[0, 0, 0]))

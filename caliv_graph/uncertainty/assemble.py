@@ -1,0 +1,90 @@
+"""One calibration from matrices: for the result of a solve, and for a predicted covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
+from caliv_graph.products import Array, Calibration, Guess, LidarResult, Uncertainty
+
+_NO_OFFSETS: Mapping[str, tuple[float, float]] = {}
+
+
+def assemble_matrices(
+    solved: Mapping[str, gtsam.Pose3],
+    guesses: Mapping[str, Guess],
+    cov: Array,
+    information: Array,
+    uncertainty: Uncertainty,
+    reference: str,
+    scans: Mapping[str, int],
+    gradient: Array | None = None,
+    time_offsets: Mapping[str, tuple[float, float]] = _NO_OFFSETS,
+) -> Calibration:
+    """A calibration of every LiDAR, without requirements and provenance.
+
+    Args:
+        solved: extrinsics of the n LiDARs in the graph, in the order of the matrices.
+        guesses: initial guess of every LiDAR, in the order of the result. A LiDAR that is not in
+            the graph is reported by it.
+        cov: (6n, 6n) vehicle axes.
+        information: (6n, 6n) of the data alone, vehicle axes.
+        uncertainty: verdicts on the solved LiDARs.
+        reference: name of the reference LiDAR.
+        scans: LiDAR -> clouds of a target that carry weight; absent: none.
+        gradient: (6n,) of the data's log-likelihood, vehicle axes.
+        time_offsets: LiDAR -> value and sigma in seconds, where estimated.
+    """
+    names = list(guesses)
+    poses = {name: solved.get(name, guesses[name].T_vehicle_lidar) for name in names}
+    to_right = _to_right(names, solved)
+    cov_joint = np.zeros((6 * len(names), 6 * len(names)))
+    for row, name in enumerate(names):
+        if name not in solved:
+            block = slice(6 * row, 6 * row + 6)
+            axes = right_to_vehicle_axes(poses[name])
+            cov_joint[block, block] = axes.T @ np.diag(guesses[name].sigmas ** 2) @ axes
+    cov_joint += to_right @ cov @ to_right.T
+    information_joint = to_right @ information @ to_right.T
+    nothing = dict.fromkeys(AXES, False)
+    lidars = {
+        name: LidarResult(
+            T_vehicle_lidar=poses[name],
+            cov=cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
+            determined=dict(uncertainty.determined.get(name, nothing)),
+            scans_used=scans.get(name, 0),
+            saw_target=scans.get(name, 0) > 0,
+            time_offset=time_offsets.get(name),
+            guess=guesses[name],
+        )
+        for row, name in enumerate(names)
+    }
+    complete = not uncertainty.undetermined and all(
+        all(lidar.determined.values()) for lidar in lidars.values()
+    )
+    return Calibration(
+        status="ok" if complete else "partial",
+        reference=reference,
+        lidars=lidars,
+        cov_joint=0.5 * (cov_joint + cov_joint.T),
+        information_data=0.5 * (information_joint + information_joint.T),
+        undetermined=uncertainty.undetermined,
+        weak=uncertainty.weak,
+        unmet=(),
+        provenance={},
+        gradient_data=None if gradient is None else to_right @ gradient,
+    )
+
+
+def _to_right(names: Sequence[str], solved: Mapping[str, gtsam.Pose3]) -> Array:
+    """(6N, 6n) from vehicle axes of the solved LiDARs to right perturbations of all."""
+    out = np.zeros((6 * len(names), 6 * len(solved)))
+    for column, (name, T) in enumerate(solved.items()):
+        row = names.index(name)
+        axes = right_to_vehicle_axes(T).T
+        out[6 * row : 6 * row + 6, 6 * column : 6 * column + 6] = axes
+    return out

@@ -1,0 +1,1 @@
+"""Sentences for users about findings: directions, contradictions, symmetries, time offsets."""

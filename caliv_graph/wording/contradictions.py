@@ -1,0 +1,212 @@
+"""Sentences about contradictions: what contradicts what, by how much, and what to check."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import ndtri
+
+from caliv_graph.conventions import AXES
+from caliv_graph.uncertainty.consistency import (
+    FAR_M,
+    OUTLIERS,
+    SCALE_LIMIT,
+    Assumed,
+    CloudCount,
+    CoarseRegistrations,
+    Contradiction,
+    GuessContradiction,
+    Heading,
+    ScoreTest,
+    difference,
+    lateness,
+    p_value,
+)
+
+MOST_OF = 0.75
+"""Fraction of the outliers that lie in one part of the drive from which that part is named."""
+
+
+def contradiction_sentence(found: Contradiction) -> str:
+    """A finding of `uncertainty.consistency.contradictions` for the user."""
+    match found:
+        case GuessContradiction():
+            return _guess(found)
+        case CloudCount():
+            return (
+                f"{_outliers(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
+                "many. The result follows the other clouds, which may be the wrong ones: check its "
+                "stamps, its mount and the target"
+            )
+        case CoarseRegistrations():
+            return _coarse(found)
+        case ScoreTest():
+            return f"{_score_test(found)}. {_SCORE_TEST_REMEDIES[found.kind]}"
+        case Assumed():
+            return _assumed(found)
+        case Heading():
+            return _heading(found)
+
+
+def _guess(found: GuessContradiction) -> str:
+    parts = []
+    for i in found.axes:
+        off, sigmas = abs(found.difference[i]), abs(found.difference[i]) / found.sigma[i]
+        guessed = float(found.guess.sigmas[i])
+        if i >= 3:
+            value = float(found.guess.T_vehicle_lidar.translation()[i - 3])
+            parts.append(
+                f"{AXES[i]} differs from the initial guess {value:.2f} +- {guessed:.2f} m by "
+                f"{off:.2f} m: {sigmas:.0f} sigma"
+            )
+        else:
+            parts.append(
+                f"{AXES[i]} differs from the initial guess (+- {math.degrees(guessed):.1f} "
+                f"degrees) by {math.degrees(off):.1f} degrees: {sigmas:.0f} sigma"
+            )
+    return f"lidar '{found.lidar}': {'; '.join(parts)}. {_guess_remedy(found)}"
+
+
+def _guess_remedy(found: GuessContradiction) -> str:
+    """The likely mistake, and what to check."""
+    if found.swapped_with is not None:
+        return (
+            f"The estimate agrees with the guess of '{found.swapped_with}': check whether their "
+            "topics are swapped"
+        )
+    if found.late_s is not None:
+        way = "late" if found.late_s > 0.0 else "early"
+        return (
+            f"Stamps that are {abs(found.late_s):.2f} s {way} at {found.speed_m_s:.1f} m/s have "
+            "this effect: check the clock of the LiDAR, then the guess"
+        )
+    if any(i < 3 for i in found.axes):
+        return (
+            "Check the signs and the unit (degrees) of rpy_deg, that it is T_vehicle_lidar and not "
+            "its inverse, and that the topic is that of this LiDAR"
+        )
+    return (
+        "Check the guess (metres, signs, T_vehicle_lidar and not its inverse) and that the topic "
+        "is that of this LiDAR"
+    )
+
+
+def _outliers(count: CloudCount) -> str:
+    """How many clouds of a LiDAR are outliers, where in the drive, and how far off."""
+    offset = ""
+    if count.offset_vehicle is not None:
+        x, y, z = count.offset_vehicle
+        length = float(np.linalg.norm(count.offset_vehicle))
+        offset = (
+            f", median offset {length:.2f} m ({x:+.2f} forward, {y:+.2f} left, {z:+.2f} up)"
+            if length < FAR_M
+            else f", median offset above {FAR_M:.0f} m"
+        )
+    return (
+        f"lidar '{count.lidar}': {count.outliers} of its {count.clouds} target clouds contradict "
+        f"the other clouds{_where(count)}{offset}"
+    )
+
+
+def _where(count: CloudCount) -> str:
+    """The part of the drive that most of the outliers are in."""
+    pairs = [
+        (count.left, count.right, "in left turns", "in right turns"),
+        (count.early, count.late, "in the first half", "in the second half"),
+    ]
+    for first, second, one, other in pairs:
+        for here, there, text in ((first, second, one), (second, first, other)):
+            if here[1] > MOST_OF * count.outliers and there[0] > 0 and here[0] > 0:
+                return f", {here[1]} of them {text}"
+    return ""
+
+
+def _coarse(found: CoarseRegistrations) -> str:
+    rotation, shift = found.sigma
+    likely = ""
+    if isinstance(found.likely, CloudCount):
+        likely = f" It shows most here: {_outliers(found.likely)}."
+    elif found.likely is not None:
+        likely = f" It shows most here: {_score_test(found.likely)}."
+    names = " and ".join(f"'{name}'" for name in found.lidars)
+    return (
+        f"the target clouds (lidars {names}) and the motion of the vehicle contradict each other: "
+        f"they fit only with registration errors of {1e3 * rotation:.0f} mrad and "
+        f"{1e3 * shift:.0f} mm, {found.scale:.0f} times what the scatter of their points gives "
+        f"(limit {SCALE_LIMIT:.0f}).{likely} Check the stamps of every LiDAR, and that no mount "
+        "and no target moved"
+    )
+
+
+_SCORE_TEST_REMEDIES = {
+    "halves": "Check whether its mount or the target moved during the drive, and its clock",
+    "turns": "Late or early stamps have this effect: check its clock, or set solve.time_offset",
+    "trust": "Measure it again, or remove 'fixed' so that it is estimated",
+    "clock": "Correct its clock, or set solve.time_offset",
+}
+
+
+def _score_test(test: ScoreTest) -> str:
+    """The difference that a score test estimates, and how significant it is."""
+    overall = float(-ndtri(0.5 * max(p_value(test), 1e-300)))
+    if test.kind == "clock":
+        late_s, sigma_s = lateness(test)
+        return (
+            f"lidar '{test.lidar}': its stamps and the motion of the vehicle contradict each "
+            f"other: the stamps are {1e3 * abs(late_s):.0f} +- {1e3 * sigma_s:.0f} ms "
+            f"{'late' if late_s > 0.0 else 'early'} ({overall:.0f} sigma)"
+        )
+    d, cov, V = difference(test)
+    sigma = np.sqrt(np.diag(cov))
+    # d has no part along undetermined directions: an axis that lies in them is not named.
+    ratio = np.where(np.sum(V**2, axis=1) > 0.9, np.abs(d) / sigma, 0.0)
+    sizes = ", ".join(
+        f"{AXES[i]} by {1e3 * d[i]:+.1f} +- {1e3 * sigma[i]:.1f} {'mrad' if i < 3 else 'mm'}"
+        for i in np.argsort(-ratio).tolist()[:3]
+        if ratio[i] > max(0.5 * ratio.max(), 1.0)
+    )
+    what = {
+        "halves": "its extrinsics from the first and from the second half of its clouds differ",
+        "turns": "its extrinsics from left turns and from right turns differ",
+        "trust": "its clouds contradict the extrinsic that the config fixes (fixed: true)",
+    }[test.kind]
+    size = sizes or "along several axes together"
+    return f"lidar '{test.lidar}': {what}: {size} ({overall:.0f} sigma in total)"
+
+
+_ASSUMED = {
+    "height": (
+        "the height of the vehicle frame above the ground",
+        "m",
+        "Check ground.vehicle_height and ground.sigma",
+    ),
+    "tilt_x": (
+        "the tilt of the vehicle against the ground (x)",
+        "rad",
+        "Check ground.parallel_sigma_deg and imu.T_vehicle_imu",
+    ),
+    "tilt_y": (
+        "the tilt of the vehicle against the ground (y)",
+        "rad",
+        "Check ground.parallel_sigma_deg and imu.T_vehicle_imu",
+    ),
+}
+
+
+def _assumed(found: Assumed) -> str:
+    what, unit, remedy = _ASSUMED[found.kind]
+    return (
+        f"{found.drive}: {what} differs from the config by {found.value:+.3g} {unit} (sigma "
+        f"{found.sigma:.2g} {unit}): {abs(found.value) / found.sigma:.0f} sigma. {remedy}"
+    )
+
+
+def _heading(found: Heading) -> str:
+    sigma = found.sigma_with_allowance_rad
+    return (
+        f"{found.drive}: the orientation source and the direction of travel contradict each other "
+        f"by {math.degrees(found.yaw_rad):+.2f} +- {math.degrees(sigma):.2f} degrees "
+        f"({abs(found.yaw_rad) / sigma:.0f} sigma): the S2V yaw of every LiDAR has the same error. "
+        "Check imu.T_vehicle_imu, or set imu.yaw_bias"
+    )

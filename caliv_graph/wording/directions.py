@@ -1,0 +1,202 @@
+"""Names of directions that the data do not determine, and what would determine them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import AXES
+from caliv_graph.products import Array, Direction, Uncertainty
+from caliv_graph.uncertainty.observability import UNIT, rigid_twist, undetermined_twists
+from caliv_graph.uncertainty.predicted import PredictedCovariance
+
+NOTABLE = 0.2
+"""Fraction of a direction's largest coordinate from which an axis is named."""
+
+STATIONARY_TWISTS = 5
+"""Undetermined motions of all LiDARs together from which the vehicle did not move: driving straight
+ahead leaves four undetermined."""
+
+REMEDY_STATIONARY = (
+    "drive past the target on a path whose curvature changes, such as a figure-eight"
+)
+REMEDY_HEIGHT = (
+    "measure the height of the vehicle frame above the ground and set ground.vehicle_height and "
+    "ground.sigma, or cross a ramp while the target is in view"
+)
+REMEDY_TURN_CENTRE = (
+    "change the curvature while the target is in view: drive an S-curve or a figure-eight, or add "
+    "a drive that turns the other way"
+)
+REMEDY_STRAIGHT = (
+    "turn while the target is in view: an arc determines y and roll, an S-curve or a figure-eight "
+    "also x"
+)
+REMEDY_TILT = "turn while the target is in view, so that the heading changes, and use the ground"
+REMEDY_APART = (
+    "let these LiDARs see the same side of the target, at any time: pass it in both directions, "
+    "as in a figure-eight, or add a second target"
+)
+REMEDY_MORE = (
+    "pass the target again, closer and at other places, so that each LiDAR sees it in more scans; "
+    "better vehicle poses (IMU, GNSS) help too"
+)
+REMEDY_SYMMETRY = (
+    "use a target without rotational symmetry, such as a chair, and let these LiDARs see the same "
+    "side of it: pass it in both directions, or add a second target"
+)
+
+
+def named(uncertainty: Uncertainty, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Uncertainty:
+    """The same findings, each direction with its text and its remedy.
+
+    Args:
+        uncertainty: of `uncertainty.observability.assess`.
+        T_vehicle_lidar: the extrinsics that it was assessed at.
+    """
+    stationary = stationary_text(uncertainty.undetermined, T_vehicle_lidar)
+    undetermined = []
+    for direction in _each_named(uncertainty.undetermined, T_vehicle_lidar, weak=False):
+        if stationary and direction.together:
+            direction = replace(direction, text=stationary, remedy=REMEDY_STATIONARY)
+        undetermined.append(direction)
+    weak = _each_named(uncertainty.weak, T_vehicle_lidar, weak=True)
+    return replace(uncertainty, undetermined=tuple(undetermined), weak=tuple(weak))
+
+
+def named_prediction(predicted: PredictedCovariance) -> PredictedCovariance:
+    """The same prediction, each direction with its text and its remedy."""
+    poses = {n: predicted.calibration.lidars[n].T_vehicle_lidar for n in predicted.lidars}
+    uncertainty = named(predicted.uncertainty, poses)
+    calibration = replace(
+        predicted.calibration, undetermined=uncertainty.undetermined, weak=uncertainty.weak
+    )
+    return replace(predicted, uncertainty=uncertainty, calibration=calibration)
+
+
+def _each_named(
+    directions: Iterable[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool
+) -> Iterable[Direction]:
+    for direction in directions:
+        yield replace(
+            direction,
+            text=describe(direction.vector, T_vehicle_lidar),
+            remedy=remedy(direction.vector, T_vehicle_lidar, weak),
+        )
+
+
+def describe(parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> str:
+    """The name of a direction.
+
+    Args:
+        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
+        T_vehicle_lidar: the extrinsics.
+    """
+    twist = rigid_twist(parts, T_vehicle_lidar)
+    if twist is None:
+        return _describe_apart(parts)
+    names = list(parts)
+    together = len(names) > 1
+    return _describe_twist(twist, "all LiDARs" if together else f"lidar '{names[0]}'", together)
+
+
+def remedy(
+    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool = False
+) -> str:
+    """What would determine a direction: a manoeuvre, or a setting.
+
+    Args:
+        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
+        T_vehicle_lidar: the extrinsics.
+        weak: the data determine it, but weakly.
+    """
+    twist = rigid_twist(parts, T_vehicle_lidar)
+    if twist is None and weak:
+        return REMEDY_MORE
+    if twist is None:
+        size = np.max([np.abs(part / UNIT) for part in parts.values()], axis=0)
+        return REMEDY_SYMMETRY if size.argmax() == AXES.index("yaw") else REMEDY_APART
+    notable = set(_notable(twist))
+    if notable == {"z"}:
+        return REMEDY_HEIGHT
+    if "yaw" in notable and notable <= {"yaw", "x", "y"}:
+        return REMEDY_TURN_CENTRE
+    if notable & {"x", "y"}:
+        return REMEDY_STRAIGHT
+    return REMEDY_TILT if notable <= {"roll", "pitch"} else REMEDY_STATIONARY
+
+
+def stationary_text(
+    undetermined: Sequence[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> str:
+    """The name of every common direction of a vehicle that did not move; empty if it moved.
+
+    Args:
+        undetermined: all directions.
+        T_vehicle_lidar: the extrinsics.
+    """
+    lost, best = undetermined_twists(undetermined, T_vehicle_lidar)
+    if lost < STATIONARY_TWISTS:
+        return ""
+    if lost == len(AXES):
+        return "all S2V axes: the vehicle did not move"
+    # The one motion that is determined: the ground determines the height.
+    height = np.abs(best / UNIT).argmax() == AXES.index("z")
+    return f"all S2V axes but {'the height' if height else 'one'}: the vehicle did not move"
+
+
+def _notable(twist: Array) -> list[str]:
+    """Axes of a twist that are named."""
+    scaled = np.abs(twist / UNIT)
+    leading = scaled / scaled.max()
+    return [axis for axis, size in zip(AXES, leading, strict=True) if size > NOTABLE]
+
+
+def _describe_twist(twist: Array, whole: str, several: bool) -> str:
+    """A motion of the whole sensor set relative to the vehicle."""
+    together = " together" if several else ""
+    notable = _notable(twist)
+    if notable == ["z"]:
+        return f"height of {whole}{together}"
+    if notable in (["x"], ["y"]):
+        way = "forward" if notable == ["x"] else "sideways"
+        return f"shift of {whole}{together} {way}: {notable[0]}"
+    if "yaw" in notable and set(notable) <= {"yaw", "x", "y"}:
+        shift = " and ".join(axis for axis in ("x", "y") if axis in notable)
+        if not shift:
+            return f"rotation of {whole} about the vertical through the vehicle frame: yaw"
+        radius_m = float(np.hypot(twist[3], twist[4]) / abs(twist[2]))
+        return (
+            f"rotation of {whole} about the turn centre: {shift} and yaw together, "
+            f"{radius_m:.2f} m per rad"
+        )
+    return f"{' and '.join(notable)} of {whole}{together}"
+
+
+def _describe_apart(parts: Mapping[str, Array]) -> str:
+    """A direction in which LiDARs move relative to each other."""
+    largest = max(float(np.abs(p / UNIT).max()) for p in parts.values())
+    sizes = {
+        name: size
+        for name, part in parts.items()
+        if ((size := np.abs(part / UNIT / largest)) > NOTABLE).any()
+    }
+    names = list(sizes)
+    if len(names) == 1:
+        axes = [axis for axis, v in zip(AXES, sizes[names[0]], strict=True) if v > NOTABLE]
+        together = " together" if len(axes) > 1 else ""
+        return f"{' and '.join(axes)} of lidar '{names[0]}'{together}"
+    # Which way each of them moves is in the vector; the text names the axes, the largest first.
+    of_any = np.max(list(sizes.values()), axis=0)
+    order = np.argsort(-of_any, kind="stable").tolist()
+    affected = _listed([AXES[i] for i in order if of_any[i] > NOTABLE])
+    quoted = [f"'{name}'" for name in names]
+    return f"relative {affected} between lidars {_listed(quoted)}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    """The words as a person lists them: a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

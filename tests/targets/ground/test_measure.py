@@ -1,0 +1,254 @@
+"""The ground over a drive: motion compensation, choice of scans, and what is reported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import load_config, parse_config
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import (
+    GroundObservation,
+    LidarScan,
+    MotionData,
+    TargetCloud,
+    TargetObservation,
+    Trajectory,
+)
+from caliv_graph.readers.caliv_folder import CalivFolder
+from caliv_graph.targets.ground.measure import GroundMeter, measure_grounds, nearest_scans
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
+from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.select import GivenTrajectory
+from tests.samples import pose
+from tests.targets.ground.scans import HEIGHT_M, beams, level, scan_of
+
+ROOT = Path(__file__).parents[3]
+RELEASED = ROOT.parent / "shared" / "data" / "caliv_released"
+
+CONFIG = parse_config(
+    {
+        "lidars": {
+            "front": {"topic": "a", "initial": {"xyz": [1.0, 0.0, 2.0], "rpy_deg": [1.0, 8.0, 0]}}
+        }
+    },
+    "made up",
+    Path(),
+)
+
+SECOND_NS = 1_000_000_000
+
+
+def pitching(rate_rad_s: float) -> GivenTrajectory:
+    """A vehicle that stands and pitches evenly about its frame's origin."""
+    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
+    poses = tuple(
+        gtsam.Pose3(gtsam.Rot3.Pitch(rate_rad_s * (t - SECOND_NS // 2) / SECOND_NS), np.zeros(3))
+        for t in stamps
+    )
+    return GivenTrajectory(Trajectory(stamps.astype(np.int64), poses))
+
+
+def test_meter_compensates_the_motion() -> None:
+    # A sweep of 0.1 s, during which the vehicle noses down by 20 mrad; the LiDAR at its origin.
+    rate = 0.2
+    trajectory = pitching(rate)
+    columns, channels = 120, 26
+    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
+    points = []
+    for direction, time_s in zip(beams(columns, channels), times_s, strict=True):
+        R = gtsam.Rot3.Pitch(math.radians(8.0) + rate * time_s).matrix()
+        down = float((R @ direction)[2])
+        points.append(direction * (HEIGHT_M / -down if down < -1e-3 else np.nan))
+    cloud = np.array(points)
+    seen = np.isfinite(cloud[:, 0])
+    scan = LidarScan("front", SECOND_NS // 2, cloud[seen], "sweep", times_s[seen])
+    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 8.0, 0]}}}
+    config = parse_config({"lidars": mounted}, "made up", Path())
+
+    observation = GroundMeter(config, trajectory, 3).measure(scan)
+    assert observation is not None
+    eight = math.radians(8.0)
+    expected = [-math.sin(eight), 0.0, math.cos(eight)]
+    assert observation.normal_lidar == pytest.approx(expected, abs=1e-5)
+    assert observation.distance_m == pytest.approx(HEIGHT_M, abs=1e-4)
+    assert (observation.lidar, observation.drive, observation.stamp_ns) == (
+        "front",
+        3,
+        SECOND_NS // 2,
+    )
+    assert np.sqrt(np.diag(observation.cov)) == pytest.approx(
+        [NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M], rel=0.05
+    )
+    # Without the times it would be off by milliradians.
+    naive = GroundMeter(config, trajectory, 3).measure(replace(scan, point_times_s=None))
+    assert naive is None or np.abs(naive.normal_lidar - expected).max() > 2e-3
+
+
+def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
+    # 2 m/s ahead while turning by 0.3 rad/s: with a pitch that is 2 degrees off, the ground seems
+    # to rise by 7 mm from the first column of the sweep to the last.
+    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
+    moving = tuple(
+        gtsam.Pose3.Expmap((t / SECOND_NS - 0.5) * np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0]))
+        for t in stamps
+    )
+    trajectory = GivenTrajectory(Trajectory(stamps.astype(np.int64), moving))
+    true = pose((1.0, 0.2, HEIGHT_M), (1.0, 8.0, -2.0))
+    guess = pose((1.05, 0.15, 1.9), (2.5, 6.0, 1.0))
+    columns, channels = 120, 26
+    times_s = np.repeat(np.arange(columns) / columns * 0.1, channels)
+    directions = beams(columns, channels)
+    # The vehicle stays level: all columns see the ground as if it stood.
+    down = -(directions @ true.rotation().matrix().T)[:, 2]
+    seen = down > 0.02
+    points = directions[seen] * (HEIGHT_M / down[seen])[:, None]
+    scan = LidarScan("front", SECOND_NS // 2, points, "sweep", times_s[seen])
+    lidar = {"topic": "a", "initial": {"xyz": [1.05, 0.15, 1.9], "rpy_deg": [2.5, 6.0, 1.0]}}
+    config = parse_config({"lidars": {"front": lidar}}, "made up", Path())
+
+    found = GroundMeter(config, trajectory, 0).measure(scan)
+    assert found is not None
+    assert found.R_vehicle_lidar == pytest.approx(guess.rotation().matrix(), abs=1e-12)
+    assert found.by_extrinsic is not None
+    normal = true.rotation().matrix()[2]
+    off = np.append(found.axes_lidar @ (found.normal_lidar - normal), found.distance_m - HEIGHT_M)
+    w = gtsam.Rot3.Logmap(guess.rotation().between(true.rotation()))
+    corrected = off + found.by_extrinsic @ w
+    assert np.abs(off[:2]).max() > 4e-4
+    assert abs(off[2]) > 4e-4
+    assert np.abs(corrected[:2]).max() < 4e-5
+    assert abs(corrected[2]) < 2e-4
+    # Clouds of one instant have nothing to be corrected.
+    at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
+    assert at_once is not None
+    assert at_once.by_extrinsic is None
+
+
+def test_meter_says_why_there_is_no_ground() -> None:
+    meter = GroundMeter(CONFIG, pitching(0.0), 1)
+    empty = LidarScan("front", 5, np.zeros((0, 3)), "empty")
+    assert meter.measure(empty) is None
+    assert meter.measure(replace(scan_of(level), stamp_ns=6)) is not None
+    assert meter.warnings() == ()
+    assert meter.measure(empty) is None
+    assert meter.warnings() == (
+        "ground: lidar 'front' has it in 1 of 3 scans of drive 2: "
+        "2 under 60 points near the ground",
+    )
+
+
+def test_meter_refuses_stamps_outside_the_trajectory() -> None:
+    meter = GroundMeter(CONFIG, pitching(0.0), 0)
+    with pytest.raises(TrajectoryError, match="outside the given poses"):
+        meter.measure(replace(scan_of(level), stamp_ns=2 * SECOND_NS))
+
+
+def test_ground_as_of_another_stamp() -> None:
+    # The vehicle noses down by 0.2 rad/s; the scan is taken 50 ms before the pose it speaks for.
+    mounted = {"front": {"topic": "a", "initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 10.0, 0]}}}
+    config = parse_config({"lidars": mounted}, "made up", Path())
+    meter = GroundMeter(config, pitching(0.2), 0)
+    scan = replace(scan_of(level), stamp_ns=SECOND_NS // 2)
+    at_ns = SECOND_NS // 2 + 50_000_000
+    found = meter.measure(scan, at_ns)
+    assert found is not None
+    assert found.stamp_ns == at_ns
+    tilt = math.radians(10.0) + 0.2 * 0.05
+    assert found.normal_lidar == pytest.approx([-math.sin(tilt), 0.0, math.cos(tilt)], abs=1e-6)
+    assert found.distance_m == pytest.approx(HEIGHT_M, abs=1e-6)
+
+
+def test_nearest_scans() -> None:
+    ms = 1_000_000
+    scans = [0, 100 * ms, 200 * ms, 500 * ms]
+    # To the nearest, unless another pose is nearer to it, or it is more than 60 ms away.
+    poses = [20 * ms, 40 * ms, 149 * ms, 200 * ms, 439 * ms, 561 * ms]
+    assert nearest_scans(poses, scans) == {0: 20 * ms, 100 * ms: 149 * ms, 200 * ms: 200 * ms}
+    assert nearest_scans([440 * ms], scans) == {500 * ms: 440 * ms}
+    assert nearest_scans([], scans) == {}
+    assert nearest_scans(poses, []) == {}
+
+
+class TwoLidars:
+    """A recording in memory: `front` at 0.2, 0.4, ... s, `rear` 30 ms later."""
+
+    name = "made up"
+    lidars = ("front", "rear")
+
+    def __init__(self) -> None:
+        self.read: list[tuple[str, int]] = []
+
+    def scan_stamps_ns(self, lidar: str) -> list[int]:
+        return [200_000_000 * i + 30_000_000 * (lidar == "rear") for i in range(1, 5)]
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        for stamp_ns in self.scan_stamps_ns(lidar):
+            if wanted is None or stamp_ns in wanted:
+                self.read.append((lidar, stamp_ns))
+                yield replace(scan_of(level), lidar=lidar, stamp_ns=stamp_ns)
+
+    def motion(self) -> MotionData:
+        return MotionData("made up")
+
+    def warnings(self) -> tuple[str, ...]:
+        return ()
+
+
+def test_all_lidars_see_the_ground_when_one_sees_the_target() -> None:
+    lidar = {"topic": "a", "initial": {"xyz": [0, 0, 2], "rpy_deg": [0, 10.0, 0]}}
+    lidars = {name: lidar | {"topic": name} for name in ("front", "rear", "blind")}
+    config = parse_config({"lidars": lidars}, "made up", Path())
+    # The front LiDAR sees the target twice, the rear one once.
+    seen = [("front", 400_000_000), ("front", 600_000_000), ("rear", 830_000_000)]
+    clouds = tuple(TargetCloud(name, 0, t, np.zeros((1, 3)), "cloud") for name, t in seen)
+    targets = [TargetObservation(0, "target", np.zeros(3), clouds)]
+    recording, progress = TwoLidars(), SilentProgress()
+    found, warnings = measure_grounds([recording], [pitching(0.0)], targets, config, progress)
+    assert [(o.lidar, o.stamp_ns // 1_000_000) for o in found] == [
+        ("front", 400),
+        ("front", 600),
+        ("front", 830),
+        ("rear", 400),
+        ("rear", 600),
+        ("rear", 830),
+    ]
+    assert len(recording.read) == 6
+    assert warnings == ()
+    assert all(o.distance_m == pytest.approx(HEIGHT_M, abs=1e-6) for o in found)
+    off = config.model_copy(update={"ground": config.ground.model_copy(update={"use": False})})
+    assert measure_grounds([recording], [pitching(0.0)], targets, off, progress) == ((), ())
+    assert len(recording.read) == 6
+
+
+@pytest.mark.skipif(not RELEASED.is_dir(), reason="the authors' drive is not there")
+def test_authors_drive_agrees_with_their_extrinsics() -> None:
+    config: Config = load_config(ROOT / "configs" / "caliv_released.yaml")
+    recording = CalivFolder(RELEASED, config.lidars)
+    trajectory = GivenTrajectory(given_trajectory(recording.motion()))
+    meter = GroundMeter(config, trajectory, 0)
+    published = {
+        "sensor_1": pose((2.259, 0.0, 1.938), (0.0, 10.0, 0.0)),
+        "sensor_2": pose((-0.3987347, 0.002735673, 2.098425312), (0.0, 10.0, 180.0)),
+    }
+    for name, T in published.items():
+        stamps = set(recording.scan_stamps_ns(name)[::3])
+        found: list[GroundObservation] = []
+        for scan in recording.scans(name, stamps):
+            observation = meter.measure(scan)
+            assert observation is not None
+            found.append(observation)
+        normals = np.array([T.rotation().matrix() @ o.normal_lidar for o in found])
+        heights = [o.distance_m - n @ T.translation() for o, n in zip(found, normals, strict=True)]
+        # Their vehicle frame is on the ground; it leans out of the turn by a little over 1 mrad.
+        assert np.mean(heights) == pytest.approx(0.0, abs=1e-3)
+        assert normals.mean(axis=0)[:2] == pytest.approx([0.0, -1.2e-3], abs=5e-4)
+    assert meter.warnings() == ()

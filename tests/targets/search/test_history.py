@@ -1,0 +1,59 @@
+"""The field of view of a LiDAR, from the azimuths of its returns."""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.products import IntArray
+from caliv_graph.targets.search.history import LidarHistory
+from caliv_graph.targets.search.objects import ScanObject, ScanObjects
+
+
+def object_at(azimuth_deg: float) -> ScanObject:
+    """A thing 2 degrees wide, fully seen."""
+    middle = math.radians(azimuth_deg)
+    return ScanObject(
+        centre=np.zeros(3),
+        base=np.zeros(3),
+        range_m=9.0,
+        extent_m=0.3,
+        bottom_m=0.1,
+        top_m=1.0,
+        points=100,
+        azimuth=(middle - math.radians(1.0), middle + math.radians(1.0)),
+        highest_rad=-0.1,
+        hidden=False,
+        outline=np.zeros((1, 3)),
+    )
+
+
+def whole(azimuth_deg: float, bins: IntArray) -> bool:
+    """Whether an object there is in full view of a LiDAR with returns in these half degrees."""
+    scan = ScanObjects((object_at(azimuth_deg),), bins, 0.2, True)
+    poses = np.eye(3)[None], np.zeros((1, 3))
+    history = LidarHistory("front", gtsam.Pose3(), [scan], poses, 1.0)
+    return bool(history.whole[0])
+
+
+@pytest.mark.parametrize("azimuth_deg", [-28.0, 0.0, 0.7, 28.0])
+def test_gaps_between_columns_are_in_view(azimuth_deg: float) -> None:
+    # A column every 1.5 degrees from -30 to 30.
+    assert whole(azimuth_deg, np.arange(-60, 61, 3))
+
+
+@pytest.mark.parametrize("azimuth_deg", [-45.0, -29.5, 29.5, 45.0, 180.0])
+def test_what_the_edge_may_cut_is_not_whole(azimuth_deg: float) -> None:
+    assert not whole(azimuth_deg, np.arange(-60, 61, 3))
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 179.5, -179.5])
+def test_a_lidar_that_looks_all_around_has_no_edge(azimuth_deg: float) -> None:
+    assert whole(azimuth_deg, np.arange(-360, 360, 2))
+
+
+def test_a_scan_without_returns_has_no_field_of_view() -> None:
+    assert not whole(0.0, np.zeros(0, np.int64))

@@ -1,0 +1,157 @@
+"""Sentences about contradictions: what, by how much, and what to check."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from caliv_graph.conventions import AXES
+from caliv_graph.products import Array, Guess
+from caliv_graph.uncertainty.consistency import (
+    Assumed,
+    CloudCount,
+    CoarseRegistrations,
+    GuessContradiction,
+    Heading,
+    ScoreTest,
+    ScoreTestKind,
+)
+from caliv_graph.wording.contradictions import contradiction_sentence
+from tests.samples import MOUNTINGS, pose
+
+GUESS_SIGMAS = np.array([math.radians(1.73)] * 3 + [0.058] * 3)
+FRONT = pose(*MOUNTINGS["front"])
+
+
+def along(axis: str, size: float) -> Array:
+    return np.asarray(size * np.eye(6)[AXES.index(axis)])
+
+
+def off_guess(off: Array, swapped: str | None = None, late_s: float | None = None) -> str:
+    axes = tuple(np.flatnonzero(off).tolist())
+    guess = Guess(FRONT, GUESS_SIGMAS)
+    return contradiction_sentence(
+        GuessContradiction("front", guess, off, GUESS_SIGMAS, axes, swapped, late_s, 2.0)
+    )
+
+
+def split(
+    d: Array, sigma: Array | float, kind: ScoreTestKind = "halves", lidar: str = "front"
+) -> ScoreTest:
+    information = np.diag(np.atleast_1d(sigma) ** -2.0)
+    return ScoreTest(lidar, kind, information, information @ np.atleast_1d(d))
+
+
+def counted(outliers: int, offset: Array | None = None, **parts: tuple[int, int]) -> CloudCount:
+    halves = dict.fromkeys(("left", "right", "early", "late"), (40, outliers // 2))
+    return CloudCount("front", 80, outliers, **{**halves, **parts}, offset_vehicle=offset)
+
+
+def test_a_late_clock_explains_an_offset_along_x() -> None:
+    assert off_guess(along("x", -0.58), late_s=0.29) == (
+        "lidar 'front': x differs from the initial guess 2.00 +- 0.06 m by 0.58 m: 10 sigma. "
+        "Stamps that are 0.29 s late at 2.0 m/s have this effect: check the clock of the LiDAR, "
+        "then the guess"
+    )
+    assert "0.29 s early" in off_guess(along("x", 0.58), late_s=-0.29)
+
+
+def test_swapped_topics_are_named() -> None:
+    text = off_guess(along("x", -2.4), swapped="rear")
+    assert "The estimate agrees with the guess of 'rear': check whether their topics are" in text
+
+
+def test_a_wrong_rotation_may_be_a_wrong_sign() -> None:
+    text = off_guess(along("pitch", 0.35))
+    assert "pitch differs from the initial guess (+- 1.7 degrees) by 20.1 degrees: 12 sigma" in text
+    assert "signs and the unit (degrees) of rpy_deg" in text
+    assert "Check the guess (metres" in off_guess(along("y", 0.6))
+
+
+def test_outliers_come_with_their_number_and_offset() -> None:
+    assert contradiction_sentence(counted(25, np.array([-0.2, 0.0, 0.05]))) == (
+        "lidar 'front': 25 of its 80 target clouds contradict the other clouds, median offset "
+        "0.21 m (-0.20 forward, +0.00 left, +0.05 up); an outlier ratio of 10% does not explain "
+        "that many. The result follows the other clouds, which may be the wrong ones: check its "
+        "stamps, its mount and the target"
+    )
+    far = contradiction_sentence(counted(25, np.array([40.0, 0.0, 0.0])))
+    assert ", median offset above 3 m;" in far
+
+
+def test_the_part_of_the_drive_is_named_if_most_outliers_are_in_it() -> None:
+    text = contradiction_sentence(counted(40, right=(40, 38), left=(40, 2)))
+    assert "contradict the other clouds, 38 of them in right turns;" in text
+    text = contradiction_sentence(counted(40, early=(40, 0), late=(40, 40)))
+    assert "in the second half" in text
+    assert "turns" not in contradiction_sentence(counted(40))
+    # On an arc all clouds are in one turn: that is no information.
+    assert "turns" not in contradiction_sentence(counted(40, right=(80, 40), left=(0, 0)))
+
+
+def test_coarse_registrations_name_where_it_shows_most() -> None:
+    late = split(np.array([0.017]), 0.0028, "clock")
+    both = ("front", "rear")
+    assert contradiction_sentence(CoarseRegistrations(10.0, (0.032, 0.015), both, late)) == (
+        "the target clouds (lidars 'front' and 'rear') and the motion of the vehicle contradict "
+        "each other: they fit only with registration errors of 32 mrad and 15 mm, 10 times what "
+        "the scatter of their points gives (limit 5). It shows most here: lidar 'front': its "
+        "stamps and the motion of the vehicle contradict each other: the stamps are 17 +- 3 ms "
+        "late (5 sigma). Check the stamps of every LiDAR, and that no mount and no target moved"
+    )
+    text = contradiction_sentence(CoarseRegistrations(10.0, (0.032, 0.015), both, counted(3)))
+    assert "It shows most here: lidar 'front': 3 of its 80 target clouds contradict" in text
+    assert "shows most" not in contradiction_sentence(
+        CoarseRegistrations(10.0, (0.032, 0.015), both, None)
+    )
+
+
+def test_extrinsics_that_differ_come_with_their_size() -> None:
+    sigma = np.array([2e-4] * 3 + [2e-3] * 3)
+    # 50 mm over hypot(2, 5) mm: 9.3 sigma in one of six axes, a little less in all.
+    assert contradiction_sentence(split(along("x", -0.05), sigma)) == (
+        "lidar 'front': its extrinsics from the first and from the second half of its clouds "
+        "differ: x by -50.0 +- 5.4 mm (8 sigma in total). Check whether its mount or the target "
+        "moved during the drive, and its clock"
+    )
+    turns = contradiction_sentence(split(along("yaw", 0.02), sigma, "turns"))
+    assert "from left turns and from right turns differ: yaw by +20.0 +- 1.0 mrad" in turns
+    assert "(fixed: true)" in contradiction_sentence(split(along("y", 0.2), sigma, "trust"))
+
+
+def test_a_clock_comes_with_its_lateness() -> None:
+    text = contradiction_sentence(split(np.array([0.3]), 1e-3, "clock"))
+    assert "the stamps are 300 +- 2 ms late" in text
+    assert text.endswith("Correct its clock, or set solve.time_offset")
+    assert "early" in contradiction_sentence(split(np.array([-0.3]), 1e-3, "clock"))
+
+
+@pytest.mark.parametrize(
+    ("found", "text"),
+    [
+        (
+            Assumed("drive", "height", -0.1, 0.005),
+            "drive: the height of the vehicle frame above the ground differs from the config by "
+            "-0.1 m (sigma 0.005 m): 20 sigma. Check ground.vehicle_height and ground.sigma",
+        ),
+        (
+            Assumed("drive", "tilt_y", 0.02, 0.001),
+            "drive: the tilt of the vehicle against the ground (y) differs from the config by "
+            "+0.02 rad (sigma 0.001 rad): 20 sigma. Check ground.parallel_sigma_deg and "
+            "imu.T_vehicle_imu",
+        ),
+    ],
+    ids=["height", "tilt"],
+)
+def test_an_assumption_comes_with_its_key(found: Assumed, text: str) -> None:
+    assert contradiction_sentence(found) == text
+
+
+def test_a_heading_comes_with_its_angle_and_the_allowance() -> None:
+    degree = math.radians(1.0)
+    text = contradiction_sentence(Heading("drive", degree, 1e-3, told_apart=True))
+    assert "contradict each other by +1.00 +- 0.12 degrees (9 sigma)" in text
+    measured = Heading("drive", degree, 3e-3, told_apart=True, measured=True)
+    assert "+1.00 +- 0.17 degrees" in contradiction_sentence(measured)

@@ -1,0 +1,237 @@
+"""Names of directions, and what would determine them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import retract_vehicle_axes
+from caliv_graph.products import Array
+from caliv_graph.results.calibration_file import read_calibration, write_calibration
+from caliv_graph.uncertainty.observability import UNIT, assess, scaling
+from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
+from caliv_graph.wording.directions import (
+    REMEDY_APART,
+    REMEDY_HEIGHT,
+    REMEDY_MORE,
+    REMEDY_STATIONARY,
+    REMEDY_STRAIGHT,
+    REMEDY_SYMMETRY,
+    REMEDY_TILT,
+    REMEDY_TURN_CENTRE,
+    describe,
+    named,
+    named_prediction,
+    remedy,
+)
+from tests.drives_with_chair import RADIUS_M
+from tests.samples import MOUNTINGS, pose, turn_about, twist_of_all
+
+LIDARS = {name: pose(*MOUNTINGS[name]) for name in ("front", "rear")}
+SIGMAS = np.array([0.03] * 3 + [0.06] * 3)
+
+HEIGHT = "height of all LiDARs together"
+TURN = f"rotation of all LiDARs about the turn centre: x and yaw together, {RADIUS_M:.2f} m per rad"
+
+# ------------------------------------------------------------------ names
+
+
+@pytest.mark.parametrize(
+    ("twist", "text"),
+    [
+        ([0, 0, 0, 0, 0, 1], HEIGHT),
+        ([0, 0, 0, 1, 0, 0], "shift of all LiDARs together forward: x"),
+        ([0, 0, 0, 0, -2, 0], "shift of all LiDARs together sideways: y"),
+        ([1, 0, 0, 0, 0, 0], "roll of all LiDARs together"),
+        ([0, 0.01, 0, 0, 0, 0], "pitch of all LiDARs together"),
+        (
+            [0, 0, 1, 0, 0, 0],
+            "rotation of all LiDARs about the vertical through the vehicle frame: yaw",
+        ),
+        (turn_about((0.0, -RADIUS_M)), TURN),
+        (turn_about((0.0, RADIUS_M)), TURN),
+    ],
+    ids=["z", "x", "y", "roll", "pitch", "yaw", "right turn", "left turn"],
+)
+def test_motions_of_all_lidars_together_are_one_direction(twist: list[float], text: str) -> None:
+    for scale in (1.0, -0.3):
+        parts = {name: scale * part for name, part in twist_of_all(twist, LIDARS).items()}
+
+        assert describe(parts, LIDARS) == text
+
+
+@pytest.mark.parametrize("centre", [(-1.0, 7.5), (3.0, -4.0), (0.2, -25.0)], ids=str)
+def test_the_radius_is_the_distance_of_the_turn_centre(centre: tuple[float, float]) -> None:
+    text = describe(twist_of_all(turn_about(centre), LIDARS), LIDARS)
+
+    assert text.startswith("rotation of all LiDARs about the turn centre: ")
+    assert text.endswith(f" and yaw together, {math.hypot(*centre):.2f} m per rad")
+    # Turned about that point, a LiDAR keeps its distance from it.
+    parts = twist_of_all(turn_about(centre), LIDARS)
+    for name, T in LIDARS.items():
+        moved = retract_vehicle_axes(T, 1e-3 * parts[name]).translation()
+        before = np.linalg.norm(T.translation()[:2] - centre)
+        assert np.linalg.norm(moved[:2] - centre) == pytest.approx(before, rel=1e-6)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_one_lidar_that_moves_alone_is_named(axis: str) -> None:
+    parts = {"front": np.eye(6)[AXES.index(axis)] * UNIT, "rear": np.zeros(6)}
+
+    assert describe(parts, LIDARS) == f"{axis} of lidar 'front'"
+
+
+def test_axes_that_move_alone_together_are_named_together() -> None:
+    parts = {"front": np.zeros(6), "rear": np.array([0.0, 0.0, 1e-3, 9e-3, 0.0, 0.0])}
+
+    assert describe(parts, LIDARS) == "yaw and x of lidar 'rear' together"
+
+
+def test_lidars_that_move_apart_are_named_with_their_axes() -> None:
+    up, down = np.zeros(6), np.zeros(6)
+    up[5], down[5], down[2] = 0.01, -0.005, 0.5e-3
+    tilted = down + np.array([0.4e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    assert describe({"front": up, "rear": down}, LIDARS) == (
+        "relative z and yaw between lidars 'front' and 'rear'"
+    )
+    assert describe({"front": up, "rear": tilted}, LIDARS) == (
+        "relative z, yaw and roll between lidars 'front' and 'rear'"
+    )
+    three = {**LIDARS, "left": pose(*MOUNTINGS["left"])}
+    assert describe({"front": up, "rear": down, "left": -up}, three) == (
+        "relative z and yaw between lidars 'front', 'rear' and 'left'"
+    )
+
+
+def test_a_single_lidar_is_named_instead_of_all() -> None:
+    only = {"front": LIDARS["front"]}
+
+    assert describe({"front": np.eye(6)[5]}, only) == "height of lidar 'front'"
+    text = describe(twist_of_all(turn_about((0.0, -RADIUS_M)), only), only)
+    assert text.startswith("rotation of lidar 'front' about the turn centre: ")
+
+
+# ------------------------------------------------------------------ remedies
+
+
+@pytest.mark.parametrize(
+    ("twist", "expected"),
+    [
+        ([0, 0, 0, 0, 0, 1], REMEDY_HEIGHT),
+        ([0, 0, 1, -9.16, 0, 0], REMEDY_TURN_CENTRE),
+        ([0, 0, 1, 9.16, 1.0, 0], REMEDY_TURN_CENTRE),
+        ([0, 0, 0, 1, 0, 0], REMEDY_STRAIGHT),
+        ([0, 0, 0, 0, 1, 0], REMEDY_STRAIGHT),
+        ([1, 0, 0, 0, 3, 0], REMEDY_STRAIGHT),
+        ([1, 0, 0, 0, 0, 0], REMEDY_TILT),
+        ([0, 1, 0, 0, 0, 0], REMEDY_TILT),
+    ],
+)
+def test_every_direction_has_a_manoeuvre_that_fixes_it(twist: list[float], expected: str) -> None:
+    for scale in (1.0, -1e-3):
+        parts = {name: scale * part for name, part in twist_of_all(twist, LIDARS).items()}
+        assert remedy(parts, LIDARS) == expected
+
+
+@pytest.mark.parametrize(("axis", "expected"), [("x", REMEDY_APART), ("yaw", REMEDY_SYMMETRY)])
+def test_lidars_that_move_apart_have_to_see_the_same_side(axis: str, expected: str) -> None:
+    parts = {"front": np.eye(6)[AXES.index(axis)] * UNIT, "rear": np.zeros(6)}
+
+    assert remedy(parts, LIDARS) == expected
+    # Where they do see it, what helps is to see it more often.
+    assert remedy(parts, LIDARS, weak=True) == REMEDY_MORE
+
+
+def rigid_loss(*lost: int) -> Array:
+    """Information of two LiDARs that determines all but some motions of both together."""
+    rows = np.vstack(
+        [
+            np.array(
+                [p / UNIT for p in twist_of_all(np.eye(6)[i].tolist(), LIDARS).values()]
+            ).ravel()
+            for i in lost
+        ]
+    )
+    basis = np.linalg.qr(rows.T)[0]
+    kept = np.eye(12) - basis @ basis.T
+    unit = np.tile(UNIT, 2)
+    return np.asarray(1e4 * kept / np.outer(unit, unit))
+
+
+def predicted(*lost: int) -> PredictedCovariance:
+    return named_prediction(
+        predict_covariance(
+            rigid_loss(*lost),
+            ("front", "rear"),
+            "rear",
+            LIDARS,
+            dict.fromkeys(LIDARS, SIGMAS),
+            {},
+            {},
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("lost", "text"),
+    [
+        (range(6), "all S2V axes: the vehicle did not move"),
+        (range(5), "all S2V axes but the height: the vehicle did not move"),
+        ((0, 1, 2, 3, 5), "all S2V axes but one: the vehicle did not move"),
+    ],
+    ids=["all", "but height", "but y"],
+)
+def test_a_vehicle_that_did_not_move_is_named_as_the_cause(lost: Iterable[int], text: str) -> None:
+    found = predicted(*lost)
+
+    assert [d.text for d in found.undetermined] == [text] * len(list(lost))
+    assert {d.remedy for d in found.undetermined} == {REMEDY_STATIONARY}
+    assert [d.text for d in found.calibration.undetermined] == [text] * len(list(lost))
+    # The pair is determined all the same.
+    assert set(found.determined_s2s) == {("front", "rear")}
+
+
+def test_remedies_are_in_the_file_and_are_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+
+    write_calibration(predicted(5).calibration, file)
+
+    written = yaml.safe_load(file.read_text())["observability"]["undetermined"]
+    assert [entry["remedy"] for entry in written] == [REMEDY_HEIGHT]
+    assert [d.remedy for d in read_calibration(file).undetermined] == [REMEDY_HEIGHT]
+
+
+def test_four_lost_motions_are_named_one_by_one() -> None:
+    texts = {d.text for d in predicted(0, 3, 4, 5).undetermined}
+
+    assert len(texts) == 4
+    assert not any("did not move" in text for text in texts)
+
+
+def test_names_do_not_change_the_numbers() -> None:
+    unit = scaling(2)
+    D = np.diag((0.1 * unit) ** -2.0)
+    D[7, 7] = 6e-3**-2.0
+    D[11, 11] = 0.0
+    plain = assess(D, np.diag(np.tile(SIGMAS, 2) ** -2.0), LIDARS)
+
+    found = named(plain, LIDARS)
+
+    assert [d.text for d in plain.undetermined + plain.weak] == ["", ""]
+    assert [d.text for d in found.undetermined] == ["z of lidar 'rear'"]
+    assert [d.remedy for d in found.undetermined] == [REMEDY_APART]
+    assert [d.text for d in found.weak] == ["pitch of lidar 'rear'"]
+    assert [d.remedy for d in found.weak] == [REMEDY_MORE]
+    for before, after in zip(
+        plain.undetermined + plain.weak, found.undetermined + found.weak, strict=True
+    ):
+        assert replace(after, text="", remedy="") == before
+    assert found.determined == plain.determined

@@ -46,7 +46,13 @@ Run = dict[str, Any]
 
 
 class KnockedRecording:
-    """A drive with a mount that is knocked; everything else, noise included, is unchanged."""
+    """A drive with a mount that is knocked; everything else, noise included, is unchanged.
+
+    Attributes:
+        before: the drive with the mount as it is before the knock.
+        after: the same drive with the mount as it is after the knock.
+        knock_ns: stamp of the knock.
+    """
 
     def __init__(
         self, scenario: Scenario, seed: int, lidar: str, turn_rad: Array, after_s: float
@@ -60,9 +66,9 @@ class KnockedRecording:
             turn_rad: (3,) rotation vector about the LiDAR's own origin, vehicle axes.
             after_s: seconds since the start of the drive.
         """
-        self._before = simulate_drive(scenario, seed)
-        self.knock_ns = self._before.truth.start_ns + round(after_s * NANOSECONDS_PER_SECOND)
-        mount = self._before.truth.T_vehicle_lidar[lidar]
+        self.before = simulate_drive(scenario, seed)
+        self.knock_ns = self.before.truth.start_ns + round(after_s * NANOSECONDS_PER_SECOND)
+        mount = self.before.truth.T_vehicle_lidar[lidar]
         moved = retract_vehicle_axes(mount, np.concatenate([turn_rad, np.zeros(3)]))
         x, y, z = (float(v) for v in moved.translation())
         roll, pitch, yaw = (float(v) for v in np.degrees(rpy(moved.rotation().matrix())))
@@ -70,32 +76,32 @@ class KnockedRecording:
             update={"mounting": PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))}
         )
         knocked = scenario.model_copy(update={"lidars": {**scenario.lidars, lidar: model}})
-        self._after = simulate_drive(knocked, seed)
+        self.after = simulate_drive(knocked, seed)
 
     @property
     def truth(self) -> SimulatedTruth:
         """Truth before the knock. The vehicle's poses are true for the whole drive."""
-        return self._before.truth
+        return self.before.truth
 
     @property
     def world(self) -> World:
         """The world around the drive."""
-        return self._before.world
+        return self.before.world
 
     def motion(self) -> MotionData:
         """IMU, GNSS and velocity."""
-        return self._before.motion()
+        return self.before.motion()
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         """Stamps of the clouds of one LiDAR, ascending."""
-        return self._before.scan_stamps_ns(lidar)
+        return self.before.scan_stamps_ns(lidar)
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in order of their stamps."""
         stamps = [s for s in self.scan_stamps_ns(lidar) if wanted is None or s in wanted]
         before = {s for s in stamps if s < self.knock_ns}
-        yield from self._before.scans(lidar, before)
-        yield from self._after.scans(lidar, set(stamps) - before)
+        yield from self.before.scans(lidar, before)
+        yield from self.after.scans(lidar, set(stamps) - before)
 
 
 @dataclass(frozen=True)

@@ -249,7 +249,7 @@ def test_a_knock_changes_the_scans_after_it_and_nothing_else(
         assert same == (plain.stamp_ns < knocked.knock_ns)
         assert plain.stamp_ns == moved.stamp_ns
     assert {plain.stamp_ns < knocked.knock_ns for plain, _ in pairs} == {True, False}
-    mount = knocked._after.truth.T_vehicle_lidar["front"]
+    mount = knocked.after.truth.T_vehicle_lidar["front"]
     difference = vehicle_axes_difference(mount, recording.truth.T_vehicle_lidar["front"])
     assert difference == pytest.approx(np.concatenate([turn, np.zeros(3)]), abs=1e-9)
     assert list(knocked.scans("rear", set(stamps)))[-1].points_lidar == pytest.approx(

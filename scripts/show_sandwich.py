@@ -67,7 +67,7 @@ from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.register import ANNEALING, FINE_SIGMA_M, FLOOR_PER_RANGE_SIGMA
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
-from caliv_graph.scenario.shapes import make_world
+from caliv_graph.scenario.world import make_world
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.targets.cloud.views import view_weights

@@ -54,6 +54,10 @@ class Kernel(ABC):
     def weights(self, squared: Array) -> Array:
         """Weights (J,) from 0 to 1 of squared whitened residuals (J,) with DOF coordinates."""
 
+    @abstractmethod
+    def reason(self, weight: float) -> str:
+        """Why a cloud has a weight below one, for the report."""
+
 
 class NoKernel(Kernel):
     """Full weight for every cloud."""
@@ -64,6 +68,10 @@ class NoKernel(Kernel):
         """Ones."""
         return np.ones_like(squared)
 
+    def reason(self, weight: float) -> str:
+        """Never asked for."""
+        return ""
+
 
 class Huber(Kernel):
     """Huber's kernel: full weight up to `huber_k` per root of DOF, then falling with 1 / r."""
@@ -72,6 +80,14 @@ class Huber(Kernel):
         """`min(1, k sqrt(DOF) / r)`."""
         bend = self._config.huber_k * np.sqrt(DOF)
         return np.asarray(np.minimum(1.0, bend / np.sqrt(np.maximum(squared, 1e-12))))
+
+    def reason(self, weight: float) -> str:
+        """The residual that gives the weight."""
+        bend = self._config.huber_k * np.sqrt(DOF)
+        return (
+            f"its pose residual is {bend / weight:.1f} sigma ({DOF} degrees of freedom; full "
+            f"weight up to {bend:.1f})"
+        )
 
 
 class Trimmed(Kernel):
@@ -84,6 +100,10 @@ class Trimmed(Kernel):
         if dropped:
             weights[np.argsort(squared, kind="stable")[-dropped:]] = 0.0
         return weights
+
+    def reason(self, weight: float) -> str:
+        """The percentage."""
+        return f"its pose residual is among the largest {self._config.trim_percent:g} percent"
 
 
 class TruncatedLeastSquares(Kernel):
@@ -119,6 +139,11 @@ class TruncatedLeastSquares(Kernel):
         self._mu = mu * GNC_FACTOR
         self._annealed = self._mu > _MOST_CONVEX
         return np.clip(middle, 0.0, 1.0)
+
+    def reason(self, weight: float) -> str:
+        """The probability beyond which residuals are truncated."""
+        p = self._config.tls_p_value
+        return f"its pose residual is larger than noise explains (robust.tls_p_value {p:g})"
 
 
 KERNELS: Mapping[str, type[Kernel]] = {

@@ -22,7 +22,7 @@ each of six axes, probability 1e-9. Such a cloud was registered to the wrong pla
 field of view, it slid along the shape). Even down-weighted by half, as by Huber's kernel, it would
 bias the solution."""
 
-MIN_CONTROL = 1e-4
+MIN_REDUNDANCY = 1e-4
 """Minimum redundancy for a testable residual: along a direction in which the rest of the data
 controls a smaller part of a cloud's information, its error cannot be found."""
 
@@ -135,7 +135,7 @@ def _deletion_covariances(W: Array, own: Array) -> tuple[Array, IntArray]:
     some = values > 1e-9 * values[:, -1:]
     white = axes * np.where(some, 1.0 / np.sqrt(np.where(some, values, 1.0)), 0.0)[:, None, :]
     part, along = np.linalg.eigh(np.einsum("jax,jab,jby->jxy", white, own_blocks(W), white))
-    controlled = part > MIN_CONTROL
+    controlled = part > MIN_REDUNDANCY
     roots = white @ along * np.where(controlled, part, np.inf)[:, None, :] ** -0.5
     return roots @ np.swapaxes(roots, 1, 2), controlled.sum(axis=1)
 

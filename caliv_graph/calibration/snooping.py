@@ -32,7 +32,7 @@ MOST_LOST = 0.25
 """Part of a LiDAR's clouds that may be lost one by one. From a tenth on they are reported as a
 contradiction (`uncertainty.consistency.OUTLIERS`)."""
 
-MIN_REDUNDANCY = 0.5
+MIN_SNOOPED_WEIGHT = 0.5
 """Weight below which a cloud is dropped where it is not clear which clouds are wrong: even
 down-weighted, it would bias the solution by the joint information."""
 
@@ -50,7 +50,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
 
     If a LiDAR would lose more than MOST_LOST of its clouds, its clock, its mount or the target is
     wrong rather than the clouds, and `score_tests` reports it: noise and values stay as they are,
-    and weights below MIN_REDUNDANCY become zero. Kernel `none` changes nothing.
+    and weights below MIN_SNOOPED_WEIGHT become zero. Kernel `none` changes nothing.
 
     Args:
         state: of `solve_registered`; gets new weights and values, and where clouds are lost new
@@ -91,7 +91,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
         if _too_many(problem, ~kept & (explained > 0.5)):
             state.noise, state.scale = fitted
             state.sound, state.values = sound, values
-            state.weights.values = np.where(weights < MIN_REDUNDANCY, MIN_WEIGHT, weights)
+            state.weights.values = np.where(weights < MIN_SNOOPED_WEIGHT, MIN_WEIGHT, weights)
             return
         if (by == (sound & kept)).all():
             return

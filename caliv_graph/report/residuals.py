@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.kernels import DOF
+from caliv_graph.calibration.kernels import KERNELS
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.config.model import RobustConfig
 from caliv_graph.products import Array, IntArray, Solution
@@ -168,14 +167,12 @@ def cloud_residuals(solution: Solution, placement: int) -> Array:
 def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdict, ...]:
     """The clouds with a weight below `NOTABLE_WEIGHT`, lowest weight first."""
     out = []
+    kernel = KERNELS[robust.kernel](robust)
     for m, registration in enumerate(solution.registrations):
         r = cloud_residuals(solution, m)
-        explained = (
-            np.ones(len(r))
-            if robust.kernel == "none"
-            else explained_part(registration.inlier_ratio)
-        )
-        typical = float(np.median(registration.inlier_ratio))
+        ratio = registration.inlier_ratio
+        explained = explained_part(ratio) if kernel.drops else np.ones(len(r))
+        typical = float(np.median(ratio))
         for j, cloud in enumerate(registration.observation.clouds):
             weight = float(solution.cloud_weights[m][j])
             if weight >= NOTABLE_WEIGHT:
@@ -183,10 +180,12 @@ def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdic
             reasons = []
             if explained[j] < 1.0:
                 reasons.append(
-                    f"only {registration.inlier_ratio[j]:.0%} of its points lie on the target "
+                    f"only {ratio[j]:.0%} of its points lie on the target "
                     f"(median of all clouds: {typical:.0%})"
                 )
-            reasons += _misfit(weight / max(float(explained[j]), 1e-9), robust)
+            by_residual = weight / max(float(explained[j]), 1e-9)
+            if by_residual <= 0.99:
+                reasons.append(kernel.reason(by_residual))
             out.append(
                 CloudVerdict(
                     cloud.lidar,
@@ -201,24 +200,6 @@ def down_weighted(solution: Solution, robust: RobustConfig) -> tuple[CloudVerdic
                 )
             )
     return tuple(sorted(out, key=lambda cloud: cloud.weight))
-
-
-def _misfit(part: float, robust: RobustConfig) -> list[str]:
-    """The reason why the kernel reduced a cloud's weight to `part`; empty if it did not."""
-    if part > 0.99:
-        return []
-    if robust.kernel == "huber":
-        bend = robust.huber_k * math.sqrt(DOF)
-        return [
-            f"its pose residual is {bend / part:.1f} sigma ({DOF} degrees of freedom; full weight "
-            f"up to {bend:.1f})"
-        ]
-    if robust.kernel == "tls":
-        return [
-            "its pose residual is larger than noise explains (robust.tls_p_value "
-            f"{robust.tls_p_value:g})"
-        ]
-    return [f"its pose residual is among the largest {robust.trim_percent:g} percent"]
 
 
 def _of_clouds(solution: Solution) -> Residuals:

@@ -293,9 +293,14 @@ def add_ground(
         J[:, 2, plane : plane + 2] = -arm[:, :2]
         J[:, 2, plane + 2] = -1.0
         np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, :, None] * J))
-    if assumptions.ground != "height":
-        return
-    at = np.flatnonzero(stood)
+    if assumptions.ground == "height":
+        _add_contact(H, motion, np.flatnonzero(stood), origin, columns)
+
+
+def _add_contact(
+    H: Array, motion: PlannedMotion, at: IntArray, origin: Array, columns: Columns
+) -> None:
+    """Adds that the vehicle stands on the plane, at the nodes `at`; heights are about `origin`."""
     R, place = motion.R_map_vehicle[at], motion.position_map[at] - origin
     J = np.zeros((len(at), 1, H.shape[1]))
     J[:, 0, 3:6] = R[:, 2]

@@ -120,7 +120,7 @@ def test_lidars_that_share_views_are_determined_against_each_other() -> None:
 
 
 def test_nothing_is_known_to_the_vehicle_but_the_height() -> None:
-    # Five of six, the ground telling the height (SPEC 4).
+    # Five of six, the ground determines the height.
     _, run = shared()
     assert run.calibration.status == "partial"
     assert len(run.calibration.undetermined) == 5

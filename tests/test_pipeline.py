@@ -231,7 +231,7 @@ def test_an_arc_holds_height_and_the_turn_about_its_centre_and_says_so(quiet: li
         for name in tried.poses:
             assert tried.lost(name) == {"x", "yaw", "z"}
             sigma = sigmas_s2v(calibration, name)
-            # SPEC 8: the guesses of two LiDARs, 58 mm and 30 mrad each, come to this.
+            # The lower bound: the guesses of two LiDARs, 58 mm and 30 mrad each, come to this.
             assert sigma[2] == pytest.approx(4.33 * MRAD, rel=0.05)
             assert sigma[3] == pytest.approx(40.0 * MM, rel=0.05)
             assert sigma[5] == pytest.approx(41.0 * MM, rel=0.05)
@@ -266,7 +266,7 @@ def staged(quiet: list[Tried]) -> Tried:
 
 def test_staged_is_as_good_as_the_paper_between_sensors(staged: Tried) -> None:
     assert staged.run.solution.mode == "staged"
-    # SPEC 8's figures for the paper's procedure and its authors' code, the larger of both.
+    # The figures of the paper's procedure and its authors' code, the larger of both.
     limits = np.array([4.9 * MRAD, 7.7 * MRAD, 1.5 * MRAD, 20 * MM, 20 * MM, 26 * MM])
     assert (np.abs(staged.s2s()) < limits).all(), rounded(staged.s2s())
 
@@ -306,7 +306,7 @@ def test_errors_of_sensor_to_sensor_are_such_as_the_covariance_says(noisy: list[
 def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
     errors = np.array([tried.s2s() for tried in noisy])
 
-    # SPEC 8 has 5 mm and 0.5 to 0.9 mrad for four times the clouds: twice that, and the bias of
+    # The lower bound is 5 mm and 0.5 to 0.9 mrad for four times the clouds: twice that, and the bias of
     # the registration on top.
     rms = np.sqrt((errors**2).mean(axis=0))
     assert (rms[:3] < 3.0 * MRAD).all(), rounded(rms)

@@ -118,7 +118,7 @@ def cloud_error(values: gtsam.Values, measured: gtsam.Pose3) -> Array:
 
 
 def predicted(values: gtsam.Values) -> gtsam.Pose3:
-    """SPEC 3: T_target_map X_i E S_a, by points: a point of the LiDAR, through every frame."""
+    """T_target_map X_i E S_a, by points: a point of the LiDAR, through every frame."""
     front = values.atPose3(E).compose(values.atPose3(S))
     return values.atPose3(C).compose(values.atPose3(X).compose(front))
 

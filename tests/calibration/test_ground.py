@@ -1,4 +1,4 @@
-"""The ground in the graph: Jacobians, numbers by hand, the table of SPEC 4, wrong planes."""
+"""The ground in the graph: Jacobians, numbers by hand, the table of null directions, wrong planes."""
 
 from __future__ import annotations
 
@@ -405,7 +405,7 @@ def moved_mountings(case: Case) -> gtsam.Values:
     return values
 
 
-# ------------------------------------------------------------------ SPEC 4
+# ------------------------------------------------------------------ null directions
 
 COUNT = 16
 STRAIGHT = path([0.0] * COUNT)

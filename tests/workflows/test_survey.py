@@ -1,4 +1,4 @@
-"""SPEC 4's table on noisy simulated drives, by what `observability` finds before calibrating."""
+"""The table of null directions on noisy simulated drives, by what `observability` finds before calibrating."""
 
 from __future__ import annotations
 

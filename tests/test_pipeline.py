@@ -306,7 +306,7 @@ def test_errors_of_sensor_to_sensor_are_such_as_the_covariance_says(noisy: list[
 def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
     errors = np.array([tried.s2s() for tried in noisy])
 
-    # The lower bound is 5 mm and 0.5 to 0.9 mrad for four times the clouds: twice that, and the bias of
+    # The bound is 5 mm and 0.5 to 0.9 mrad for four times the clouds: twice that, and the bias of
     # the registration on top.
     rms = np.sqrt((errors**2).mean(axis=0))
     assert (rms[:3] < 3.0 * MRAD).all(), rounded(rms)

@@ -1,4 +1,4 @@
-"""The ground in the graph: Jacobians, numbers by hand, the table of null directions, wrong planes."""
+"""The ground in the graph: Jacobians, numbers by hand, null directions, wrong planes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of null directions on noisy simulated drives, by what `observability` finds before calibrating."""
+"""The table of null directions on noisy simulated drives, as `observability` finds them."""
 
 from __future__ import annotations
 

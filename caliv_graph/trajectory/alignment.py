@@ -60,11 +60,11 @@ def align(
     gravity_m_s2: float,
     name: str,
 ) -> Array:
-    """(3, 3) R_map_imu at the first sample, without an orientation source.
+    """(3, 3) R_map_imu at the first sample, of the samples and fixes up to `until_ns`.
 
     Args:
         dead: the IMU, its gyroscope's bias removed.
-        until_ns: the samples and fixes up to this stamp are used.
+        until_ns: stamp, nanoseconds.
         positions: of the antenna; None: the heading at the start is the map's x axis.
         velocities: stamps (n,) and velocities (n, 3) of the IMU's origin in its own axes, if known.
         forward_imu: (3,) the vehicle's x axis in the imu frame.
@@ -128,11 +128,7 @@ def _yaw_by_accelerations(
     path_map: Array,
     gravity_m_s2: float,
 ) -> float:
-    """Heading by least squares: linear in its cosine and sine, start, velocity and bias.
-
-    In the levelled frame at the start, `Rz(-yaw) z = p0 + v0 t + g t^2 / 2 + dp - A b`, b the
-    accelerometer's bias, which also absorbs the error of the levelling.
-    """
+    """Yaw by least squares, linear in its cosine and sine (`README.md`, section 6)."""
     begin = int(dead.stamps_ns[0])
     t = (stamps - begin) * 1e-9
     x, y, _ = (path_map - path_map[0]).T

@@ -1,11 +1,6 @@
 """The smoother's factor graph, and the conversion of estimates to GTSAM's values and back.
 
-Variables of node i:
-    I_i  `T_map_imu`, right perturbation, rotation then translation
-    V_i  velocity of the IMU's origin in the map, m/s
-    B_i  `imuBias.ConstantBias` of accelerometer and gyroscope, imu frame
-and, where the config asks for it, one yaw bias of the orientation source for the whole drive.
-`README.md` of this folder derives every factor.
+`README.md` of this folder defines the variables of a node and derives every factor.
 """
 
 from __future__ import annotations
@@ -39,12 +34,7 @@ and large enough that the graph stays well conditioned."""
 
 @dataclass
 class TrajectoryGraph:
-    """The factors, and the kind of each.
-
-    Attributes:
-        factors: the nonlinear graph.
-        kinds: of each factor, in order: `imu`, `gnss`, `orientation`, `velocity`, or `prior`.
-    """
+    """The factors, and the kind of each: `imu`, `gnss`, `orientation`, `velocity`, or `prior`."""
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)
@@ -58,14 +48,10 @@ class TrajectoryGraph:
 def build_graph(
     data: SmootherInput, nodes: IntArray, states: States, dropped: IntArray, kernel: str
 ) -> TrajectoryGraph:
-    """All factors; the measurements are integrated and carried with the biases of an estimate.
+    """All factors; the measurements are integrated and carried with the biases of `states`.
 
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        states: the estimate.
-        dropped: (k,) indices of the GNSS fixes that are left out.
-        kernel: robust kernel of the fixes; only `huber` changes the noise model.
+    The GNSS fixes of indices `dropped` (k,) are left out. `kernel` is the robust kernel of the
+    others; only `huber` changes the noise model.
     """
     graph = TrajectoryGraph()
     carried = carry_to_nodes(data, nodes, without_bias(data.inertial, nodes, states))

@@ -72,7 +72,7 @@ def _per_message(
 ) -> tuple[Array, str]:
     """(n, d, d) covariances and their source: the first of the three that is stated.
 
-    A covariance that holds for all is a read-only view: a drive of hours has a million messages.
+    One that holds for all is a read-only view: a drive of hours has a million messages.
     """
     d = len(table)
     if configured is not None:
@@ -148,14 +148,9 @@ def orientation_covariances(imu: ImuSamples, config: Config) -> tuple[Array, str
 def given_pose_covariances(cov: Array | None, config: Config) -> Array | None:
     """Covariances of the white errors of given poses; the config's figures before the messages'.
 
-    Args:
-        cov: (m, 6, 6) of the messages, rotation then position, NaN where unknown; None: no message
-            states one.
-        config: `noise.pose_rotation_deg` and `noise.pose_position_m`.
-
-    Returns:
-        (m, 6, 6) with no sigma below `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`, NaN where
-        unknown. None: all unknown, or the config gives both figures.
+    `cov` and the result are (m, 6, 6), rotation then position, NaN where unknown, or None: all
+    unknown, or the config gives both figures. No sigma of the result is below
+    `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`.
     """
     rotation_deg, position_m = config.noise.pose_rotation_deg, config.noise.pose_position_m
     if cov is None or (rotation_deg is not None and position_m is not None):

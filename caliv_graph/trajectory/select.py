@@ -75,13 +75,7 @@ class GivenTrajectory:
         return seconds, Slerp(seconds, Rotation.from_matrix(R)), t
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
-        """Vehicle poses at any times within the span.
-
-        Args:
-            stamps_ns: (m,) in any order.
-
-        Returns:
-            R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) in metres.
+        """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3), metres, at any times within the span.
 
         Raises:
             TrajectoryError: a stamp is outside the span.
@@ -93,14 +87,7 @@ class GivenTrajectory:
         return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
 
     def error_covariances(self, stamps_ns: Sequence[int] | IntArray) -> Array | None:
-        """Covariances of the poses' errors as the messages state them.
-
-        Args:
-            stamps_ns: (m,) in any order.
-
-        Returns:
-            (m, 6, 6) rotation in vehicle axes (rad), then position in map axes (m); NaN where
-            unknown. None: no message states one.
+        """`given.error_covariances` at stamps (m,) in any order.
 
         Raises:
             TrajectoryError: a stamp is outside the span.
@@ -121,16 +108,10 @@ def smooth_trajectories(
     wanted: Sequence[Sequence[int] | IntArray] | None = None,
     motions: Mapping[int, MotionData] | None = None,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
-    """The trajectory of each drive.
+    """The trajectory of each drive: given poses if `topics.pose` is set or there is no IMU.
 
-    Given poses are used if `topics.pose` is set or there is no IMU; otherwise raw sensors are
-    smoothed.
-
-    Args:
-        recordings: opened drives.
-        config: topics, extrinsics, noise.
-        wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
-        motions: motion data by the recording's index, if they have been read already.
+    `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
+    `motions` are motion data by the recording's index, if they have been read already.
 
     Raises:
         TrajectoryError: the data of a drive do not determine its motion.

@@ -22,8 +22,7 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 
 SCANS_OF_A_PLACE = 10
 """Scans of each place of a target that is moved while the vehicle stands. All show the same spots
-of it: more scans would average the noise but not the sampling by the beams, and their covariance
-would be too small."""
+of it: more would average the noise but not the sampling by the beams."""
 
 
 def extract_targets(
@@ -34,16 +33,13 @@ def extract_targets(
 ) -> tuple[TargetObservation, ...]:
     """Reads every scan once and keeps the points of the targets (paper III-D.2).
 
-    Args:
-        recordings: the drives.
-        trajectories: one per drive; scans outside its span are left out.
-        config: regions, initial guesses, ranges, filters.
-        progress: advances with every scan.
+    Scans outside the span of their drive's trajectory are left out, LiDARs that saw the target in
+    fewer than `extraction.min_scans` scans too, with a warning. `progress` advances with every
+    scan.
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; one per place for
-        a target that was moved while the vehicle stood. LiDARs that saw the target in fewer than
-        `extraction.min_scans` scans are left out with a warning.
+        a target that was moved while the vehicle stood.
 
     Raises:
         TargetError: no LiDAR sees a target, or none was found.

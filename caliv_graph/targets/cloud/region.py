@@ -278,15 +278,10 @@ class RegionExtractor:
         return [member for _, member in scored[:MOST_CANDIDATES]]
 
     def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
-        """The clouds of the static object among the candidates, one per scan at most.
+        """The clouds of the static object among the candidates of a LiDAR's scans, best first.
 
         With a wrong guess even a static object moves in the map; but one error of the extrinsic,
-        small by its sigma, must explain that motion (`track`). Somebody who walks past does not
-        fit, nor does another object in some of the scans.
-
-        Args:
-            found: the candidates of each scan, best first.
-            lidar: its name.
+        small by its sigma, must explain that motion (`track`).
         """
         scans = [candidates for candidates in found if candidates]
         if not scans:

@@ -44,14 +44,10 @@ class CandidateSet:
     def of(
         cls, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array
     ) -> CandidateSet:
-        """The candidates of a LiDAR.
+        """The candidates of a LiDAR, at R (n, 3, 3) and t (n, 3) of T_region_lidar, the guess.
 
-        Args:
-            centres_lidar: (n, 3) metres, middle of each.
-            R: (n, 3, 3) of T_region_lidar at the guess.
-            t: (n, 3) of it, metres.
-            scan: (n,) index of the scan of each.
-            prior: (6,) sigmas of the guess, rad and m.
+        `centres_lidar` (n, 3) are their middles, metres, `scan` (n,) their scans, `prior` (6,) the
+        sigmas of the guess, rad and m.
         """
         places = np.einsum("nij,nj->ni", R, centres_lidar) + t
         moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)

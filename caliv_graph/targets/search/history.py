@@ -131,7 +131,7 @@ class LidarHistory:
     ) -> BoolArray:
         """(scans,) whether an object at a place (3,) in the map should be in view.
 
-        That is: within the field of view and these ranges, with no occluder.
+        Within the field of view and these ranges, with no occluder.
         """
         c, s = math.cos(alignment.yaw_rad), math.sin(alignment.yaw_rad)
         R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -119,11 +119,9 @@ class ScanObjects:
 
 
 def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
-    """Segments a scan into ground and objects.
+    """Segments a scan (N, 3), metres, lidar frame, motion compensated, into ground and objects.
 
-    Args:
-        points_lidar: (N, 3) metres, lidar frame, motion compensated.
-        R_map_lidar: (3, 3) attitude of the LiDAR, as good as the guess.
+    `R_map_lidar` (3, 3) is the attitude of the LiDAR, as good as the guess.
     """
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
     across = np.hypot(points_lidar[:, 0], points_lidar[:, 1])
@@ -154,16 +152,7 @@ def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
 
 @dataclass(frozen=True)
 class _Standing:
-    """Points above the ground.
-
-    Attributes:
-        index: (n,) in the scan.
-        level: (n, 3) metres, level axes about the LiDAR.
-        height: (n,) metres above the ground.
-        azimuth: (n,) rad, lidar frame.
-        elevation: (n,) rad, lidar frame.
-        range_m: (n,) metres.
-    """
+    """Points above the ground: indices (n,) in the scan, places in level axes, directions."""
 
     index: IntArray
     level: Array

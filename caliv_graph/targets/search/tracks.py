@@ -37,7 +37,7 @@ walks past is in a tenth."""
 SCATTER_M = 0.10
 SCATTER_PER_EXTENT = 0.15
 """Maximum scatter of a static object about its place, third quartile: constant, plus this part of
-its extent, since its visible side changes. Measured: 0.20 m at most for a chair 0.9 m wide with a
+its extent, since its visible side changes. Measured: at most 0.20 m for a chair 0.9 m wide with a
 guess 10 degrees off; 0.3 to 0.4 m for somebody who strolls about or waits."""
 
 FULL_POINTS = 300
@@ -163,10 +163,7 @@ def _bottom(history: LidarHistory, members: IntArray) -> float:
 
 
 def _height(history: LidarHistory, members: IntArray) -> tuple[float, bool]:
-    """Height of an object above ground, metres, and whether its top was ever in view.
-
-    Where the field of view cuts the top off, the height is a lower bound.
-    """
+    """Height of an object above ground, metres; whether its top was in view, else a bound."""
     tops, cut = history.top_m[members], history.top_cut[members]
     known = np.isfinite(tops)
     if not known.any():

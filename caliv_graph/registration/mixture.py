@@ -8,8 +8,6 @@ this folder derives the formulas; the M-step of the poses is in `quadratic`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -109,7 +107,6 @@ def information_weights(mixture: Mixture) -> tuple[Array, Array]:
     return np.asarray(1.0 / mixture.var_normal - along), np.asarray(along)
 
 
-@dataclass(frozen=True)
 class _Components:
     """The components for the E-step: means and normals (3, K); factors (K,) of the log-density.
 
@@ -117,31 +114,20 @@ class _Components:
     number, and the search in `tree` is a sixth faster.
     """
 
-    tree: cKDTree
-    neighbours: int
-    log_peak: Array
-    above: Array
-    aside: Array
-    means: Array
-    normals: Array
-
-    @classmethod
-    def of(cls, mixture: Mixture) -> _Components:
+    def __init__(self, mixture: Mixture) -> None:
         places = np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target])
-        return cls(
-            tree=cKDTree(places, balanced_tree=False),
-            neighbours=min(NEIGHBOURS, len(mixture.weights)),
-            log_peak=(
-                np.log(mixture.weights)
-                - 1.5 * np.log(2.0 * np.pi)
-                - 0.5 * np.log(mixture.var_normal)
-                - np.log(mixture.var_tangent)
-            ),
-            above=-0.5 / mixture.var_normal,
-            aside=-0.5 / mixture.var_tangent,
-            means=mixture.means_target.T.copy(),
-            normals=mixture.normals_target.T.copy(),
+        self.tree = cKDTree(places, balanced_tree=False)
+        self.neighbours = min(NEIGHBOURS, len(mixture.weights))
+        self.log_peak = (
+            np.log(mixture.weights)
+            - 1.5 * np.log(2.0 * np.pi)
+            - 0.5 * np.log(mixture.var_normal)
+            - np.log(mixture.var_tangent)
         )
+        self.above = -0.5 / mixture.var_normal
+        self.aside = -0.5 / mixture.var_tangent
+        self.means = mixture.means_target.T.copy()
+        self.normals = mixture.normals_target.T.copy()
 
     def densities(
         self, points: Array, normals: Array, beams: Array, flatness: Array, reach_m: float
@@ -196,7 +182,7 @@ def expect(
         outlier_density: gamma / (h (gamma + 1)) with h the volume of the region, per cubic metre.
         cloud_weights: (J,) weight of each cloud: robust weight times view weight.
     """
-    components = _Components.of(mixture)
+    components = _Components(mixture)
     near = np.empty((len(stack.points), components.neighbours), dtype=np.int64)
     alpha = np.empty(near.shape)
     forces, directions = np.empty(alpha.shape), np.empty(stack.points.shape)

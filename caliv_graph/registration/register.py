@@ -73,6 +73,7 @@ class JointRegistration:
         clouds: the same, thinned and stacked.
         tolerance: (rad, m) of `register_jointly`.
         weights: (J,) robust weight of each cloud, set from outside.
+        inlier_ratio: (J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class JointRegistration:
         self._volume = 1.0
         self._mixture: Mixture | None = None
         self._expected: tuple[Array, Array, Array] | None = None
-        self._inlier_ratio: Array = np.ones(self.clouds.count)
+        self.inlier_ratio: Array = np.ones(self.clouds.count)
         self._view_weights = np.ones(self.clouds.count) if view_weights is None else view_weights
         self.weights: Array = np.ones(self.clouds.count)
 
@@ -132,11 +133,6 @@ class JointRegistration:
         if self._mixture is None:
             raise RegistrationError(f"{self.observation.name}: not seeded yet")
         return self._mixture
-
-    @property
-    def inlier_ratio(self) -> Array:
-        """(J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step."""
-        return self._inlier_ratio
 
     @property
     def finest(self) -> bool:
@@ -156,7 +152,7 @@ class JointRegistration:
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         density = self._gamma / (self._volume * (self._gamma + 1.0))
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._view_weights)
-        self._inlier_ratio = who.inlier_ratio
+        self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
         # Not the quadratic itself: it is as large as all the rest.

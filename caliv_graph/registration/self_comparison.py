@@ -118,7 +118,6 @@ def views_of(registration: Registration, most: int = MOST_VIEWS) -> tuple[View, 
     )
 
 
-@dataclass(frozen=True)
 class Shape:
     """A shape and the views of it.
 
@@ -132,26 +131,17 @@ class Shape:
         sigma_m: noise along the beam, 1 sigma, metres.
     """
 
-    means: Array
-    normals: Array
-    chosen: IntArray
-    views: tuple[ViewIndex, ...]
-    tree: cKDTree
-    spacing_m: float
-    sigma_m: float
-
-    @classmethod
-    def of(cls, mixture: Mixture, views: Sequence[View], sigma_m: float) -> Shape:
+    def __init__(self, mixture: Mixture, views: Sequence[View], sigma_m: float) -> None:
         """Indexes the components that have points, and the views."""
-        means, normals = mixture.means_target, mixture.normals_target
         # Components without points may be anywhere.
         alive = np.flatnonzero(mixture.weights > 0.05 / len(mixture.weights))
+        self.means, self.normals = mixture.means_target[alive], mixture.normals_target[alive]
         few = np.linspace(0, len(alive) - 1, min(MOST_COMPONENTS, len(alive))).round().astype(int)
-        tree = cKDTree(np.column_stack([means[alive], NORMAL_METRES * normals[alive]]))
-        seen = tuple(ViewIndex.of(view) for view in views if len(view.points_target) >= 10)
-        chosen = np.sort(few)
-        spacing_m = float(np.median(np.asarray(tree.query(tree.data, k=2)[0])[:, 1]))
-        return cls(means[alive], normals[alive], chosen, seen, tree, spacing_m, sigma_m)
+        self.chosen: IntArray = np.sort(few)
+        self.views = tuple(ViewIndex.of(view) for view in views if len(view.points_target) >= 10)
+        self.tree = cKDTree(np.column_stack([self.means, NORMAL_METRES * self.normals]))
+        self.spacing_m = float(np.median(np.asarray(self.tree.query(self.tree.data, k=2)[0])[:, 1]))
+        self.sigma_m = sigma_m
 
     def rotated(self, axis: Array, angle_rad: float) -> RotationResult | None:
         """The shape compared with itself after a rotation about `axis` (3,), a unit vector.

@@ -103,7 +103,7 @@ def symmetries(
     """
     if not views or len(mixture.weights) < 20:
         return ()
-    shape = Shape.of(mixture, views, sigma_range_m)
+    shape = Shape(mixture, views, sigma_range_m)
     identity = shape.compare(np.eye(3), np.zeros(3))
     axes = _axes(mixture)
     found: list[Symmetry | None] = [None] * len(axes)
@@ -121,7 +121,7 @@ def refit(symmetry: Symmetry, mixture: Mixture) -> Symmetry:
     With an axis that is off by millimetres, `marginalise_symmetry` would leave information along
     the symmetry.
     """
-    shape = Shape.of(mixture, (), 0.0)
+    shape = Shape(mixture, (), 0.0)
     fits = []
     for signed in (symmetry.fitted_rad, -symmetry.fitted_rad):
         fit = shape.fit(symmetry.axis_target, signed, symmetry.centre_target, REFIT_SPACINGS)
@@ -176,23 +176,17 @@ def _axes(mixture: Mixture) -> list[Array]:
 def _symmetry_about(shape: Shape, axis: Array, identity: Comparison) -> Symmetry | None:
     """The smallest rotation about an axis that is a symmetry, or None."""
     limit = identity.contradicted + MOST_CONTRADICTED
-
-    def tried(signed_rad: float) -> RotationResult | None:
-        """A rotation; None if too little was seen at both ends."""
-        result = shape.rotated(axis, signed_rad)
-        least = FEWEST_COMPARED * identity.compared
-        return None if result is None or result.comparison.compared <= least else result
+    least = FEWEST_COMPARED * identity.compared
 
     def worse_of_both(angle_rad: float, enough: float = math.inf) -> RotationResult | None:
-        """A rotation and its inverse, the more contradicted one.
+        """A rotation and its inverse, the more contradicted one; None if either is hardly seen.
 
-        None if too little was seen of either. If the first is contradicted by more than `enough`,
-        the inverse is not tried.
+        If the first is contradicted by more than `enough`, the inverse is not tried.
         """
         worst: RotationResult | None = None
         for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
-            result = tried(signed)
-            if result is None:
+            result = shape.rotated(axis, signed)
+            if result is None or result.comparison.compared <= least:
                 return None
             if worst is None or result.comparison.contradicted > worst.comparison.contradicted:
                 worst = result

@@ -156,20 +156,11 @@ def _jacobian(
     """The Jacobian of a linear graph, its columns where `place` (first, how many) has each key."""
     rows, columns, entries = np.asarray(graph.sparseJacobian_())
     # GTSAM's columns are in ascending order of the keys; the last one is the right-hand side.
-    order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in _keys(graph))])
+    keys = sorted(set(graph.keyVector()))
+    order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in keys)])
     keep = columns <= len(order)
-    return scipy.sparse.csr_array(
-        (
-            entries[keep],
-            (rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]),
-        ),
-        shape=(int(rows.max()), size),
-    )
-
-
-def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
-    """The keys of a graph, ascending."""
-    return sorted(set(graph.keyVector()))
+    where = rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]
+    return scipy.sparse.csr_array((entries[keep], where), shape=(int(rows.max()), size))
 
 
 def inverse_of(A: Array) -> Array:

@@ -9,14 +9,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array
 
 NoiseModel = gtsam.noiseModel.Base
-
-
-def _skew(v: Array) -> Array:
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def position_factor(
@@ -43,7 +39,7 @@ def position_factor(
     if delay_s == 0.0:
         return gtsam.GPSFactorArm(key_imu, position_map, offset_imu, noise)
     shift = np.array([0.0, 0.0, -0.5 * gravity_m_s2 * delay_s**2]) - position_map
-    skew_offset = -_skew(offset_imu)
+    skew_offset = -skew(offset_imu)
     by_velocity = delay_s * np.eye(3)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -75,7 +71,7 @@ def velocity_factor(
         predicted = back @ (values.atVector(key_velocity) + gained_map)
         if jacobians is not None:
             J = np.zeros((3, 6))
-            J[:, :3] = _skew(predicted)
+            J[:, :3] = skew(predicted)
             jacobians[0] = J
             jacobians[1] = back
         return np.asarray(predicted - velocity_imu)

@@ -82,7 +82,9 @@ def heading_disagreement(
     sideways = s * velocity[:, 0] + c * velocity[:, 1]
     if measured is not None:
         sideways = sideways - along[:, 1]
-    separable = measured is None and _separable(forward, turn)
+    # The curvature varies: curves to both sides, or curves and straights.
+    curvatures = float(np.ptp(np.percentile(turn / forward, [5, 95])))
+    separable = measured is None and curvatures > MIN_CURVATURE_RANGE_1_M
     solution, variance = _fit(forward, turn if separable else None, sideways, measured is not None)
     sigma = math.sqrt(variance + _heading_sigma(smoothed) ** 2)
     yaw = coarse + float(solution[0])
@@ -157,12 +159,6 @@ def _turn_between(seen: Array, expected: Array, axis_only: bool) -> float:
         return math.atan2(float(cross.sum()), float(dot.sum()))
     double = math.atan2(float((2.0 * cross * dot).sum()), float((dot**2 - cross**2).sum()))
     return 0.5 * double
-
-
-def _separable(forward: Array, turn: Array) -> bool:
-    """Whether the curvature varies: curves to both sides, or curves and straights."""
-    curvature = turn / forward
-    return float(np.ptp(np.percentile(curvature, [5, 95]))) > MIN_CURVATURE_RANGE_1_M
 
 
 def _heading_sigma(smoothed: SmoothedTrajectory) -> float:

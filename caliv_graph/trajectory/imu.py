@@ -283,10 +283,8 @@ def preintegrate(
     half_turn = exp_so3(0.5 * middle_gyro * dt[:, None])
     middle_force = np.einsum("nij,nj->ni", half_turn, middle_force)
     first = np.searchsorted(edges, nodes_ns)
-    bridge_of = _bridged(inertial, nodes_ns)
     out = []
-    for i in range(len(nodes_ns) - 1):
-        gap_s = bridge_of[i]
+    for i, gap_s in enumerate(_bridged(inertial, nodes_ns).tolist()):
         parameters = plain if gap_s == 0.0 else _parameters(noise, gravity_m_s2, gap_s)
         measured = gtsam.PreintegratedCombinedMeasurements(parameters, biases[i])
         for k in range(first[i], first[i + 1]):

@@ -120,11 +120,7 @@ def orientations_at_nodes(
         _oriented(imu, cov, nodes_ns, dead, noise, samples[a:b], node[a:b])
         for a, b in itertools.pairwise(cuts)
     ]
-    return NodeOrientations(
-        np.concatenate([part.nodes for part in parts]),
-        np.concatenate([part.R_map_imu for part in parts]),
-        np.concatenate([part.cov for part in parts]),
-    )
+    return NodeOrientations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _oriented(
@@ -135,8 +131,8 @@ def _oriented(
     noise: ImuNoise,
     samples: IntArray,
     node: IntArray,
-) -> NodeOrientations:
-    """`orientations_at_nodes` of some samples (m,) that carry one; `node` (m,) is theirs."""
+) -> tuple[IntArray, Array, Array]:
+    """`NodeOrientations` of some samples (m,) that carry one; `node` (m,) is theirs."""
     assert imu.orientation_xyzw is not None
     stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples]
     R = rotations_of(imu.orientation_xyzw[samples])
@@ -154,7 +150,7 @@ def _oriented(
     R_reference = R_node[reference[node]]
     differences = log_so3(np.swapaxes(R_reference, 1, 2) @ R_node)
     nodes, mean, mean_cov = _weighted_mean(node, differences, cov_node)
-    return NodeOrientations(nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov)
+    return nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov
 
 
 def usable_orientations(imu: ImuSamples) -> BoolArray:
@@ -232,11 +228,6 @@ def positions_at_nodes(
     node = nearest_node(nodes_ns, stamps[fixes])
     at_node = nodes_ns[node]
     dR, _, dp = dead.between(at_node, stamps[fixes])
-    return NodePositions(
-        node,
-        fixes,
-        positions.position_map[fixes],
-        dp + dR @ arm_imu,
-        np.asarray((stamps[fixes] - at_node) * 1e-9),
-        positions.cov_map[fixes],
-    )
+    delay_s = np.asarray((stamps[fixes] - at_node) * 1e-9)
+    position, cov = positions.position_map[fixes], positions.cov_map[fixes]
+    return NodePositions(node, fixes, position, dp + dR @ arm_imu, delay_s, cov)

@@ -137,31 +137,25 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
     begin, end = GivenTrajectory(trajectory).span_ns
     lost = stamps[(stamps < begin) | (stamps > end)]
-    warnings = _unknown_covariances(trajectory, motion.name)
-    if not len(lost):
-        return GivenTrajectory(trajectory, (), warnings)
-    if len(lost) == len(stamps):
+    if len(lost) and len(lost) == len(stamps):
         raise TrajectoryError(
             f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
             f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s. Do their clocks agree?"
         )
-    line = (
-        f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
-    )
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line, *warnings))
-
-
-def _unknown_covariances(trajectory: Trajectory, name: str) -> tuple[str, ...]:
-    """A line if some messages state a covariance and others do not."""
-    if trajectory.cov is None:
-        return ()
-    known = stated(trajectory.cov)
-    if known.all() or not known.any():
-        return ()
-    return (
-        f"{name}: {int((~known).sum())} of {len(known)} vehicle poses state no covariance: their "
-        "white error is estimated",
-    )
+    warnings = []
+    if len(lost):
+        warnings.append(
+            f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, "
+            "lost"
+        )
+    count = len(trajectory.stamps_ns)
+    unknown = 0 if trajectory.cov is None else int((~stated(trajectory.cov)).sum())
+    if 0 < unknown < count:
+        warnings.append(
+            f"{motion.name}: {unknown} of {count} vehicle poses state no covariance: their white "
+            "error is estimated"
+        )
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings))
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
@@ -171,11 +165,6 @@ def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
     after = np.minimum(stamps + TWIST_WINDOW_NS, end)
     first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
-    return np.array(
-        [
-            gtsam.Pose3.Logmap(a.between(b)) / max(seconds, 1e-9)
-            for a, b, seconds in zip(
-                first, second, (after - before) / NANOSECONDS_PER_SECOND, strict=True
-            )
-        ]
-    )
+    seconds = np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)
+    steps = zip(first, second, seconds, strict=True)
+    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])

@@ -42,7 +42,7 @@ def smooth_trajectory(
     nodes = place_nodes(data.inertial, wanted)
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
     robust = solve_without_outliers(data, nodes, states)
-    data, estimate = robust.data, robust.estimate
+    data, estimate, positions = robust.data, robust.estimate, robust.data.positions
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
     warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
@@ -56,8 +56,8 @@ def smooth_trajectory(
         T_vehicle_imu=data.T_vehicle_imu,
         gravity_m_s2=data.gravity_m_s2,
         yaw_bias=None if yaw_sigma is None else (estimate.states.yaw_bias_rad, yaw_sigma),
-        gnss_rejected=_rejected_stamps(data, robust.dropped),
-        origin_deg_m=None if data.positions is None else data.positions.origin_deg_m,
+        gnss_rejected=robust.dropped if positions is None else positions.stamps_ns[robust.dropped],
+        origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
         chain=chain_of(linear, len(nodes), data.yaw_bias),
@@ -99,13 +99,6 @@ def _at_wanted(
         T_map_vehicle=poses_of_vehicle(states, i, data.T_vehicle_imu),
         cov=np.asarray(Ad @ cov_imu[i] @ Ad.T),
     )
-
-
-def _rejected_stamps(data: SmootherInput, dropped: IntArray) -> IntArray:
-    """(k,) stamps of the dropped fixes."""
-    if data.positions is None:
-        return np.zeros(0, dtype=np.int64)
-    return data.positions.stamps_ns[dropped]
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

@@ -120,7 +120,7 @@ def _placements(
     moved = periods(centres, extractor.trajectory, config.extraction.min_scans)
     if not moved:
         clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
-        return [_observation(0, label, extractor, clouds, config, hints)]
+        return [_observation(label, extractor, clouds, config, hints)]
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -135,11 +135,11 @@ def _placements(
         most = max(most, SCANS_OF_A_PLACE, config.extraction.min_scans)
         extraction = config.extraction.model_copy(update={"max_scans": most})
         fewer = config.model_copy(update={"extraction": extraction})
-        observation = _observation(0, name, own, clouds, fewer, ())
+        observation = _observation(name, own, clouds, fewer, ())
         if observation.clouds:
             out.append(observation)
     if not out:
-        return [_observation(0, label, extractor, [], config, hints)]
+        return [_observation(label, extractor, [], config, hints)]
     warnings = [*hints, *_warnings_of_moves(label, extractor, out, len(moved), config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
@@ -195,7 +195,6 @@ def _warnings_of_moves(
 
 
 def _observation(
-    placement: int,
     label: str,
     extractor: RegionExtractor,
     found: list[TargetCloud],
@@ -224,9 +223,8 @@ def _observation(
             )
     if not kept:
         warnings = [_why_none(label, config, extractor.tallies)]
-    return TargetObservation(
-        placement, label, extractor.centre_map, tuple(kept), tuple(warnings), seen_ns
-    )
+    centre = extractor.centre_map
+    return TargetObservation(0, label, centre, tuple(kept), tuple(warnings), seen_ns)
 
 
 def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:

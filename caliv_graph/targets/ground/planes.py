@@ -310,20 +310,18 @@ def _judged(
     # By chance, points on a line may scatter little; the nominal covariance depends on geometry.
     if not all(_is_determined(c) for c in (cov, nominal)):
         return None, "too little ground to determine its tilt"
-    return (
-        GroundPlane(
-            normal_lidar=normal,
-            distance_m=distance_m,
-            axes_lidar=axes,
-            cov=cov,
-            beyond=beyond,
-            centre_lidar=centre @ axes - distance_m * normal,
-            points=count,
-            scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
-            radius_m=radius_m,
-        ),
-        "",
+    ground = GroundPlane(
+        normal_lidar=normal,
+        distance_m=distance_m,
+        axes_lidar=axes,
+        cov=cov,
+        beyond=beyond,
+        centre_lidar=centre @ axes - distance_m * normal,
+        points=count,
+        scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
+        radius_m=radius_m,
     )
+    return ground, ""
 
 
 def _is_determined(cov: Array) -> bool:

@@ -53,9 +53,9 @@ class ShapeQuadratic:
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
         gradient: (J, 6) of the negative log-likelihood.
-        across: (K, 6 J) root of the loss to the means across the surface, `sqrt(|a| / mass) n^T A`.
-        sign: (K,) of a, which is negative where a component is thicker than it is wide.
-        along: (K, 4 J) root of the rest of it, `sqrt(b / mass)` times the sums of alpha (1, y).
+        across: (K, 6 J) root of the loss to the means across the surface.
+        sign: (K,) of a of `information_weights`: negative where a component is thicker than wide.
+        along: (K, 4 J) root of the rest of the loss to the means.
         moments: (J, K, 10) sums of alpha h h^T, h = (1, y), target frame.
         coupling: (K, 10, 3, 6) linear map from the moments of a cloud and component to the coupling
             of its orientation and the cloud.

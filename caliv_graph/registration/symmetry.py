@@ -1,9 +1,9 @@
 """Symmetries of the reconstructed target, and their elimination from a calibration.
 
 No cloud of a drum determines the yaw of a LiDAR about its axis; if a guess is off by more than 45
-degrees about a cube, registration converges 90 degrees off. The quadratic does not have the freedom
-of a drum in its null space, since its components tile a smooth surface like the dimples of a golf
-ball. `marginalise_symmetry` removes that information (`README.md` of this folder).
+degrees about a cube, registration converges 90 degrees off. The quadratic claims information on the
+freedom of a drum, since its components tile a smooth surface like the dimples of a golf ball:
+`marginalise_symmetry` removes it (`README.md` of this folder).
 """
 
 from __future__ import annotations

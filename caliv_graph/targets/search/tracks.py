@@ -78,18 +78,14 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
     gate = gate_m(history, config)
     bases = history.bases(alignment)
     wide, wide_scan = history.outlines(history.extent_m >= WIDE_M, alignment)
-    wide_tree = cKDTree(wide[:, :2]) if len(wide) else None
-    tree = cKDTree(bases[:, :2])
+    wide_tree, tree = cKDTree(wide[:, :2]), cKDTree(bases[:, :2])
     travelled = float(np.ptp(history.t_map_vehicle[:, :2], axis=0).max(initial=0.0))
     out = []
     for members in tracks_at_places(history, bases[:, :2], gate):
         place = np.average(bases[members], axis=0, weights=1.0 / history.range_m[members])
         scans = history.scan_of[members]
-        in_wide = (
-            set(wide_scan[wide_tree.query_ball_point(place[:2], gate)].tolist())
-            if wide_tree is not None
-            else set()
-        ) - set(scans.tolist())
+        in_wide = set(wide_scan[wide_tree.query_ball_point(place[:2], gate)].tolist())
+        in_wide -= set(scans.tolist())
         met = set(history.scan_of[tree.query_ball_point(place[:2], 1.3 * gate)].tolist()) | in_wide
         centre_m = np.linalg.norm((bases[members] - history.t_map_vehicle[scans])[:, :2], axis=1)
         missed = _in_view(history, alignment, place, centre_m, gate) - met

@@ -100,7 +100,7 @@ class CloudStack:
     def features(self) -> Array:
         """(N, 13) what `moments.cell_moments` sums over points, lidar frame.
 
-        `second_moments` of the points less their cloud's centre, and flatness times normal.
+        `second_moments` of `centred`, and flatness times normal.
         """
         return np.column_stack(
             [second_moments(self.centred), self.flatness[:, None] * self.normals]
@@ -136,11 +136,10 @@ def second_moments(points: Array) -> Array:
 
 
 def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
-    """Pseudo-random priorities (N,) by which points (N, 3) are drawn.
+    """Pseudo-random priorities (N,) by which points (N, 3) are drawn: hashes of their coordinates.
 
-    A stride would alias with the scan lines. A priority is a hash of the point's coordinates in the
-    frame of its LiDAR. So the draw does not depend on the initial guess, nor on other points at the
-    edge of the region.
+    A stride would alias with the scan lines. In the frame of its LiDAR the draw depends neither on
+    the initial guess nor on other points at the edge of the region.
     """
     bits = np.ascontiguousarray(points, dtype=np.float64).view(np.uint64)
     state = np.zeros(len(points), dtype=np.uint64)
@@ -156,15 +155,10 @@ def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
 def surface_normals(
     points: Array, sigma_range_m: float, around: Array | None = None
 ) -> tuple[Array, Array]:
-    """Surface normals of one cloud, towards the sensor.
+    """(N, 3) unit normals towards the sensor, and (N,) flatness 0 to 1, of points of one cloud.
 
-    Args:
-        points: (N, 3) metres, lidar frame; where normals are wanted.
-        sigma_range_m: noise along the beam, 1 sigma; it limits the flatness.
-        around: (M, 3) the whole cloud; None: `points`.
-
-    Returns:
-        (N, 3) unit normals and (N,) flatness between 0 and 1.
+    `points` (N, 3) and the whole cloud `around` (M, 3), by default the same, are in metres, lidar
+    frame. The noise along the beam limits the flatness.
     """
     around = points if around is None else around
     return _normals_across(
@@ -175,13 +169,11 @@ def surface_normals(
 def stack_clouds(
     observation: TargetObservation, max_points: int, sigma_range_m: float, normals: bool = True
 ) -> CloudStack:
-    """Stacks the clouds of a placement, at most `max_points` points of each.
+    """Stacks the clouds of a placement, none of them empty.
 
-    Args:
-        observation: the clouds, none of them empty.
-        max_points: a larger cloud is thinned (`sampling_order`).
-        sigma_range_m: noise along the beam, metres.
-        normals: False if `merged_normals` follows; until then all point to the sensor.
+    Clouds of more than `max_points` points are thinned (`sampling_order`). Without `normals`, if
+    `merged_normals` follows, all normals point to the sensor. The noise along the beam is in
+    metres.
     """
     points, normal, flatness = [], [], []
     for cloud in observation.clouds:
@@ -212,7 +204,7 @@ def stack_clouds(
 
 
 def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> CloudStack:
-    """Surface normals from the aligned clouds of each LiDAR, merged.
+    """The same clouds, with normals and flatness from the aligned clouds of each LiDAR, merged.
 
     One cloud has one or two columns of points on the leg of a chair; a dozen clouds show its faces.
 
@@ -222,9 +214,6 @@ def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> Cl
         t: (J, 3) translations of it, metres.
         lidar: (J,) index of the LiDAR of each cloud. Clouds of different LiDARs are not merged:
             their alignment is what is estimated.
-
-    Returns:
-        The same clouds with new normals and flatness.
     """
     points = stack.moved(R, t)
     beams = stack.rotated(R, stack.beams)
@@ -253,10 +242,7 @@ def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> Cl
 
 
 def _towards_sensor(normals: Array, flatness: Array, beams: Array) -> Array:
-    """Normals, blended with the direction to the sensor where flatness is low.
-
-    Where a normal cannot be estimated, the surface still faces the sensor.
-    """
+    """Normals, blended with the direction to the sensor where they cannot be estimated."""
     own = np.minimum(flatness / TRUSTED_FLATNESS, 1.0)[:, None]
     mixed = own * normals - (1.0 - own) * beams
     return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1), 1e-12)[:, None])
@@ -270,23 +256,11 @@ def _normals_across(
     radius_m: float,
     sigma_range_m: float,
 ) -> tuple[Array, Array]:
-    """Normals by regression of the depth along the beam over the position across it.
+    """(n, 3) unit normals and (n,) flatness at points (n, 3) of the surface `around` (N, 3).
 
-    The noise is in the depth alone. A plane through the points of a ball, the common way, is biased
-    towards the sensor by 10 degrees and more on slanted surfaces: the ball cuts off the points with
-    large noise. Across the beam nothing is cut off, and the gate on the distance from the *plane*
-    along the beam is symmetric.
-
-    Args:
-        points: (n, 3) where normals are wanted, seen from about the same side.
-        around: (N, 3) points of the same surface, seen from that side too; `points` among them.
-        beams: (m, 3) directions from the sensor to these points, of any length; their mean is used.
-        neighbours: of each point at most.
-        radius_m: of the neighbourhood across the beam.
-        sigma_range_m: noise along the beam, 1 sigma.
-
-    Returns:
-        (n, 3) unit normals towards the sensor, (n,) flatness.
+    By regression of the depth along the mean of `beams` over the position across it, since the
+    noise is in the depth alone: the plane of a ball of points is biased (`README.md` of this
+    folder).
     """
     along = beams.mean(axis=0)
     along /= np.linalg.norm(along)
@@ -316,17 +290,10 @@ def _normals_across(
 def _gated_slope(
     kernel: Array, depth: Array, across: Sequence[Array], width_m: Array, sigma_range_m: float
 ) -> tuple[Array, Array, Array]:
-    """Planes through the depths of the neighbours, by weighted least squares with narrowing gate.
+    """(n, 2) slopes of planes through depths (n, k); last weights and (n, 3, 3) normal matrices.
 
-    Args:
-        kernel: (n, k) weight of the neighbours by their distance across the beam.
-        depth: (n, k) metres along the beam.
-        across: six (n, k): 1, u, v, u^2, u v, v^2 of the position across, in kernel widths.
-        width_m: (n, 1) of the kernels.
-        sigma_range_m: noise along the beam, 1 sigma.
-
-    Returns:
-        (n, 2) slopes of the depth, (n, k) last weights, (n, 3, 3) last normal matrices.
+    `across` is 1, u, v, u^2, u v, v^2, (n, k) each, of the position across in widths (n, 1) of
+    `kernel`.
     """
     _, u, v, *_ = across
     depths = (depth, u * depth, v * depth)

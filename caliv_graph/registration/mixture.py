@@ -1,17 +1,12 @@
 """The mixture that a target is reconstructed as: seed, E-step, and M-step of the components.
 
-GMMCalib (Evangelidis & Horaud 2018 behind it) has isotropic components. A chair is seen from its
-front by one LiDAR and from its back by another, 2 to 3 cm apart. Isotropic components pull the two
-skins together: on the CaLiV authors' drive by 36 mrad of roll between the LiDARs. So a component
-here has a normal, a variance along it and one across it, and explains only points whose beam came
-from the side that its normal points to. Without normals, beam intersections and `ALONG_SURFACE`,
-and with equal variances, the formulas are those of GMMCalib. `caliv_graph/registration/README.md`
-has the derivation; the M-step of the poses is in `quadratic`.
+GMMCalib's components are isotropic, and pull the front and back of a chair together, which two
+LiDARs see 2 to 3 cm apart. So a component here has a normal, a variance along it and one across it,
+and explains only points whose beam came from the side that its normal points to. `README.md` of
+this folder derives the formulas; the M-step of the poses is in `quadratic`.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -57,12 +52,10 @@ PART_POINTS = 8192
 """Points of a part of the E-step: what belongs to them stays in the processor's cache."""
 
 ALONG_SURFACE = 0.07
-"""Factor on the information of residuals *along* the surface, 0 to 1. Components are pieces of a
-surface, and the sampling of a piece by the beams differs from view to view: a LiDAR has more points
-on the side of a piece that faces it. With factor 1 every cloud appears too near, which biases the
-extrinsic of a sparse LiDAR by 5 mm, and the covariance is too small. Edges and legs have real
-information along the surface: with factor 0 three sparse LiDARs are 1 mm off, the other way.
-"""
+"""Factor on the information of residuals *along* the surface, 0 to 1. The sampling of a surface by
+the beams differs from view to view: with factor 1 every cloud appears too near, which biases the
+extrinsic of a sparse LiDAR by 5 mm. Edges and legs have real information along the surface: with
+factor 0 three sparse LiDARs are 1 mm off, the other way."""
 
 NORMAL_SIGMA_RAD = 0.2
 """Prior of a component's normal about the mean normal of its points, 1 sigma. Normals are blurred
@@ -77,17 +70,12 @@ the components use of the data the poses do not get."""
 
 
 def seed_mixture(stack: CloudStack, R: Array, t: Array, components: int, sigma_m: float) -> Mixture:
-    """The initial mixture: components on points drawn where normals are reliable.
+    """The initial mixture of width `sigma_m`: components on points with reliable normals.
 
     Every cloud contributes the same number of points: a near cloud with many does not take all
-    components. The draw does not depend on the poses (`sampling_order`).
-
-    Args:
-        stack: the clouds.
-        R: (J, 3, 3) rotations of current `T_target_lidar`.
-        t: (J, 3) translations of current `T_target_lidar`.
-        components: how many; fewer if there are few points (`POINTS_PER_COMPONENT`).
-        sigma_m: initial standard deviation along and across the normal, metres.
+    components. The draw does not depend on the poses `T_target_lidar`, rotations R (J, 3, 3) and
+    translations t (J, 3). There are fewer `components` if there are few points
+    (`POINTS_PER_COMPONENT`).
     """
     points = stack.moved(R, t)
     normals = stack.rotated(R, stack.normals)
@@ -114,77 +102,40 @@ def seed_mixture(stack: CloudStack, R: Array, t: Array, components: int, sigma_m
 
 
 def information_weights(mixture: Mixture) -> tuple[Array, Array]:
-    """(K,) a and b of `W = a n n^T + b I`, the weight of the residuals of a component's points.
-
-    Across the surface W is `1 / var_normal`, along it `ALONG_SURFACE / var_tangent`.
-    """
+    """(K,) a and b of `W = a n n^T + b I`, the weight of the residuals of a component's points."""
     along = ALONG_SURFACE / mixture.var_tangent
     return np.asarray(1.0 / mixture.var_normal - along), np.asarray(along)
 
 
-@dataclass(frozen=True)
 class _Components:
-    """The components, laid out for the E-step.
+    """The components for the E-step: means and normals (3, K); factors (K,) of the log-density.
 
-    Attributes:
-        tree: of means and scaled normals. Components lie on surfaces: boxes halved in the middle
-            fit them better than those halved in number, and the search is a sixth faster.
-        neighbours: number of components per point, k.
-        log_peak: (K,) logarithm of prior times density at the mean.
-        above: (K,) factor of the squared height above the surface in the log-density.
-        aside: (K,) factor of the squared distance along the surface.
-        means: (3, K) metres, target frame.
-        normals: (3, K) unit vectors.
+    Components lie on surfaces: boxes halved in the middle fit them better than those halved in
+    number, and the search in `tree` is a sixth faster.
     """
 
-    tree: cKDTree
-    neighbours: int
-    log_peak: Array
-    above: Array
-    aside: Array
-    means: Array
-    normals: Array
-
-    @classmethod
-    def of(cls, mixture: Mixture) -> _Components:
+    def __init__(self, mixture: Mixture) -> None:
         places = np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target])
-        return cls(
-            tree=cKDTree(places, balanced_tree=False),
-            neighbours=min(NEIGHBOURS, len(mixture.weights)),
-            log_peak=(
-                np.log(mixture.weights)
-                - 1.5 * np.log(2.0 * np.pi)
-                - 0.5 * np.log(mixture.var_normal)
-                - np.log(mixture.var_tangent)
-            ),
-            above=-0.5 / mixture.var_normal,
-            aside=-0.5 / mixture.var_tangent,
-            means=mixture.means_target.T.copy(),
-            normals=mixture.normals_target.T.copy(),
+        self.tree = cKDTree(places, balanced_tree=False)
+        self.neighbours = min(NEIGHBOURS, len(mixture.weights))
+        self.log_peak = (
+            np.log(mixture.weights)
+            - 1.5 * np.log(2.0 * np.pi)
+            - 0.5 * np.log(mixture.var_normal)
+            - np.log(mixture.var_tangent)
         )
+        self.above = -0.5 / mixture.var_normal
+        self.aside = -0.5 / mixture.var_tangent
+        self.means = mixture.means_target.T.copy()
+        self.normals = mixture.normals_target.T.copy()
 
     def densities(
         self, points: Array, normals: Array, beams: Array, flatness: Array, reach_m: float
     ) -> tuple[IntArray, Array, Array, Array]:
-        """Densities of points under their nearest components.
+        """(n, k) near components; densities; heights above, slides along beams to their surfaces.
 
-        The distance of a point from a component along the surface is measured where the point's
-        beam meets the component's plane. The noise is along the beam. On a slanted surface it
-        displaces the point along the surface too, and would choose the component: at the far edge
-        of a face the last component would get the points with positive noise, at the near edge
-        those with negative noise. Every face would rotate about its middle, and with it a LiDAR by
-        0.5 mrad.
-
-        Args:
-            points: (n, 3) metres, target frame.
-            normals: (n, 3) unit vectors, target frame.
-            beams: (n, 3) unit vectors from the sensor, target frame.
-            flatness: (n,) reliability of the normals.
-            reach_m: farthest intersection of a beam with a surface from its point.
-
-        Returns:
-            All (n, k): indices of the components, densities (prior included), heights of the points
-            above the surfaces, distances along the beams from the points to the surfaces.
+        The distance along the surface is measured where the point's beam meets the component's
+        plane: the noise along the beam does not choose the component (`README.md`).
         """
         k = self.neighbours
         _, found = self.tree.query(np.column_stack([points, NORMAL_METRES * normals]), k)
@@ -220,20 +171,18 @@ def expect(
 ) -> Responsibilities:
     """E-step: responsibilities of the nearest components (GMMCalib's, with oriented components).
 
-    For a point y at height h above a plane of normal n, with beam b, the lever of the residual in
-    the gradient ends where the beam meets the plane, at `y - h b / (n^T b)`. The lever of the noisy
-    point is correlated with its residual: least squares would rotate all surfaces edge-on to their
-    beams, where the noise across them is smaller.
+    The lever of a residual in the gradient ends where the beam meets the surface, not at the noisy
+    point, whose lever is correlated with its residual.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
-        t: (J, 3) translations of current `T_target_lidar`.
+        t: (J, 3) translations of it.
         mixture: the current components.
         outlier_density: gamma / (h (gamma + 1)) with h the volume of the region, per cubic metre.
         cloud_weights: (J,) weight of each cloud: robust weight times view weight.
     """
-    components = _Components.of(mixture)
+    components = _Components(mixture)
     near = np.empty((len(stack.points), components.neighbours), dtype=np.int64)
     alpha = np.empty(near.shape)
     forces, directions = np.empty(alpha.shape), np.empty(stack.points.shape)
@@ -284,14 +233,13 @@ def maximise_shape(
 ) -> Mixture:
     """M-step of the components at new poses: means, normals, variances, priors.
 
-    A normal is estimated from the heights of the points along their beams, where the E-step saw
-    them, with the mean normal of the points as a prior. With that prior alone, slanted and frontal
-    views of a narrow face would not agree on its place.
+    A normal is estimated from the heights of the points along their beams, with the mean normal of
+    the points as a prior.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of the new `T_target_lidar`.
-        t: (J, 3) translations of the new `T_target_lidar`.
+        t: (J, 3) translations of it.
         mixture: the components of the E-step.
         sigma_floor_m: smallest standard deviation; annealed from coarse to the noise level.
         cells: (J, K, 23) `cell_moments` of its responsibilities.
@@ -326,11 +274,7 @@ def maximise_shape(
 def _updated_normals(
     normals: Array, prior: Array, orientation_information: Array, torque: Array
 ) -> Array:
-    """(K, 3) normals at their maximum a posteriori.
-
-    A rotation v costs `v^T C v / 2 - torque^T v` by the points, and `|v - w|^2 / 2` over
-    `NORMAL_SIGMA_RAD` squared by the prior, w being the rotation from `normals` to `prior`.
-    """
+    """(K, 3) normals at their maximum a posteriori."""
     axis = cross(normals, prior)
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ka,ka->k", normals, prior))

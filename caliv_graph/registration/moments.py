@@ -1,8 +1,7 @@
 """Weighted sums over points, per cloud and component, and the linear algebra on them.
 
-A point enters all M-steps through `alpha h h^T`, h = (1, y), of which ten numbers differ. So the
-sums are formed once, in the frame of the LiDAR, and carried to the target frame by the pose of each
-cloud. What is linear in them (information of poses, gradients, scatter) is then a matrix product.
+The sums are formed once, in the frame of the LiDAR, and carried to the target frame by the pose of
+each cloud. All M-steps are linear in them: matrix products.
 """
 
 from __future__ import annotations
@@ -70,16 +69,9 @@ class Responsibilities:
 
 
 def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:
-    """Sums over the points of each cloud and component ("cell").
+    """(J, K, 23) sums over the points of each cloud and component ("cell"), for K `components`.
 
-    Args:
-        stack: the clouds.
-        who: responsibilities of the components for their points.
-        components: how many there are, K.
-
-    Returns:
-        (J, K, 23): `MOMENTS`, `NORMALS` and `SURFACE_MOMENTS` of each cell, lidar axes, points less
-        their cloud's centre.
+    `MOMENTS`, `NORMALS` and `SURFACE_MOMENTS`, lidar axes, points less their cloud's centre.
     """
     width = who.component.shape[1]
     ends = np.append(stack.starts, len(stack.points))

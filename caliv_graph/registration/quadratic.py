@@ -1,9 +1,8 @@
 """The quadratic that the points of all clouds put on the poses of the clouds.
 
-The M-step of the poses, with places and orientations of the components eliminated: joint
-information and gradient over all clouds. It is an estimating equation: residuals are those of the
-points, levers are those of where the beams meet the surface, and information along the surface is
-reduced (`mixture.ALONG_SURFACE`). `caliv_graph/registration/README.md` derives each term.
+The M-step of the poses, with places and orientations of the components eliminated. It is an
+estimating equation: residuals are those of the points, levers are those of where the beams meet the
+surface. `README.md` of this folder derives each term.
 """
 
 from __future__ import annotations
@@ -45,34 +44,24 @@ LEAST_LEVER_M = 1e-5
 class ShapeQuadratic:
     """Information and gradient over the poses of all clouds, the shape eliminated.
 
-    Left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then translation) change
-    the negative log-likelihood by `d^T H d / 2 + g^T d`. H is `blocks` on the diagonal, the
-    information of each cloud given the shape, minus what is lost since mean and orientation of each
-    component are estimated from the same points (two Schur complements). The loss couples clouds.
-
-    In H, y is the place where a point's beam meets the surface. In `gradient` and `torque` the
-    residual is that of the point itself, its lever reaches to that place.
-
-    Means: a cloud moves the mean of component k by `A_jk d_j / mass_k`, A_jk (3, 6) being the sum
-    of `alpha [-skew(y), I]`. The loss is the sum over k of `A_jk^T W_k A_j'k / mass_k`, W_k
-    the (3, 3) weight of its residuals. Since `W_k = a n n^T + b I`, this is two matrix products:
-    `across` of the first term, `along` of the second.
-
-    Orientations: a component rotated by v about its mean m moves `v x (y - m)`. With
-    G = -skew(y - m), its information is C = sum of `alpha G^T W G`, its coupling to a cloud is
-    `P_jk = sum of alpha G^T W [-skew(y), I]`, and the loss is `P_jk^T C_k^-1 P_j'k`. Clouds
-    that share no component are then independent of each other, in rotation too.
+    An estimating equation (`caliv_graph/registration/README.md`), not one likelihood: a step d of
+    left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then translation)
+    minimises `d^T H d / 2 + g^T d`. H is `blocks` on the diagonal minus what
+    is lost since mean and orientation of each component are estimated from the same points: two
+    Schur complements, which couple clouds. Clouds that share no component are independent of each
+    other.
 
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
-        gradient: (J, 6) of the negative log-likelihood.
-        across: (K, 6 J) root of the loss to the means across the surface, `sqrt(|a| / mass) n^T A`.
+        gradient: (J, 6) g of the estimating equation.
+        across: (K, 6 J) root of the loss to the means across the surface.
         sign: (K,) of a, negative where `var_normal > var_tangent / ALONG_SURFACE`.
-        along: (K, 4 J) root of the rest of it, `sqrt(b / mass)` times the sums of alpha (1, y).
+        along: (K, 4 J) root of the rest of the loss to the means.
         moments: (J, K, 10) sums of alpha h h^T, h = (1, y), target frame.
-        coupling: (K, 10, 3, 6) linear map from the moments of a cloud and component to P.
-        orientation_information: (K, 3, 3) C of each component.
-        torque: (K, 3) negative gradient with respect to the rotation v of each component.
+        coupling: (K, 10, 3, 6) linear map from the moments of a cloud and component to the coupling
+            of its orientation and the cloud.
+        orientation_information: (K, 3, 3) of each component.
+        torque: (K, 3) negative gradient with respect to the rotation of each component.
     """
 
     blocks: Array
@@ -88,9 +77,8 @@ class ShapeQuadratic:
     def joint(self, given_orientations: bool = False) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite.
 
-        Args:
-            given_orientations: eliminate the means alone. Half the work, and never less
-                information: a step is the same or shorter.
+        With `given_orientations` the means alone are eliminated: half the work, and never less
+        information, so that a step is the same or shorter.
         """
         count = len(self.blocks)
         flat = self.sign > 0.0
@@ -164,17 +152,12 @@ _PAIRS = np.einsum("ace,bcf->abef", JACOBIAN, JACOBIAN).reshape(16, 36)
 def shape_quadratic(
     stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, who: Responsibilities
 ) -> ShapeQuadratic:
-    """Linearises the negative log-likelihood at the current poses (`ShapeQuadratic`).
-
-    A point y of cloud j with responsibility alpha contributes `alpha (y - mu)^T W (y - mu) / 2`,
-    with `dy = [-skew(y), I] d_j` and W of its component (`information_weights`). The levers in
-    what multiplies d reach to where the beam meets the surface: those of the noisy point would be
-    longer by the noise wherever a surface is slanted, and correlated with its residual.
+    """Linearises the negative log-likelihood at the current poses.
 
     Args:
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
-        t: (J, 3) translations of current `T_target_lidar`.
+        t: (J, 3) translations of it.
         mixture: the components of the E-step.
         cells: (J, K, 23) `cell_moments` of the responsibilities.
         who: the responsibilities; their lever corrections enter.
@@ -224,7 +207,7 @@ def shape_quadratic(
 
 
 def _coupling(W: Array, means: Array) -> Array:
-    """(K, 10, 3, 6) linear map from moments to P of `ShapeQuadratic`, components about `means`."""
+    """(K, 10, 3, 6) `ShapeQuadratic.coupling`, components about `means`."""
     K = len(means)
     P = (W[:, *np.triu_indices(3)] @ _ROTATION_ROWS).reshape(K, 10, 3, 6)
     # Rotations are about the mean, not about the origin: first moments, which come first.
@@ -234,13 +217,7 @@ def _coupling(W: Array, means: Array) -> Array:
 
 
 def _orientation_information(scatter: Array, mass: Array, W: Array) -> Array:
-    """C (K, 3, 3) of `ShapeQuadratic`.
-
-    Args:
-        scatter: (K, 3, 3) of the places where the beams meet the surface, about their mean.
-        mass: (K,) of all clouds together.
-        W: (K, 3, 3) weight of the residuals.
-    """
+    """(K, 3, 3) of `ShapeQuadratic`, from the scatter (K, 3, 3) about the mean and mass (K,)."""
     K = len(mass)
     C = scatter.reshape(K, 1, 9) @ (W.reshape(K, 9) @ _SKEW_W_SKEW).reshape(K, 9, 9)
     C = C.reshape(K, 3, 3)

@@ -1,10 +1,9 @@
 """Joint registration of all clouds of a placement to the latent target frame (paper III-D.2).
 
-Variables: a pose `T_target_lidar` per cloud and the components of the mixture. Noise: the
-variances of the components. Gauge: a common motion of all clouds and the shape changes no residual;
-the mean motion of the clouds is removed from each step. So the target frame stays where the
-pre-alignment put it: origin at the target's centre, axes of the map.
-`caliv_graph/registration/README.md` derives the estimating equations.
+Variables: a pose `T_target_lidar` per cloud and the components of the mixture. Gauge: the mean
+motion of the clouds is removed from each step, so that the target frame stays where the
+pre-alignment put it: origin at the target's centre, axes of the map. `README.md` of this folder
+derives the steps.
 """
 
 from __future__ import annotations
@@ -74,6 +73,7 @@ class JointRegistration:
         clouds: the same, thinned and stacked.
         tolerance: (rad, m) of `register_jointly`.
         weights: (J,) robust weight of each cloud, set from outside.
+        inlier_ratio: (J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step.
     """
 
     def __init__(
@@ -91,8 +91,7 @@ class JointRegistration:
             config: size of the mixture and of the clouds.
             rough: the coarse pass: fewer points, half the components, a wider tolerance.
             normals: False if `refine_normals` follows.
-            view_weights: (J,) weight of each cloud, below 1 where several have the same view
-                (`targets.cloud.views`); None: all 1.
+            view_weights: (J,) weight of each cloud (`targets.cloud.views`); None: all 1.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -117,7 +116,7 @@ class JointRegistration:
         self._volume = 1.0
         self._mixture: Mixture | None = None
         self._expected: tuple[Array, Array, Array] | None = None
-        self._inlier_ratio: Array = np.ones(self.clouds.count)
+        self.inlier_ratio: Array = np.ones(self.clouds.count)
         self._view_weights = np.ones(self.clouds.count) if view_weights is None else view_weights
         self.weights: Array = np.ones(self.clouds.count)
 
@@ -134,11 +133,6 @@ class JointRegistration:
         if self._mixture is None:
             raise RegistrationError(f"{self.observation.name}: not seeded yet")
         return self._mixture
-
-    @property
-    def inlier_ratio(self) -> Array:
-        """(J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step."""
-        return self._inlier_ratio
 
     @property
     def finest(self) -> bool:
@@ -158,7 +152,7 @@ class JointRegistration:
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         density = self._gamma / (self._volume * (self._gamma + 1.0))
         who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._view_weights)
-        self._inlier_ratio = who.inlier_ratio
+        self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
         # Not the quadratic itself: it is as large as all the rest.
@@ -183,16 +177,10 @@ class JointRegistration:
         converged: bool,
         last_step: tuple[float, float],
     ) -> Registration:
-        """Packs the registration at `T_target_lidar` (R, t).
+        """Packs the registration at `T_target_lidar`, R (J, 3, 3) and t (J, 3) metres.
 
-        Args:
-            R: (J, 3, 3).
-            t: (J, 3) metres.
-            blocks: (J, 6, 6) information of each pose given the shape.
-            joint: (6 J, 6 J) information of all poses, the shape eliminated.
-            iterations: that were made.
-            converged: whether the last step was below the tolerance.
-            last_step: (rad, m).
+        `blocks` (J, 6, 6) is the information of each pose given the shape, `joint` (6 J, 6 J) that
+        of all poses, the shape eliminated; `last_step` in rad and m.
         """
         # A cloud without inliers has no information; its matrix must be invertible nevertheless.
         trace = float(np.median(np.trace(blocks, axis1=1, axis2=2)))
@@ -211,13 +199,10 @@ class JointRegistration:
 
 
 def centre_clouds(clouds: CloudStack, R: Array, t: Array) -> Array:
-    """Translations that put the middle of every cloud's extent at the origin.
+    """(J, 3) translations that put the middle of every cloud's extent at the origin.
 
     An initial guess displaces the target by up to 1 m (3 degrees at 20 m). All clouds of a target
     have about the same extent, whatever the density of their points.
-
-    Returns:
-        (J, 3) new translations.
     """
     points = clouds.moved(R, t)
     out = t.copy()
@@ -237,8 +222,7 @@ def left_step(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 def free_step(quadratic: ShapeQuadratic) -> Array:
     """M-step of the poses without a graph: damped Newton step on the joint quadratic.
 
-    Returns:
-        (J, 6) left perturbations, mean zero (the gauge); NaN if there is no solution.
+    (J, 6) left perturbations, mean zero (the gauge); NaN if there is no solution.
     """
     count = len(quadratic.blocks)
     H = quadratic.joint(given_orientations=True)
@@ -268,8 +252,7 @@ def register_jointly(
     """Registers all clouds of a placement to one reconstructed target (paper III-D.2).
 
     GMMCalib alternates between poses and means. Here one step solves for the poses of all clouds
-    with the means eliminated: tens of iterations instead of hundreds, and no information between
-    clouds that share no component.
+    with the means eliminated: tens of iterations instead of hundreds.
 
     Args:
         state: the clouds; its mixture is seeded here.
@@ -277,9 +260,6 @@ def register_jointly(
         max_iterations: at most.
         coarse: False if the pre-alignment is right to 1 or 2 cm: the clouds are then not centred,
             and annealing begins finer.
-
-    Returns:
-        A pose and a 6x6 information per cloud, and the reconstructed target.
 
     Raises:
         RegistrationError: the clouds could not be brought together.

@@ -65,11 +65,9 @@ class View:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Result for each compared component after a rotation.
+    """Whether a surface was seen where each rotated component is, (k,).
 
-    Attributes:
-        same: (k,) a surface was seen where the rotated component is.
-        different: (k,) beams pass through there, or end elsewhere. Neither: not seen.
+    `different`: beams pass through there, or end elsewhere. Neither: not seen.
     """
 
     same: BoolArray
@@ -89,13 +87,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class RotationResult:
-    """A rotation that was tried.
+    """A rotation that was tried: the comparison of the rotated shape with the views.
 
-    Attributes:
-        angle_rad: of the rotation.
-        comparison: of the rotated shape with the views.
-        axis: (3,) unit vector, fitted.
-        centre: (3,) metres, a place on the axis, fitted.
+    Axis (3,), a unit vector, and centre (3,), metres, a place on it, are fitted.
     """
 
     angle_rad: float
@@ -105,12 +99,7 @@ class RotationResult:
 
 
 def views_of(registration: Registration, most: int = MOST_VIEWS) -> tuple[View, ...]:
-    """The clouds of a registration in its target frame, from directions as different as possible.
-
-    Args:
-        registration: as `register_jointly` or the solved graph left it.
-        most: how many at most.
-    """
+    """Clouds of a registration, target frame, from directions as different as possible."""
     R, t = stack(list(registration.T_target_lidar))
     explained = np.flatnonzero(registration.inlier_ratio > 0.5)
     if not len(explained):
@@ -129,7 +118,6 @@ def views_of(registration: Registration, most: int = MOST_VIEWS) -> tuple[View, 
     )
 
 
-@dataclass(frozen=True)
 class Shape:
     """A shape and the views of it.
 
@@ -143,36 +131,23 @@ class Shape:
         sigma_m: noise along the beam, 1 sigma, metres.
     """
 
-    means: Array
-    normals: Array
-    chosen: IntArray
-    views: tuple[ViewIndex, ...]
-    tree: cKDTree
-    spacing_m: float
-    sigma_m: float
-
-    @classmethod
-    def of(cls, mixture: Mixture, views: Sequence[View], sigma_m: float) -> Shape:
+    def __init__(self, mixture: Mixture, views: Sequence[View], sigma_m: float) -> None:
         """Indexes the components that have points, and the views."""
-        means, normals = mixture.means_target, mixture.normals_target
         # Components without points may be anywhere.
         alive = np.flatnonzero(mixture.weights > 0.05 / len(mixture.weights))
+        self.means, self.normals = mixture.means_target[alive], mixture.normals_target[alive]
         few = np.linspace(0, len(alive) - 1, min(MOST_COMPONENTS, len(alive))).round().astype(int)
-        tree = cKDTree(np.column_stack([means[alive], NORMAL_METRES * normals[alive]]))
-        seen = tuple(ViewIndex.of(view) for view in views if len(view.points_target) >= 10)
-        chosen = np.sort(few)
-        spacing_m = float(np.median(np.asarray(tree.query(tree.data, k=2)[0])[:, 1]))
-        return cls(means[alive], normals[alive], chosen, seen, tree, spacing_m, sigma_m)
+        self.chosen: IntArray = np.sort(few)
+        self.views = tuple(ViewIndex.of(view) for view in views if len(view.points_target) >= 10)
+        self.tree = cKDTree(np.column_stack([self.means, NORMAL_METRES * self.normals]))
+        self.spacing_m = float(np.median(np.asarray(self.tree.query(self.tree.data, k=2)[0])[:, 1]))
+        self.sigma_m = sigma_m
 
     def rotated(self, axis: Array, angle_rad: float) -> RotationResult | None:
-        """The shape compared with itself after a rotation, about the axis that fits best.
+        """The shape compared with itself after a rotation about `axis` (3,), a unit vector.
 
-        Args:
-            axis: (3,) unit vector; its place and a small tilt are fitted.
-            angle_rad: of the rotation.
-
-        Returns:
-            None if no components of the rotated shape are near those of the shape.
+        The place of the axis and a small tilt are fitted. None if no components of the rotated
+        shape are near those of the shape.
         """
         low, high = np.percentile(self.means, [2, 98], axis=0)
         centre = np.asarray(0.5 * (low + high), np.float64)
@@ -190,11 +165,8 @@ class Shape:
     ) -> tuple[Array, Array] | None:
         """Registers the rotated shape to itself: point-to-plane ICP with narrowing gates.
 
-        Args:
-            axis: (3,) unit vector.
-            angle_rad: of the rotation, which is held.
-            centre: (3,) a place on the axis, metres.
-            spacings: minimum of the gates in distances between components.
+        The angle is held; `centre` (3,) is a place on `axis` (3,), metres. `spacings` is the
+        minimum of the gates in distances between components.
 
         Returns:
             R (3, 3) and t (3,) of the rigid motion; None if under 10 pairs are near.
@@ -289,11 +261,7 @@ class ViewIndex:
         )
 
     def look(self, points: Array, normals: Array) -> tuple[Array, Array, BoolArray]:
-        """Compares expected surface elements with the returns of this view.
-
-        Args:
-            points: (k, 3) metres, their places.
-            normals: (k, 3) unit vectors, their normals.
+        """Compares expected surface elements, places and normals (k, 3), with this view's returns.
 
         Returns:
             (k,) metres from the elements to the surface that was seen, along their normals, NaN if

@@ -1,12 +1,9 @@
 """Symmetries of the reconstructed target, and their elimination from a calibration.
 
-A drum looks the same after any rotation about its axis: no cloud of it determines the yaw of a
-LiDAR about that axis. A cube looks the same after 90 degrees: if the initial guess of a LiDAR is
-off by more than half of that about the target, registration converges 90 degrees off.
-
-The quadratic does not have the freedom of a drum in its null space: its components tile a smooth
-surface like the dimples of a golf ball, and each holds points across the surface as well as along
-the normal. `marginalise_symmetry` removes the information that this claims.
+No cloud of a drum determines the yaw of a LiDAR about its axis; if a guess is off by more than 45
+degrees about a cube, registration converges 90 degrees off. The quadratic claims information on the
+freedom of a drum, since its components tile a smooth surface like the dimples of a golf ball:
+`marginalise_symmetry` removes it (`README.md` of this folder).
 """
 
 from __future__ import annotations
@@ -96,25 +93,17 @@ class Symmetry:
 def symmetries(
     mixture: Mixture, views: Sequence[View], sigma_range_m: float
 ) -> tuple[Symmetry, ...]:
-    """Rotations after which a reconstructed shape looks the same, within its noise.
+    """Rotations after which a reconstructed shape looks the same: the smallest of each axis.
 
-    Tested axes: the vertical and the two main horizontal directions of its surfaces. Tested
-    rotations about each: `BETWEEN_DEG` for a continuous symmetry, `ORDERS` for the others. The axis
-    is where the rotated shape fits itself best. A component contradicts a rotation if beams pass
+    Tested axes: the vertical, first, and the two main horizontal directions of its surfaces. Tested
+    rotations about each: `BETWEEN_DEG` for a continuous symmetry, `ORDERS` for the others. A
+    component contradicts a rotation if beams of the `views` (`self_comparison.views_of`) pass
     through its rotated place, or end elsewhere by more than the noise. Places that no beam came
-    near contradict nothing and are listed (`Symmetry.unseen`).
-
-    Args:
-        mixture: the shape, target frame.
-        views: of the LiDARs (`self_comparison.views_of`).
-        sigma_range_m: noise along the beam, metres.
-
-    Returns:
-        Those found, the vertical first; of each axis the smallest rotation.
+    near are listed (`Symmetry.unseen`).
     """
     if not views or len(mixture.weights) < 20:
         return ()
-    shape = Shape.of(mixture, views, sigma_range_m)
+    shape = Shape(mixture, views, sigma_range_m)
     identity = shape.compare(np.eye(3), np.zeros(3))
     axes = _axes(mixture)
     found: list[Symmetry | None] = [None] * len(axes)
@@ -127,16 +116,12 @@ def symmetries(
 
 
 def refit(symmetry: Symmetry, mixture: Mixture) -> Symmetry:
-    """The axis of a symmetry, fitted again to the shape as it now is.
+    """A symmetry whose axis is right to some degrees, fitted again to the shape as it now is.
 
     With an axis that is off by millimetres, `marginalise_symmetry` would leave information along
     the symmetry.
-
-    Args:
-        symmetry: its axis is right to some degrees.
-        mixture: the shape, target frame.
     """
-    shape = Shape.of(mixture, (), 0.0)
+    shape = Shape(mixture, (), 0.0)
     fits = []
     for signed in (symmetry.fitted_rad, -symmetry.fitted_rad):
         fit = shape.fit(symmetry.axis_target, signed, symmetry.centre_target, REFIT_SPACINGS)
@@ -155,17 +140,9 @@ def refit(symmetry: Symmetry, mixture: Mixture) -> Symmetry:
 def marginalise_symmetry(H: Array, gradient: Array, symmetry: Symmetry) -> tuple[Array, Array]:
     """Marginalises the rotation of every cloud about a continuous symmetry's axis.
 
-    Each cloud j may be rotated about the axis by an angle of its own. With T the (6 J, J) matrix of
-    these rotations, they are eliminated by a Schur complement: `H - H T (T^T H T)^-1 T^T H`, the
-    gradient likewise.
-
-    Args:
-        H: (6 J, 6 J) information of left perturbations of `T_target_lidar`, or (6, 6) of one.
-        gradient: (6 J,) likewise.
-        symmetry: a continuous one.
-
-    Returns:
-        Information and gradient of the same shapes, zero along every such rotation.
+    Each cloud may be rotated about the axis by an angle of its own. H is the information (6 J, 6 J)
+    of left perturbations of `T_target_lidar`, the gradient (6 J,). The results have the same shapes
+    and are zero along every such rotation.
     """
     count = len(H) // 6
     T = np.kron(np.eye(count), symmetry.generator()[:, None])
@@ -199,23 +176,17 @@ def _axes(mixture: Mixture) -> list[Array]:
 def _symmetry_about(shape: Shape, axis: Array, identity: Comparison) -> Symmetry | None:
     """The smallest rotation about an axis that is a symmetry, or None."""
     limit = identity.contradicted + MOST_CONTRADICTED
-
-    def tried(signed_rad: float) -> RotationResult | None:
-        """A rotation; None if too little was seen at both ends."""
-        result = shape.rotated(axis, signed_rad)
-        least = FEWEST_COMPARED * identity.compared
-        return None if result is None or result.comparison.compared <= least else result
+    least = FEWEST_COMPARED * identity.compared
 
     def worse_of_both(angle_rad: float, enough: float = math.inf) -> RotationResult | None:
-        """A rotation and its inverse, the more contradicted one.
+        """A rotation and its inverse, the more contradicted one; None if either is hardly seen.
 
-        None if too little was seen of either. If the first is contradicted by more than `enough`,
-        the inverse is not tried.
+        If the first is contradicted by more than `enough`, the inverse is not tried.
         """
         worst: RotationResult | None = None
         for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
-            result = tried(signed)
-            if result is None:
+            result = shape.rotated(axis, signed)
+            if result is None or result.comparison.compared <= least:
                 return None
             if worst is None or result.comparison.contradicted > worst.comparison.contradicted:
                 worst = result

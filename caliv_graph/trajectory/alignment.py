@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, interpolate
@@ -30,8 +31,7 @@ def level(force_up: Array) -> Array:
     sine, cosine = float(np.linalg.norm(axis)), float(up[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis / sine
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = skew(axis / sine)
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
@@ -60,11 +60,11 @@ def align(
     gravity_m_s2: float,
     name: str,
 ) -> Array:
-    """(3, 3) R_map_imu at the first sample, without an orientation source.
+    """(3, 3) R_map_imu at the first sample, of the samples and fixes up to `until_ns`.
 
     Args:
         dead: the IMU, its gyroscope's bias removed.
-        until_ns: the samples and fixes up to this stamp are used.
+        until_ns: stamp, nanoseconds.
         positions: of the antenna; None: the heading at the start is the map's x axis.
         velocities: stamps (n,) and velocities (n, 3) of the IMU's origin in its own axes, if known.
         forward_imu: (3,) the vehicle's x axis in the imu frame.
@@ -75,8 +75,7 @@ def align(
         TrajectoryError: too few fixes to determine the heading.
     """
     begin = int(dead.stamps_ns[0])
-    ends = np.array([begin]), np.array([until_ns])
-    _, gained, _ = dead.between(*ends)
+    _, gained, _ = dead.between(np.array([begin]), np.array([until_ns]))
     R_level = level(gained[0])
     if positions is None:
         x, y, _ = R_level @ forward_imu
@@ -89,10 +88,9 @@ def align(
         )
     stamps = positions.stamps_ns[inside]
     path_map = positions.position_map[inside]
-    enough = False
-    if velocities is not None:
-        enough = ((velocities[0] >= begin) & (velocities[0] <= until_ns)).sum() >= MIN_FIXES
-    if velocities is not None and enough:
+    if velocities is not None and (
+        ((velocities[0] >= begin) & (velocities[0] <= until_ns)).sum() >= MIN_FIXES
+    ):
         yaw = _yaw_by_velocities(dead, R_level, velocities, stamps, path_map)
     else:
         _, _, dp = dead.between(np.full(len(stamps), begin), stamps)
@@ -128,11 +126,7 @@ def _yaw_by_accelerations(
     path_map: Array,
     gravity_m_s2: float,
 ) -> float:
-    """Heading by least squares: linear in its cosine and sine, start, velocity and bias.
-
-    In the levelled frame at the start, `Rz(-yaw) z = p0 + v0 t + g t^2 / 2 + dp - A b`, b the
-    accelerometer's bias, which also absorbs the error of the levelling.
-    """
+    """Yaw by least squares, linear in its cosine and sine (`README.md`, section 6)."""
     begin = int(dead.stamps_ns[0])
     t = (stamps - begin) * 1e-9
     x, y, _ = (path_map - path_map[0]).T

@@ -1,11 +1,6 @@
 """The smoother's factor graph, and the conversion of estimates to GTSAM's values and back.
 
-Variables of node i:
-    I_i  `T_map_imu`, right perturbation, rotation then translation
-    V_i  velocity of the IMU's origin in the map, m/s
-    B_i  `imuBias.ConstantBias` of accelerometer and gyroscope, imu frame
-and, where the config asks for it, one yaw bias of the orientation source for the whole drive.
-`README.md` of this folder derives every factor.
+`README.md` of this folder defines the variables of a node and derives every factor.
 """
 
 from __future__ import annotations
@@ -39,12 +34,7 @@ and large enough that the graph stays well conditioned."""
 
 @dataclass
 class TrajectoryGraph:
-    """The factors, and the kind of each.
-
-    Attributes:
-        factors: the nonlinear graph.
-        kinds: of each factor, in order: `imu`, `gnss`, `orientation`, `velocity`, or `prior`.
-    """
+    """The factors, and the kind of each: `imu`, `gnss`, `orientation`, `velocity`, or `prior`."""
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)
@@ -58,14 +48,10 @@ class TrajectoryGraph:
 def build_graph(
     data: SmootherInput, nodes: IntArray, states: States, dropped: IntArray, kernel: str
 ) -> TrajectoryGraph:
-    """All factors; the measurements are integrated and carried with the biases of an estimate.
+    """All factors; the measurements are integrated and carried with the biases of `states`.
 
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        states: the estimate.
-        dropped: (k,) indices of the GNSS fixes that are left out.
-        kernel: robust kernel of the fixes; only `huber` changes the noise model.
+    The GNSS fixes of indices `dropped` (k,) are left out. `kernel` is the robust kernel of the
+    others; only `huber` changes the noise model.
     """
     graph = TrajectoryGraph()
     carried = carry_to_nodes(data, nodes, without_bias(data.inertial, nodes, states))
@@ -90,27 +76,13 @@ def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, state
     ]
     measurements = preintegrate(data.inertial, nodes, biases, noise, data.gravity_m_s2)
     for i, measured in enumerate(measurements):
-        graph.add(
-            "imu",
-            gtsam.CombinedImuFactor(
-                key_imu(i),
-                key_velocity(i),
-                key_imu(i + 1),
-                key_velocity(i + 1),
-                key_bias(i),
-                key_bias(i + 1),
-                measured,
-            ),
-        )
+        poses = key_imu(i), key_velocity(i), key_imu(i + 1), key_velocity(i + 1)
+        factor = gtsam.CombinedImuFactor(*poses, key_bias(i), key_bias(i + 1), measured)
+        graph.add("imu", factor)
     bias_sigmas = np.array([noise.force_bias] * 3 + [noise.gyro_bias] * 3)
-    graph.add(
-        "prior",
-        gtsam.PriorFactorConstantBias(
-            key_bias(0),
-            gtsam.imuBias.ConstantBias(),
-            gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas),
-        ),
-    )
+    model = gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
+    no_bias = gtsam.imuBias.ConstantBias()
+    graph.add("prior", gtsam.PriorFactorConstantBias(key_bias(0), no_bias, model))
 
 
 def _add_positions(
@@ -128,18 +100,12 @@ def _add_positions(
             estimator = gtsam.noiseModel.mEstimator.Huber.Create(threshold)
             noise = gtsam.noiseModel.Robust.Create(estimator, noise)
         i = int(positions.nodes[k])
-        graph.add(
-            "gnss",
-            position_factor(
-                key_imu(i),
-                key_velocity(i),
-                positions.position_map[k],
-                positions.offset_imu[k],
-                float(positions.delay_s[k]),
-                data.gravity_m_s2,
-                noise,
-            ),
+        measured, offset = positions.position_map[k], positions.offset_imu[k]
+        delay_s, gravity = float(positions.delay_s[k]), data.gravity_m_s2
+        factor = position_factor(
+            key_imu(i), key_velocity(i), measured, offset, delay_s, gravity, noise
         )
+        graph.add("gnss", factor)
 
 
 def _add_orientations(
@@ -193,9 +159,8 @@ def to_values(states: States, data: SmootherInput) -> gtsam.Values:
     for i in range(len(states.p_map_imu)):
         out.insert(key_imu(i), gtsam.Pose3(gtsam.Rot3(states.R_map_imu[i]), states.p_map_imu[i]))
         out.insert(key_velocity(i), states.velocity_map[i])
-        out.insert(
-            key_bias(i), gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
-        )
+        bias = gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
+        out.insert(key_bias(i), bias)
     if data.yaw_bias:
         out.insert(key_yaw_bias(), np.array([states.yaw_bias_rad]))
     return out

@@ -1,9 +1,7 @@
-"""The information of a chain of states, and its Schur complements.
+"""The information of a chain of states, and its Schur complements (`README.md`, section 8).
 
-A trajectory's Hessian is block tridiagonal in time, with a narrow border for variables of the whole
-drive (a yaw bias). The joint information of some of its poses is then a banded solve: for hundreds
-of poses GTSAM's general elimination takes 2 to 8 times as long (`scripts/benchmark_trajectory.py
---solvers`).
+A banded solve: for the joint information of hundreds of poses GTSAM's general elimination takes 2
+to 8 times as long (`scripts/benchmark_trajectory.py --solvers`).
 """
 
 from __future__ import annotations
@@ -53,13 +51,11 @@ class Chain:
         state_dims: Sequence[int],
         common_keys: Sequence[int],
     ) -> Chain:
-        """The Hessian of a linear graph.
+        """The Hessian of a whitened linear graph.
 
-        Args:
-            graph: whitened; every factor touches one state, two neighbours, or common variables.
-            state_keys: per state its keys, in the order of their coordinates in the state.
-            state_dims: dimensions of these; they add up to 15.
-            common_keys: of the common variables, one dimension each.
+        Every factor touches one state, two neighbours, or common variables. `state_keys` are the
+        keys of each state in the order of its coordinates, `state_dims` their dimensions, which add
+        up to 15. `common_keys` are the common variables, of one dimension each.
         """
         n, k = len(state_keys), len(common_keys)
         size = STATE * n + k
@@ -96,11 +92,7 @@ class Chain:
         return Chain(diagonal, coupling, border, corner)
 
     def only(self, wanted: IntArray) -> Chain:
-        """The chain of some states, all others eliminated.
-
-        Args:
-            wanted: (m,) ascending indices of the states to keep, at least one.
-        """
+        """The chain of the states of ascending indices `wanted` (m,), all others eliminated."""
         keep = set(wanted.tolist())
         n, k = len(self.diagonal), self.corner.shape[0]
         diagonal, border = self.diagonal.copy(), self.border.copy()
@@ -131,11 +123,7 @@ class Chain:
         return Chain(diagonal[wanted], coupling, border[wanted], corner.reshape(k, k))
 
     def pose_information(self, wanted: IntArray) -> Array:
-        """(6 m, 6 m) joint information of the poses of some states, all else eliminated.
-
-        Args:
-            wanted: (m,) ascending indices of states.
-        """
+        """(6 m, 6 m) joint information of the poses of the states `wanted`, all else eliminated."""
         chain = self.only(wanted)
         m, rest, k = len(wanted), STATE - POSE, chain.corner.shape[0]
         pose, other = slice(0, POSE), slice(POSE, STATE)
@@ -168,20 +156,11 @@ def _jacobian(
     """The Jacobian of a linear graph, its columns where `place` (first, how many) has each key."""
     rows, columns, entries = np.asarray(graph.sparseJacobian_())
     # GTSAM's columns are in ascending order of the keys; the last one is the right-hand side.
-    order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in _keys(graph))])
+    keys = sorted(set(graph.keyVector()))
+    order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in keys)])
     keep = columns <= len(order)
-    return scipy.sparse.csr_array(
-        (
-            entries[keep],
-            (rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]),
-        ),
-        shape=(int(rows.max()), size),
-    )
-
-
-def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
-    """The keys of a graph, ascending."""
-    return sorted(set(graph.keyVector()))
+    where = rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]
+    return scipy.sparse.csr_array((entries[keep], where), shape=(int(rows.max()), size))
 
 
 def inverse_of(A: Array) -> Array:

@@ -25,19 +25,11 @@ are absolute times or the wrong unit."""
 def deskew(
     scan: LidarScan, T_vehicle_lidar: gtsam.Pose3, trajectory: VehicleTrajectory
 ) -> LidarScan:
-    """Moves every point into the LiDAR's frame at the scan's stamp.
+    """Moves every point into the LiDAR's frame at the scan's stamp (`README.md`, section 9).
 
-    A point with time dt was measured at stamp + dt: `p' = (X(stamp) E)^-1 X(stamp + dt) E p`, X
-    T_map_vehicle, E T_vehicle_lidar. Before and after the trajectory's span the vehicle is taken to
-    stand: this concerns points of the first and last scan of a drive.
-
-    Args:
-        scan: with per-point times; one without is returned as it is.
-        T_vehicle_lidar: the extrinsic, guess or estimate.
-        trajectory: of the drive.
-
-    Returns:
-        The scan with `point_times_s` None.
+    A scan without per-point times is returned as it is, others with `point_times_s` None. Before
+    and after the trajectory's span the vehicle is taken to stand: this concerns points of the first
+    and last scan of a drive.
 
     Raises:
         TrajectoryError: the stamp is outside the trajectory's span, or the times are unusable.

@@ -1,9 +1,7 @@
-"""The measurement factors of the trajectory, one function per kind.
+"""The measurement factors of the trajectory, one function per kind (`README.md`, section 3).
 
 Variables beside node i: I_i = T_map_imu (right perturbation), V_i velocity of the IMU's origin in
-the map. The IMU carries a measurement between two nodes to the nearest (`DeadReckoning`); over at
-most half a node spacing the IMU's own noise is far below the measurement's.
-All Jacobians are analytic; the tests check them numerically.
+the map. All Jacobians are analytic; the tests check them numerically.
 """
 
 from __future__ import annotations
@@ -11,14 +9,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array
 
 NoiseModel = gtsam.noiseModel.Base
-
-
-def _skew(v: Array) -> Array:
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def position_factor(
@@ -30,25 +24,22 @@ def position_factor(
     gravity_m_s2: float,
     noise: NoiseModel,
 ) -> gtsam.NoiseModelFactor:
-    """A position of the GNSS antenna, `delay_s` after the node.
-
-    `r = p + V dt + g dt^2 / 2 + R q - z`; q is the IMU's displacement since the node plus the lever
-    arm, rotated to the time of the fix, both in the IMU's frame at the node.
+    """A position of the GNSS antenna: `r = p + V dt + g dt^2 / 2 + R q - z`, map axes.
 
     Args:
         key_imu: of I_i.
         key_velocity: of V_i.
-        position_map: (3,) measured, metres.
-        offset_imu: (3,) q, metres.
-        delay_s: of the measurement after the node, negative: before it. Zero gives GTSAM's own
-            factor.
+        position_map: (3,) measured z, metres.
+        offset_imu: (3,) q, metres: displacement since the node and lever arm, imu frame at the
+            node.
+        delay_s: dt, of the measurement after the node. Zero gives GTSAM's own factor.
         gravity_m_s2: along -z of the map.
-        noise: of r, 3 dimensions, map axes.
+        noise: of r, 3 dimensions.
     """
     if delay_s == 0.0:
         return gtsam.GPSFactorArm(key_imu, position_map, offset_imu, noise)
     shift = np.array([0.0, 0.0, -0.5 * gravity_m_s2 * delay_s**2]) - position_map
-    skew_offset = -_skew(offset_imu)
+    skew_offset = -skew(offset_imu)
     by_velocity = delay_s * np.eye(3)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -69,16 +60,10 @@ def position_factor(
 def velocity_factor(
     key_imu: int, key_velocity: int, velocity_imu: Array, gained_map: Array, noise: NoiseModel
 ) -> gtsam.CustomFactor:
-    """A velocity of the IMU's origin in its own axes, carried to the node.
+    """A velocity of the IMU's origin, carried to the node: `r = R^T (V + u) - z`, imu axes.
 
-    `r = R^T (V + u) - z`, u the velocity that gravity adds until the measurement.
-
-    Args:
-        key_imu: of I_i.
-        key_velocity: of V_i.
-        velocity_imu: (3,) z in m/s.
-        gained_map: (3,) u in m/s.
-        noise: of r, 3 dimensions, imu axes.
+    `velocity_imu` is z, (3,) m/s; `gained_map` is u, the velocity (3,) m/s that gravity adds until
+    the measurement; `noise` has the 3 dimensions of r.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -86,7 +71,7 @@ def velocity_factor(
         predicted = back @ (values.atVector(key_velocity) + gained_map)
         if jacobians is not None:
             J = np.zeros((3, 6))
-            J[:, :3] = _skew(predicted)
+            J[:, :3] = skew(predicted)
             jacobians[0] = J
             jacobians[1] = back
         return np.asarray(predicted - velocity_imu)
@@ -97,15 +82,10 @@ def velocity_factor(
 def biased_orientation_factor(
     key_imu: int, key_yaw_bias: int, R_map_imu: gtsam.Rot3, noise: NoiseModel
 ) -> gtsam.CustomFactor:
-    """An orientation whose source has a constant bias b about the map's z axis.
+    """An orientation whose source has a yaw bias b: `r = Log(Z^T Rz(b) R)`, imu axes.
 
-    `r = Log(Z^T Rz(b) R)`: the source measures the true orientation rotated by b.
-
-    Args:
-        key_imu: of I_i.
-        key_yaw_bias: of b, a vector of 1, radians.
-        R_map_imu: measured, Z.
-        noise: of r, 3 dimensions, imu axes.
+    The source measures the true orientation rotated by b, a vector of 1, radians, about the map's z
+    axis. `R_map_imu` is the measured Z; `noise` has the 3 dimensions of r.
     """
     Z_inverse = R_map_imu.inverse()
 
@@ -127,25 +107,17 @@ def biased_orientation_factor(
 def orientation_factor(
     key_imu: int, R_map_imu: gtsam.Rot3, noise: NoiseModel
 ) -> gtsam.NoiseModelFactor:
-    """An orientation, `r = Log(Z^T R)`; GTSAM's own factor.
-
-    Args:
-        key_imu: of I_i.
-        R_map_imu: measured, Z.
-        noise: of r, 3 dimensions, imu axes.
-    """
+    """An orientation, `r = Log(Z^T R)`, 3 dimensions, imu axes; GTSAM's own factor."""
     return gtsam.PoseRotationPrior3D(key_imu, R_map_imu, noise)
 
 
 def marginal_factor(
     keys: list[int], information: Array, poses: tuple[gtsam.Pose3, ...]
 ) -> gtsam.LinearContainerFactor:
-    """A Gaussian on several poses at once as one native factor of a nonlinear graph.
+    """A Gaussian on m poses at once as one native factor of a nonlinear graph.
 
-    Args:
-        keys: m, of the poses.
-        information: (6 m, 6 m) joint, right perturbations of `poses`, rotation then translation.
-        poses: m, the mean.
+    `information` is their joint one, (6 m, 6 m), of right perturbations (rotation then translation)
+    of the mean `poses`.
     """
     m = len(keys)
     blocks = information.reshape(m, 6, m, 6).swapaxes(1, 2)

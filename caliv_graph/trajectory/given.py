@@ -27,13 +27,9 @@ def given_trajectory(motion: MotionData) -> Trajectory:
 
 
 def error_covariances(trajectory: Trajectory, stamps_ns: IntArray) -> Array | None:
-    """Covariances of the errors of given poses, as their messages state them.
+    """Covariances of the errors of given poses as their messages state them, at stamps (m,).
 
-    Between two poses they are interpolated linearly (README, section 11).
-
-    Args:
-        trajectory: given poses; their covariances are right perturbations.
-        stamps_ns: (m,) within its span.
+    Between two poses they are interpolated linearly (`README.md`, section 11).
 
     Returns:
         (m, 6, 6) of the rotation in vehicle axes (rad), then the position in map axes (m); NaN

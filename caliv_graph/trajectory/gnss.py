@@ -55,16 +55,9 @@ def positions_in_map(
     altitude = gnss.altitude_m[usable]
     origin = (float(latitude[0]), float(longitude[0]), float(altitude[0]))
     enu = pymap3d.geodetic2enu(latitude, longitude, altitude, *origin)
-    return (
-        Positions(
-            np.asarray(gnss.stamps_ns, dtype=np.int64)[usable],
-            np.stack([np.asarray(axis, dtype=np.float64) for axis in enu], axis=1),
-            cov[usable],
-            origin,
-            source,
-        ),
-        warnings,
-    )
+    stamps = np.asarray(gnss.stamps_ns, dtype=np.int64)[usable]
+    position_map = np.stack([np.asarray(axis, dtype=np.float64) for axis in enu], axis=1)
+    return Positions(stamps, position_map, cov[usable], origin, source), warnings
 
 
 def normal_gravity(latitude_deg: float, altitude_m: float) -> float:

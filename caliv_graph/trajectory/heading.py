@@ -1,8 +1,7 @@
 """Heading against course over ground: a check of the vehicle frame's yaw.
 
-An orientation source with a yaw bias, or an IMU whose extrinsic is a degree off, rotates every
-LiDAR's extrinsic by the same angle. Only the vehicle's motion shows it: its rear axle does not slip
-sideways.
+An error of that yaw turns every LiDAR's extrinsic by the same angle. Only the vehicle's motion
+shows it: its rear axle does not slip sideways.
 """
 
 from __future__ import annotations
@@ -62,17 +61,9 @@ def heading_disagreement(
 ) -> HeadingDisagreement | None:
     """Compares the direction in which the vehicle points with the one in which it moves.
 
-    Where velocities with a lateral part are recorded, the motion in vehicle axes is compared with
-    them. Otherwise the rear axle is assumed not to slip: `v_y = -psi v_x - x_axle w_z`, psi the
-    error of the heading, x_axle the axle's place in the vehicle frame. Curves of different radius
-    separate the two. On a single arc they are not separable, and x_axle is taken as zero.
-
-    Args:
-        smoothed: of the drive.
-        motion: what it was smoothed from.
-
-    Returns:
-        The comparison, or None if the vehicle hardly moves.
+    The motion in vehicle axes is compared with recorded velocities that have a lateral part.
+    Without them the rear axle is assumed not to slip (`README.md`, section 10). None if the vehicle
+    hardly moves.
     """
     begin, end = smoothed.span_ns
     at = np.arange(begin, end, SPACING_NS, dtype=np.int64)
@@ -91,7 +82,9 @@ def heading_disagreement(
     sideways = s * velocity[:, 0] + c * velocity[:, 1]
     if measured is not None:
         sideways = sideways - along[:, 1]
-    separable = measured is None and _separable(forward, turn)
+    # The curvature varies: curves to both sides, or curves and straights.
+    curvatures = float(np.ptp(np.percentile(turn / forward, [5, 95])))
+    separable = measured is None and curvatures > MIN_CURVATURE_RANGE_1_M
     solution, variance = _fit(forward, turn if separable else None, sideways, measured is not None)
     sigma = math.sqrt(variance + _heading_sigma(smoothed) ** 2)
     yaw = coarse + float(solution[0])
@@ -116,16 +109,10 @@ def heading_disagreement(
 def _fit(
     forward: Array, turn: Array | None, sideways: Array, measured: bool
 ) -> tuple[Array, float]:
-    """Least squares of `sideways = -yaw forward - x_axle turn`.
+    """Solution of `sideways = -yaw forward - x_axle turn`, (n,) each, and the variance of yaw.
 
-    Args:
-        forward: (n,) m/s.
-        turn: (n,) rad/s; None: the axle is not estimated.
-        sideways: (n,) m/s.
-        measured: whether it is the difference to a measured velocity.
-
-    Returns:
-        (1,) yaw or (2,) yaw and x_axle; variance of the yaw.
+    Without `turn` the axle is not estimated. `measured`: `sideways` is relative to a measured
+    velocity.
     """
     A = np.stack([-forward] if turn is None else [-forward, -turn], axis=1)
     solution, *_ = np.linalg.lstsq(A, sideways, rcond=None)
@@ -149,13 +136,7 @@ def _or_axle(yaw: float, forward: Array, turn: Array, separated: bool) -> str:
 
 
 def _measured_at(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array | None:
-    """(n, 2) measured velocities; None if the lateral one is not measured: odometry sets it to 0.
-
-    Args:
-        motion: of the drive.
-        stamps_ns: (n,) instants.
-        begin_ns: origin of the interpolation's time axis.
-    """
+    """(n, 2) measured velocities; None if the lateral one is not: odometry sets it to 0."""
     if motion.twist is None:
         return None
     finite = np.isfinite(motion.twist.velocity).all(axis=1)
@@ -178,12 +159,6 @@ def _turn_between(seen: Array, expected: Array, axis_only: bool) -> float:
         return math.atan2(float(cross.sum()), float(dot.sum()))
     double = math.atan2(float((2.0 * cross * dot).sum()), float((dot**2 - cross**2).sum()))
     return 0.5 * double
-
-
-def _separable(forward: Array, turn: Array) -> bool:
-    """Whether the curvature varies: curves to both sides, or curves and straights."""
-    curvature = turn / forward
-    return float(np.ptp(np.percentile(curvature, [5, 95]))) > MIN_CURVATURE_RANGE_1_M
 
 
 def _heading_sigma(smoothed: SmoothedTrajectory) -> float:

@@ -1,9 +1,7 @@
 """The IMU between any two instants: cleaned samples, dead reckoning, preintegrated factors.
 
-A sample is the value at its stamp; between two samples the readings are linear in time. A step is
-integrated with the reading at its middle, the specific force rotated by half of the step's
-rotation. A zero-order hold would lag by half a sample, which in a turn is a heading error that no
-bias explains.
+Between two samples the readings are linear in time. A zero-order hold would lag by half a sample,
+which in a turn is a heading error that no bias explains (`README.md`, section 2).
 """
 
 from __future__ import annotations
@@ -91,10 +89,6 @@ class Inertial:
 def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...]]:
     """Drops unusable samples and selects the longest piece without a long gap.
 
-    Args:
-        imu: as read.
-        name: of the recording, for messages.
-
     Returns:
         The samples, and what was left out or bridged, a line each.
 
@@ -130,11 +124,7 @@ def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...
 
 
 def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array, list[str]]:
-    """Stamps (n,), angular velocities and specific forces (n, 3) that are finite; warnings.
-
-    Raises:
-        TrajectoryError: fewer than two are, stamps do not increase, or gravity is missing.
-    """
+    """Stamps (n,), angular velocities and specific forces (n, 3) that are finite; warnings."""
     finite = np.asarray(np.isfinite(imu.angular_velocity).all(axis=1))
     finite_force = np.asarray(np.isfinite(imu.specific_force).all(axis=1))
     for what, usable in (("angular velocity", finite), ("linear acceleration", finite_force)):
@@ -269,17 +259,11 @@ def preintegrate(
     noise: ImuNoise,
     gravity_m_s2: float,
 ) -> list[gtsam.PreintegratedCombinedMeasurements]:
-    """Preintegrated measurements from each node to the next, starting and ending exactly there.
+    """Preintegrated measurements of the imu frame from each node to the next, n - 1.
 
-    Args:
-        inertial: samples.
-        nodes_ns: (n,) strictly increasing, within the samples; ends of bridged gaps among them.
-        biases: n, linearisation point of each interval at its first node.
-        noise: of the IMU.
-        gravity_m_s2: along -z of the map.
-
-    Returns:
-        n - 1 measurements of the imu frame itself.
+    Nodes (n,) increase strictly, within the samples; the ends of bridged gaps are among them. A
+    bias is the linearisation point of the interval that begins at its node. Gravity is along -z of
+    the map.
     """
     plain = _parameters(noise, gravity_m_s2, 0.0)
     fill = [
@@ -299,10 +283,8 @@ def preintegrate(
     half_turn = exp_so3(0.5 * middle_gyro * dt[:, None])
     middle_force = np.einsum("nij,nj->ni", half_turn, middle_force)
     first = np.searchsorted(edges, nodes_ns)
-    bridge_of = _bridged(inertial, nodes_ns)
     out = []
-    for i in range(len(nodes_ns) - 1):
-        gap_s = bridge_of[i]
+    for i, gap_s in enumerate(_bridged(inertial, nodes_ns).tolist()):
         parameters = plain if gap_s == 0.0 else _parameters(noise, gravity_m_s2, gap_s)
         measured = gtsam.PreintegratedCombinedMeasurements(parameters, biases[i])
         for k in range(first[i], first[i + 1]):

@@ -45,11 +45,7 @@ SPEED_WINDOW_NS = 1_000_000_000
 
 
 def first_states(data: SmootherInput, nodes: IntArray) -> States:
-    """The initial guess of all nodes; without orientation, of those of the drive's first part.
-
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
+    """The initial guess of all nodes (n,); without orientation, of those of the drive's first part.
 
     Raises:
         TrajectoryError: there is no orientation, and the fixes do not determine the heading.
@@ -80,13 +76,7 @@ def first_states(data: SmootherInput, nodes: IntArray) -> States:
 
 
 def extended_states(data: SmootherInput, nodes: IntArray, states: States) -> States:
-    """The estimate of the first nodes, extended to all of them by dead reckoning.
-
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        states: of the first nodes.
-    """
+    """The estimate of the first nodes, extended to all nodes (n,) by dead reckoning."""
     done = len(states.p_map_imu)
     fill = len(nodes) - done
 
@@ -132,13 +122,9 @@ def standing_gyro(
 ) -> Array | None:
     """(3,) mean angular rate in the first windows at standstill: the gyroscope's bias.
 
-    A gyroscope does not distinguish standstill from a steady turn, so GNSS or velocities must
-    confirm it. None if the vehicle does not stand, or nothing confirms it.
-
-    Args:
-        inertial: samples.
-        positions: of the antenna, if known.
-        speeds: stamps (n,) and speeds (n,) m/s, if known.
+    A gyroscope does not distinguish standstill from a steady turn, so GNSS or velocities (stamps
+    (n,) and speeds (n,) m/s) must confirm it. None if the vehicle does not stand, or nothing
+    confirms it.
     """
     if positions is None and speeds is None:
         return None

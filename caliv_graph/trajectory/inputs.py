@@ -69,10 +69,7 @@ class SmootherInput:
 
 
 def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list[str]]:
-    """Checks that the data suffice, cleans them, and finds the noise of each sensor.
-
-    Returns:
-        The input, and warnings, a line each.
+    """Checks that the data suffice, cleans them, and finds the noise of each sensor; warnings.
 
     Raises:
         TrajectoryError: a sensor that is needed is missing, or its data contradict themselves.
@@ -120,11 +117,7 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
 def _positions(
     motion: MotionData, config: Config, inertial: Inertial, needed: bool
 ) -> tuple[Positions | None, float, list[str]]:
-    """The fixes in the map, None if none lies within the IMU's span; normal gravity; warnings.
-
-    Raises:
-        TrajectoryError: the fixes are needed, and none lies within the span.
-    """
+    """The fixes in the map, None if none lies within the IMU's span; normal gravity; warnings."""
     assert motion.gnss is not None
     positions, lines = positions_in_map(motion.gnss, config, motion.name)
     gravity = normal_gravity(positions.origin_deg_m[0], positions.origin_deg_m[2])
@@ -143,11 +136,7 @@ def _positions(
 
 
 def _has_orientation(imu: ImuSamples, inertial: Inertial, name: str) -> bool:
-    """Whether messages carry an orientation; its vertical must agree with the accelerometer's.
-
-    Raises:
-        TrajectoryError: the two verticals disagree.
-    """
+    """Whether messages carry an orientation; its vertical must agree with the accelerometer's."""
     usable = usable_orientations(imu) & np.isfinite(imu.specific_force).all(axis=1)
     stamps = imu.stamps_ns
     usable &= (stamps >= inertial.begin_ns) & (stamps <= inertial.end_ns)

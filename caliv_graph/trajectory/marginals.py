@@ -33,11 +33,7 @@ class Marginals:
     """Marginals of a linear graph."""
 
     def __init__(self, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> None:
-        """Eliminates the graph.
-
-        Args:
-            linear: whitened.
-            ordering: of its variables; a trajectory's nodes in order of time.
+        """Eliminates a whitened graph in this order of its variables, nodes in order of time.
 
         Raises:
             TrajectoryError: the graph is singular.
@@ -48,10 +44,7 @@ class Marginals:
             raise TrajectoryError(UNDETERMINED) from None
 
     def covariances(self, keys: Sequence[int]) -> Array:
-        """(m, d, d) covariances of m variables of the same dimension d.
-
-        Args:
-            keys: of the variables, in order of elimination.
+        """(m, d, d) covariances of m variables of one dimension d, in order of elimination.
 
         Raises:
             TrajectoryError: a variable is undetermined.

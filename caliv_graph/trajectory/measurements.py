@@ -1,8 +1,7 @@
-"""Measurements carried to the nearest node of the trajectory by the IMU.
+"""Measurements carried to the nearest node of the trajectory by the IMU (`README.md`, section 3).
 
-Orientations around a node (at 100 Hz, ten of them) are rotated to it by the gyroscope and averaged
-with their weights; over half a node spacing the gyroscope adds less noise than could be measured.
-Velocities likewise. GNSS fixes are not averaged, since each may be an outlier.
+Orientations and velocities around a node are averaged with their weights. GNSS fixes are not, since
+each may be an outlier.
 """
 
 from __future__ import annotations
@@ -87,11 +86,7 @@ def _rotated(R: Array, cov: Array) -> Array:
 
 
 def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray, Array, Array]:
-    """Means of (m, 3) values by group, weighted by their (m, 3, 3) covariances.
-
-    Returns:
-        Groups (g,), means (g, 3) and covariances of the means (g, 3, 3).
-    """
+    """Groups (g,); means (g, 3) of (m, 3) values weighted by `cov` (m, 3, 3); their covariances."""
     groups, at = np.unique(group, return_inverse=True)
     weight = np.linalg.inv(cov)
     information = np.zeros((len(groups), 3, 3))
@@ -107,12 +102,7 @@ def orientations_at_nodes(
 ) -> NodeOrientations | None:
     """Averages the IMU's orientations around each node; None if there are none.
 
-    Args:
-        imu: as read; rows of NaN have no orientation.
-        cov: (n, 3, 3) rad^2 of each.
-        nodes_ns: stamps of the nodes.
-        dead: the IMU without bias.
-        noise: of the IMU.
+    `cov` (n, 3, 3) rad^2 is that of each message, `dead` the IMU without bias.
     """
     if imu.orientation_xyzw is None:
         return None
@@ -130,11 +120,7 @@ def orientations_at_nodes(
         _oriented(imu, cov, nodes_ns, dead, noise, samples[a:b], node[a:b])
         for a, b in itertools.pairwise(cuts)
     ]
-    return NodeOrientations(
-        np.concatenate([part.nodes for part in parts]),
-        np.concatenate([part.R_map_imu for part in parts]),
-        np.concatenate([part.cov for part in parts]),
-    )
+    return NodeOrientations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _oriented(
@@ -145,8 +131,8 @@ def _oriented(
     noise: ImuNoise,
     samples: IntArray,
     node: IntArray,
-) -> NodeOrientations:
-    """`orientations_at_nodes` of some samples (m,) that carry one; `node` (m,) is theirs."""
+) -> tuple[IntArray, Array, Array]:
+    """`NodeOrientations` of some samples (m,) that carry one; `node` (m,) is theirs."""
     assert imu.orientation_xyzw is not None
     stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples]
     R = rotations_of(imu.orientation_xyzw[samples])
@@ -164,7 +150,7 @@ def _oriented(
     R_reference = R_node[reference[node]]
     differences = log_so3(np.swapaxes(R_reference, 1, 2) @ R_node)
     nodes, mean, mean_cov = _weighted_mean(node, differences, cov_node)
-    return NodeOrientations(nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov)
+    return nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov
 
 
 def usable_orientations(imu: ImuSamples) -> BoolArray:
@@ -233,11 +219,7 @@ def positions_at_nodes(
 ) -> NodePositions | None:
     """Fixes within the trajectory and their nodes; None if there are none.
 
-    Args:
-        positions: of the antenna.
-        nodes_ns: stamps of the nodes.
-        dead: the IMU without bias.
-        arm_imu: (3,) antenna in the imu frame.
+    `dead` is the IMU without bias, `arm_imu` (3,) the antenna in the imu frame, metres.
     """
     stamps = positions.stamps_ns
     fixes = np.flatnonzero((stamps >= nodes_ns[0]) & (stamps <= nodes_ns[-1]))
@@ -246,11 +228,6 @@ def positions_at_nodes(
     node = nearest_node(nodes_ns, stamps[fixes])
     at_node = nodes_ns[node]
     dR, _, dp = dead.between(at_node, stamps[fixes])
-    return NodePositions(
-        node,
-        fixes,
-        positions.position_map[fixes],
-        dp + dR @ arm_imu,
-        np.asarray((stamps[fixes] - at_node) * 1e-9),
-        positions.cov_map[fixes],
-    )
+    delay_s = np.asarray((stamps[fixes] - at_node) * 1e-9)
+    position, cov = positions.position_map[fixes], positions.cov_map[fixes]
+    return NodePositions(node, fixes, position, dp + dR @ arm_imu, delay_s, cov)

@@ -45,12 +45,8 @@ class NodeMeasurements:
 def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
     """Stamps (n,) of the nodes.
 
-    A node is at every wanted stamp, at both ends, and at the ends of gaps; further nodes lie evenly
-    between them.
-
-    Args:
-        inertial: the IMU samples.
-        wanted: (m,) stamps at which poses are wanted, ascending, within the samples.
+    A node is at every `wanted` stamp (m,) (ascending, within the samples), at both ends, and at the
+    ends of gaps; further nodes lie evenly between them.
     """
     begin, end = inertial.begin_ns, inertial.end_ns
     fixed = np.unique(np.concatenate([wanted, [begin, end], inertial.gaps_ns.ravel()]))
@@ -68,13 +64,7 @@ def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
 
 
 def carry_to_nodes(data: SmootherInput, nodes: IntArray, dead: DeadReckoning) -> NodeMeasurements:
-    """Carries every measurement to its nearest node.
-
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        dead: the IMU, bias removed.
-    """
+    """Carries every measurement to its nearest node; `dead` is the IMU without bias."""
     assert data.motion.imu is not None
     positions = orientations = velocities = None
     if data.positions is not None:

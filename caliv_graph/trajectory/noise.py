@@ -72,7 +72,7 @@ def _per_message(
 ) -> tuple[Array, str]:
     """(n, d, d) covariances and their source: the first of the three that is stated.
 
-    A covariance that holds for all is a read-only view: a drive of hours has a million messages.
+    One that holds for all is a read-only view: a drive of hours has a million messages.
     """
     d = len(table)
     if configured is not None:
@@ -145,17 +145,19 @@ def orientation_covariances(imu: ImuSamples, config: Config) -> tuple[Array, str
     )
 
 
+def _set_sigma(cov: Array, axes: slice, sigma: float) -> None:
+    """Makes some axes of (n, d, d) covariances independent, with this sigma."""
+    cov[:, axes, :] = 0.0
+    cov[:, :, axes] = 0.0
+    cov[:, axes, axes] = sigma**2 * np.eye(axes.stop - axes.start)
+
+
 def given_pose_covariances(cov: Array | None, config: Config) -> Array | None:
     """Covariances of the white errors of given poses; the config's figures before the messages'.
 
-    Args:
-        cov: (m, 6, 6) of the messages, rotation then position, NaN where unknown; None: no message
-            states one.
-        config: `noise.pose_rotation_deg` and `noise.pose_position_m`.
-
-    Returns:
-        (m, 6, 6) with no sigma below `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`, NaN where
-        unknown. None: all unknown, or the config gives both figures.
+    `cov` and the result are (m, 6, 6), rotation then position, NaN where unknown, or None: all
+    unknown, or the config gives both figures. No sigma of the result is below
+    `MIN_POSE_ROTATION_RAD` and `MIN_POSE_POSITION_M`.
     """
     rotation_deg, position_m = config.noise.pose_rotation_deg, config.noise.pose_position_m
     if cov is None or (rotation_deg is not None and position_m is not None):
@@ -163,14 +165,10 @@ def given_pose_covariances(cov: Array | None, config: Config) -> Array | None:
     out, known = cov.copy(), stated(cov)
     if not known.any():
         return None
-    for block, sigma in (
-        (slice(0, 3), None if rotation_deg is None else math.radians(rotation_deg)),
-        (slice(3, 6), position_m),
-    ):
-        if sigma is not None:
-            out[:, block, :] = 0.0
-            out[:, :, block] = 0.0
-            out[:, block, block] = sigma**2 * np.eye(3)
+    if rotation_deg is not None:
+        _set_sigma(out, slice(0, 3), math.radians(rotation_deg))
+    if position_m is not None:
+        _set_sigma(out, slice(3, 6), position_m)
     least = np.array([MIN_POSE_ROTATION_RAD] * 3 + [MIN_POSE_POSITION_M] * 3) ** 2
     at = np.arange(6)
     out[:, at, at] = np.maximum(out[:, at, at], least)
@@ -185,13 +183,9 @@ def gnss_covariances(gnss: GnssFixes, config: Config) -> tuple[Array, str]:
     cov, source = _per_message(len(gnss.stamps_ns), None, gnss.cov_enu, np.diag(table**2))
     cov = cov.copy()
     if horizontal is not None:
-        cov[:, :2, :] = 0.0
-        cov[:, :, :2] = 0.0
-        cov[:, 0, 0] = cov[:, 1, 1] = horizontal**2
+        _set_sigma(cov, slice(0, 2), horizontal)
     if vertical is not None:
-        cov[:, 2, :] = 0.0
-        cov[:, :, 2] = 0.0
-        cov[:, 2, 2] = vertical**2
+        _set_sigma(cov, slice(2, 3), vertical)
     if horizontal is not None and vertical is not None:
         source = "config"
     elif horizontal is not None or vertical is not None:

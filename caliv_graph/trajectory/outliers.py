@@ -36,13 +36,9 @@ NOISE_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Robust:
-    """The estimate after rejection.
+    """The estimate after rejection, and the input, the fixes with the noise that was used.
 
-    Attributes:
-        data: the input, the fixes with the noise that was used.
-        estimate: the solved graph.
-        dropped: (k,) indices of the fixes that were dropped.
-        warnings: a line each.
+    `dropped` (k,) are the indices of the fixes that were dropped.
     """
 
     data: SmootherInput
@@ -52,13 +48,7 @@ class Robust:
 
 
 def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States) -> Robust:
-    """Solves for all nodes; drops GNSS fixes that white noise does not explain, worst first.
-
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        states: initial guess of all nodes.
-    """
+    """Solves for all nodes; drops GNSS fixes that white noise does not explain, worst first."""
     none = np.zeros(0, dtype=np.int64)
     kernel = data.config.robust.kernel
     if data.positions is None or kernel == "none":
@@ -96,9 +86,7 @@ def _with_fitting_noise(
 ) -> tuple[SmootherInput, States, list[str]]:
     """Scales the covariance of the fixes where more than `MAX_REJECTED` of them exceed the limit.
 
-    A receiver that states no covariance gets the paper's 17 mm and may be good to a metre. The
-    scale is the median of the squared residuals over its expectation (chi-square, 3 degrees of
-    freedom).
+    A receiver that states no covariance gets the paper's 17 mm and may be good to a metre.
     """
     assert data.positions is not None
     none, stated_by = np.zeros(0, dtype=np.int64), data.positions.source
@@ -132,8 +120,7 @@ def _final_limit(config: Config) -> float:
 def _outliers(squares: Array, config: Config, limit: float | None) -> tuple[IntArray, float]:
     """Fixes to drop now, and the limit that they exceed.
 
-    The limit decreases from round to round: a jump pulls the first solution towards itself, so that
-    sound fixes beside it exceed the final limit until the worst ones are dropped.
+    It decreases from round to round: a jump makes sound fixes beside it exceed the final limit.
     """
     final = _final_limit(config)
     if config.robust.kernel == "trimmed":

@@ -75,13 +75,7 @@ class GivenTrajectory:
         return seconds, Slerp(seconds, Rotation.from_matrix(R)), t
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
-        """Vehicle poses at any times within the span.
-
-        Args:
-            stamps_ns: (m,) in any order.
-
-        Returns:
-            R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) in metres.
+        """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3), metres, at any times within the span.
 
         Raises:
             TrajectoryError: a stamp is outside the span.
@@ -93,14 +87,7 @@ class GivenTrajectory:
         return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
 
     def error_covariances(self, stamps_ns: Sequence[int] | IntArray) -> Array | None:
-        """Covariances of the poses' errors as the messages state them.
-
-        Args:
-            stamps_ns: (m,) in any order.
-
-        Returns:
-            (m, 6, 6) rotation in vehicle axes (rad), then position in map axes (m); NaN where
-            unknown. None: no message states one.
+        """`given.error_covariances` at stamps (m,) in any order.
 
         Raises:
             TrajectoryError: a stamp is outside the span.
@@ -121,16 +108,10 @@ def smooth_trajectories(
     wanted: Sequence[Sequence[int] | IntArray] | None = None,
     motions: Mapping[int, MotionData] | None = None,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
-    """The trajectory of each drive.
+    """The trajectory of each drive: given poses if `topics.pose` is set or there is no IMU.
 
-    Given poses are used if `topics.pose` is set or there is no IMU; otherwise raw sensors are
-    smoothed.
-
-    Args:
-        recordings: opened drives.
-        config: topics, extrinsics, noise.
-        wanted: per drive the stamps at which poses are wanted; None: those of all clouds.
-        motions: motion data by the recording's index, if they have been read already.
+    `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
+    `motions` are motion data by the recording's index, if they have been read already.
 
     Raises:
         TrajectoryError: the data of a drive do not determine its motion.
@@ -156,31 +137,25 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
     begin, end = GivenTrajectory(trajectory).span_ns
     lost = stamps[(stamps < begin) | (stamps > end)]
-    warnings = _unknown_covariances(trajectory, motion.name)
-    if not len(lost):
-        return GivenTrajectory(trajectory, (), warnings)
-    if len(lost) == len(stamps):
+    if len(lost) and len(lost) == len(stamps):
         raise TrajectoryError(
             f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
             f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s. Do their clocks agree?"
         )
-    line = (
-        f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, lost"
-    )
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), (line, *warnings))
-
-
-def _unknown_covariances(trajectory: Trajectory, name: str) -> tuple[str, ...]:
-    """A line if some messages state a covariance and others do not."""
-    if trajectory.cov is None:
-        return ()
-    known = stated(trajectory.cov)
-    if known.all() or not known.any():
-        return ()
-    return (
-        f"{name}: {int((~known).sum())} of {len(known)} vehicle poses state no covariance: their "
-        "white error is estimated",
-    )
+    warnings = []
+    if len(lost):
+        warnings.append(
+            f"{motion.name}: {len(lost)} of {len(stamps)} scans are outside the given poses' span, "
+            "lost"
+        )
+    count = len(trajectory.stamps_ns)
+    unknown = 0 if trajectory.cov is None else int((~stated(trajectory.cov)).sum())
+    if 0 < unknown < count:
+        warnings.append(
+            f"{motion.name}: {unknown} of {count} vehicle poses state no covariance: their white "
+            "error is estimated"
+        )
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings))
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
@@ -190,11 +165,6 @@ def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
     after = np.minimum(stamps + TWIST_WINDOW_NS, end)
     first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
-    return np.array(
-        [
-            gtsam.Pose3.Logmap(a.between(b)) / max(seconds, 1e-9)
-            for a, b, seconds in zip(
-                first, second, (after - before) / NANOSECONDS_PER_SECOND, strict=True
-            )
-        ]
-    )
+    seconds = np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)
+    steps = zip(first, second, seconds, strict=True)
+    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])

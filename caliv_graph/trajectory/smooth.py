@@ -1,14 +1,8 @@
 """One smoothed trajectory with covariance from IMU, GNSS, velocity and orientation, in GTSAM.
 
-The pose of the IMU is the variable, not that of the vehicle. Off the vehicle's origin an
-accelerometer measures a term of the angular acceleration, which GTSAM's `body_P_sensor` leaves out:
-at a steering transition, 1 m of lever is an error of 0.2 m/s in velocity. T_vehicle_imu is
-constant, so results carry over to the vehicle by its adjoint, without approximation.
-
-The map is ENU, gravity along -z, its origin the first GNSS fix. Without GNSS the start of the
-vehicle is the origin, and without an orientation source its heading is the x axis.
-
-`README.md` of this folder derives the factors and lists the constants.
+The pose of the IMU is the variable, not that of the vehicle (`README.md`, section 1). The map is
+ENU, gravity along -z, its origin the first GNSS fix. Without GNSS the start of the vehicle is the
+origin, and without an orientation source its heading is the x axis.
 """
 
 from __future__ import annotations
@@ -35,15 +29,10 @@ BIAS_SIGMAS = 5.0
 def smooth_trajectory(
     motion: MotionData, config: Config, stamps_ns: Sequence[int] | IntArray
 ) -> SmoothedTrajectory:
-    """Smooths one drive.
+    """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
 
-    Args:
-        motion: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
-        config: extrinsics, noise, robust kernel.
-        stamps_ns: stamps at which poses are wanted (of LiDAR scans), in any order.
-
-    Returns:
-        The trajectory. Stamps outside the span of the IMU are in `lost_ns`.
+    Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
+    IMU are in `lost_ns` of the result.
 
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
@@ -53,7 +42,7 @@ def smooth_trajectory(
     nodes = place_nodes(data.inertial, wanted)
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
     robust = solve_without_outliers(data, nodes, states)
-    data, estimate = robust.data, robust.estimate
+    data, estimate, positions = robust.data, robust.estimate, robust.data.positions
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
     warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
@@ -67,8 +56,8 @@ def smooth_trajectory(
         T_vehicle_imu=data.T_vehicle_imu,
         gravity_m_s2=data.gravity_m_s2,
         yaw_bias=None if yaw_sigma is None else (estimate.states.yaw_bias_rad, yaw_sigma),
-        gnss_rejected=_rejected_stamps(data, robust.dropped),
-        origin_deg_m=None if data.positions is None else data.positions.origin_deg_m,
+        gnss_rejected=robust.dropped if positions is None else positions.stamps_ns[robust.dropped],
+        origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
         chain=chain_of(linear, len(nodes), data.yaw_bias),
@@ -80,11 +69,7 @@ def smooth_trajectory(
 def _within_span(
     data: SmootherInput, stamps_ns: Sequence[int] | IntArray
 ) -> tuple[IntArray, IntArray, list[str]]:
-    """Wanted stamps within the IMU's span, those outside, and a warning about the latter.
-
-    Raises:
-        TrajectoryError: all are outside.
-    """
+    """Wanted stamps within the IMU's span, those outside, and a warning about the latter."""
     inertial = data.inertial
     wanted = np.unique(np.asarray(stamps_ns, dtype=np.int64))
     inside = (wanted >= inertial.begin_ns) & (wanted <= inertial.end_ns)
@@ -114,13 +99,6 @@ def _at_wanted(
         T_map_vehicle=poses_of_vehicle(states, i, data.T_vehicle_imu),
         cov=np.asarray(Ad @ cov_imu[i] @ Ad.T),
     )
-
-
-def _rejected_stamps(data: SmootherInput, dropped: IntArray) -> IntArray:
-    """(k,) stamps of the dropped fixes."""
-    if data.positions is None:
-        return np.zeros(0, dtype=np.int64)
-    return data.positions.stamps_ns[dropped]
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

@@ -66,12 +66,7 @@ def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> Dead
 def within_span(
     stamps_ns: Sequence[int] | IntArray, span_ns: tuple[int, int], whose: str
 ) -> IntArray:
-    """The stamps (m,) as an array, all within a span.
-
-    Args:
-        stamps_ns: (m,) in any order.
-        span_ns: first and last that there may be.
-        whose: name of the span, for the message.
+    """The stamps (m,) as an array, in their order; `whose` span it is, for the message.
 
     Raises:
         TrajectoryError: a stamp is outside.
@@ -105,8 +100,7 @@ class SmoothedTrajectory:
         values: the estimate, as values of the graph.
         chain: the graph's information at the estimate.
         inertial: the IMU samples used.
-        factor_kinds: of each factor of the graph, in order: `imu`, `gnss`, `orientation`,
-            `velocity`, or `prior`.
+        factor_kinds: of each factor of the graph, in order (`build.TrajectoryGraph`).
     """
 
     trajectory: Trajectory
@@ -136,13 +130,7 @@ class SmoothedTrajectory:
         return without_bias(self.inertial, self.nodes_ns, self.states)
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
-        """Vehicle poses at any times within the span: the IMU's motion from the node before.
-
-        Args:
-            stamps_ns: (m,) in any order.
-
-        Returns:
-            R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) in metres.
+        """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3), metres, at any times within the span.
 
         Raises:
             TrajectoryError: a stamp is outside the span.
@@ -222,14 +210,11 @@ class SmoothedTrajectory:
     def joint_information(
         self, stamps_ns: Sequence[int] | IntArray
     ) -> tuple[Array, tuple[gtsam.Pose3, ...]]:
-        """The joint Gaussian of the vehicle's poses at some stamps, given all motion data.
-
-        Args:
-            stamps_ns: (m,) increasing, among the wanted stamps.
+        """The joint Gaussian of the vehicle's poses at wanted stamps (m,), increasing.
 
         Returns:
-            Information (6 m, 6 m), right perturbations, rotation then translation, rad and m,
-            velocities, biases and all other poses eliminated; and its mean, m T_map_vehicle.
+            Information (6 m, 6 m), right perturbations, rotation then translation, rad and m, all
+            else eliminated; and its mean, m T_map_vehicle.
 
         Raises:
             KeyError: a stamp has no node.

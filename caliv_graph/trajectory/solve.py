@@ -57,13 +57,7 @@ MAX_POSITION_SIGMA_M = 10.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """A solved graph.
-
-    Attributes:
-        states: the estimate.
-        graph: its factors, built with the biases of the estimate before.
-        values: the estimate as GTSAM's values.
-    """
+    """A solved graph, built with the biases of the estimate before, and the estimate."""
 
     states: States
     graph: TrajectoryGraph
@@ -71,10 +65,9 @@ class Estimate:
 
 
 def solve_from_the_start(data: SmootherInput, nodes: IntArray, states: States) -> States:
-    """Extends an estimate of the first nodes to all nodes.
+    """Extends an estimate of the first nodes to all nodes, doubling its length after every solve.
 
-    The part that is estimated is solved, then doubled in length by dead reckoning, and so on: the
-    initial guess without an orientation source holds for a short time only.
+    The initial guess without an orientation source holds for a short time only.
     """
     none = np.zeros(0, dtype=np.int64)
     while len(states.p_map_imu) < len(nodes):
@@ -96,13 +89,8 @@ def solve(
 ) -> Estimate:
     """Builds and solves the graph until its biases are those it was built with.
 
-    Args:
-        data: the measurements.
-        nodes: (n,) stamps of the nodes.
-        states: initial guess.
-        dropped: (k,) indices of the GNSS fixes that are left out.
-        kernel: robust kernel of the fixes.
-        tolerance: relative decrease of the error at which a solve stops.
+    The GNSS fixes of indices `dropped` (k,) are left out; `kernel` is the robust kernel of the
+    others. `tolerance` is the relative decrease of the error at which a solve stops.
     """
     for _ in range(MAX_PASSES):
         graph = build_graph(data, nodes, states, dropped, kernel)
@@ -119,16 +107,10 @@ def solve(
 def optimise(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, n: int, tolerance: float
 ) -> gtsam.Values:
-    """Gauss-Newton, with Levenberg-Marquardt damping where a full step does not descend.
+    """Gauss-Newton over n nodes, with Levenberg-Marquardt damping where a step does not descend.
 
-    GTSAM's optimisers end in the same place (1e-13 m) and take 6 to 14 times as long on a graph
-    with factors in Python (`scripts/benchmark_trajectory.py --solvers`).
-
-    Args:
-        graph: over n nodes.
-        values: initial guess.
-        n: number of nodes.
-        tolerance: relative decrease of the error at which to stop.
+    It stops at a relative decrease of the error below `tolerance`. GTSAM's optimisers end in the
+    same place and take 6 to 14 times as long (`README.md`, section 5).
     """
     ordering = node_ordering(n, values.exists(key_yaw_bias()))
     error = graph.error(values)
@@ -195,15 +177,10 @@ def chain_of(linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool) -> Chain
 def covariances_of(
     linear: gtsam.GaussianFactorGraph, data: SmootherInput, states: States
 ) -> tuple[Array, float | None]:
-    """Marginal covariances of the IMU's poses, and the sigma of the yaw bias if it is estimated.
+    """Marginal covariances of the IMU's poses; sigma of the yaw bias, radians, if it is estimated.
 
-    Args:
-        linear: the graph, linearised at the estimate.
-        data: its input.
-        states: the estimate.
-
-    Returns:
-        (n, 6, 6) right perturbations, rotation then translation, rad and m; radians.
+    Of a graph linearised at `states`: (n, 6, 6) right perturbations, rotation then translation, rad
+    and m.
 
     Raises:
         TrajectoryError: the poses are undetermined, or far less certain than is of use.

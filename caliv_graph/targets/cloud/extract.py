@@ -22,8 +22,7 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 
 SCANS_OF_A_PLACE = 10
 """Scans of each place of a target that is moved while the vehicle stands. All show the same spots
-of it: more scans would average the noise but not the sampling by the beams, and their covariance
-would be too small."""
+of it: more would average the noise but not the sampling by the beams."""
 
 
 def extract_targets(
@@ -34,16 +33,13 @@ def extract_targets(
 ) -> tuple[TargetObservation, ...]:
     """Reads every scan once and keeps the points of the targets (paper III-D.2).
 
-    Args:
-        recordings: the drives.
-        trajectories: one per drive; scans outside its span are left out.
-        config: regions, initial guesses, ranges, filters.
-        progress: advances with every scan.
+    Scans outside the span of their drive's trajectory are left out, LiDARs that saw the target in
+    fewer than `extraction.min_scans` scans too, with a warning. `progress` advances with every
+    scan.
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; one per place for
-        a target that was moved while the vehicle stood. LiDARs that saw the target in fewer than
-        `extraction.min_scans` scans are left out with a warning.
+        a target that was moved while the vehicle stood.
 
     Raises:
         TargetError: no LiDAR sees a target, or none was found.
@@ -124,7 +120,7 @@ def _placements(
     moved = periods(centres, extractor.trajectory, config.extraction.min_scans)
     if not moved:
         clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
-        return [_observation(0, label, extractor, clouds, config, hints)]
+        return [_observation(label, extractor, clouds, config, hints)]
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -139,11 +135,11 @@ def _placements(
         most = max(most, SCANS_OF_A_PLACE, config.extraction.min_scans)
         extraction = config.extraction.model_copy(update={"max_scans": most})
         fewer = config.model_copy(update={"extraction": extraction})
-        observation = _observation(0, name, own, clouds, fewer, ())
+        observation = _observation(name, own, clouds, fewer, ())
         if observation.clouds:
             out.append(observation)
     if not out:
-        return [_observation(0, label, extractor, [], config, hints)]
+        return [_observation(label, extractor, [], config, hints)]
     warnings = [*hints, *_warnings_of_moves(label, extractor, out, len(moved), config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
@@ -199,7 +195,6 @@ def _warnings_of_moves(
 
 
 def _observation(
-    placement: int,
     label: str,
     extractor: RegionExtractor,
     found: list[TargetCloud],
@@ -228,9 +223,8 @@ def _observation(
             )
     if not kept:
         warnings = [_why_none(label, config, extractor.tallies)]
-    return TargetObservation(
-        placement, label, extractor.centre_map, tuple(kept), tuple(warnings), seen_ns
-    )
+    centre = extractor.centre_map
+    return TargetObservation(0, label, centre, tuple(kept), tuple(warnings), seen_ns)
 
 
 def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:

@@ -24,13 +24,9 @@ LARGEST_TARGET_M2 = 3.0
 
 
 def azimuth_edges(points_lidar: Array) -> tuple[float, float] | None:
-    """Azimuths of the field of view.
+    """Centre and half width, radians, of the azimuths of points (N, 3) of whole scans, lidar frame.
 
-    Args:
-        points_lidar: (N, 3) of whole scans, metres, lidar frame.
-
-    Returns:
-        (centre, half width) in radians, or None if it covers 360 degrees.
+    None if they cover 360 degrees.
     """
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
     # Bins of 0.1 degrees: finer than EDGE_RAD, and far cheaper than sorting every point.
@@ -46,12 +42,9 @@ def azimuth_edges(points_lidar: Array) -> tuple[float, float] | None:
 
 
 def is_cut(target_lidar: Array, edges: tuple[float, float] | None, points: int) -> bool:
-    """Whether the edge of the field of view may cut the target's points (N, 3) off.
+    """Whether the edge of the field of view may cut the target's points (N, 3) off, lidar frame.
 
-    Args:
-        target_lidar: (N, 3) metres, lidar frame.
-        edges: of the field of view (`azimuth_edges`).
-        points: number of points of the whole scan.
+    `edges` are of `azimuth_edges`, `points` is the number of points of the whole scan.
     """
     if edges is None or len(target_lidar) > 0.5 * points:
         # A scan of little else than the target does not show the field of view.
@@ -87,12 +80,10 @@ class FieldOfView:
         return cls(azimuth_edges(np.concatenate(clouds)), density / math.radians(CELL_DEG) ** 2)
 
     def may_see(self, towards: Array, margin_m: Array, min_points: int) -> BoolArray:
-        """(m,) whether an object as large as a target may have enough points.
+        """(m,) whether an object as large as a target may have `min_points` points.
 
-        Args:
-            towards: (m, 3) middle of the region, lidar frame, metres.
-            margin_m: (m,) possible distance of the object from there.
-            min_points: minimum number of points.
+        It is within `margin_m` (m,) of the middles `towards` (m, 3) of a region, metres, lidar
+        frame.
         """
         range_m = np.linalg.norm(towards, axis=1)
         nearest = np.maximum(range_m - margin_m, 0.1)

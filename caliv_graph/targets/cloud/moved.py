@@ -1,11 +1,8 @@
 """Places of a target that somebody moves while the vehicle stands.
 
-A standing vehicle sees a target from one side. A target that is carried from place to place is seen
-from several, and a place that two LiDARs see makes S2S observable. Every place is a placement of
-its own: places are independent of each other.
-
-While the vehicle stands, a static object has one place in the *LiDAR's* frame. So neither guess nor
-pose is needed to find the times at which it stood.
+Every place is a placement of its own, independent of the others; one that two LiDARs see makes S2S
+observable. A static object has one place in the *LiDAR's* frame while the vehicle stands: neither
+guess nor pose is needed to find the times at which it stood.
 """
 
 from __future__ import annotations
@@ -42,11 +39,9 @@ SAME_PLACE_M = 0.05
 
 @dataclass(frozen=True)
 class CandidateCentres:
-    """Centres of the candidates of one LiDAR in a region, scan by scan.
+    """Centres (n, 3) of the candidates of one LiDAR in a region, metres, lidar frame.
 
-    Attributes:
-        stamps_ns: (n,) ascending, the scan of each candidate.
-        centres_lidar: (n, 3) metres, middle of each, lidar frame.
+    `stamps_ns` (n,), ascending, are the scans of the candidates.
     """
 
     stamps_ns: IntArray
@@ -93,10 +88,7 @@ def periods(
 ) -> list[Period]:
     """The times between moves of the target; empty if it was not moved.
 
-    Args:
-        candidates: of each LiDAR in the target's region.
-        trajectory: of the vehicle; moves are searched while it stands.
-        fewest: minimum number of scans of a stay.
+    Moves are searched while the vehicle stands; a stay has at least `fewest` scans.
     """
     stamps = np.unique(np.concatenate([s.stamps_ns for s in candidates.values()]))
     if not len(stamps):
@@ -238,11 +230,7 @@ def _settled(seen: CandidateCentres, stay: Stay) -> Stay:
 
 
 def _cuts(stays: Sequence[Stay]) -> list[int]:
-    """The fewest times that separate all stays which do not overlap.
-
-    LiDARs that see the same place see it at the same time. Stays that do not overlap, of whichever
-    LiDAR, are at two places.
-    """
+    """The fewest times that separate all stays that do not overlap: those are at two places."""
     between = [
         (before.end_ns, after.begin_ns)
         for before in stays

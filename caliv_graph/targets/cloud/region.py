@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
@@ -21,6 +19,7 @@ from caliv_graph.products import Array, IntArray, LidarScan, TargetCloud
 from caliv_graph.targets.cloud.field_of_view import azimuth_edges, is_cut
 from caliv_graph.targets.cloud.track import CandidateSet
 from caliv_graph.targets.ground.fit import fit_ground, height_above
+from caliv_graph.targets.search.objects import LINK_M, connected
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -39,9 +38,6 @@ MIN_EXTENT_M = 0.2
 MAX_EXTENT_M = 2.0
 """Bounds of the largest horizontal extent of a candidate. Targets are 0.3 to 1.5 m wide; partial
 views are smaller, tilt errors of the ground and noise make them larger."""
-
-LINK_M = 0.3
-"""Points nearer than this belong to one object; in sparse clouds the distance is larger."""
 
 OUTSIDE_M = 0.2
 """Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
@@ -88,17 +84,6 @@ def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
     return GUESS_SIGMAS * (max(sigma.xyz_m()) + max(sigma.rpy_rad()) * range_m)
 
 
-def _clusters(points: Array, link_m: float) -> IntArray:
-    """Labels (N,) of connected components: points nearer than `link_m` are connected."""
-    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
-    graph = coo_array(
-        (np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])),
-        shape=(len(points), len(points)),
-    )
-    _, labels = connected_components(graph, directed=False)
-    return np.asarray(labels, dtype=np.int64)
-
-
 def _filtered(points: Array, extraction: ExtractionConfig) -> IntArray:
     """Indices of the points that survive the voxel and the statistical outlier filter."""
     keep = np.arange(len(points))
@@ -120,13 +105,14 @@ class RegionExtractor:
     Attributes:
         centre: (3,) metres, middle of the region in its own frame.
         tallies: counts of each LiDAR, for messages.
+        trajectory: the vehicle's poses in the drive.
     """
 
     def __init__(self, region: TargetRegion, config: Config, trajectory: VehicleTrajectory) -> None:
         """Binds the region to a drive."""
         self._region = region
         self._config = config
-        self._trajectory = trajectory
+        self.trajectory = trajectory
         self._low = np.array(region.min)
         self._high = np.array(region.max)
         self.centre = 0.5 * (self._low + self._high)
@@ -138,14 +124,9 @@ class RegionExtractor:
         self._guess = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
         self.tallies: dict[str, Tally] = {name: Tally() for name in config.lidars}
 
-    @property
-    def trajectory(self) -> VehicleTrajectory:
-        """The vehicle's poses in the drive."""
-        return self._trajectory
-
     def fresh(self) -> RegionExtractor:
         """The same extractor with empty tallies."""
-        return RegionExtractor(self._region, self._config, self._trajectory)
+        return RegionExtractor(self._region, self._config, self.trajectory)
 
     @property
     def centre_map(self) -> Array:
@@ -166,9 +147,7 @@ class RegionExtractor:
         tally = self.tallies[scan.lidar]
         tally.scans += 1
         extraction = self._config.extraction
-        T_vehicle_lidar = self._guess[scan.lidar]
-        rotations, translations = self._lidar_poses(scan.lidar, [scan.stamp_ns])
-        R, t = rotations[0], translations[0]
+        R, t = (part[0] for part in self._lidar_poses(scan.lidar, [scan.stamp_ns]))
         if len(scan.points_lidar) == 0:
             tally.rejected["empty within the range limits"] += 1
             return []
@@ -199,31 +178,19 @@ class RegionExtractor:
                 continue
             times = None if scan.point_times_s is None else scan.point_times_s[kept]
             compact = replace(scan, points_lidar=scan.points_lidar[kept], point_times_s=times)
-            target = deskew(compact, T_vehicle_lidar, self._trajectory).points_lidar
+            target = deskew(compact, self._guess[scan.lidar], self.trajectory).points_lidar
             low, high = np.percentile(target, [2, 98], axis=0)
-            out.append(
-                Candidate(
-                    cloud=TargetCloud(
-                        scan.lidar,
-                        drive,
-                        scan.stamp_ns,
-                        target,
-                        scan.source,
-                        swept=None if times is None else compact,
-                    ),
-                    centre_lidar=0.5 * (low + high),
-                    R_region_lidar=R,
-                    t_region_lidar=t,
-                    cut=is_cut(target, edges, len(scan.points_lidar)),
-                )
-            )
+            swept = None if times is None else compact
+            cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
+            cut = is_cut(target, edges, len(scan.points_lidar))
+            out.append(Candidate(cloud, 0.5 * (low + high), R, t, cut))
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
         return out
 
     def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int]) -> tuple[Array, Array]:
         """Rotations (m, 3, 3) and translations (m, 3) of T_region_lidar, at the guess."""
-        R_map_vehicle, t_map_vehicle = self._trajectory.poses_at(stamps_ns)
+        R_map_vehicle, t_map_vehicle = self.trajectory.poses_at(stamps_ns)
         guess = self._guess[lidar]
         R = self._R_map_region.T @ R_map_vehicle @ guess.rotation().matrix()
         t = t_map_vehicle + R_map_vehicle @ guess.translation() - self._t_map_region
@@ -264,7 +231,9 @@ class RegionExtractor:
         if len(points) < 3:
             return []
         # Beams diverge: gaps within one object at 20 m separate two objects at 5 m.
-        labels = _clusters(points, max(LINK_M, 0.02 * range_m))
+        link_m = max(LINK_M, 0.02 * range_m)
+        pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
+        labels = connected(pairs, len(points))
         scored = []
         for label in np.unique(labels):
             member = np.flatnonzero(labels == label)
@@ -278,15 +247,10 @@ class RegionExtractor:
         return [member for _, member in scored[:MOST_CANDIDATES]]
 
     def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
-        """The clouds of the static object among the candidates, one per scan at most.
+        """The clouds of the static object among the candidates of a LiDAR's scans, best first.
 
         With a wrong guess even a static object moves in the map; but one error of the extrinsic,
-        small by its sigma, must explain that motion (`track`). Somebody who walks past does not
-        fit, nor does another object in some of the scans.
-
-        Args:
-            found: the candidates of each scan, best first.
-            lidar: its name.
+        small by its sigma, must explain that motion (`track`).
         """
         scans = [candidates for candidates in found if candidates]
         if not scans:
@@ -295,18 +259,14 @@ class RegionExtractor:
         prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
         if self._config.lidars[lidar].fixed:
             prior = np.full(6, 1e-3)
-        flat = [(i, c) for i, candidates in enumerate(scans) for c in candidates]
-        index = np.array([i for i, _ in flat])
-        members = [c for _, c in flat]
-        best = CandidateSet.of(
-            np.array([c.centre_lidar for c in members]),
-            np.array([c.R_region_lidar for c in members]),
-            np.array([c.t_region_lidar for c in members]),
-            index,
-            prior,
-        ).longest_track()
+        flat = [c for candidates in scans for c in candidates]
+        index = np.repeat(np.arange(len(scans)), [len(candidates) for candidates in scans])
+        centres = np.array([c.centre_lidar for c in flat])
+        R = np.array([c.R_region_lidar for c in flat])
+        t = np.array([c.t_region_lidar for c in flat])
+        best = CandidateSet(centres, R, t, index, prior).longest_track()
         lost = len(scans) - len(best)
         if lost:
             self.tallies[lidar].rejected["something else stood there"] += lost
-        clouds = [self.accept(flat[n][1]) for n in best.tolist()]
+        clouds = [self.accept(flat[n]) for n in best.tolist()]
         return [cloud for cloud in clouds if cloud is not None]

@@ -30,10 +30,7 @@ def scans_to_decode(
     config: Config,
     regions: Sequence[TargetRegion],
 ) -> frozenset[int]:
-    """Stamps of the scans of a LiDAR that may see a target; the others are not decoded.
-
-    The field of view and the resolution are estimated from a few of its scans.
-    """
+    """Stamps of the scans of a LiDAR that may see a target; the others are not decoded."""
     begin, end = trajectory.span_ns
     stamps = np.array([s for s in recording.scan_stamps_ns(lidar) if begin <= s <= end], np.int64)
     if len(stamps) <= FEW_SCANS:

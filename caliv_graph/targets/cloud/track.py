@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from caliv_graph.geometry.se3 import skew
@@ -22,7 +20,6 @@ PLACE_SIGMA_M = 0.1
 """Scatter of the middle of a target's visible points, 1 sigma."""
 
 
-@dataclass(frozen=True)
 class CandidateSet:
     """The candidates of all scans of a LiDAR, and how its extrinsic moves them.
 
@@ -34,29 +31,15 @@ class CandidateSet:
         prior: (6,) sigmas of the guess, rad and m.
     """
 
-    scan: IntArray
-    places: Array
-    moves: Array
-    reach_m: Array
-    prior: Array
-
-    @classmethod
-    def of(
-        cls, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array
-    ) -> CandidateSet:
-        """The candidates of a LiDAR.
-
-        Args:
-            centres_lidar: (n, 3) metres, middle of each.
-            R: (n, 3, 3) of T_region_lidar at the guess.
-            t: (n, 3) of it, metres.
-            scan: (n,) index of the scan of each.
-            prior: (6,) sigmas of the guess, rad and m.
-        """
-        places = np.einsum("nij,nj->ni", R, centres_lidar) + t
-        moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)
-        reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
-        return cls(scan, places, moves, reach_m, prior)
+    def __init__(
+        self, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array
+    ) -> None:
+        """Middles (n, 3), metres, at R (n, 3, 3) and t (n, 3) of T_region_lidar, the guess."""
+        self.scan = scan
+        self.places = np.einsum("nij,nj->ni", R, centres_lidar) + t
+        self.moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)
+        self.reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
+        self.prior = prior
 
     def longest_track(self) -> IntArray:
         """Indices of the candidates of the object that is static in most scans, one per scan."""

@@ -13,7 +13,7 @@ beams hit the same spots of it. Beams of common LiDARs are 2 to 10 cm apart at 1
 
 SCANS_OF_A_VIEW = 3.0
 """Sum of the weights of all clouds with the same view. They average the noise of the range, but not
-the error of the sampling by the beams. In simulations of a standing vehicle (10 mm noise) 80 clouds
+the error of the sampling by the beams: in simulations of a standing vehicle (10 mm noise) 80 clouds
 have the information of 2 to 6."""
 
 TOTAL_PER_LIDARS = 2.5
@@ -22,10 +22,9 @@ LiDARs fewer of each, since S2S depends on all of them and the cost grows with t
 
 
 def view_weights(centres_lidar: Array) -> Array:
-    """(n,) weight of each cloud of one LiDAR, 0 to 1: below 1 where several have the same view.
+    """(n,) weight, 0 to 1, of each cloud of a LiDAR: below 1 where several have the same view.
 
-    Args:
-        centres_lidar: (n, 3) metres, place of the target in the frame of the LiDAR, per cloud.
+    A view is the place of the target in the frame of the LiDAR, `centres_lidar` (n, 3), metres.
     """
     if not len(centres_lidar):
         return np.zeros(0)
@@ -39,12 +38,7 @@ def view_weights(centres_lidar: Array) -> Array:
 
 
 def evenly_spread(weights: Array, most: int) -> IntArray:
-    """Indices of at most `most` clouds, ascending, evenly spread over the sum of their weights.
-
-    Args:
-        weights: (n,) of `view_weights`, in order of time.
-        most: maximum number; all if there are no more.
-    """
+    """Indices of at most `most` clouds, ascending, evenly spread over the sum of weights (n,)."""
     if len(weights) <= most:
         return np.arange(len(weights), dtype=np.int64)
     middle = np.cumsum(weights) - 0.5 * weights
@@ -55,10 +49,5 @@ def evenly_spread(weights: Array, most: int) -> IntArray:
 
 
 def clouds_per_lidar(max_scans: int, seeing: int) -> int:
-    """Clouds of one LiDAR that are used at most.
-
-    Args:
-        max_scans: `extraction.max_scans`.
-        seeing: number of LiDARs that see the target often enough.
-    """
+    """Clouds of one LiDAR that are used at most if so many LiDARs see the target often enough."""
     return min(max_scans, max(round(TOTAL_PER_LIDARS * max_scans / max(seeing, 1)), 10))

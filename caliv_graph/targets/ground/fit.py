@@ -27,15 +27,10 @@ MIN_POINTS = 30
 
 
 def fit_ground(points: Array, distance: float) -> Array | None:
-    """The near-horizontal plane that most points lie on.
+    """The near-horizontal plane that most points (N, 3) lie on, metres, z roughly up.
 
-    Args:
-        points: (N, 3) metres, z roughly up.
-        distance: metres, half thickness of the plane.
-
-    Returns:
-        (4,): unit normal (upwards) n and offset d with `n . p + d = 0`; None if no plane was found
-        or it holds fewer than a tenth of the points.
+    Within `distance` of it. Unit normal n (upwards) and offset d, (4,), with `n . p + d = 0`; None
+    if no plane was found or it holds fewer than a tenth of the points.
     """
     if len(points) < MIN_POINTS:
         return None

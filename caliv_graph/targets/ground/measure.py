@@ -49,10 +49,8 @@ class GroundMeter:
     def measure(self, scan: LidarScan, at_ns: int | None = None) -> GroundObservation | None:
         """The ground's plane in a scan as it was read; None if there is none.
 
-        Args:
-            scan: not motion compensated; its stamp within the trajectory's span.
-            at_ns: a stamp near the scan's, at which the ground is wanted; None: the scan's own. The
-                plane is relative to the LiDAR's pose at that time, by the trajectory.
+        The scan is not motion compensated. The plane is relative to the LiDAR's pose at `at_ns` by
+        the trajectory, a stamp near the scan's; None: the scan's own.
 
         Raises:
             TrajectoryError: the stamp is outside the trajectory's span, or point times are invalid.
@@ -116,14 +114,9 @@ class GroundMeter:
 def nearest_scans(
     poses_ns: Sequence[int] | IntArray, scans_ns: Sequence[int] | IntArray
 ) -> dict[int, int]:
-    """For each pose the nearest scan, if one is near enough.
+    """Stamp of the pose by stamp of the nearest scan, for poses with a scan near enough.
 
-    Args:
-        poses_ns: stamps of the poses.
-        scans_ns: stamps of the scans of one LiDAR, ascending.
-
-    Returns:
-        Stamp of the pose by stamp of the scan. No scan is used twice.
+    `scans_ns` are those of one LiDAR, ascending. No scan is used twice.
     """
     scans = np.asarray(scans_ns, dtype=np.int64)
     out: dict[int, int] = {}
@@ -146,20 +139,11 @@ def measure_grounds(
     config: Config,
     progress: Progress,
 ) -> tuple[tuple[GroundObservation, ...], tuple[str, ...]]:
-    """The ground in the scans of all LiDARs, whenever one of them sees a target.
+    """The ground in the scans of all LiDARs, whenever one of them sees a target; and warnings.
 
     All LiDARs at the same poses: heave of the body and error of the trajectory are then common to
-    them, and the ground determines S2S to the 2 mm of a plane.
-
-    Args:
-        recordings: the drives.
-        trajectories: one per drive.
-        targets: the stamps of their clouds are the poses of the graph.
-        config: initial guesses, noise, and whether the ground is to be used.
-        progress: advances with every scan.
-
-    Returns:
-        Observations by drive, LiDAR and stamp, each at the stamp of a pose; and warnings.
+    them, and the ground determines S2S to the 2 mm of a plane. Observations are by drive, LiDAR and
+    stamp, each at the stamp of a pose: those of the clouds of `targets`.
 
     Raises:
         RecordingError: a cloud could not be read.

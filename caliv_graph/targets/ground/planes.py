@@ -1,9 +1,7 @@
 """The ground's plane in one scan: robust fit, covariance, and the tests that it is a plane.
 
-The noise of a LiDAR is along its beams, which graze the ground: a range error of 10 mm is a height
-error of 2 mm at 10 m. So points are judged and selected *along the beam*, where the noise is
-symmetric. Selection by distance from the LiDAR, or from the plane of a ball of points, would be
-biased: by 1 mm of height in every scan, which no number of scans averages out.
+Points are judged and selected *along the beam*, where the noise is symmetric: selection by distance
+from the LiDAR, or from the plane of a ball of points, is biased by 1 mm of height in every scan.
 """
 
 from __future__ import annotations
@@ -132,11 +130,9 @@ class GroundPlane:
 
 
 def near_points(points: Array, up: Array) -> IntArray:
-    """Indices of the points that may be ground about a LiDAR, at most `CELL_POINTS` per cell.
+    """Indices of the points (N, 3) that may be ground, at most `CELL_POINTS` per cell.
 
-    Args:
-        points: (N, 3) metres, lidar frame.
-        up: (3,) unit vector, upwards to 10 degrees.
+    `up` (3,) is a unit vector, upwards in the lidar frame to 10 degrees.
     """
     height = points @ up
     square = np.einsum("ni,ni->n", points, points)
@@ -164,16 +160,10 @@ def _cells(xy: Array, size_m: float) -> IntArray:
 
 
 def fit_plane(points: Array, up: Array, sigma_range_m: float) -> tuple[GroundPlane | None, str]:
-    """Fits the ground's plane to the points near a LiDAR.
+    """Fits the ground's plane to the points (N, 3) of `near_points`, motion compensated.
 
-    Args:
-        points: (N, 3) metres, lidar frame, motion compensated, of `near_points`.
-        up: (3,) unit vector, upwards in the lidar frame to 10 degrees.
-        sigma_range_m: noise along the beam, 1 sigma, metres.
-
-    Returns:
-        The plane and an empty string; or None and the reason, where there is no ground or where it
-        is no plane even close to the vehicle.
+    `up` (3,) is a unit vector, upwards in the lidar frame to 10 degrees. Without ground, or where
+    it is no plane even close to the vehicle: None and the reason.
     """
     if len(points) < MIN_POINTS:
         return None, f"under {MIN_POINTS} points near the ground"
@@ -193,13 +183,9 @@ def fit_plane(points: Array, up: Array, sigma_range_m: float) -> tuple[GroundPla
 
 @dataclass(frozen=True)
 class _Fit:
-    """Points relative to a plane, (N,) unless stated.
+    """Points relative to a plane: heights (N,) and their sigmas, metres; whether usable.
 
-    Attributes:
-        height: metres above it.
-        place: (N, 2) where the beam meets the plane, along its tangent axes, from the LiDAR's foot.
-        sigma_m: of the height, metres.
-        usable: whether the beam meets the plane, within the radius.
+    `place` (N, 2) is where the beam meets the plane, along its tangent axes, from the LiDAR's foot.
     """
 
     height: Array
@@ -324,20 +310,18 @@ def _judged(
     # By chance, points on a line may scatter little; the nominal covariance depends on geometry.
     if not all(_is_determined(c) for c in (cov, nominal)):
         return None, "too little ground to determine its tilt"
-    return (
-        GroundPlane(
-            normal_lidar=normal,
-            distance_m=distance_m,
-            axes_lidar=axes,
-            cov=cov,
-            beyond=beyond,
-            centre_lidar=centre @ axes - distance_m * normal,
-            points=count,
-            scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
-            radius_m=radius_m,
-        ),
-        "",
+    ground = GroundPlane(
+        normal_lidar=normal,
+        distance_m=distance_m,
+        axes_lidar=axes,
+        cov=cov,
+        beyond=beyond,
+        centre_lidar=centre @ axes - distance_m * normal,
+        points=count,
+        scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
+        radius_m=radius_m,
     )
+    return ground, ""
 
 
 def _is_determined(cov: Array) -> bool:
@@ -354,16 +338,10 @@ def _is_determined(cov: Array) -> bool:
 
 
 def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array]:
-    """The best paraboloid through heights, relative to their best plane.
+    """The best paraboloid through heights (n,) at places (n, 2), relative to their best plane.
 
-    Args:
-        place: (n, 2) metres from the LiDAR's foot, along the axes.
-        height: (n,) metres above the best plane.
-        weight: (n,).
-
-    Returns:
-        Root mean square of the difference over the patch, metres; and (3,) the change of
-        (a, b, distance) if the paraboloid continues to the LiDAR's foot.
+    Root mean square of the difference, metres; and (3,) change of (a, b, distance) at the LiDAR's
+    foot.
     """
     centre = np.average(place, axis=0, weights=weight)
     scale = np.abs(place - centre).max()
@@ -382,17 +360,7 @@ def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array]:
 
 
 def response(plane: GroundPlane, points: Array, moved: Array, sigma_range_m: float) -> Array:
-    """Derivative of a plane's (a, b, distance) with respect to motions of its points.
-
-    Args:
-        plane: as it was fitted.
-        points: (N, 3) metres that it was fitted to.
-        moved: (N, 3, k) metres, k small displacements of them.
-        sigma_range_m: noise along the beam.
-
-    Returns:
-        (3, k) changes of (a, b, distance).
-    """
+    """(3, k) changes of a plane's (a, b, distance) with k small motions (N, 3, k) of its points."""
     beams = points / np.linalg.norm(points, axis=1)[:, None]
     both = (plane.normal_lidar, plane.distance_m)
     fit = _against(points, beams, both, plane.axes_lidar, plane.radius_m, sigma_range_m)

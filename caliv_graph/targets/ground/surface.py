@@ -79,13 +79,9 @@ class GroundSurface:
 
 
 def fit_surface(points: Array) -> GroundSurface | None:
-    """The ground in a scan.
+    """The ground in a scan (N, 3), metres, z up to the error of the initial guess.
 
-    Args:
-        points: (N, 3) metres about the LiDAR, z up to the error of the initial guess.
-
-    Returns:
-        The surface; None if there is no near-horizontal plane.
+    None if there is no near-horizontal plane.
     """
     lowest = points[_lowest_of_cells(points)]
     plane = fit_ground(lowest, PLANE_DISTANCE_M)

@@ -1,11 +1,9 @@
 """Finding the target: the compact static object on the ground that all LiDARs pass.
 
-Some scans of each LiDAR are segmented into objects (`objects`). The initial guesses are off by
-degrees, so that a static object moves in the map as the vehicle turns; but one error per LiDAR,
-small by its sigma, must explain that motion for *all* objects. So the yaw and shift that minimise
-the motion are found first (`align`). What still moves then, or is missing where it should be in
-view, is not static. The static ones are judged by size and height (`tracks`), and matched across
-LiDARs (`find`).
+Some scans of each LiDAR are segmented into objects (`objects`). One error per LiDAR, small by the
+sigma of its guess, must explain the motion of all static ones in the map: yaw and shift are found
+first (`align`). What still moves then, or is missing where it should be in view, is not static. The
+static ones are judged by size and height (`tracks`), and matched across LiDARs (`find`).
 
 Words: an *object* is a cluster of points of one scan; a *track* is what one LiDAR saw at one place
 in several scans; a *proposal* is a track, or matching tracks of several LiDARs, that may be the

@@ -34,8 +34,7 @@ PLACE_SIGMA_M = 0.2
 def align(history: LidarHistory, config: Config) -> Alignment:
     """The yaw and shift of a LiDAR that minimise the motion of its objects in the map.
 
-    Yaw is searched, then both are refined. On an arc they are correlated: then the smallest
-    correction is taken.
+    On an arc they are correlated: then the smallest correction is taken.
     """
     lidar = config.lidars[history.name]
     usable = history.whole & (history.extent_m < WIDE_M)
@@ -89,10 +88,7 @@ def gate_m(history: LidarHistory, config: Config) -> float:
 def tracks_at_places(history: LidarHistory, bases: Array, radius_m: float) -> list[IntArray]:
     """Indices of the objects of each track, one per scan; the place with most scans first.
 
-    Args:
-        history: of the LiDAR.
-        bases: (n, 2) metres, places of its objects.
-        radius_m: of a place.
+    `bases` (n, 2), metres, are the places of the objects; `radius_m` is that of a place.
     """
     left = history.whole & (history.extent_m < WIDE_M)
     out = []

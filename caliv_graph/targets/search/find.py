@@ -83,16 +83,7 @@ def find_target(
     config: Config,
     progress: Progress,
 ) -> list[FoundTarget]:
-    """Finds the target of each drive.
-
-    Args:
-        recordings: the drives.
-        trajectories: one per drive.
-        config: initial guesses and their sigmas, ranges, minimum points and scans.
-        progress: advances with every scan.
-
-    Returns:
-        One target per drive, in their order.
+    """Finds the target of each drive, in their order; `progress` advances with every scan.
 
     Raises:
         TargetError: a drive shows no object that could be a target.

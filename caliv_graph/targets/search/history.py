@@ -71,11 +71,10 @@ class LidarHistory:
         self.range_m = np.array([o.range_m for o in self.objects])
         self.bottom_m = np.array([o.bottom_m for o in self.objects])
         self.top_m = np.array([o.top_m for o in self.objects])
-        azimuth = np.array([o.azimuth for o in self.objects]).reshape(-1, 2)
-        self._azimuth = azimuth
-        self.whole: BoolArray = np.array(
-            [not o.hidden for o in self.objects], dtype=bool
-        ) & self._in_view(azimuth[:, 0] - EDGE_RAD, azimuth[:, 1] + EDGE_RAD)
+        self._azimuth = np.array([o.azimuth for o in self.objects]).reshape(-1, 2)
+        low, high = self._azimuth.T
+        free: BoolArray = np.array([not o.hidden for o in self.objects], dtype=bool)
+        self.whole: BoolArray = free & self._in_view(low - EDGE_RAD, high + EDGE_RAD)
         self.top_cut: BoolArray = np.array(
             [o.highest_rad > self._highest_rad - EDGE_RAD for o in self.objects], dtype=bool
         )
@@ -131,7 +130,7 @@ class LidarHistory:
     ) -> BoolArray:
         """(scans,) whether an object at a place (3,) in the map should be in view.
 
-        That is: within the field of view and these ranges, with no occluder.
+        Within the field of view and these ranges, with no occluder.
         """
         c, s = math.cos(alignment.yaw_rad), math.sin(alignment.yaw_rad)
         R_yaw = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -31,7 +31,7 @@ VOXEL_M = 0.1
 """Clustering looks at one point per voxel of this size."""
 
 LINK_M = 0.3
-"""Points nearer than this belong to one object (as in `cloud.region`)."""
+"""Points nearer than this belong to one object; in sparse clouds the distance is larger."""
 
 MAX_LINK_M = 1.0
 """Points farther apart than this do not, whatever the spacing of the beams."""
@@ -119,11 +119,9 @@ class ScanObjects:
 
 
 def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
-    """Segments a scan into ground and objects.
+    """Segments a scan (N, 3), metres, lidar frame, motion compensated, into ground and objects.
 
-    Args:
-        points_lidar: (N, 3) metres, lidar frame, motion compensated.
-        R_map_lidar: (3, 3) attitude of the LiDAR, as good as the guess.
+    `R_map_lidar` (3, 3) is the attitude of the LiDAR, as good as the guess.
     """
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
     across = np.hypot(points_lidar[:, 0], points_lidar[:, 1])
@@ -146,7 +144,8 @@ def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
         elevation=elevation[near[above]],
         range_m=range_m[near[above]],
     )
-    spacing = _beam_spacing(azimuth, elevation)(stands.azimuth, stands.elevation)
+    bins_of = _direction_bin(stands.elevation), _direction_bin(stands.azimuth)
+    spacing = _beam_spacing(azimuth, elevation)[bins_of]
     labels = _clusters(stands, spacing)
     objects = _describe(stands, labels, points_lidar, R_map_lidar, surface, spacing)
     return ScanObjects(tuple(objects), bins, highest, True)
@@ -154,16 +153,7 @@ def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
 
 @dataclass(frozen=True)
 class _Standing:
-    """Points above the ground.
-
-    Attributes:
-        index: (n,) in the scan.
-        level: (n, 3) metres, level axes about the LiDAR.
-        height: (n,) metres above the ground.
-        azimuth: (n,) rad, lidar frame.
-        elevation: (n,) rad, lidar frame.
-        range_m: (n,) metres.
-    """
+    """Points above the ground: indices (n,) in the scan, places in level axes, directions."""
 
     index: IntArray
     level: Array
@@ -173,29 +163,22 @@ class _Standing:
     range_m: Array
 
 
-class _BeamSpacing:
-    """Angle between neighbouring beams by direction: rings may be unevenly spaced."""
-
-    def __init__(self, spacing: Array) -> None:
-        self._spacing = spacing
-
-    def __call__(self, azimuth: Array, elevation: Array) -> Array:
-        return self._spacing[_direction_bin(elevation), _direction_bin(azimuth)]
-
-
 def _direction_bin(angle: Array) -> IntArray:
     bins: IntArray = np.floor((angle + math.pi) / BIN_RAD).astype(np.int64)
     return bins % round(2.0 * math.pi / BIN_RAD)
 
 
-def _beam_spacing(azimuth: Array, elevation: Array) -> _BeamSpacing:
-    """Spacing from the density of returns. A bin half in the sky takes that of its neighbours."""
+def _beam_spacing(azimuth: Array, elevation: Array) -> Array:
+    """Angle between neighbouring beams by bins of elevation and azimuth, from the returns.
+
+    Rings may be unevenly spaced. A bin half in the sky takes the density of its neighbours.
+    """
     n = round(2.0 * math.pi / BIN_RAD)
     key = _direction_bin(elevation) * n + _direction_bin(azimuth)
     count = np.bincount(key, minlength=n * n).reshape(n, n).astype(np.float64)
     solid = np.cos((np.arange(n) + 0.5) * BIN_RAD - math.pi)[:, None]
     density = maximum_filter(count / np.maximum(np.abs(solid), 0.1), size=3, mode="wrap")
-    return _BeamSpacing(BIN_RAD / np.sqrt(np.maximum(density, 0.25)))
+    return np.asarray(BIN_RAD / np.sqrt(np.maximum(density, 0.25)))
 
 
 def _clusters(stands: _Standing, spacing: Array) -> IntArray:
@@ -215,14 +198,16 @@ def _clusters(stands: _Standing, spacing: Array) -> IntArray:
         counts = np.array([len(f) for f in found])
         to = np.concatenate([np.asarray(f, dtype=np.intp) for f in found])
         pairs.append(np.column_stack([np.repeat(sparse, counts), to]))
-    edges = np.vstack(pairs)
-    graph = coo_array(
-        (np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])),
-        shape=(len(points), len(points)),
-    )
-    _, labels = connected_components(graph, directed=False)
-    of_point: IntArray = labels[member.ravel()].astype(np.int64)
+    of_point: IntArray = connected(np.vstack(pairs), len(points))[member.ravel()]
     return of_point
+
+
+def connected(pairs: IntArray, count: int) -> IntArray:
+    """Labels (count,) of the connected components of points, given linked pairs (p, 2) of them."""
+    links = np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])
+    graph = coo_array(links, shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    return np.asarray(labels, dtype=np.int64)
 
 
 def _describe(

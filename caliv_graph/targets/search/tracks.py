@@ -37,7 +37,7 @@ walks past is in a tenth."""
 SCATTER_M = 0.10
 SCATTER_PER_EXTENT = 0.15
 """Maximum scatter of a static object about its place, third quartile: constant, plus this part of
-its extent, since its visible side changes. Measured: 0.20 m at most for a chair 0.9 m wide with a
+its extent, since its visible side changes. Measured: at most 0.20 m for a chair 0.9 m wide with a
 guess 10 degrees off; 0.3 to 0.4 m for somebody who strolls about or waits."""
 
 FULL_POINTS = 300
@@ -78,18 +78,14 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
     gate = gate_m(history, config)
     bases = history.bases(alignment)
     wide, wide_scan = history.outlines(history.extent_m >= WIDE_M, alignment)
-    wide_tree = cKDTree(wide[:, :2]) if len(wide) else None
-    tree = cKDTree(bases[:, :2])
+    wide_tree, tree = cKDTree(wide[:, :2]), cKDTree(bases[:, :2])
     travelled = float(np.ptp(history.t_map_vehicle[:, :2], axis=0).max(initial=0.0))
     out = []
     for members in tracks_at_places(history, bases[:, :2], gate):
         place = np.average(bases[members], axis=0, weights=1.0 / history.range_m[members])
         scans = history.scan_of[members]
-        in_wide = (
-            set(wide_scan[wide_tree.query_ball_point(place[:2], gate)].tolist())
-            if wide_tree is not None
-            else set()
-        ) - set(scans.tolist())
+        in_wide = set(wide_scan[wide_tree.query_ball_point(place[:2], gate)].tolist())
+        in_wide -= set(scans.tolist())
         met = set(history.scan_of[tree.query_ball_point(place[:2], 1.3 * gate)].tolist()) | in_wide
         centre_m = np.linalg.norm((bases[members] - history.t_map_vehicle[scans])[:, :2], axis=1)
         missed = _in_view(history, alignment, place, centre_m, gate) - met
@@ -163,10 +159,7 @@ def _bottom(history: LidarHistory, members: IntArray) -> float:
 
 
 def _height(history: LidarHistory, members: IntArray) -> tuple[float, bool]:
-    """Height of an object above ground, metres, and whether its top was ever in view.
-
-    Where the field of view cuts the top off, the height is a lower bound.
-    """
+    """Height of an object above ground, metres; whether its top was in view, else a bound."""
     tops, cut = history.top_m[members], history.top_cut[members]
     known = np.isfinite(tops)
     if not known.any():

@@ -52,16 +52,9 @@ def check(
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Tests a calibration against its data and its initial guesses.
 
-    Args:
-        calibration: the result.
-        solution: the solved graph.
-        recordings: the drives.
-        trajectories: one per drive.
-        motions: motion data of each drive, by its index.
-
-    Returns:
-        The calibration, inconsistent if something contradicts something; and warnings: headings
-        that disagree, and what could not be tested.
+    `recordings` and `trajectories` are one per drive, `motions` by the index of the drive. Returns
+    the calibration, inconsistent if something contradicts something; and warnings: headings that
+    disagree, and what could not be tested.
     """
     headings = _headings(trajectories, motions)
     drives = [Path(recording.name).name for recording in recordings]
@@ -106,12 +99,7 @@ def check(
 def cloud_counts(
     solution: Solution, trajectories: Sequence[VehicleTrajectory]
 ) -> tuple[CloudCount, ...]:
-    """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie.
-
-    Args:
-        solution: the solved graph.
-        trajectories: one per drive, for the yaw rates.
-    """
+    """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie."""
     observed = [c for r in solution.registrations for c in r.observation.clouds]
     weights = np.concatenate(solution.cloud_weights)
     down = weights < 0.5
@@ -177,12 +165,7 @@ def registration_sigma(solution: Solution) -> tuple[float, float]:
 
 
 def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...]:
-    """Height and tilt of the vehicle above the ground: the assumption and the estimate.
-
-    Args:
-        solution: the solved graph.
-        drives: what to call them.
-    """
+    """Height and tilt of the vehicle above the ground: assumed and estimated."""
     out = []
     for index, kind in enumerate(solution.factor_kinds):
         if kind not in ("ground_height", "ground_tilt"):

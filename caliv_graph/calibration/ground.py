@@ -1,9 +1,8 @@
 """The ground in the graph: a plane per drive, seen by the LiDARs and stood upon by the vehicle.
 
-Variables (keys in `conventions`): per drive g = (slope along map x, slope along map y, height in m)
-of the plane `z = height + slopes . (xy - centre)`, with the centre in the middle of the drive, so
-that height and slopes hardly correlate; the error of the vehicle's height above it (role b); and
-the tilt at which the vehicle stands on it (role c). Jacobians are analytic.
+A plane g is (slope along map x, slope along map y, height in m): `z = height + slopes . (xy -
+centre)`, the centre in the middle of the drive, so that height and slopes hardly correlate.
+`caliv_graph/calibration/README.md`, "Ground", has the three roles.
 """
 
 from __future__ import annotations
@@ -106,11 +105,8 @@ def ground_graph(
 ) -> CalibrationGraph:
     """All factors of the ground; empty if it is not to be used or was not seen.
 
-    Args:
-        problem: LiDARs and poses. Observations of others are left out.
-        observations: the planes.
-        config: which of the roles are used, and their sigmas.
-        weights: of `ground_weights`; None: all full.
+    Observations of LiDARs and poses that the problem has not are left out. Without `weights` (of
+    `ground_weights`) all have full weight.
     """
     graph = CalibrationGraph()
     if not config.use:
@@ -191,11 +187,7 @@ def ground_values(
 ) -> gtsam.Values:
     """First values of the variables of `ground_graph`, and of no others.
 
-    Args:
-        problem: LiDARs and poses.
-        observations: the planes.
-        values: of poses and extrinsics, guesses will do.
-        config: as for `ground_graph`.
+    `values` has poses and extrinsics; guesses will do.
     """
     out = gtsam.Values()
     if not config.use:

@@ -81,9 +81,7 @@ class DenseSystem:
     def covariance_of(self, key: int, cov_extrinsics: Array) -> Array:
         """Marginal covariance of a variable that is no extrinsic.
 
-        Args:
-            key: of the variable.
-            cov_extrinsics: covariance of the extrinsics, tangents in the order of `keys`.
+        `cov_extrinsics` is the covariance of the extrinsics, tangents in the order of `keys`.
         """
         split = len(self.b) - 6 * self.extrinsics
         start = self.offset(key)
@@ -99,9 +97,8 @@ class DenseSystem:
     def schur(self) -> tuple[Array, Array, Array, Array]:
         """Eliminates everything but the extrinsics.
 
-        Returns:
-            D (6n, 6n) and c (6n,) of the reduced quadratic; and G, g with which the eliminated
-            variables follow: `d_rest = g - G d_extrinsics`.
+        Returns D (6n, 6n) and c (6n,) of the reduced quadratic; and G, g with which the eliminated
+        variables follow: `d_rest = g - G d_extrinsics`.
 
         Raises:
             SolveError: the rest is singular.
@@ -175,13 +172,8 @@ def add_shape(
 ) -> DenseSystem:
     """Adds a quadratic on the poses of all clouds, `d^T H d / 2 + g^T d` (left perturbations).
 
+    `lines` says how the poses move with the variables, `H_clouds` is (6 J, 6 J), `gradient` (6 J,).
     A common motion of a target's clouds is a gauge freedom of it: GAUGE_PRIOR holds the frame.
-
-    Args:
-        system: the rest of the graph.
-        lines: how the clouds' poses move with the variables.
-        H_clouds: (6 J, 6 J).
-        gradient: (6 J,).
     """
     J = cloud_rows(system, lines)
     return _with_rows(system, J, J.T @ H_clouds, gradient)
@@ -221,10 +213,8 @@ def adjusted_residuals(
 ) -> tuple[Array, Array]:
     """Residuals of the clouds adjusted for the estimation of all variables, and their covariance.
 
-    With H the clouds' information, r their residuals and A the information of all variables: the
-    gradient `v = H (r + J d)` at the solution d, and its covariance `W = H - H J A^-1 J^T H`. W is
-    the information on an error in the measured poses; it is zero along what poses, targets and
-    extrinsics can absorb.
+    `W` is the information on an error in the measured poses; it is zero along what poses, targets
+    and extrinsics can absorb (`caliv_graph/calibration/README.md`, "Data snooping").
 
     Args:
         system: the rest of the graph, which determines all variables together with the clouds.
@@ -233,7 +223,7 @@ def adjusted_residuals(
         residuals: (J, 6) `Log(predicted measured^-1)`.
 
     Returns:
-        (6 J, 6 J) W and (6 J,) v.
+        (6 J, 6 J) W and (6 J,) v, the gradient at the solution.
 
     Raises:
         SolveError: a variable is unobservable.
@@ -258,12 +248,7 @@ def _starts(system: DenseSystem) -> dict[int, int]:
 
 
 def add_gauge_prior(H: Array, starts: Mapping[int, int]) -> None:
-    """Adds GAUGE_PRIOR to the frames of the targets.
-
-    Args:
-        H: (M, M) information, changed in place.
-        starts: first coordinate of each variable.
-    """
+    """Adds GAUGE_PRIOR to the frames of the targets in H (M, M), in place; `starts` by variable."""
     letter = gtsam.symbolChr(key_target(0))
     for key, start in starts.items():
         if gtsam.symbolChr(key) == letter:

@@ -75,13 +75,10 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations at most.
 
-    Args:
-        state: of `solve_registered`, taken along.
-        states: the registration of each placement, taken along.
-        most: iterations at most.
-        advance: called after each.
+    `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
+    along; `advance` is called after each iteration.
 
     Raises:
         SolveError: a pose or a target has no measurement.
@@ -101,14 +98,9 @@ def refined(
 
 @dataclass
 class _Loop:
-    """What the iterations of the joint loop carry along.
+    """What the iterations carry along; `base` is the graph without clouds and guesses.
 
-    Attributes:
-        state: values, weights, noise.
-        states: the registration of each placement.
-        base: the graph without clouds and guesses, which stays the same.
-        prior: (6n, 6n) information of the guesses, vehicle axes.
-        undetermined: number of undetermined directions once it is fixed; None: not yet.
+    `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed.
     """
 
     state: SolveState
@@ -191,10 +183,7 @@ class _Loop:
 
 
 def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
-    """A new mixture, and if asked for new normals, at the poses of the graph.
-
-    EM ends near its start: the start shall not depend on the initial guess.
-    """
+    """A new mixture, and if asked for new normals, at the graph's poses: EM ends near its start."""
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
         if normals:

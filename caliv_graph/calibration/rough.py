@@ -73,8 +73,8 @@ def rough_solve(
         config: kernels, noise, ground.
         progress: reports every stage.
         iterations: of each registration at most.
-        look_for_symmetries: whether to marginalise what a target that looks the same after a
-            rotation cannot determine.
+        look_for_symmetries: marginalise what a target that looks the same after a rotation cannot
+            determine.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
@@ -119,8 +119,7 @@ def symmetries_of_targets(
 ) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
     """Per placement the continuous symmetry of its target; and a warning for each.
 
-    The rotation of a cloud about a drum is unobservable: it comes from noise and from where the
-    beams fell, and is marginalised.
+    The rotation of a cloud about a drum comes from noise and from where the beams fell.
     """
     turns: list[Symmetry | None] = []
     warnings = []

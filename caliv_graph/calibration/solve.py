@@ -1,8 +1,7 @@
 """The graph solve of registered clouds, and what all modes use of it.
 
 The paper's minimisation: one pose factor per registered cloud, robust weights, noise levels from
-the data. Then the problem reduced to the extrinsics, for steps and covariances, and the packed
-result.
+the data. Then the problem reduced to the extrinsics, for steps and covariances.
 """
 
 from __future__ import annotations
@@ -100,12 +99,8 @@ def solve_registered(
 ) -> SolveState:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
 
-    Args:
-        problem: LiDARs, poses and clouds.
-        registrations: of its placements, in order.
-        grounds: the ground as the LiDARs saw it.
-        config: kernels, noise, ground.
-        turns: per placement the continuous symmetry of its target; empty: none.
+    `registrations` are of the problem's placements, in order; `turns` the continuous symmetry of
+    each placement's target, empty for none.
 
     Raises:
         SolveError: the graph is singular.
@@ -177,15 +172,9 @@ def with_determined_offsets(
 ) -> tuple[Problem, dict[str, float]]:
     """The problem without the time offsets that the drive does not determine.
 
-    At constant speed on an arc an offset of a LiDAR has the same effect as its own x and yaw: with
-    the offset free the drive would not determine them.
-
-    Args:
-        state: of `solve_registered`, offsets free.
-        registrations: what it was given.
-
-    Returns:
-        The problem; and LiDAR -> 1 sigma in seconds of each offset that was free.
+    At constant speed on an arc a free offset of a LiDAR has the same effect as its own x and yaw.
+    `state` and `registrations` are those of `solve_registered`. Returns the problem; and LiDAR -> 1
+    sigma in seconds of each offset that was free.
     """
     problem = state.problem
     if not problem.offsets:
@@ -198,12 +187,7 @@ def with_determined_offsets(
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
-    """The problem of registered clouds, motion and ground, reduced to the extrinsics.
-
-    Args:
-        state: of `solve_registered`.
-        registrations: what it was given.
-    """
+    """The problem of registered clouds, motion and ground, reduced to the extrinsics."""
     return _reduction(state, registrations)()
 
 
@@ -225,15 +209,10 @@ def settle(
     registrations: Sequence[Registration],
     step: Callable[[Reduced], Array],
 ) -> tuple[Reduced, Array, bool]:
-    """Repeats a Gauss-Newton step on the joint information until it is small.
+    """Repeats a Gauss-Newton step on the joint information until it is small; moves `state`.
 
-    Args:
-        state: of `solve_registered`; its values are moved.
-        registrations: what it was given.
-        step: (6 n,) of the extrinsics, vehicle axes, from the problem reduced to them.
-
-    Returns:
-        The last linearisation, the last step, and whether that was small.
+    `step` gives (6 n,) of the extrinsics, vehicle axes, from the problem reduced to them. Returns
+    the last linearisation, the last step, and whether that was small.
 
     Raises:
         SolveError: a pose or a target has no measurement.
@@ -256,12 +235,7 @@ def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
 
 
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
-    """(6 J, 6 J) joint information of all registered poses, with robust weights.
-
-    Args:
-        state: weights, scale of the registration's sigmas, symmetries that are marginalised.
-        registrations: of the placements, in order.
-    """
+    """(6 J, 6 J) joint information of all registered poses, with robust weights."""
     turns = state.turns or [None] * len(registrations)
     out, start = [], 0
     for r, turn in zip(registrations, turns, strict=True):
@@ -279,10 +253,7 @@ def measured_poses(
 ) -> tuple[list[gtsam.Pose3], Array]:
     """Registered poses (J,) and informations (J, 6, 6) of all placements, in order.
 
-    Args:
-        registrations: of the placements, in order.
-        turns: per placement the continuous symmetry of its target, to be marginalised; empty:
-            none.
+    The continuous symmetries `turns` of the placements' targets are marginalised; empty: none.
     """
     poses = [T for r in registrations for T in r.T_target_lidar]
     information = []
@@ -298,12 +269,7 @@ def measured_poses(
 
 
 def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:
-    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`, rad and m.
-
-    Args:
-        lines: with the predicted poses T_target_lidar.
-        measured: those that the registration found.
-    """
+    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`, rad and m."""
     return np.array(
         [
             gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))

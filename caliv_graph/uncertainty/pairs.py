@@ -57,11 +57,8 @@ def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
 def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
     """Which axes of `T_to_from` the data determine, by the rule of `observability.assess`.
 
-    The undetermined subspace is mapped to the pair: a direction in which both LiDARs move
-    together, such as the rotation about the turn centre, does not change the pair.
-
-    Returns:
-        Per axis of `conventions.AXES`: rotation about, shift along the axes of `to`.
+    The undetermined subspace is mapped to the pair. Per axis of `conventions.AXES`: rotation about,
+    shift along the axes of `to`.
     """
     results = [calibration.lidars[name] for name in (source, to)]
     if not all(result.saw_target for result in results):

@@ -67,11 +67,8 @@ class LidarTopics:
 def drive_folder(path: Path) -> Path:
     """The folder of a CaLiV drive that holds the poses and a folder of clouds per sensor.
 
-    Args:
-        path: that folder, or the one around it.
-
     Raises:
-        RecordingError: the path is missing, or no CaLiV folder.
+        RecordingError: the path is missing, or neither that folder nor the one around it.
     """
     # Without LiDARs this checks the poses alone.
     CalivFolder(path, {})

@@ -32,13 +32,7 @@ _NORM_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class FrameTransform:
-    """One link of a tree of frames.
-
-    Attributes:
-        parent: frame.
-        child: frame.
-        T_parent_child: its pose.
-    """
+    """One link of a tree of frames."""
 
     parent: str
     child: str
@@ -49,11 +43,7 @@ class FrameTree:
     """Frames that are fixed to each other."""
 
     def __init__(self, transforms: Iterable[FrameTransform]) -> None:
-        """Builds the tree.
-
-        Args:
-            transforms: of two with the same child the later one counts, as in tf.
-        """
+        """Of two transforms with the same child the later one counts, as in tf."""
         self._up = {link.child: link for link in transforms if link.child != link.parent}
         self._frames = dict.fromkeys(
             frame for link in self._up.values() for frame in (link.parent, link.child)

@@ -134,11 +134,7 @@ class _Rows:
 
 
 class _Stated:
-    """Rows of numbers that mostly repeat the row before, as covariances in messages do.
-
-    A row is kept only if it differs: at 200 Hz the repetitions would take most of the memory of a
-    long drive.
-    """
+    """Rows of numbers that mostly repeat the row before, as covariances do: kept once."""
 
     def __init__(self, width: int) -> None:
         self._width = width
@@ -511,17 +507,10 @@ def check_imu(samples: ImuSamples) -> ImuCheck:
 
 
 def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
-    """Covariances of poses from ROS's convention into ours.
+    """Covariances (n, 6, 6) of poses from ROS's convention into ours, rad and m.
 
     ROS: x, y, z, then rotation about the fixed axes, all in the parent's axes. Ours: right
     perturbation, rotation then translation. `cov_ros = B cov B^T`, `B = [[0, R], [R, 0]]`.
-
-    Args:
-        R_map_vehicle: (n, 3, 3).
-        cov_ros: (n, 6, 6) m^2, m rad, rad^2.
-
-    Returns:
-        (n, 6, 6) rad^2, rad m, m^2.
     """
     B = np.zeros((len(R_map_vehicle), 6, 6))
     B[:, :3, 3:] = R_map_vehicle
@@ -532,8 +521,7 @@ def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
 def _covariances(flat: Array) -> Array:
     """(n, k, k) of (n, k * k), symmetric; NaN where a message states none.
 
-    In ROS all zeros mean unknown; some drivers write a negative value instead. A single zero on the
-    diagonal also means unknown: no measurement is without error.
+    In ROS all zeros mean unknown; some drivers write a negative value or a single zero.
     """
     size = round(flat.shape[1] ** 0.5)
     cov = flat.reshape(-1, size, size)
@@ -548,12 +536,7 @@ def _or_none(cov: Array) -> Array | None:
 
 
 def _common(kinds: Array, which: IntArray) -> Array | None:
-    """One covariance for all samples: the median of each element.
-
-    Args:
-        kinds: (d, 3, 3) that were stated.
-        which: (n,) of them each sample has.
-    """
+    """One covariance for all samples: the median of each element of the `which` (n,) of `kinds`."""
     cov = kinds[which[:1]] if (which == which[0]).all() else kinds[which]
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     return np.asarray(np.median(known, axis=0)) if len(known) else None

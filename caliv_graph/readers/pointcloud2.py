@@ -94,11 +94,7 @@ def decode_pointcloud2(
 ) -> DecodedCloud:
     """Decodes a `sensor_msgs/PointCloud2`: any order of fields, padding and endianness.
 
-    Args:
-        message: with the fields of that type.
-        stamp_ns: stamp of the cloud, which times are related to.
-        min_range: metres; nearer returns are dropped.
-        max_range: metres; farther returns are dropped.
+    Times are related to `stamp_ns`; returns outside the ranges (metres) are dropped.
 
     Raises:
         DamagedMessageError: the data do not fit the fields.
@@ -130,14 +126,9 @@ def decode_livox(
     """Decodes a Livox `CustomMsg` from its bytes: as objects, 30,000 points would take 0.3 s.
 
     `std_msgs/Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd;
-    CustomPoint[] points`, of `uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line`.
-
-    Args:
-        raw: the serialised message.
-        is_ros1: whether as in ROS 1; else CDR, which aligns each value to its size.
-        stamp_ns: stamp of the cloud, which times are related to.
-        min_range: metres; nearer returns are dropped.
-        max_range: metres; farther returns are dropped.
+    CustomPoint[] points`, of `uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line`,
+    as in ROS 1 or as CDR, which aligns each value to its size. Further arguments as in
+    `decode_pointcloud2`.
 
     Raises:
         DamagedMessageError: its size does not fit the number of its points.

@@ -89,14 +89,9 @@ class TimesSeen:
 
 @dataclass(frozen=True)
 class _Index:
-    """The result of the first pass over the bag.
+    """The result of the first pass over the bag; `scans` has per LiDAR the record time by stamp.
 
-    Attributes:
-        clocks: by topic.
-        frame_ids: of the first message of each topic.
-        scans: per LiDAR the record time by stamp, in the order of the stamps.
-        collectors: by kind of motion data and topic.
-        damaged: messages that do not decode as their type, by topic.
+    `collectors` are by kind and topic; `damaged` counts messages that do not decode, by topic.
     """
 
     clocks: Mapping[str, Clock]
@@ -118,11 +113,7 @@ class RosbagRecording:
     ) -> None:
         """Opens the bag and checks that it has the topics; reads its index only.
 
-        Args:
-            path: the bag.
-            lidars: LiDARs of the config by the user's name.
-            topics: of the motion data.
-            also: further topics of motion data to look at, which `motion` does not use.
+        `also` names further topics of motion data to look at, which `motion` does not use.
 
         Raises:
             RecordingError: the bag is missing or damaged; a topic is missing, of the wrong type, or
@@ -219,16 +210,10 @@ class RosbagRecording:
         return list(self._index().scans[lidar])
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in the order of their stamps, never more than a few decoded.
+        """The clouds of one LiDAR in the order of their stamps, a few decoded ahead (`Recording`).
 
-        NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
-        than its `max_range`. A cloud that is damaged is left out and counted in `warnings`. Clouds
-        recorded out of order are kept until their turn.
-
-        Args:
-            lidar: its name.
-            wanted: stamps of the clouds that are asked for, None: all. The others are not decoded,
-                and parts of the bag without a wanted cloud are not read.
+        A cloud that is damaged is left out and counted in `warnings`. Clouds recorded out of order are
+        kept until their turn. Parts of the bag without a wanted cloud are not read.
 
         Raises:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.
@@ -276,11 +261,7 @@ class RosbagRecording:
         return list(dict.fromkeys([*self._warnings, *self._cloud_warnings()]))
 
     def _topic(self, name: str, key: str, what: str, types: Sequence[str]) -> Topic:
-        """The topic of the bag that a key of the config names.
-
-        Raises:
-            RecordingError: it is missing, or of a type that does not fit.
-        """
+        """The topic of the bag that a key of the config names; RecordingError: none that fits."""
         there = self._bag.topics
         fitting = [topic.name for topic in there.values() if topic.type in types]
         topic = there.get(name) or there.get(f"/{name.strip('/')}")

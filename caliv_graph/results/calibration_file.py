@@ -91,11 +91,6 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 def write_calibration(calibration: Calibration, path: Path, force: bool = False) -> None:
     """Writes calibration.yaml in one step. The same calibration gives the same bytes.
 
-    Args:
-        calibration: what to write.
-        path: the file.
-        force: replace an older one.
-
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
         ValueError: the calibration holds numbers that are not finite.

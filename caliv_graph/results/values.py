@@ -56,11 +56,7 @@ def _unit(xyzw: tuple[float, float, float, float]) -> tuple[float, float, float,
 
 
 def check_matrix(rows: list[list[float]], size: int) -> list[list[float]]:
-    """A covariance or an information.
-
-    Args:
-        rows: of the matrix, as the file has them.
-        size: of the matrix.
+    """A covariance or an information, as a file has its rows.
 
     Raises:
         ValueError: it is of another size, not symmetric or not positive semidefinite.

@@ -1,7 +1,6 @@
 """What a recorded drive determines, before it is calibrated.
 
-The early stages of `pipeline.calibrate`: trajectory, target, ground, a rough registration and one
-solve of the graph, which puts the extrinsics near enough to read the information off. Shape and
+The early stages of `pipeline.calibrate`, a rough registration and one solve of the graph. Shape and
 extrinsics are not refined together, which is what takes the time.
 """
 
@@ -59,12 +58,7 @@ class Survey:
 
 
 def survey(recordings: Sequence[Recording], config: Config, progress: Progress) -> Survey:
-    """Finds out what recorded drives of one vehicle determine.
-
-    Args:
-        recordings: opened drives (`readers.open_recording`).
-        config: as for `calibrate`.
-        progress: reports every stage.
+    """Finds out what recorded drives (`readers.open_recording`) of one vehicle determine.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -90,13 +84,6 @@ def survey_observations(
     progress: Progress,
 ) -> Survey:
     """The same from extracted targets and grounds; without names and the warnings before it.
-
-    Args:
-        observations: clouds of each target placement.
-        trajectories: one per drive.
-        grounds: the ground as the LiDARs saw it.
-        config: modes, kernels, priors.
-        progress: reports every stage.
 
     Raises:
         RegistrationError, SolveError: it could not be done.

@@ -72,6 +72,10 @@ class FrameTree:
         T_common_parent = self._compose(to_parent[: to_parent.index(common)])
         return T_common_parent.between(T_common_child)
 
+    def links_to(self, frame: str) -> list[FrameTransform]:
+        """The links from the root down to a frame; empty if the frame is not known."""
+        return [self._up[child] for child in reversed(self._chain(frame)[:-1])]
+
     def _chain(self, frame: str) -> list[str]:
         """The frame, its parent, that one's parent, ...; empty if the frame is not known."""
         if frame not in self._frames:
@@ -142,12 +146,9 @@ def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
         raise ConfigError(
             f"{path}: is a xacro. Expand it first: 'xacro {path.name} > vehicle.urdf'"
         )
-    return tuple(_joint(joint, path) for joint in root.iter("joint") if _is_fixed(joint))
-
-
-def _is_fixed(joint: ET.Element) -> bool:
-    # Transmissions name joints too, without their poses.
-    return joint.get("type") == "fixed"
+    # Transmissions name joints too, without their type and poses.
+    fixed = [joint for joint in root.iter("joint") if joint.get("type") == "fixed"]
+    return tuple(_joint(joint, path) for joint in fixed)
 
 
 def _joint(joint: ET.Element, path: Path) -> FrameTransform:

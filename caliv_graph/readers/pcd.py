@@ -301,7 +301,4 @@ def _read_ascii(data: bytes, header: _Header) -> Array:
 
 
 def _stack(coordinates: list[npt.NDArray[np.floating]]) -> Array:
-    points = np.empty((len(coordinates[0]), 3))
-    for axis, values in enumerate(coordinates):
-        points[:, axis] = values
-    return points
+    return np.stack(coordinates, axis=1).astype(np.float64, order="C")

@@ -28,13 +28,6 @@ CLOUD_TYPES = (POINTCLOUD2, *LIVOX_TYPES)
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of the types of `sensor_msgs/PointField`."""
 
-_TYPE_NAMES = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16"} | {
-    "i4": "int32",
-    "u4": "uint32",
-    "f4": "float32",
-    "f8": "float64",
-}
-
 _TIME_FIELDS = (
     "t",
     "time",
@@ -106,11 +99,8 @@ def decode_pointcloud2(
         raise UnusableCloudsError(
             f"x, y, z as float32 or float64 are needed, its fields are {shown}"
         )
-    # Before room is made for the points: a damaged size can be any.
     columns = [_column(message, fields[axis]) for axis in "xyz"]
-    points = np.empty((len(columns[0]), 3))
-    for axis_number, values in enumerate(columns):
-        points[:, axis_number] = values
+    points = np.stack(columns, axis=1).astype(np.float64, order="C")
     kept = is_return(points, min_range, max_range)
     times = [
         (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name])[kept])
@@ -165,7 +155,8 @@ def decode_livox(
 
 
 def _type_name(field: Any) -> str:
-    return _TYPE_NAMES.get(_TYPES.get(field.datatype, ""), f"type {field.datatype}")
+    known = _TYPES.get(field.datatype)
+    return np.dtype(known).name if known else f"type {field.datatype}"
 
 
 def _column(message: Any, field: Any) -> npt.NDArray[Any]:

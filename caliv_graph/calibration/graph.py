@@ -23,7 +23,6 @@ from caliv_graph.trajectory.factors import marginal_factor
 OFFSET_SIGMA_S = 0.05
 """Prior sigma of a LiDAR's time offset: half a revolution at 10 Hz."""
 
-
 FactorKind = Literal[
     "motion",
     "given_pose",

@@ -30,7 +30,6 @@ PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
 
-
 TOGETHER_NS = 5_000_000
 """A scan nearer to a pose than this has the heave of that pose: a body that heaves by 5 mm at 2 Hz
 has moved by 0.3 mm."""

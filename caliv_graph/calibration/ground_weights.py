@@ -29,22 +29,17 @@ from caliv_graph.products import Array, GroundObservation, IntArray
 APART_NS = 10_000_000
 """Scans are grouped by their time from their pose, in steps of this."""
 
-
 SPREADS = (4.0, 8.0)
 """Spreads of its group up to which an observation has full weight, and beyond which it has none."""
-
 
 MEDIAN_OF_NORMAL = 0.6745
 """Median of the absolute value of a standard normal variable: makes of medians a spread."""
 
-
 FEWEST_ALIKE = 5
 """Fewer observations give no spread; all keep full weight."""
 
-
 FEWEST_PAIRS = 20
 """Pairs of observations that give a spread with a standard error of a sixth."""
-
 
 TILT_RAD = (math.radians(1.0), math.radians(2.0))
 """Tilt against the median of the drive below which the vehicle stands on the plane, and above which

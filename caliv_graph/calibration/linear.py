@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -21,7 +22,6 @@ from caliv_graph.products import Array
 GAUGE = 1e-9
 """Relative ridge under which a dense system is solved: unobservable
 directions (the clouds' poses when all weights vanish) stay where they are."""
-
 
 GAUGE_PRIOR = 1.0
 """Gauge prior on a target frame, information per radian^2 and metre^2. The place and orientation of
@@ -74,9 +74,14 @@ class DenseSystem:
     b: Array
     extrinsics: int
 
+    @cached_property
+    def starts(self) -> dict[int, int]:
+        """First coordinate of each variable."""
+        return dict(zip(self.keys, np.cumsum([0, *self.sizes]).tolist(), strict=False))
+
     def offset(self, key: int) -> int:
         """First coordinate of a variable."""
-        return sum(self.sizes[: self.keys.index(key)])
+        return self.starts[key]
 
     def covariance_of(self, key: int, cov_extrinsics: Array) -> Array:
         """Marginal covariance of a variable that is no extrinsic.
@@ -184,7 +189,7 @@ def _with_rows(
 ) -> DenseSystem:
     """Adds the clouds' quadratic; J (6 J, M) their rows, `seen` = `J^T H`."""
     H = system.H + (J.T @ seen.T)
-    add_gauge_prior(H, _starts(system))
+    add_gauge_prior(H, system.starts)
     return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
@@ -193,13 +198,12 @@ def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.c
 
     Left perturbations of the predicted T_target_lidar by right perturbations of the variables.
     """
-    starts = _starts(system)
     rows, columns, entries = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
             row, column = np.indices(jacobian.shape)
             rows.append((6 * j + row).ravel())
-            columns.append((starts[key] + column).ravel())
+            columns.append((system.offset(key) + column).ravel())
             entries.append(jacobian.ravel())
     # Every cloud depends on four or five variables of hundreds.
     return scipy.sparse.csr_array(
@@ -240,11 +244,6 @@ def adjusted_residuals(
         ) from None
     W = H_clouds - seen.T @ scipy.linalg.cho_solve(factor, seen)
     return W, gradient + seen.T @ scipy.linalg.cho_solve(factor, full.b)
-
-
-def _starts(system: DenseSystem) -> dict[int, int]:
-    """First coordinate of each variable."""
-    return dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
 
 
 def add_gauge_prior(H: Array, starts: Mapping[int, int]) -> None:

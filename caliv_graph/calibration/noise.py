@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import gtsam
 import numpy as np
@@ -49,32 +49,20 @@ CLOUDS_USED = 50
 """Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
 
 
-def _names(noise: NoiseConfig) -> list[float | None]:
+def _configured(noise: NoiseConfig) -> list[float | None]:
     """The values of the config in SI units, in the order of the parameters."""
-    rad = [
+    white, drift = (
         None if v is None else math.radians(v)
         for v in (noise.pose_rotation_deg, noise.pose_drift_rotation_deg)
-    ]
-    return [
-        rad[0],
-        noise.pose_position_m,
-        rad[1],
-        noise.pose_drift_position_m,
-        None,
-    ]
+    )
+    return [white, noise.pose_position_m, drift, noise.pose_drift_position_m, None]
 
 
 def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     """The values of the config, and `TYPICAL` for the others."""
-    given = _names(noise)
-    typical = [
-        TYPICAL.white_rotation_rad,
-        TYPICAL.white_position_m,
-        TYPICAL.drift_rotation_rad,
-        TYPICAL.drift_position_m,
-    ]
-    values = [t if g is None else g for g, t in zip(given, typical, strict=False)]
-    return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
+    typical = astuple(TYPICAL)
+    values = [t if g is None else g for g, t in zip(_configured(noise), typical, strict=True)]
+    return PoseNoise(*values[:4], drift_time_s=noise.pose_drift_time_s)
 
 
 def sound_clouds(
@@ -132,7 +120,7 @@ def fit_pose_noise(
     first = first_pose_noise(config)
     likelihood = _RestrictedLikelihood.at(problem, measured, information, sound, values, first)
     # What the config states is kept; without given poses there are no pose errors to estimate.
-    free = np.array([g is None for g in _names(config)])
+    free = np.array([g is None for g in _configured(config)])
     fitted = problem.given() & ~problem.stated()
     free &= np.array([fitted.any()] * 2 + [problem.given().any()] * 2 + [True])
 
@@ -141,11 +129,8 @@ def fit_pose_noise(
         full[free] = x
         return full
 
-    def cost(x: Array) -> float:
-        return likelihood.cost(logarithms(x))
-
     found = minimize(
-        cost,
+        lambda x: likelihood.cost(logarithms(x)),
         likelihood.prior[free],
         # Nelder-Mead stops short in the valleys between white and Gauss-Markov errors.
         method="Powell",
@@ -156,8 +141,7 @@ def fit_pose_noise(
     if problem.stated_cov is not None and problem.stated().any() and not fitted.any():
         variances = np.diagonal(problem.stated_cov[problem.stated()], axis1=1, axis2=2)
         value[:2] = np.sqrt([variances[:, :3].mean(), variances[:, 3:].mean()]).tolist()
-    noise = PoseNoise(value[0], value[1], value[2], value[3], first.drift_time_s)
-    return noise, float(value[4])
+    return PoseNoise(*value[:4], drift_time_s=first.drift_time_s), float(value[4])
 
 
 @dataclass(frozen=True)
@@ -223,15 +207,7 @@ class _RestrictedLikelihood:
                 scipy.linalg.block_diag(*R),
             ),
             ridge=_ridge(problem, A.shape[1]),
-            prior=np.log(
-                [
-                    first.white_rotation_rad,
-                    first.white_position_m,
-                    first.drift_rotation_rad,
-                    first.drift_position_m,
-                    TYPICAL_SCALE,
-                ]
-            ),
+            prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
         )
 
     def cost(self, logarithms: Array) -> float:

@@ -122,8 +122,8 @@ def solve_registered(
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and
     # the noise fit would find none of it: solve without weights, and leave out what is far off.
-    plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
-    state.weights, robust = plain, state.weights
+    robust = state.weights
+    state.weights = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
     explained = explained_parts(registrations)
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
@@ -289,24 +289,15 @@ def base_graph(state: SolveState) -> CalibrationGraph:
     return merged(
         pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
-        _ground_graph(state),
+        ground_graph(problem, state.grounds, state.config.ground, state.ground_weights),
         prior_graph(problem, sorted(problem.fixed)),
     )
 
 
 def guessed_graph(state: SolveState) -> CalibrationGraph:
     """`base_graph`, and the guesses of the extrinsics that are estimated."""
-    return merged(base_graph(state), _guess_graph(state.problem))
-
-
-def _guess_graph(problem: Problem) -> CalibrationGraph:
-    """The guesses of the extrinsics that are estimated."""
-    return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
-
-
-def _ground_graph(state: SolveState) -> CalibrationGraph:
-    """The ground's factors with their weights."""
-    return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
+    estimated = [n for n in state.problem.lidars if n not in state.problem.fixed]
+    return merged(base_graph(state), prior_graph(state.problem, estimated))
 
 
 def offset_from_guesses(state: SolveState) -> Array:

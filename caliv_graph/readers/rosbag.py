@@ -212,8 +212,8 @@ class RosbagRecording:
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in the order of their stamps, a few decoded ahead (`Recording`).
 
-        A cloud that is damaged is left out and counted in `warnings`. Clouds recorded out of order are
-        kept until their turn. Parts of the bag without a wanted cloud are not read.
+        A damaged cloud is left out and counted in `warnings`. Clouds recorded out of order are kept
+        until their turn. Parts of the bag without a wanted cloud are not read.
 
         Raises:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.

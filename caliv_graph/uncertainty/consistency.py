@@ -244,9 +244,6 @@ def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
     )
 
 
-# ------------------------------------------------------------------ guesses
-
-
 def against_guesses(
     lidars: Mapping[str, LidarResult], speed_m_s: float = 0.0
 ) -> Iterator[GuessContradiction]:
@@ -300,9 +297,6 @@ def _late_s(off: Array, wrong: Sequence[int], speed_m_s: float) -> float | None:
     return float(-off[3] / speed_m_s)
 
 
-# ------------------------------------------------------------------ clouds
-
-
 def too_many_outliers(count: CloudCount) -> bool:
     """Whether a LiDAR has more outliers than `OUTLIERS` explains; their number is binomial."""
     return bool(bdtrc(count.outliers - 1, count.clouds, OUTLIERS) < CONTRADICTION_P)
@@ -328,9 +322,6 @@ def coarse_registrations(inputs: CheckInputs) -> tuple[CoarseRegistrations, ...]
             likely,
         ),
     )
-
-
-# ------------------------------------------------------------------ score tests
 
 
 def p_value(test: ScoreTest) -> float:
@@ -368,9 +359,6 @@ def lateness(test: ScoreTest) -> tuple[float, float]:
     if information <= CLOCK_DETERMINED_S**-2.0:
         return 0.0, CLOCK_DETERMINED_S
     return float(test.gradient[0]) / information, math.hypot(information**-0.5, CLOCK_BIAS_S)
-
-
-# ------------------------------------------------------------------ vehicle
 
 
 def assumption_contradicted(assumed: Assumed) -> bool:

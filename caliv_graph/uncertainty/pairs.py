@@ -38,7 +38,8 @@ def sensor_pairs(lidars: Iterable[str], reference: str) -> tuple[tuple[str, str]
 def pair_covariance(calibration: Calibration, source: str, to: str) -> Array:
     """Covariance of `T_to_from`, (6, 6), right perturbation (frame of `from`), priors included."""
     a, b = (calibration.lidars[name].T_vehicle_lidar for name in (source, to))
-    return relative_covariance(a, b, _block(calibration, calibration.cov_joint, source, to))
+    rows = _rows(calibration, source, to)
+    return relative_covariance(a, b, calibration.cov_joint[np.ix_(rows, rows)])
 
 
 def sigmas_s2v(calibration: Calibration, name: str) -> Array:
@@ -86,8 +87,3 @@ def _rows(calibration: Calibration, *lidars: str) -> list[int]:
     """Rows of the joint matrices that belong to these LiDARs, in the order of the arguments."""
     names = list(calibration.lidars)
     return [6 * names.index(lidar) + axis for lidar in lidars for axis in range(6)]
-
-
-def _block(calibration: Calibration, matrix: Array, *lidars: str) -> Array:
-    rows = _rows(calibration, *lidars)
-    return np.asarray(matrix[np.ix_(rows, rows)])

@@ -14,16 +14,8 @@ from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
-from caliv_graph.geometry.se3 import (
-    vehicle_axes_difference,
-)
-from caliv_graph.products import (
-    Array,
-    Calibration,
-    Guess,
-    Recording,
-    Solution,
-)
+from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.products import Array, Calibration, Guess, Recording, Solution
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess
 from caliv_graph.wording.directions import named

@@ -14,14 +14,7 @@ import numpy as np
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.errors import SolveError
-from caliv_graph.products import (
-    Array,
-    Calibration,
-    IntArray,
-    MotionData,
-    Recording,
-    Solution,
-)
+from caliv_graph.products import Array, Calibration, IntArray, MotionData, Recording, Solution
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory

@@ -18,9 +18,7 @@ from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
-from caliv_graph.calibration.solve import (
-    solve_registered,
-)
+from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config

@@ -11,9 +11,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.calibration.factors import (
-    predict_cloud,
-)
+from caliv_graph.calibration.factors import predict_cloud
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_target
 from caliv_graph.errors import SolveError

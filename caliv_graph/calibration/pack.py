@@ -7,20 +7,13 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    cloud_graph,
-    merged,
-)
+from caliv_graph.calibration.graph import cloud_graph, merged
 from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
 from caliv_graph.conventions import key_target, key_vehicle
 from caliv_graph.errors import SolveError
-from caliv_graph.products import (
-    Array,
-    Registration,
-    Solution,
-)
+from caliv_graph.products import Array, Registration, Solution
 
 
 def packed_solution(

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    CalibrationGraph,
-)
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.linear import (
     CloudLinearisation,
     DenseSystem,
@@ -20,10 +18,7 @@ from caliv_graph.calibration.linear import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_offset
-from caliv_graph.products import (
-    Array,
-    LinearisedGraph,
-)
+from caliv_graph.products import Array, LinearisedGraph
 
 
 @dataclass

@@ -25,11 +25,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.products import GroundObservation, Registration, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.registration.self_comparison import views_of
-from caliv_graph.registration.symmetry import (
-    Symmetry,
-    alarming,
-    symmetries,
-)
+from caliv_graph.registration.symmetry import Symmetry, alarming, symmetries
 from caliv_graph.wording.offsets import undetermined_offset_sentences
 from caliv_graph.wording.symmetries import symmetry_sentence
 

@@ -28,10 +28,7 @@ from caliv_graph.calibration.graph import (
 )
 from caliv_graph.calibration.ground import GroundWeights, ground_graph, ground_values
 from caliv_graph.calibration.ground_weights import ground_weights
-from caliv_graph.calibration.linear import (
-    CloudLinearisation,
-    linearise_clouds,
-)
+from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
     first_pose_noise,
@@ -44,13 +41,7 @@ from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config.model import Config, RobustConfig
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import (
-    Array,
-    BoolArray,
-    GroundObservation,
-    PoseNoise,
-    Registration,
-)
+from caliv_graph.products import Array, BoolArray, GroundObservation, PoseNoise, Registration
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry
 
 REWEIGHTINGS = 12

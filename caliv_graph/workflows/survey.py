@@ -15,23 +15,13 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.rough import RoughSolve, rough_solve
-from caliv_graph.calibration.solve import (
-    reduced_registered,
-)
+from caliv_graph.calibration.solve import reduced_registered
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.pipeline import prepare
-from caliv_graph.products import (
-    Array,
-    GroundObservation,
-    Recording,
-    TargetObservation,
-)
+from caliv_graph.products import Array, GroundObservation, Recording, TargetObservation
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.uncertainty.predicted import (
-    PredictedCovariance,
-    predict_covariance,
-)
+from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import named_prediction
 
 ROUGH_ITERATIONS = 40

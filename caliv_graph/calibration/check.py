@@ -176,11 +176,8 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
 
 def typical_speed(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> float:
     """Median speed of the vehicle over the clouds, m/s."""
-    return float(
-        np.median(
-            [
-                np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
-                for drive, stamp in solution.T_map_vehicle
-            ]
-        )
-    )
+    speeds = [
+        np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
+        for drive, stamp in solution.T_map_vehicle
+    ]
+    return float(np.median(speeds))

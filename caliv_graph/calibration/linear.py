@@ -89,11 +89,7 @@ class DenseSystem:
         split = len(self.b) - 6 * self.extrinsics
         start = self.offset(key)
         which = slice(start, start + self.sizes[self.keys.index(key)])
-        rest = self.H[:split, :split].copy()
-        diagonal = np.arange(split)
-        rest[diagonal, diagonal] *= 1.0 + GAUGE
-        unit = np.eye(split)[:, which]
-        own = scipy.linalg.cho_solve(scipy.linalg.cho_factor(rest, lower=True), unit)
+        own = scipy.linalg.cho_solve(self._rest_factor(), np.eye(split)[:, which])
         follows = own.T @ self.H[:split, split:]
         return np.asarray(own[which] + follows @ cov_extrinsics @ follows.T)
 
@@ -107,22 +103,25 @@ class DenseSystem:
             SolveError: the rest is singular.
         """
         split = len(self.b) - 6 * self.extrinsics
-        rest = self.H[:split, :split].copy()
-        diagonal = np.arange(split)
-        rest[diagonal, diagonal] *= 1.0 + GAUGE
-        try:
-            factor = scipy.linalg.cho_factor(rest, lower=True, check_finite=False)
-        except scipy.linalg.LinAlgError:
-            raise SolveError(
-                "the graph without extrinsics is singular: a pose or a target has no measurement"
-            ) from None
-        both = scipy.linalg.cho_solve(
-            factor, np.column_stack([self.H[:split, split:], self.b[:split]]), check_finite=False
-        )
+        known = np.column_stack([self.H[:split, split:], self.b[:split]])
+        both = scipy.linalg.cho_solve(self._rest_factor(), known, check_finite=False)
         G, g = both[:, :-1], both[:, -1]
         D = self.H[split:, split:] - self.H[split:, :split] @ G
         c = self.b[split:] - self.H[split:, :split] @ g
         return 0.5 * (D + D.T), c, G, g
+
+    def _rest_factor(self) -> tuple[Array, bool]:
+        """Cholesky factor of everything but the extrinsics; SolveError if it is singular."""
+        split = len(self.b) - 6 * self.extrinsics
+        rest = self.H[:split, :split].copy()
+        diagonal = np.arange(split)
+        rest[diagonal, diagonal] *= 1.0 + GAUGE
+        try:
+            return scipy.linalg.cho_factor(rest, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            raise SolveError(
+                "the graph without extrinsics is singular: a pose or a target has no measurement"
+            ) from None
 
 
 def dense_system(

@@ -62,7 +62,7 @@ def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     """The values of the config, and `TYPICAL` for the others."""
     typical = astuple(TYPICAL)
     values = [t if g is None else g for g, t in zip(_configured(noise), typical, strict=True)]
-    return PoseNoise(*values[:4], drift_time_s=noise.pose_drift_time_s)
+    return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
 
 
 def sound_clouds(
@@ -129,8 +129,11 @@ def fit_pose_noise(
         full[free] = x
         return full
 
+    def cost(x: Array) -> float:
+        return likelihood.cost(logarithms(x))
+
     found = minimize(
-        lambda x: likelihood.cost(logarithms(x)),
+        cost,
         likelihood.prior[free],
         # Nelder-Mead stops short in the valleys between white and Gauss-Markov errors.
         method="Powell",
@@ -141,7 +144,8 @@ def fit_pose_noise(
     if problem.stated_cov is not None and problem.stated().any() and not fitted.any():
         variances = np.diagonal(problem.stated_cov[problem.stated()], axis1=1, axis2=2)
         value[:2] = np.sqrt([variances[:, :3].mean(), variances[:, 3:].mean()]).tolist()
-    return PoseNoise(*value[:4], drift_time_s=first.drift_time_s), float(value[4])
+    noise = PoseNoise(value[0], value[1], value[2], value[3], first.drift_time_s)
+    return noise, float(value[4])
 
 
 @dataclass(frozen=True)

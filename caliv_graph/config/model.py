@@ -184,7 +184,7 @@ class GroundConfig(Section):
 
 
 class ImuConfig(Section):
-    """PoseConfig of the IMU."""
+    """The IMU on the vehicle."""
 
     T_vehicle_imu: PoseConfig = PoseConfig(xyz=(0.0, 0.0, 0.0))
     gravity_m_s2: Positive | None = Field(
@@ -199,7 +199,7 @@ class ImuConfig(Section):
 
 
 class GnssConfig(Section):
-    """PoseConfig of the GNSS antenna."""
+    """The GNSS antenna on the vehicle."""
 
     lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
 

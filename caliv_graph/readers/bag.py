@@ -44,13 +44,7 @@ _RECOVERY = {
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag.
-
-    Attributes:
-        name: as recorded.
-        type: of its messages in ROS 2 spelling, such as sensor_msgs/msg/Imu.
-        messages: how many there are.
-    """
+    """One topic of a bag; `type` in ROS 2 spelling, such as sensor_msgs/msg/Imu."""
 
     name: str
     type: str
@@ -59,12 +53,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Header:
-    """The `std_msgs/Header` that a message begins with.
-
-    Attributes:
-        stamp_ns: its stamp, 0 if the sender did not set it.
-        frame_id: its frame.
-    """
+    """The `std_msgs/Header` that a message begins with; a stamp that was not set is 0."""
 
     stamp_ns: int
     frame_id: str

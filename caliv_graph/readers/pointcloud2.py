@@ -52,13 +52,7 @@ class UnusableCloudsError(Exception):
 
 @dataclass(frozen=True)
 class TimeField:
-    """The field with the times of a cloud's points.
-
-    Attributes:
-        name: of the field.
-        type: of the field, such as uint32.
-        unit: such as `ns after the stamp`.
-    """
+    """The field with the times of a cloud's points; `unit` is such as `ns after the stamp`."""
 
     name: str
     type: str

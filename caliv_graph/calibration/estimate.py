@@ -2,7 +2,7 @@
 
 The paper's pipeline is its first half: register all clouds to the latent target, then solve the
 graph with one pose factor per cloud (`solve`). `staged` stops there; `joint` and `auto` refine
-shape and graph together (`refine`). `caliv_graph/calibration/README.md`, "Modes", has the gauge.
+shape and graph together (`refine`). The gauge is in `caliv_graph/calibration/README.md`.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def target_pose_factor(
     information: Array,
     twist: Array | None = None,
 ) -> gtsam.CustomFactor:
-    """A registered cloud: `r = Log(Zhat Z^-1)`, at the target (`README.md`, "Clouds").
+    """A registered cloud: `r = Log(Zhat Z^-1)`, the residual at the target (`README.md` says why).
 
     Z is `T_target_lidar` as registered, `information` (6, 6) of its left perturbation (target
     frame), rad and m. `predict_cloud` gives Zhat from `keys` and `twist`.

@@ -25,6 +25,7 @@ from caliv_graph.readers.discover import (
     choose_lidar_topics,
     choose_motion_topics,
     drive_folder,
+    first_frame,
     is_recorded_bag,
     recorded_sensors,
 )
@@ -32,7 +33,6 @@ from caliv_graph.readers.frames import (
     TF_TYPES,
     FrameTransform,
     FrameTree,
-    clean_frame,
     message_transforms,
     read_urdf,
 )
@@ -166,7 +166,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
         ("gnss", "gnss.lever_arm", _GNSS_TEMPLATE),
     ):
         if kind in motion.chosen:
-            guess = frames.extrinsic(_frame_of(bag, motion.chosen[kind]))
+            guess = frames.extrinsic(first_frame(bag, motion.chosen[kind]) or "")
             if guess.T_vehicle_sensor is None:
                 unknown.append(key)
             xyz, rpy_deg = guess.numbers()
@@ -270,14 +270,6 @@ def _still_links(bag: Bag, topic: str) -> Iterable[FrameTransform]:
         if count >= _STILL_MESSAGES:
             break
     return [first[key] for key, same in repeated.items() if same]
-
-
-def _frame_of(bag: Bag, topic: str) -> str:
-    raw = bag.first_message(topic)
-    try:
-        return "" if raw is None else clean_frame(bag.header(raw).frame_id)
-    except DamagedMessageError:
-        return ""
 
 
 def _topics_text(bag: Bag, motion: MotionTopics) -> str:

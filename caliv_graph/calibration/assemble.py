@@ -14,16 +14,8 @@ from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
-from caliv_graph.geometry.se3 import (
-    vehicle_axes_difference,
-)
-from caliv_graph.products import (
-    Array,
-    Calibration,
-    Guess,
-    Recording,
-    Solution,
-)
+from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.products import Array, Calibration, Guess, Recording, Solution
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess
 from caliv_graph.wording.directions import named
@@ -40,11 +32,7 @@ def assemble(
 ) -> Calibration:
     """The reported result: every LiDAR of the config, in its order, in right perturbations.
 
-    Args:
-        solution: the solved graph.
-        config: guesses, and what was asked.
-        recordings: the drives, for the provenance.
-        digests: of the drives (`drive_digest`).
+    `recordings` and their `digests` (`drive_digest`) go to the provenance.
     """
     uncertainty = named(
         assess(
@@ -75,8 +63,7 @@ def assemble(
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
     """Information and gradient of the data (vehicle axes), without what `fixed: true` added.
 
-    The solve counts a trusted extrinsic as a measurement. It is still a guess, and two calibrations
-    that share it must not count it twice.
+    A trusted extrinsic is a guess: two calibrations that share it must not count it twice.
     """
     information = solution.information_data.copy()
     gradient = None if solution.gradient_data is None else solution.gradient_data.copy()

@@ -14,14 +14,7 @@ import numpy as np
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.errors import SolveError
-from caliv_graph.products import (
-    Array,
-    Calibration,
-    IntArray,
-    MotionData,
-    Recording,
-    Solution,
-)
+from caliv_graph.products import Array, Calibration, IntArray, MotionData, Recording, Solution
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -52,16 +45,9 @@ def check(
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Tests a calibration against its data and its initial guesses.
 
-    Args:
-        calibration: the result.
-        solution: the solved graph.
-        recordings: the drives.
-        trajectories: one per drive.
-        motions: motion data of each drive, by its index.
-
-    Returns:
-        The calibration, inconsistent if something contradicts something; and warnings: headings
-        that disagree, and what could not be tested.
+    `recordings` and `trajectories` are one per drive, `motions` by the index of the drive. Returns
+    the calibration, inconsistent if something contradicts something; and warnings: headings that
+    disagree, and what could not be tested.
     """
     headings = _headings(trajectories, motions)
     drives = [Path(recording.name).name for recording in recordings]
@@ -106,12 +92,7 @@ def check(
 def cloud_counts(
     solution: Solution, trajectories: Sequence[VehicleTrajectory]
 ) -> tuple[CloudCount, ...]:
-    """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie.
-
-    Args:
-        solution: the solved graph.
-        trajectories: one per drive, for the yaw rates.
-    """
+    """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie."""
     observed = [c for r in solution.registrations for c in r.observation.clouds]
     weights = np.concatenate(solution.cloud_weights)
     down = weights < 0.5
@@ -177,12 +158,7 @@ def registration_sigma(solution: Solution) -> tuple[float, float]:
 
 
 def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...]:
-    """Height and tilt of the vehicle above the ground: the assumption and the estimate.
-
-    Args:
-        solution: the solved graph.
-        drives: what to call them.
-    """
+    """Height and tilt of the vehicle above the ground: assumed and estimated."""
     out = []
     for index, kind in enumerate(solution.factor_kinds):
         if kind not in ("ground_height", "ground_tilt"):
@@ -200,11 +176,8 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
 
 def typical_speed(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> float:
     """Median speed of the vehicle over the clouds, m/s."""
-    return float(
-        np.median(
-            [
-                np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
-                for drive, stamp in solution.T_map_vehicle
-            ]
-        )
-    )
+    speeds = [
+        np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
+        for drive, stamp in solution.T_map_vehicle
+    ]
+    return float(np.median(speeds))

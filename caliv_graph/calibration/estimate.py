@@ -1,12 +1,8 @@
 """The estimator: registration, graph solve, and what `solve.mode` asks for after them.
 
 The paper's pipeline is its first half: register all clouds to the latent target, then solve the
-graph with one pose factor per cloud, robustly (`solve`). `staged` stops there, in the paper's two
-stages. `joint` and `auto` go on (`refine`): expectation-maximisation whose M-step is the graph
-solve.
-
-Gauge: the target frames stay where they are, for the shapes are free; the map is held by the given
-poses, the extrinsics by the data or the guesses (mode `auto`, `caliv_graph/uncertainty/README.md`).
+graph with one pose factor per cloud (`solve`). `staged` stops there; `joint` and `auto` refine
+shape and graph together (`refine`). The gauge is in `caliv_graph/calibration/README.md`.
 """
 
 from __future__ import annotations
@@ -22,9 +18,7 @@ from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
-from caliv_graph.calibration.solve import (
-    solve_registered,
-)
+from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -49,8 +43,7 @@ def estimate(
         trajectories: one per drive.
         config: modes, kernels, priors.
         progress: reports every stage.
-        grounds: the ground under the vehicle, as the LiDARs saw it. The paper's procedure,
-            `staged`, does without.
+        grounds: the ground as the LiDARs saw it; the paper's procedure, `staged`, does without.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
@@ -124,8 +117,7 @@ def _deskewed(
 ) -> TargetObservation:
     """The clouds again, their sweeps put together with the extrinsics that have been found.
 
-    A guess that is off by 3 degrees puts what the vehicle moves by during a sweep, 0.1 to 0.2 m,
-    off by some millimetres, in all clouds alike.
+    A guess that is 3 degrees off moves all clouds alike by some millimetres.
     """
     clouds = []
     for cloud in observation.clouds:

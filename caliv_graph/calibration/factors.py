@@ -1,9 +1,7 @@
-"""The factors of the calibration graph, one function per kind.
+"""The factors of the calibration graph, one function per kind, with analytic Jacobians.
 
-Variables (keys in `conventions`): X_i = T_map_vehicle, E = T_vehicle_ref, S_a = T_ref_a for every
-LiDAR but the reference, C = T_target_map, and per given pose a Gauss-Markov error b_i (6: rotation
-in vehicle axes, position in map axes). All Jacobians are analytic; the tests check them
-numerically.
+`caliv_graph/calibration/README.md` defines the variables X_i, E, S_a, C and b_i; `conventions`
+their keys.
 """
 
 from __future__ import annotations
@@ -22,14 +20,10 @@ from caliv_graph.products import Array
 
 
 def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Array]]:
-    """The product of poses, and how it moves with each of them.
+    """The product Z of poses T_0 ... T_n, and how it moves with each of them.
 
-    Args:
-        chain: T_0 ... T_n.
-
-    Returns:
-        The product Z, and per pose the (6, 6) derivative of a *left* perturbation of Z by a right
-        perturbation of that pose: `Z = Exp(J d) Z`, J the adjoint of the product up to it.
+    Per pose the (6, 6) derivative of a *left* perturbation of Z by a right perturbation of that
+    pose: `Z = Exp(J d) Z`, J the adjoint of the product up to it.
     """
     product = chain[0]
     jacobians = [product.AdjointMap()]
@@ -45,11 +39,11 @@ def predict_cloud(
     """The pose that a cloud should have, `C X_i Exp(-o xi) E S_a`, and how it moves.
 
     Args:
-        keys: of C, X_i, the time offset o of the LiDAR if `twist` is given, E and, unless the
-            LiDAR is the reference, S_a.
+        keys: of C, X_i, the time offset o if `twist` is given, E and, unless the LiDAR is the
+            reference, S_a.
         values: of all of them.
-        twist: (6,) xi, velocity of the vehicle at the stamp as a right perturbation per second:
-            stamps that are late by o were taken where the vehicle was o seconds before.
+        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second;
+            stamps are late by o.
 
     Returns:
         T_target_lidar; and per key the (6, size) derivative of its left perturbation.
@@ -70,13 +64,10 @@ def target_pose_factor(
     information: Array,
     twist: Array | None = None,
 ) -> gtsam.CustomFactor:
-    """A registered cloud: `r = Log(Zhat Z^-1)`, at the target (`README.md`, "Clouds").
+    """A registered cloud: `r = Log(Zhat Z^-1)`, the residual at the target (`README.md` says why).
 
-    Args:
-        keys: as in `predict_cloud`, which gives Zhat.
-        T_target_lidar: the registered pose Z of the cloud.
-        information: (6, 6) of the left perturbation of Z (target frame), rad and m.
-        twist: as in `predict_cloud`.
+    Z is `T_target_lidar` as registered, `information` (6, 6) of its left perturbation (target
+    frame), rad and m. `predict_cloud` gives Zhat from `keys` and `twist`.
     """
     Z_inverse = T_target_lidar.inverse()
     order = list(keys)
@@ -104,15 +95,8 @@ def given_pose_factor(
     """A given pose with a white error and the Gauss-Markov error b_i.
 
     `r = [Log(R_given^T R) - b_rotation, t - t_given - b_position]`: rotation in vehicle axes,
-    position in map axes, since a position filter's error does not turn with the vehicle.
-
-    Args:
-        key_pose: of X_i.
-        key_pose_error: of b_i.
-        T_map_vehicle: as given.
-        sigma_rotation_rad: of the white error, per axis.
-        sigma_position_m: of the white error, per axis.
-        cov: (6, 6) of the white error, in place of the two sigmas; None: the sigmas.
+    position in map axes, since a position filter's error does not turn with the vehicle. The white
+    error has one sigma per kind of axis, or the covariance `cov` (6, 6).
     """
     R_given = T_map_vehicle.rotation()
     t_given = T_map_vehicle.translation()
@@ -140,11 +124,7 @@ def gauss_markov_factor(
 ) -> gtsam.LinearContainerFactor:
     """A step of the first-order Gauss-Markov error, `b_after = decay * b_before + noise`.
 
-    Args:
-        key_before: key of the error before the step.
-        key_after: key of the one after it.
-        decay: exp(-dt / correlation time).
-        sigmas: (6,) of the step.
+    `decay` is exp(-dt / correlation time), `sigmas` (6,) those of the step.
     """
     linear = gtsam.JacobianFactor(
         key_before,
@@ -165,10 +145,7 @@ def extrinsic_prior(
 ) -> gtsam.CustomFactor:
     """The initial guess of one LiDAR's extrinsic, on `T_vehicle_a = E S_a`, in vehicle axes.
 
-    Args:
-        keys: of E and, unless the LiDAR is the reference, S_a.
-        T_vehicle_lidar: the guess.
-        sigmas: (6,), rotation about and shift along the vehicle's axes, rad and m.
+    `keys` are of E and, unless the LiDAR is the reference, S_a; `sigmas` (6,) rad and m.
     """
     order = list(keys)
 

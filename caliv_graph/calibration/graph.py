@@ -23,7 +23,6 @@ from caliv_graph.trajectory.factors import marginal_factor
 OFFSET_SIGMA_S = 0.05
 """Prior sigma of a LiDAR's time offset: half a revolution at 10 Hz."""
 
-
 FactorKind = Literal[
     "motion",
     "given_pose",
@@ -42,11 +41,7 @@ FactorKind = Literal[
 
 
 class CalibrationGraph(gtsam.NonlinearFactorGraph):
-    """A factor graph that knows of which kind each of its factors is.
-
-    Attributes:
-        kinds: of every factor, in order.
-    """
+    """A factor graph that knows the kind of each of its factors: `kinds`, in order."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +61,7 @@ def pose_error_sigmas(noise: PoseNoise) -> Array:
 def motion_graph(problem: Problem) -> CalibrationGraph:
     """The joint Gaussian of motion data on the vehicle's poses, a factor per drive that has them.
 
-    Hundreds of poses with all their correlations take time to build: build it once.
+    It has the correlations of hundreds of poses and takes time to build.
     """
     graph = CalibrationGraph()
     drives = problem.drives()
@@ -86,14 +81,9 @@ def motion_graph(problem: Problem) -> CalibrationGraph:
 def pose_graph(
     problem: Problem, noise: PoseNoise, motion: CalibrationGraph | None = None
 ) -> CalibrationGraph:
-    """The vehicle's poses without any LiDAR.
+    """The vehicle's poses without any LiDAR; `motion` is `motion_graph(problem)`, if built before.
 
-    Given poses have white and Gauss-Markov errors, smoothed ones a joint Gaussian.
-
-    Args:
-        problem: the poses.
-        noise: error model of the given ones.
-        motion: `motion_graph(problem)`, if it was built before.
+    Given poses have white and Gauss-Markov errors (`noise`), smoothed ones a joint Gaussian.
     """
     graph = merged(motion_graph(problem) if motion is None else motion)
     times, drives, given = problem.times_s(), problem.drives(), problem.given()
@@ -198,10 +188,7 @@ def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
 
 
 def _median_pose(poses: Sequence[gtsam.Pose3]) -> gtsam.Pose3:
-    """The pose of the list that has the smallest sum of distances to the others.
-
-    Distances are taken where the poses put the origin of their inverse: at the target.
-    """
+    """The pose with the smallest sum of distances to the others, measured at the target."""
     if not poses:
         return gtsam.Pose3()
     centres = np.array([p.inverse().translation() for p in poses])

@@ -1,9 +1,8 @@
 """The ground in the graph: a plane per drive, seen by the LiDARs and stood upon by the vehicle.
 
-Variables (keys in `conventions`): per drive g = (slope along map x, slope along map y, height in m)
-of the plane `z = height + slopes . (xy - centre)`, with the centre in the middle of the drive, so
-that height and slopes hardly correlate; the error of the vehicle's height above it (role b); and
-the tilt at which the vehicle stands on it (role c). Jacobians are analytic.
+A plane g is (slope along map x, slope along map y, height in m): `z = height + slopes . (xy -
+centre)`, the centre in the middle of the drive, so that height and slopes hardly correlate.
+`caliv_graph/calibration/README.md`, "Ground", has the three roles.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from caliv_graph.targets.cloud.views import view_weights
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
-
 
 TOGETHER_NS = 5_000_000
 """A scan nearer to a pose than this has the heave of that pose: a body that heaves by 5 mm at 2 Hz
@@ -106,11 +104,8 @@ def ground_graph(
 ) -> CalibrationGraph:
     """All factors of the ground; empty if it is not to be used or was not seen.
 
-    Args:
-        problem: LiDARs and poses. Observations of others are left out.
-        observations: the planes.
-        config: which of the roles are used, and their sigmas.
-        weights: of `ground_weights`; None: all full.
+    Observations of LiDARs and poses that the problem has not are left out. Without `weights` (of
+    `ground_weights`) all have full weight.
     """
     graph = CalibrationGraph()
     if not config.use:
@@ -191,11 +186,7 @@ def ground_values(
 ) -> gtsam.Values:
     """First values of the variables of `ground_graph`, and of no others.
 
-    Args:
-        problem: LiDARs and poses.
-        observations: the planes.
-        values: of poses and extrinsics, guesses will do.
-        config: as for `ground_graph`.
+    `values` has poses and extrinsics; guesses will do.
     """
     out = gtsam.Values()
     if not config.use:

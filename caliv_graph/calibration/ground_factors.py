@@ -41,11 +41,7 @@ def _normal_jacobian(g: Array) -> Array:
 
 
 def height_over(g: Array, centre: Array, place_map: Array) -> tuple[float, Array, Array]:
-    """Distance of a place from the plane along its normal, with derivatives.
-
-    Returns:
-        metres; (3,) by g; (3,) by the place.
-    """
+    """Distance of a place from the plane along its normal, metres; (3,) by g; (3,) by the place."""
     a, b = float(g[0]), float(g[1])
     inverse = 1.0 / math.sqrt(1.0 + a * a + b * b)
     x, y = float(place_map[0] - centre[0]), float(place_map[1] - centre[1])
@@ -58,7 +54,7 @@ def height_over(g: Array, centre: Array, place_map: Array) -> tuple[float, Array
 def _chain(
     values: gtsam.Values, keys: Sequence[int], derivatives: bool
 ) -> tuple[gtsam.Pose3, list[Array]]:
-    """The product of poses, and per pose what a right perturbation of it does to the product's.
+    """The product of poses, and per pose the product's right perturbation by that of the pose.
 
     Only the poses after it matter: no number here grows with the distance from the map's origin.
     """
@@ -74,8 +70,8 @@ def _chain(
 def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> tuple[Array, Array]:
     """An observation, its motion compensated with another extrinsic.
 
-    Returns:
-        (3,) tilts along its axes and distance; (3, 3) by a right perturbation of the rotation.
+    Returns (3,) tilts along its axes and distance, and (3, 3) by a right perturbation of the
+    rotation.
     """
     said = np.array([0.0, 0.0, observation.distance_m])
     if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
@@ -98,8 +94,7 @@ def ground_plane_factor(
 
     `r = [u . n, v . n, d] - [a, b, distance]`, n the plane's normal in the lidar frame and d the
     LiDAR's distance from it, both predicted from `X E S_a`; u and v are the observation's axes;
-    a, b (zero at first) and distance are its values, corrected for the motion compensation that the
-    present extrinsic `E S_a` would have made.
+    a, b and distance its values, motion compensated with the present extrinsic `E S_a`.
 
     Args:
         pose_keys: of X_i, E and, unless the LiDAR is the reference, S_a.
@@ -153,15 +148,8 @@ def standing_factor(
 ) -> gtsam.CustomFactor:
     """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
 
-    Its sigma is the heave of one scan; the error is common to the drive.
-
-    Args:
-        key_pose: of X_i.
-        key_plane: of the drive's plane.
-        key_error: of the error of the vehicle's height in the drive.
-        centre: (2,) metres, where the plane's height is defined.
-        vehicle_height_m: height of the vehicle frame above ground.
-        weight: on its information.
+    Its sigma is the heave of one scan; the error (`key_error`) is common to the drive. `centre`
+    (2,) metres is where the plane's height is defined; `weight` is on the information.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -182,14 +170,7 @@ def standing_factor(
 def parallel_factor(
     key_pose: int, key_plane: int, key_tilt: int, weight: float = 1.0
 ) -> gtsam.CustomFactor:
-    """Role c: `r` = x and y of the plane's normal in the vehicle frame, less those of the drive.
-
-    Args:
-        key_pose: of X_i.
-        key_plane: of the drive's plane.
-        key_tilt: of the tilt common to the drive.
-        weight: on its information.
-    """
+    """Role c: `r` = x and y of the plane's normal in the vehicle frame, less the drive's tilt."""
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         R_vehicle_map = values.atPose3(key_pose).rotation().matrix().T

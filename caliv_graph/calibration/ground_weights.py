@@ -29,22 +29,17 @@ from caliv_graph.products import Array, GroundObservation, IntArray
 APART_NS = 10_000_000
 """Scans are grouped by their time from their pose, in steps of this."""
 
-
 SPREADS = (4.0, 8.0)
 """Spreads of its group up to which an observation has full weight, and beyond which it has none."""
-
 
 MEDIAN_OF_NORMAL = 0.6745
 """Median of the absolute value of a standard normal variable: makes of medians a spread."""
 
-
 FEWEST_ALIKE = 5
 """Fewer observations give no spread; all keep full weight."""
 
-
 FEWEST_PAIRS = 20
 """Pairs of observations that give a spread with a standard error of a sixth."""
-
 
 TILT_RAD = (math.radians(1.0), math.radians(2.0))
 """Tilt against the median of the drive below which the vehicle stands on the plane, and above which
@@ -79,13 +74,7 @@ def ground_weights(
     """Weights by how far an observation is from its group: same drive, same LiDAR.
 
     Residuals are taken at the poses as given or smoothed: solved poses follow a wrong plane. Pose
-    errors widen the spread of all alike, and a wrong extrinsic shifts the median or widens the
-    spread. So the first rounds, with little known, drop little.
-
-    Args:
-        problem: LiDARs and poses.
-        observations: the planes.
-        values: the current estimate, with the drives' planes.
+    errors widen the spread of all alike, so that the first rounds, with little known, drop little.
     """
     taken = taken_poses(problem, observations)
     r = _residuals(problem, observations, taken, problem.T_map_vehicle, values)
@@ -111,18 +100,10 @@ def ground_weights(
 def _heave_between(
     problem: Problem, observations: Sequence[GroundObservation], taken: IntArray, height: Array
 ) -> Array:
-    """(n,) 1 sigma of the heave between each scan and its pose, estimated from the observations.
+    """(n,) 1 sigma of the heave between each scan and its pose, from `height` (n,) residuals in m.
 
-    LiDARs whose scans are not simultaneous see the vehicle at heights that differ by its heave in
-    between, which is unknown. The distances of two LiDARs at one pose, one simultaneous and one
-    later, differ by this heave and by their own errors. Without it, S2S z of such LiDARs would
-    claim 0.25 mm where it is 1.4 mm.
-
-    Args:
-        problem: LiDARs and poses.
-        observations: the planes.
-        taken: (n,) their poses, -1 for none.
-        height: (n,) residuals of their distances, metres.
+    Two LiDARs at one pose, one scanning later, differ by it. Without it their S2S z claims 0.25 mm
+    where it is 1.4 mm.
     """
     out = np.array([first_heave(problem, o) for o in observations])
     at_once: dict[int, list[int]] = {}

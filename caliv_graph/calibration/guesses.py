@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.config.model import Config, PoseSigmaConfig
-from caliv_graph.products import (
-    Guess,
-)
+from caliv_graph.products import Guess
 
 DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
 """(6,) 1 sigma of a guess for which nothing is stated: the defaults of the config."""

@@ -1,11 +1,8 @@
 """Robust kernels: weights of clouds from their squared whitened residuals.
 
-They stand in for the paper's percentile filter. `CustomFactor` cannot be cloned by GTSAM's
-`GncOptimizer`, and a hard trim is no M-estimator of GTSAM's. So all kernels are one scheme here,
-iteratively reweighted least squares: solve, weigh every cloud by its whitened residual, solve
-again.
-
-A new kernel is a class here, an entry of KERNELS, and its name in `config.model.RobustKernel`.
+They stand in for the paper's percentile filter, all in one scheme: iteratively reweighted least
+squares. (`CustomFactor` cannot be cloned by GTSAM's `GncOptimizer`; GTSAM has no hard trim.) A new
+kernel is a class here, an entry of KERNELS, and its name in `config.model.RobustKernel`.
 """
 
 from __future__ import annotations

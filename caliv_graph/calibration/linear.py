@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.calibration.factors import (
-    predict_cloud,
-)
+from caliv_graph.calibration.factors import predict_cloud
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_target
 from caliv_graph.errors import SolveError
@@ -21,7 +20,6 @@ from caliv_graph.products import Array
 GAUGE = 1e-9
 """Relative ridge under which a dense system is solved: unobservable
 directions (the clouds' poses when all weights vanish) stay where they are."""
-
 
 GAUGE_PRIOR = 1.0
 """Gauge prior on a target frame, information per radian^2 and metre^2. The place and orientation of
@@ -74,55 +72,56 @@ class DenseSystem:
     b: Array
     extrinsics: int
 
+    @cached_property
+    def starts(self) -> dict[int, int]:
+        """First coordinate of each variable."""
+        return dict(zip(self.keys, np.cumsum([0, *self.sizes]).tolist(), strict=False))
+
     def offset(self, key: int) -> int:
         """First coordinate of a variable."""
-        return sum(self.sizes[: self.keys.index(key)])
+        return self.starts[key]
 
     def covariance_of(self, key: int, cov_extrinsics: Array) -> Array:
         """Marginal covariance of a variable that is no extrinsic.
 
-        Args:
-            key: of the variable.
-            cov_extrinsics: covariance of the extrinsics, tangents in the order of `keys`.
+        `cov_extrinsics` is the covariance of the extrinsics, tangents in the order of `keys`.
         """
         split = len(self.b) - 6 * self.extrinsics
         start = self.offset(key)
         which = slice(start, start + self.sizes[self.keys.index(key)])
-        rest = self.H[:split, :split].copy()
-        diagonal = np.arange(split)
-        rest[diagonal, diagonal] *= 1.0 + GAUGE
-        unit = np.eye(split)[:, which]
-        own = scipy.linalg.cho_solve(scipy.linalg.cho_factor(rest, lower=True), unit)
+        own = scipy.linalg.cho_solve(self._rest_factor(), np.eye(split)[:, which])
         follows = own.T @ self.H[:split, split:]
         return np.asarray(own[which] + follows @ cov_extrinsics @ follows.T)
 
     def schur(self) -> tuple[Array, Array, Array, Array]:
         """Eliminates everything but the extrinsics.
 
-        Returns:
-            D (6n, 6n) and c (6n,) of the reduced quadratic; and G, g with which the eliminated
-            variables follow: `d_rest = g - G d_extrinsics`.
+        Returns D (6n, 6n) and c (6n,) of the reduced quadratic; and G, g with which the eliminated
+        variables follow: `d_rest = g - G d_extrinsics`.
 
         Raises:
             SolveError: the rest is singular.
         """
         split = len(self.b) - 6 * self.extrinsics
-        rest = self.H[:split, :split].copy()
-        diagonal = np.arange(split)
-        rest[diagonal, diagonal] *= 1.0 + GAUGE
-        try:
-            factor = scipy.linalg.cho_factor(rest, lower=True, check_finite=False)
-        except scipy.linalg.LinAlgError:
-            raise SolveError(
-                "the graph without extrinsics is singular: a pose or a target has no measurement"
-            ) from None
-        both = scipy.linalg.cho_solve(
-            factor, np.column_stack([self.H[:split, split:], self.b[:split]]), check_finite=False
-        )
+        known = np.column_stack([self.H[:split, split:], self.b[:split]])
+        both = scipy.linalg.cho_solve(self._rest_factor(), known, check_finite=False)
         G, g = both[:, :-1], both[:, -1]
         D = self.H[split:, split:] - self.H[split:, :split] @ G
         c = self.b[split:] - self.H[split:, :split] @ g
         return 0.5 * (D + D.T), c, G, g
+
+    def _rest_factor(self) -> tuple[Array, bool]:
+        """Cholesky factor of everything but the extrinsics; SolveError if it is singular."""
+        split = len(self.b) - 6 * self.extrinsics
+        rest = self.H[:split, :split].copy()
+        diagonal = np.arange(split)
+        rest[diagonal, diagonal] *= 1.0 + GAUGE
+        try:
+            return scipy.linalg.cho_factor(rest, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            raise SolveError(
+                "the graph without extrinsics is singular: a pose or a target has no measurement"
+            ) from None
 
 
 def dense_system(
@@ -175,13 +174,8 @@ def add_shape(
 ) -> DenseSystem:
     """Adds a quadratic on the poses of all clouds, `d^T H d / 2 + g^T d` (left perturbations).
 
+    `lines` says how the poses move with the variables, `H_clouds` is (6 J, 6 J), `gradient` (6 J,).
     A common motion of a target's clouds is a gauge freedom of it: GAUGE_PRIOR holds the frame.
-
-    Args:
-        system: the rest of the graph.
-        lines: how the clouds' poses move with the variables.
-        H_clouds: (6 J, 6 J).
-        gradient: (6 J,).
     """
     J = cloud_rows(system, lines)
     return _with_rows(system, J, J.T @ H_clouds, gradient)
@@ -192,7 +186,7 @@ def _with_rows(
 ) -> DenseSystem:
     """Adds the clouds' quadratic; J (6 J, M) their rows, `seen` = `J^T H`."""
     H = system.H + (J.T @ seen.T)
-    add_gauge_prior(H, _starts(system))
+    add_gauge_prior(H, system.starts)
     return replace(system, H=H, b=system.b - J.T @ gradient)
 
 
@@ -201,13 +195,12 @@ def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.c
 
     Left perturbations of the predicted T_target_lidar by right perturbations of the variables.
     """
-    starts = _starts(system)
     rows, columns, entries = [], [], []
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
             row, column = np.indices(jacobian.shape)
             rows.append((6 * j + row).ravel())
-            columns.append((starts[key] + column).ravel())
+            columns.append((system.offset(key) + column).ravel())
             entries.append(jacobian.ravel())
     # Every cloud depends on four or five variables of hundreds.
     return scipy.sparse.csr_array(
@@ -221,10 +214,8 @@ def adjusted_residuals(
 ) -> tuple[Array, Array]:
     """Residuals of the clouds adjusted for the estimation of all variables, and their covariance.
 
-    With H the clouds' information, r their residuals and A the information of all variables: the
-    gradient `v = H (r + J d)` at the solution d, and its covariance `W = H - H J A^-1 J^T H`. W is
-    the information on an error in the measured poses; it is zero along what poses, targets and
-    extrinsics can absorb.
+    `W` is the information on an error in the measured poses; it is zero along what poses, targets
+    and extrinsics can absorb (`caliv_graph/calibration/README.md`, "Data snooping").
 
     Args:
         system: the rest of the graph, which determines all variables together with the clouds.
@@ -233,7 +224,7 @@ def adjusted_residuals(
         residuals: (J, 6) `Log(predicted measured^-1)`.
 
     Returns:
-        (6 J, 6 J) W and (6 J,) v.
+        (6 J, 6 J) W and (6 J,) v, the gradient at the solution.
 
     Raises:
         SolveError: a variable is unobservable.
@@ -252,18 +243,8 @@ def adjusted_residuals(
     return W, gradient + seen.T @ scipy.linalg.cho_solve(factor, full.b)
 
 
-def _starts(system: DenseSystem) -> dict[int, int]:
-    """First coordinate of each variable."""
-    return dict(zip(system.keys, np.cumsum([0, *system.sizes]).tolist(), strict=False))
-
-
 def add_gauge_prior(H: Array, starts: Mapping[int, int]) -> None:
-    """Adds GAUGE_PRIOR to the frames of the targets.
-
-    Args:
-        H: (M, M) information, changed in place.
-        starts: first coordinate of each variable.
-    """
+    """Adds GAUGE_PRIOR to the frames of the targets in H (M, M), in place; `starts` by variable."""
     letter = gtsam.symbolChr(key_target(0))
     for key, start in starts.items():
         if gtsam.symbolChr(key) == letter:

@@ -1,17 +1,15 @@
 """Noise of the given poses and scale of the registration, estimated from the data.
 
-Filtered poses come without a usable covariance, and their errors are correlated in time. The
-variances (white and Gauss-Markov, rotation and position) and one scale on the registration's sigmas
-are estimated by restricted maximum likelihood: extrinsics and targets are integrated out, so that
-the residuals which they absorb do not count as precision (Patterson & Thompson 1971). The
-likelihood and its prior are derived in `caliv_graph/calibration/README.md`.
+Restricted maximum likelihood: extrinsics and targets are integrated out, so that residuals which
+they absorb do not count as precision (Patterson & Thompson 1971;
+`caliv_graph/calibration/README.md`, "Noise levels").
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import gtsam
 import numpy as np
@@ -51,31 +49,19 @@ CLOUDS_USED = 50
 """Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
 
 
-def _names(noise: NoiseConfig) -> list[float | None]:
+def _configured(noise: NoiseConfig) -> list[float | None]:
     """The values of the config in SI units, in the order of the parameters."""
-    rad = [
+    white, drift = (
         None if v is None else math.radians(v)
         for v in (noise.pose_rotation_deg, noise.pose_drift_rotation_deg)
-    ]
-    return [
-        rad[0],
-        noise.pose_position_m,
-        rad[1],
-        noise.pose_drift_position_m,
-        None,
-    ]
+    )
+    return [white, noise.pose_position_m, drift, noise.pose_drift_position_m, None]
 
 
 def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     """The values of the config, and `TYPICAL` for the others."""
-    given = _names(noise)
-    typical = [
-        TYPICAL.white_rotation_rad,
-        TYPICAL.white_position_m,
-        TYPICAL.drift_rotation_rad,
-        TYPICAL.drift_position_m,
-    ]
-    values = [t if g is None else g for g, t in zip(given, typical, strict=False)]
+    typical = astuple(TYPICAL)
+    values = [t if g is None else g for g, t in zip(_configured(noise), typical, strict=True)]
     return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
 
 
@@ -88,15 +74,8 @@ def sound_clouds(
 ) -> BoolArray:
     """(J,) which clouds are not far off: those that noise levels are estimated from.
 
-    Residuals are taken at the given poses. Solved poses follow a cloud that is 0.3 m off, and the
-    white error of the poses would seem as large.
-
-    Args:
-        problem: the clouds and poses.
-        measured: registered pose of each cloud.
-        information: (J, 6, 6), without robust weights.
-        values: the current extrinsics and targets, and the poses as given.
-        noise: present error model of the poses.
+    Residuals are taken at the given poses, which `values` must hold: solved poses follow a cloud
+    that is 0.3 m off. `information` (J, 6, 6) is without robust weights.
     """
     lines = linearise_clouds(problem, values)
     every = np.arange(problem.clouds)
@@ -125,8 +104,8 @@ def fit_pose_noise(
 ) -> tuple[PoseNoise, float]:
     """Variances of the given poses and the scale of the registration's sigmas.
 
-    Where a pose's message states a covariance, that is the white part of its error: nothing is
-    fitted for it, while the Gauss-Markov part is fitted for all. If all poses state one, the white
+    What the config states is kept. Where a pose's message states a covariance, that is the white
+    part of its error: only the Gauss-Markov part is fitted. If all poses state one, the white
     figures returned are the root mean square of theirs.
 
     Args:
@@ -141,7 +120,7 @@ def fit_pose_noise(
     first = first_pose_noise(config)
     likelihood = _RestrictedLikelihood.at(problem, measured, information, sound, values, first)
     # What the config states is kept; without given poses there are no pose errors to estimate.
-    free = np.array([g is None for g in _names(config)])
+    free = np.array([g is None for g in _configured(config)])
     fitted = problem.given() & ~problem.stated()
     free &= np.array([fitted.any()] * 2 + [problem.given().any()] * 2 + [True])
 
@@ -232,15 +211,7 @@ class _RestrictedLikelihood:
                 scipy.linalg.block_diag(*R),
             ),
             ridge=_ridge(problem, A.shape[1]),
-            prior=np.log(
-                [
-                    first.white_rotation_rad,
-                    first.white_position_m,
-                    first.drift_rotation_rad,
-                    first.drift_position_m,
-                    TYPICAL_SCALE,
-                ]
-            ),
+            prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
         )
 
     def cost(self, logarithms: Array) -> float:
@@ -264,10 +235,7 @@ class _RestrictedLikelihood:
 
 
 def _spread(problem: Problem, sound: BoolArray) -> IntArray:
-    """Indices of at most CLOUDS_USED of the sound clouds, evenly over the drives.
-
-    In the order of their poses: which LiDAR comes first in the config does not matter.
-    """
+    """At most CLOUDS_USED sound clouds, evenly over the drives, in any order of the LiDARs."""
     usable = np.flatnonzero(sound)
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
     step = max(1, math.ceil(len(usable) / CLOUDS_USED))
@@ -284,17 +252,10 @@ def squares_without_own_pose(
 ) -> Array:
     """Squared residuals (J,) of the clouds, the white error of their own pose integrated out.
 
-    A solved pose follows its cloud within the noise of the given pose: a cloud that is 0.3 m off
-    would be judged by a pose that moved with it. So the white error that the solve found is taken
-    back and counted as noise. The Gauss-Markov error stays: its neighbours in time determine it.
-
-    Args:
-        problem: the clouds and poses.
-        lines: Jacobians of the predicted poses at `values`.
-        residuals: (J, 6) `Log(predicted measured^-1)` at `values`.
-        information: (J, 6, 6) of the measured poses, without robust weights.
-        values: the current estimate.
-        noise: error model of the given poses.
+    A solved pose follows its cloud within the noise of the given pose, also a cloud that is 0.3 m
+    off. So the white error that the solve found is taken back and counted as noise; the
+    Gauss-Markov error stays, for its neighbours in time determine it. `residuals` (J, 6) are
+    `Log(predicted measured^-1)` at `values`, `information` (J, 6, 6) is without robust weights.
     """
     white = np.array([noise.white_rotation_rad] * 3 + [noise.white_position_m] * 3)
     B = _pose_effects(problem, lines, values, np.arange(problem.clouds))
@@ -316,16 +277,10 @@ def squares_without_own_pose(
 def _stated_effect(
     problem: Problem, B: Array, chosen: IntArray, same: Array | None = None
 ) -> Array:
-    """What the stated white errors of given poses add to the covariance of the clouds' residuals.
+    """(m, 6, 6) added to the covariance of the chosen clouds' residuals by stated white errors.
 
-    Args:
-        problem: the clouds and poses.
-        B: (m, 6, 6) effects of the pose errors on the chosen clouds.
-        chosen: (m,) clouds.
-        same: (m, m) 1 where two clouds share a pose; None: only each cloud's own.
-
-    Returns:
-        (m, 6, 6), or with `same` (m, 6, m, 6); zero where no covariance is stated.
+    `B` (m, 6, 6): effects of pose errors. With `same` (m, m), 1 where two clouds share a pose:
+    (m, 6, m, 6).
     """
     m, pose = len(chosen), problem.cloud_pose[chosen]
     stated = problem.stated()[pose]
@@ -341,11 +296,9 @@ def _stated_effect(
 def _motion_covariance(
     problem: Problem, values: gtsam.Values, chosen: IntArray, together: bool = False
 ) -> Array:
-    """Covariance that motion data leave to the poses of the chosen clouds; zero for given poses.
+    """(m, 6, 6) covariance that motion data leave to the poses of clouds; zero for given poses.
 
-    Returns:
-        (m, 6, 6), or if `together` (m, m, 6, 6) of all of them, rotation in vehicle axes and
-        position in map axes.
+    If `together` (m, m, 6, 6). Rotation in vehicle axes, position in map axes.
     """
     m = len(chosen)
     out = np.zeros((m, m, 6, 6) if together else (m, 6, 6))
@@ -372,10 +325,7 @@ def _motion_covariance(
 def _pose_effects(
     problem: Problem, lines: CloudLinearisation, values: gtsam.Values, chosen: IntArray
 ) -> Array:
-    """What pose errors do to the residuals of the chosen clouds; (m, 6, 6).
-
-    Rotation errors are in vehicle axes, position errors in map axes.
-    """
+    """(m, 6, 6) residuals of clouds by pose errors: rotation in vehicle, position in map axes."""
     B = np.zeros((len(chosen), 6, 6))
     for row, j in enumerate(chosen):
         key = key_vehicle(int(problem.cloud_pose[j]))
@@ -393,11 +343,9 @@ def _stacked(
     values: gtsam.Values,
     chosen: IntArray,
 ) -> tuple[Array, Array, Array, Array]:
-    """Residuals of the chosen clouds, and what they depend on.
+    """Residuals (6m,) of the chosen clouds, and what they depend on.
 
-    Returns:
-        (6m,) residuals; (6m, p) Jacobians by extrinsics and targets; (m, 6, 6) by pose errors
-        (rotation in vehicle axes, position in map axes); (m, 6, 6) registration covariances.
+    (6m, p) by extrinsics, targets and offsets; (m, 6, 6) by pose errors; (m, 6, 6) covariances.
     """
     keys = (*problem.extrinsic_keys(), *problem.target_keys())
     columns = {key: 6 * i for i, key in enumerate(keys)}

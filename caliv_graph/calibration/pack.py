@@ -7,30 +7,13 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    cloud_graph,
-    merged,
-)
+from caliv_graph.calibration.graph import cloud_graph, merged
 from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
 from caliv_graph.conventions import key_target, key_vehicle
 from caliv_graph.errors import SolveError
-from caliv_graph.products import (
-    Array,
-    Registration,
-    Solution,
-)
-
-
-def _whitened(residuals: Array, information: Array) -> Array:
-    """Residuals (J, 6), whitened by the root of their (J, 6, 6) information."""
-    return np.asarray(np.einsum("jba,jb->ja", np.linalg.cholesky(information), residuals))
-
-
-def _check_finite(*matrices: Array) -> None:
-    if not all(np.isfinite(matrix).all() for matrix in matrices):
-        raise SolveError("the covariance of the extrinsics is not finite")
+from caliv_graph.products import Array, Registration, Solution
 
 
 def packed_solution(
@@ -62,23 +45,28 @@ def packed_solution(
     Raises:
         SolveError: the covariance is not finite.
     """
-    _check_finite(cov, information_data)
+    if not (np.isfinite(cov).all() and np.isfinite(information_data).all()):
+        raise SolveError("the covariance of the extrinsics is not finite")
     problem, measured = state.problem, measured_poses(registrations)[0]
     weights = state.weights.values
     clouds = cloud_graph(problem, measured, information * weights[:, None, None])
     graph = merged(guessed_graph(state), clouds)
-    residuals = _whitened(cloud_residuals(reduced.lines, measured), information)
+    roots = np.linalg.cholesky(information)
+    whitened = np.einsum("jba,jb->ja", roots, cloud_residuals(reduced.lines, measured))
     cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
     return Solution(
         mode=state.config.solve.mode,
         lidars=problem.lidars,
         reference=problem.reference,
         T_vehicle_lidar={n: problem.extrinsic(state.values, n) for n in problem.lidars},
-        T_map_vehicle=_poses_in_their_maps(state),
+        T_map_vehicle={
+            pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
+            for i, pose in enumerate(problem.poses)
+        },
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
         cloud_weights=tuple(np.split(weights, cuts)),
-        residuals=tuple(np.split(residuals, cuts)),
+        residuals=tuple(np.split(whitened, cuts)),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         information_data=information_data,
@@ -94,15 +82,6 @@ def packed_solution(
         time_offsets=time_offsets,
         gradient_data=reduced.c,
     )
-
-
-def _poses_in_their_maps(state: SolveState) -> dict[tuple[int, int], gtsam.Pose3]:
-    """T_map_vehicle of every pose in the map of its drive."""
-    problem = state.problem
-    return {
-        pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
-        for i, pose in enumerate(problem.poses)
-    }
 
 
 def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:

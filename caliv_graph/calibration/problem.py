@@ -45,21 +45,19 @@ class Problem:
         poses: (drive, stamp_ns) of every pose used, ascending.
         T_map_vehicle: the given or smoothed pose of each, its map's origin moved to `origins_map`.
         origins_map: (3,) per drive, metres: where the problem's map begins in the drive's. Poses in
-            a national grid are thousands of kilometres from its origin, too far for double
-            precision.
+            a national grid are too far from its origin for double precision.
         cloud_lidar: (J,) index into `lidars`.
         cloud_pose: (J,) index into `poses`.
         cloud_placement: (J,) index of the placement.
         placements: number of placements.
         motion: per drive with a smoothed trajectory the (6 m, 6 m) information of the motion data
-            on its m poses, in order, right perturbations, rotation then translation. The poses
-            of the other drives were given; their errors are estimated.
+            on its m poses, right perturbations. The poses of the other drives were given.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is.
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
-            it, rotation in vehicle axes, then position in map axes, rad and m; NaN: not stated, its
-            white error is fitted. None: no pose has one.
+            it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
+            one.
         weights_of_views: (J,) weight of each cloud for repeated views of one place, 0 to 1
             (`targets.cloud.views`); None: all one.
     """
@@ -140,8 +138,7 @@ class Problem:
     def guess_information(self) -> Array:
         """(6n, 6n) information of the guesses, vehicle axes; trusted ones with default sigmas.
 
-        The trust is among the data (`prior_graph`). A direction is determined if the data know it
-        better than a usual guess.
+        The trust is among the data (`prior_graph`).
         """
         return np.diag(np.concatenate([self.guess_sigmas(n) for n in self.lidars]) ** -2.0)
 
@@ -176,10 +173,7 @@ class Problem:
         return pose
 
     def to_vehicle_axes(self, values: gtsam.Values) -> Array:
-        """Turns tangents of (E, S_a, ...) into vehicle axes of every LiDAR; (6n, 6n).
-
-        Rows are in the order of `lidars`, columns in that of `extrinsic_keys`.
-        """
+        """(6n, 6n) from tangents of `extrinsic_keys` (E, S_a, ...) to vehicle axes of `lidars`."""
         keys = self.extrinsic_keys()
         out = np.zeros((6 * len(self.lidars), 6 * len(keys)))
         for i, name in enumerate(self.lidars):

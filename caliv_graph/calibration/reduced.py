@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import (
-    CalibrationGraph,
-)
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.linear import (
     CloudLinearisation,
     DenseSystem,
@@ -20,10 +18,7 @@ from caliv_graph.calibration.linear import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_offset
-from caliv_graph.products import (
-    Array,
-    LinearisedGraph,
-)
+from caliv_graph.products import Array, LinearisedGraph
 
 
 @dataclass
@@ -51,9 +46,7 @@ class Reduced:
     def time_offsets(self, problem: Problem, cov: Array) -> dict[str, tuple[float, float]]:
         """Time offset and its sigma, in seconds, of the LiDARs that have a free one.
 
-        Args:
-            problem: which they are.
-            cov: (6n, 6n) of the extrinsics, vehicle axes.
+        `cov` is (6n, 6n) of the extrinsics, vehicle axes.
         """
         inverse = np.linalg.inv(self._to_axes)
         tangent = inverse @ cov @ inverse.T
@@ -68,9 +61,8 @@ class Reduced:
     def step_with(self, prior: Array, offset: Array) -> Array:
         """The step (6n,) that data and guesses together call for.
 
-        Args:
-            prior: (6n, 6n) information of the guesses.
-            offset: (6n,) where the estimate is from them.
+        `prior` (6n, 6n) is the information of the guesses, `offset` (6n,) where the estimate is
+        from them.
         """
         return np.asarray(np.linalg.solve(self.D + prior, self.c - prior @ offset), np.float64)
 

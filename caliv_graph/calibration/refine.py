@@ -75,13 +75,10 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations at most.
 
-    Args:
-        state: of `solve_registered`, taken along.
-        states: the registration of each placement, taken along.
-        most: iterations at most.
-        advance: called after each.
+    `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
+    along; `advance` is called after each iteration.
 
     Raises:
         SolveError: a pose or a target has no measurement.
@@ -101,14 +98,9 @@ def refined(
 
 @dataclass
 class _Loop:
-    """What the iterations of the joint loop carry along.
+    """What the iterations carry along; `base` is the graph without clouds and guesses.
 
-    Attributes:
-        state: values, weights, noise.
-        states: the registration of each placement.
-        base: the graph without clouds and guesses, which stays the same.
-        prior: (6n, 6n) information of the guesses, vehicle axes.
-        undetermined: number of undetermined directions once it is fixed; None: not yet.
+    `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed.
     """
 
     state: SolveState
@@ -162,10 +154,10 @@ class _Loop:
     def _squares(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
         """(J,) squared residuals of the clouds, to weigh them by."""
         state = self.state
-        wanted = _shape_measurements(state, shapes)
-        single = wanted.information / state.problem.view_weights()[:, None, None]
+        pull, information = _single_clouds(state, shapes)
+        single = information / state.problem.view_weights()[:, None, None]
         return squares_without_own_pose(
-            state.problem, lines, -wanted.pull, single, state.values, state.noise
+            state.problem, lines, -pull, single, state.values, state.noise
         )
 
     def _weigh(self, squared: Array) -> float:
@@ -191,10 +183,7 @@ class _Loop:
 
 
 def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
-    """A new mixture, and if asked for new normals, at the poses of the graph.
-
-    EM ends near its start: the start shall not depend on the initial guess.
-    """
+    """A new mixture, and if asked for new normals, at the graph's poses: EM ends near its start."""
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
         if normals:
@@ -272,21 +261,11 @@ class _Shapes:
         return np.array(blocks), np.array(gradients)
 
 
-@dataclass
-class _ShapeMeasurements:
-    """The pose of each cloud by itself, given the shape.
+def _single_clouds(state: SolveState, shapes: _Shapes) -> tuple[Array, Array]:
+    """The pose of each cloud by itself, given the shape: the quadratic as pose factors.
 
-    Attributes:
-        pull: (J, 6) left perturbations from the predicted poses to these.
-        information: (J, 6, 6) without robust weights.
+    (J, 6) left perturbations from the predicted poses; (J, 6, 6) information, no robust weights.
     """
-
-    pull: Array
-    information: Array
-
-
-def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurements:
-    """The pose factors that the quadratic stands for, one per cloud."""
     weights = state.weights.values
     blocks, gradient = shapes.single
     information = blocks / weights[:, None, None] / state.scale**2
@@ -294,8 +273,7 @@ def _shape_measurements(state: SolveState, shapes: _Shapes) -> _ShapeMeasurement
     ridge = 1e-9 * np.trace(information, axis1=1, axis2=2) + 1e-9
     information = information + ridge[:, None, None] * np.eye(6)
     force = gradient / weights[:, None] / state.scale**2
-    pull = -np.linalg.solve(information, force[..., None])[..., 0]
-    return _ShapeMeasurements(pull, information)
+    return -np.linalg.solve(information, force[..., None])[..., 0], information
 
 
 def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: bool) -> Solution:
@@ -308,7 +286,7 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
         cov = covariance_with_prior_in_null_space(loop.prior, split)
     else:
         cov = np.asarray(np.linalg.inv(reduced.D + loop.prior), np.float64)
-    pulls = _shape_measurements(state, shapes)
+    pull, information = _single_clouds(state, shapes)
     # The robust weights of the clouds are kept apart from their information.
     weighted = shapes.single[0]
     last_step = (last.turn_rad, last.shift_m)
@@ -316,8 +294,8 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     for shape, (R, t), (H, _) in zip(loop.states, shapes.poses, shapes.joints, strict=True):
         part = slice(start, start + shape.clouds.count)
         start = part.stop
-        R, t = left_step(R, t, pulls.pull[part])
-        blocks = pulls.information[part] * state.scale**2
+        R, t = left_step(R, t, pull[part])
+        blocks = information[part] * state.scale**2
         joint = H + block_diag(*(blocks - weighted[part]))
         registrations.append(shape.result(R, t, blocks, joint, iterations, converged, last_step))
     state.graph_seconds += time.perf_counter() - begun
@@ -325,7 +303,7 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
         state,
         registrations,
         reduced,
-        pulls.information,
+        information,
         reduced.D,
         cov,
         held=(),

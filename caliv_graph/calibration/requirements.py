@@ -9,12 +9,7 @@ from dataclasses import replace
 from caliv_graph.config.model import LIMIT_KEY, Config
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration
-from caliv_graph.uncertainty.pairs import (
-    pair_determined,
-    sensor_pairs,
-    sigmas_s2s,
-    sigmas_s2v,
-)
+from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs, sigmas_s2s, sigmas_s2v
 
 
 def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:

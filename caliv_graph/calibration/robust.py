@@ -35,9 +35,7 @@ def explained_part(inlier_ratio: Array) -> Array:
     """Factors (J,) on the weights of clouds by how much of each is target at all.
 
     A cloud that lies where the target is not has no residual: all its points are outliers.
-
-    Args:
-        inlier_ratio: (J,) part of each cloud's points that the mixture explains.
+    `inlier_ratio` (J,) is the part of each cloud's points that the mixture explains.
     """
     typical = max(float(np.median(inlier_ratio)), 1e-6)
     none, full = EXPLAINED
@@ -53,11 +51,9 @@ class RobustWeights:
         self.values: Array = np.ones(clouds)
 
     def update(self, squared: Array, explained: Array | float = 1.0) -> float:
-        """New weights; returns the largest change.
+        """New weights from squared whitened residuals (J,); returns the largest change.
 
-        Args:
-            squared: (J,) squared whitened residuals.
-            explained: (J,) factors for what the residuals do not show (`explained_part`).
+        `explained` (J,) are factors for what the residuals do not show (`explained_part`).
         """
         before = self.values
         if not self.kernel.drops:
@@ -66,16 +62,14 @@ class RobustWeights:
         return float(np.abs(self.values - before).max())
 
     def snoop(self, W: Array, v: Array, own: Array, explained: Array | float = 1.0) -> BoolArray:
-        """New weights by how far each cloud is off from all the others together.
+        """New weights by how far each cloud is off from all the others together (Baarda 1968).
 
-        Data snooping (Baarda 1968): a cloud that is far off bends the solution, and its neighbours
-        seem to be off as well. So the worst is dropped alone, and the others are judged without
-        it, until none is far off, or half are gone: then the clouds are not what is wrong. Kernel
-        `none` drops nothing.
+        The worst cloud is dropped alone, and the others are judged without it, until none is far
+        off, or half are gone: then the clouds are not what is wrong. Kernel `none` drops nothing.
 
         Args:
             W: (6 J, 6 J) and
-            v: (6 J,) of `graph.adjusted_residuals`, no cloud down-weighted by its residual.
+            v: (6 J,) of `adjusted_residuals`, no cloud down-weighted by its residual.
             own: (J, 6, 6) information of each cloud, the others held.
             explained: (J,) factors for what the residuals do not show (`explained_part`).
 
@@ -112,7 +106,7 @@ def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
 
     Args:
         W: (6 J, 6 J) and
-        v: (6 J,) of `graph.adjusted_residuals`.
+        v: (6 J,) of `adjusted_residuals`.
         own: (J, 6, 6) information of each cloud, the others held.
 
     Returns:
@@ -127,8 +121,7 @@ def deletion_squares(W: Array, v: Array, own: Array) -> tuple[Array, IntArray]:
 def _deletion_covariances(W: Array, own: Array) -> tuple[Array, IntArray]:
     """(J, 6, 6) inverses of W's blocks along what is controlled, else zero; (J,) its dimension.
 
-    Rotations and translations have units of their own: a block is compared with the cloud's own
-    information.
+    A block is compared with the cloud's own information, for rad and m do not compare.
     """
     values, axes = np.linalg.eigh(own)
     # The rotation of a cloud about a drum is marginalised to rounding.
@@ -149,16 +142,11 @@ def _without(W: Array, v: Array, own: Array, cloud: int) -> tuple[Array, Array]:
 
 
 def weighted_joint(H: Array, weights: Array) -> Array:
-    """Joint information of weighted clouds.
+    """Joint information (6 J, 6 J) of weighted clouds, the shape eliminated; weights (J,) 0 to 1.
 
     A cloud of weight w gets one more pose error, of information `w / (1 - w)` times the cloud's
-    own: its information becomes w times as large, and at MIN_WEIGHT its pose is as good as free. A
-    common motion of all clouds, unobservable in H, stays unobservable. H scaled by the roots of
-    the weights would tie clouds of different weights to the present place of the shape.
-
-    Args:
-        H: (6 J, 6 J) of all clouds, the shape eliminated.
-        weights: (J,) from 0, which counts as MIN_WEIGHT, to 1.
+    own. A common motion of all clouds stays unobservable; H scaled by the roots of the weights
+    would tie clouds of different weights to the present place of the shape.
     """
     less = np.flatnonzero(weights < 1.0)
     if len(less) == 0:

@@ -25,11 +25,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.products import GroundObservation, Registration, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.registration.self_comparison import views_of
-from caliv_graph.registration.symmetry import (
-    Symmetry,
-    alarming,
-    symmetries,
-)
+from caliv_graph.registration.symmetry import Symmetry, alarming, symmetries
 from caliv_graph.wording.offsets import undetermined_offset_sentences
 from caliv_graph.wording.symmetries import symmetry_sentence
 
@@ -73,8 +69,8 @@ def rough_solve(
         config: kernels, noise, ground.
         progress: reports every stage.
         iterations: of each registration at most.
-        look_for_symmetries: whether to marginalise what a target that looks the same after a
-            rotation cannot determine.
+        look_for_symmetries: marginalise what a target that looks the same after a rotation cannot
+            determine.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
@@ -119,8 +115,7 @@ def symmetries_of_targets(
 ) -> tuple[tuple[Symmetry | None, ...], tuple[str, ...]]:
     """Per placement the continuous symmetry of its target; and a warning for each.
 
-    The rotation of a cloud about a drum is unobservable: it comes from noise and from where the
-    beams fell, and is marginalised.
+    The rotation of a cloud about a drum comes from noise and from where the beams fell.
     """
     turns: list[Symmetry | None] = []
     warnings = []

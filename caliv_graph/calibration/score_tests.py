@@ -1,10 +1,8 @@
 """Score tests on the solved graph: is an extrinsic the same in all parts of the data?
 
-The noise levels are fitted to the residuals, so a wrong stamp or a moved mount hardly shows in
-them. It shows as a difference between parts of the data that should agree: the first half of a
-LiDAR's clouds against the second, left turns against right turns. Each difference is a parameter
-that the model leaves out. Its estimate follows from one linearisation at the solution, with all
-variables free (score test, Rao 1948). The derivation is in `caliv_graph/calibration/README.md`.
+A wrong stamp or a moved mount shows as a difference between parts of the data that should agree;
+the difference is a parameter that the model leaves out (Rao 1948). The derivation is in
+`caliv_graph/calibration/README.md`, "Score tests".
 """
 
 from __future__ import annotations
@@ -37,16 +35,10 @@ def score_tests(
 ) -> tuple[ScoreTest, ...]:
     """Tests parameters that the model leaves out (Rao 1948).
 
-    Args:
-        solution: the solved graph.
-        trajectories: one per drive, for the velocities.
-        trusted: LiDARs whose extrinsic is not estimated (`fixed: true`).
-
-    Returns:
-        Per LiDAR the difference of its extrinsic between the first and the second half of its
-        clouds, and between left and right turns; the offset of its clock, unless it was estimated;
-        and, if it is trusted, the correction of its extrinsic that its clouds ask for. A test for
-        which there are too few clouds is left out.
+    Per LiDAR the difference of its extrinsic between the first and the second half of its clouds,
+    and between left and right turns; the offset of its clock, unless it was estimated; and, if it
+    is one of `trusted` (`fixed: true`), the correction of its extrinsic that its clouds ask for. A
+    test for which there are too few clouds is left out. `trajectories` are one per drive.
 
     Raises:
         SolveError: the graph is singular.
@@ -71,15 +63,7 @@ def score_tests(
 def _score(graph: LinearisedGraph, columns: Array) -> tuple[Array, Array]:
     """Information (k, k) and gradient (k,) of left-out parameters, all variables eliminated.
 
-    The guesses add their information and no gradient: the estimate does not follow them along what
-    the data determine (mode `auto`), and something has to hold it along the rest.
-
-    Args:
-        graph: the solved graph, linearised.
-        columns: (6 J, k) derivatives of the clouds' poses with respect to the parameters.
-
-    Raises:
-        SolveError: the graph is singular.
+    `columns` (6 J, k): derivatives of the clouds' poses. The guesses add information, no gradient.
     """
     H = graph.information + graph.information_guesses
     seen = graph.cloud_information @ columns

@@ -43,14 +43,11 @@ SNOOPINGS = 6
 def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> None:
     """Weighs the clouds by their joint information, and estimates the noise without the lost ones.
 
-    The graph of single pose factors judges a cloud by the residual of its own pose and ignores the
-    correlation between clouds. So it misses some clouds that were registered to the wrong place
-    and that bias the joint solution. These also widen the fitted noise, of the registration or of
-    the poses, and hide in it: clouds are judged by the noise of those that agree best.
-
-    If a LiDAR would lose more than MOST_LOST of its clouds, its clock, its mount or the target is
-    wrong rather than the clouds, and `score_tests` reports it: noise and values stay as they are,
-    and weights below MIN_SNOOPED_WEIGHT become zero. Kernel `none` changes nothing.
+    Single pose factors ignore the correlation between clouds, and miss some that were registered to
+    the wrong place. These also widen the fitted noise and hide in it: clouds are judged by the
+    noise of those that agree best. If a LiDAR would lose more than MOST_LOST of its clouds, its
+    clock, its mount or the target is wrong rather than the clouds: noise and values stay, and
+    weights below MIN_SNOOPED_WEIGHT become zero. Kernel `none` changes nothing.
 
     Args:
         state: of `solve_registered`; gets new weights and values, and where clouds are lost new

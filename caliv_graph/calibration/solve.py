@@ -1,8 +1,7 @@
 """The graph solve of registered clouds, and what all modes use of it.
 
 The paper's minimisation: one pose factor per registered cloud, robust weights, noise levels from
-the data. Then the problem reduced to the extrinsics, for steps and covariances, and the packed
-result.
+the data. Then the problem reduced to the extrinsics, for steps and covariances.
 """
 
 from __future__ import annotations
@@ -29,10 +28,7 @@ from caliv_graph.calibration.graph import (
 )
 from caliv_graph.calibration.ground import GroundWeights, ground_graph, ground_values
 from caliv_graph.calibration.ground_weights import ground_weights
-from caliv_graph.calibration.linear import (
-    CloudLinearisation,
-    linearise_clouds,
-)
+from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
     first_pose_noise,
@@ -45,13 +41,7 @@ from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config.model import Config, RobustConfig
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import (
-    Array,
-    BoolArray,
-    GroundObservation,
-    PoseNoise,
-    Registration,
-)
+from caliv_graph.products import Array, BoolArray, GroundObservation, PoseNoise, Registration
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry
 
 REWEIGHTINGS = 12
@@ -100,12 +90,8 @@ def solve_registered(
 ) -> SolveState:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
 
-    Args:
-        problem: LiDARs, poses and clouds.
-        registrations: of its placements, in order.
-        grounds: the ground as the LiDARs saw it.
-        config: kernels, noise, ground.
-        turns: per placement the continuous symmetry of its target; empty: none.
+    `registrations` are of the problem's placements, in order; `turns` the continuous symmetry of
+    each placement's target, empty for none.
 
     Raises:
         SolveError: the graph is singular.
@@ -127,8 +113,8 @@ def solve_registered(
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and
     # the noise fit would find none of it: solve without weights, and leave out what is far off.
-    plain = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
-    state.weights, robust = plain, state.weights
+    robust = state.weights
+    state.weights = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
     explained = explained_parts(registrations)
     _reweight(state, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
@@ -177,15 +163,9 @@ def with_determined_offsets(
 ) -> tuple[Problem, dict[str, float]]:
     """The problem without the time offsets that the drive does not determine.
 
-    At constant speed on an arc an offset of a LiDAR has the same effect as its own x and yaw: with
-    the offset free the drive would not determine them.
-
-    Args:
-        state: of `solve_registered`, offsets free.
-        registrations: what it was given.
-
-    Returns:
-        The problem; and LiDAR -> 1 sigma in seconds of each offset that was free.
+    At constant speed on an arc a free offset of a LiDAR has the same effect as its own x and yaw.
+    `state` and `registrations` are those of `solve_registered`. Returns the problem; and LiDAR -> 1
+    sigma in seconds of each offset that was free.
     """
     problem = state.problem
     if not problem.offsets:
@@ -198,12 +178,7 @@ def with_determined_offsets(
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
-    """The problem of registered clouds, motion and ground, reduced to the extrinsics.
-
-    Args:
-        state: of `solve_registered`.
-        registrations: what it was given.
-    """
+    """The problem of registered clouds, motion and ground, reduced to the extrinsics."""
     return _reduction(state, registrations)()
 
 
@@ -225,15 +200,10 @@ def settle(
     registrations: Sequence[Registration],
     step: Callable[[Reduced], Array],
 ) -> tuple[Reduced, Array, bool]:
-    """Repeats a Gauss-Newton step on the joint information until it is small.
+    """Repeats a Gauss-Newton step on the joint information until it is small; moves `state`.
 
-    Args:
-        state: of `solve_registered`; its values are moved.
-        registrations: what it was given.
-        step: (6 n,) of the extrinsics, vehicle axes, from the problem reduced to them.
-
-    Returns:
-        The last linearisation, the last step, and whether that was small.
+    `step` gives (6 n,) of the extrinsics, vehicle axes, from the problem reduced to them. Returns
+    the last linearisation, the last step, and whether that was small.
 
     Raises:
         SolveError: a pose or a target has no measurement.
@@ -256,12 +226,7 @@ def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
 
 
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
-    """(6 J, 6 J) joint information of all registered poses, with robust weights.
-
-    Args:
-        state: weights, scale of the registration's sigmas, symmetries that are marginalised.
-        registrations: of the placements, in order.
-    """
+    """(6 J, 6 J) joint information of all registered poses, with robust weights."""
     turns = state.turns or [None] * len(registrations)
     out, start = [], 0
     for r, turn in zip(registrations, turns, strict=True):
@@ -279,10 +244,7 @@ def measured_poses(
 ) -> tuple[list[gtsam.Pose3], Array]:
     """Registered poses (J,) and informations (J, 6, 6) of all placements, in order.
 
-    Args:
-        registrations: of the placements, in order.
-        turns: per placement the continuous symmetry of its target, to be marginalised; empty:
-            none.
+    The continuous symmetries `turns` of the placements' targets are marginalised; empty: none.
     """
     poses = [T for r in registrations for T in r.T_target_lidar]
     information = []
@@ -298,12 +260,7 @@ def measured_poses(
 
 
 def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:
-    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`, rad and m.
-
-    Args:
-        lines: with the predicted poses T_target_lidar.
-        measured: those that the registration found.
-    """
+    """Residuals (J, 6) of the pose factors, `Log(predicted measured^-1)`, rad and m."""
     return np.array(
         [
             gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
@@ -323,24 +280,15 @@ def base_graph(state: SolveState) -> CalibrationGraph:
     return merged(
         pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
-        _ground_graph(state),
+        ground_graph(problem, state.grounds, state.config.ground, state.ground_weights),
         prior_graph(problem, sorted(problem.fixed)),
     )
 
 
 def guessed_graph(state: SolveState) -> CalibrationGraph:
     """`base_graph`, and the guesses of the extrinsics that are estimated."""
-    return merged(base_graph(state), _guess_graph(state.problem))
-
-
-def _guess_graph(problem: Problem) -> CalibrationGraph:
-    """The guesses of the extrinsics that are estimated."""
-    return prior_graph(problem, [n for n in problem.lidars if n not in problem.fixed])
-
-
-def _ground_graph(state: SolveState) -> CalibrationGraph:
-    """The ground's factors with their weights."""
-    return ground_graph(state.problem, state.grounds, state.config.ground, state.ground_weights)
+    estimated = [n for n in state.problem.lidars if n not in state.problem.fixed]
+    return merged(base_graph(state), prior_graph(state.problem, estimated))
 
 
 def offset_from_guesses(state: SolveState) -> Array:

@@ -28,17 +28,10 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
     """The paper's two stages on the registered clouds.
 
     Stage 1 estimates all S_a with E free under its prior. Stage 2 fixes S_a, holds the reference
-    LiDAR's translation at its guess and solves its rotation.
-
-    The reported translation is the guess. The guess is wrong by its sigma, and a fit that ignores
-    this bends the rotation instead: on an arc 50 mm of y become 10 mrad of roll. So its error is
-    *considered* (Schmidt 1966): it is free under the guess's sigma while the rotation is solved
-    for, and is not reported.
-
-    Both stages use the registration's joint information. Its diagonal blocks, one pose factor per
-    cloud, count the common information twice, since the shape was estimated from the same clouds:
-    where two LiDARs saw different skins of the target, blocks tie them together and the joint
-    information does not.
+    LiDAR's translation at its guess and solves its rotation. The error of the guess is *considered*
+    (Schmidt 1966): free under its sigma while the rotation is solved for, and not reported; else 50
+    mm of y become 10 mrad of roll on an arc. Both stages use the registration's joint information
+    (`caliv_graph/calibration/README.md`, "Modes").
 
     Args:
         state: of `solve_registered`; weights and noise are measured anew.
@@ -106,11 +99,9 @@ def _second_stage(state: SolveState) -> Callable[[Reduced], Array]:
 def _staged_covariance(
     state: SolveState, information_data: Array, prior: Array, first: gtsam.Values
 ) -> Array:
-    """Covariance of the staged result, vehicle axes.
+    """Covariance of the staged result, vehicle axes: S_a of stage 1, the translation of the guess.
 
-    S_a has the covariance of stage 1, the held translation that of the guess. The rotation is
-    solved with the translation considered: its error is that of the data and that of a
-    translation that is off by its sigma (0.1 m rotate the yaw by 0.1 m over the turning radius).
+    The rotation's error is that of the data and that of a translation that is off by its sigma.
     """
     problem = state.problem
     n = len(problem.lidars)

@@ -47,14 +47,9 @@ def parts(count: int, number: int) -> list[slice]:
 
 
 def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
-    """Does `work` on all items, several at a time.
+    """Does `work` on all items, several at a time, and raises whatever it raises.
 
-    Args:
-        work: on one item; releases the interpreter's lock for most of its time.
-        items: any number of them.
-
-    Raises:
-        Whatever `work` raises.
+    `work` should release the interpreter's lock for most of its time.
     """
     threads = min(THREADS, cores())
     if threads < 2:

@@ -62,10 +62,9 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
 
     Args:
         path: the folder. An empty one that exists is filled.
-        content: the files of a result of this kind, relative to the folder; each part of such a
-            path is a pattern (`fnmatch`). The first is the name of the main file: a folder without
-            it is not a result. With `force` only a result is replaced, and only if it holds no
-            other files: a foreign file, in a subfolder too, is never deleted.
+        content: patterns (`fnmatch`, of each part of a path) of the files of a result of this kind,
+            the main file first. With `force` only a result is replaced: a folder with the main file
+            and without any other file, in a subfolder too.
         force: replace an older result.
 
     Yields:
@@ -96,11 +95,6 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
 
 def check_output_folder(path: Path, content: Sequence[str], force: bool = False) -> None:
     """Checks before long work what `output_folder` checks after it.
-
-    Args:
-        path: see `output_folder`.
-        content: see `output_folder`.
-        force: see `output_folder`.
 
     Raises:
         OutputError: `path` exists and is not to be replaced, or cannot be written.
@@ -239,10 +233,7 @@ def _flush_to_disk(file: Any) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ignores interrupts during a swap or a clean-up, of milliseconds each.
-
-    The interrupt has no use there: the work is done, or already fails.
-    """
+    """Ignores interrupts during a swap or a clean-up: the work is done, or already fails."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -259,10 +250,7 @@ def _uninterrupted() -> Iterator[None]:
 def each_once(paths: Sequence[Path], where: str, what: str) -> None:
     """Checks that no path is given twice, under whatever names.
 
-    Args:
-        paths: as given.
-        where: the beginning of the message, before the path: an option and a space, or nothing.
-        what: a path is of, such as "a drive".
+    `where`, an option and a space or nothing, begins the message; `what` is such as "a drive".
 
     Raises:
         ConfigError: one is.

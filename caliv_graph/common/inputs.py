@@ -12,13 +12,7 @@ MOST_BYTES = 4 * 1024**3
 
 
 def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Reads a file whole.
-
-    A pipe without a writer would block for ever, and a device has no end.
-
-    Args:
-        path: the file.
-        most_bytes: a larger one is refused.
+    """Reads a file whole. A pipe without a writer would block for ever, and a device has no end.
 
     Raises:
         OSError: it is missing, a folder, a pipe or a device, too large or unreadable; `strerror`

@@ -28,24 +28,14 @@ class Advance(Protocol):
     """Reports steps that are done."""
 
     def __call__(self, n: int = 1, note: str = "") -> None:
-        """Adds to the count.
-
-        Args:
-            n: steps done since the last call.
-            note: shown beside the count until the next note.
-        """
+        """Adds `n` steps; the note is shown beside the count until the next note."""
 
 
 class Progress(Protocol):
     """Takes the reports of long work."""
 
     def stage(self, name: str, total: int | None = None) -> AbstractContextManager[Advance]:
-        """A stage of the work.
-
-        Args:
-            name: of the stage, a word or two.
-            total: steps of the stage; None if unknown.
-        """
+        """A stage of the work, named in a word or two; `total` steps, None if unknown."""
 
 
 @dataclass
@@ -118,11 +108,7 @@ class PlainProgress(SilentProgress):
     """Writes a line at the start and the end of a stage, and every `SIGN_OF_LIFE_S` between."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
-        """Makes it.
-
-        Args:
-            write: takes a line, without its end.
-        """
+        """Takes what writes a line, without its end."""
         super().__init__()
         self._write = write
         self._last_line = 0.0
@@ -148,11 +134,7 @@ class BarProgress(SilentProgress):
     """Shows a bar per stage on a terminal. A context manager: inside, no one else writes there."""
 
     def __init__(self, console: Console) -> None:
-        """Makes it.
-
-        Args:
-            console: the terminal.
-        """
+        """Shows the bars on this terminal."""
         # Here, because importing rich takes a tenth of a second.
         from rich.progress import (
             BarColumn,

@@ -46,13 +46,9 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
 
 
 def validated(model: type[Model], raw: Any, source: str, expected: str) -> Model:
-    """Validates what a YAML file holds.
+    """Validates what a YAML file held, with the model of the whole file.
 
-    Args:
-        model: of the whole file.
-        raw: what the YAML file held.
-        source: the name of the file in messages.
-        expected: what the file should hold, for the message about a file without keys.
+    `source` names the file in messages; `expected` is for the message about a file without keys.
 
     Raises:
         ConfigError: with the first problem, in one line.
@@ -66,12 +62,7 @@ def validated(model: type[Model], raw: Any, source: str, expected: str) -> Model
 
 
 def parse_config(raw: Any, source: str, base: Path) -> Config:
-    """Validates a configuration.
-
-    Args:
-        raw: what the YAML file held.
-        source: the name of the file in messages.
-        base: the folder that its paths are relative to.
+    """Validates the configuration that a YAML file held; its paths are relative to `base`.
 
     Raises:
         ConfigError: with the first problem, in one line.

@@ -9,9 +9,9 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from caliv_graph.config.sections import (
     Finite,
@@ -36,6 +36,8 @@ SolveMode = Literal["auto", "staged", "joint"]
 RobustKernel = Literal["huber", "tls", "trimmed", "none"]
 Requirement = Literal["s2s", "s2v_rotation", "s2v"]
 
+Lidar = TypeVar("Lidar")
+
 LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
 
 
@@ -55,6 +57,13 @@ def name_problem(name: str) -> str:
         f"{name[:40]!r} cannot be the name of a LiDAR: give it 1 to {_MOST_CHARACTERS} printable "
         "characters, without blanks around them"
     )
+
+
+def checked_names(lidars: dict[str, Lidar]) -> dict[str, Lidar]:
+    """The LiDARs of a file by name; raises ValueError with the first `name_problem`."""
+    for problem in filter(None, map(name_problem, lidars)):
+        raise ValueError(problem)
+    return lidars
 
 
 class PoseConfig(Section):
@@ -175,7 +184,7 @@ class GroundConfig(Section):
 
 
 class ImuConfig(Section):
-    """PoseConfig of the IMU."""
+    """The IMU on the vehicle."""
 
     T_vehicle_imu: PoseConfig = PoseConfig(xyz=(0.0, 0.0, 0.0))
     gravity_m_s2: Positive | None = Field(
@@ -190,7 +199,7 @@ class ImuConfig(Section):
 
 
 class GnssConfig(Section):
-    """PoseConfig of the GNSS antenna."""
+    """The GNSS antenna on the vehicle."""
 
     lever_arm: Place = Field((0.0, 0.0, 0.0), description="metres, antenna in the vehicle frame")
 
@@ -319,7 +328,7 @@ class Config(Section):
 
     data: DataConfig = DataConfig()
     topics: TopicsConfig = TopicsConfig()
-    lidars: dict[str, LidarConfig] = Field(min_length=1)
+    lidars: Annotated[dict[str, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
     reference: str = Field("", description="reference LiDAR; empty: the first")
     target: tuple[TargetRegion, ...] | None = Field(
         None,
@@ -371,15 +380,6 @@ class Config(Section):
                 break
             limits = {**limits, **given}
         return {**raw, "require": names, "limits": limits}
-
-    @field_validator("lidars")
-    @classmethod
-    def _names_can_be_shown(cls, lidars: dict[str, LidarConfig]) -> dict[str, LidarConfig]:
-        for name in lidars:
-            problem = name_problem(name)
-            if problem:
-                raise ValueError(problem)
-        return lidars
 
     @field_validator("target", mode="before")
     @classmethod

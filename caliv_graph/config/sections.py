@@ -70,11 +70,7 @@ class Section(BaseModel):
 def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
     """The first problem of a YAML file in one line: the place, what is wrong there, the value.
 
-    An unknown key comes first: a typo also causes a missing key.
-
-    Args:
-        error: of the validation of the whole file.
-        root: the model of the whole file.
+    An unknown key comes first: a typo also causes a missing key. `root` models the whole file.
     """
     errors = error.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
@@ -111,10 +107,9 @@ def _shown(value: Any) -> str:
 
 
 def _follow(location: Sequence[int | str], root: Any) -> tuple[list[int | str], Any]:
-    """Follows a location of pydantic, which names the branches of unions too.
+    """The keys of the file in a location of pydantic, which names the branches of unions too.
 
-    Returns:
-        The keys of the file in it, and the annotation of the value at that place.
+    And the annotation of the value at that place.
     """
     keys: list[int | str] = []
     annotation = root

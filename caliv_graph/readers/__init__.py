@@ -13,11 +13,7 @@ __all__ = ["open_recording"]
 
 
 def open_recording(config: Config, path: Path | None = None) -> Recording:
-    """Opens a drive with the reader that `config.data.format` names.
-
-    Args:
-        config: the configuration.
-        path: the drive; absent: `config.data.path`.
+    """Opens a drive (absent: `config.data.path`) with the reader that `config.data.format` names.
 
     Raises:
         ConfigError: there is no path.

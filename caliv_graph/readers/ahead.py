@@ -19,16 +19,9 @@ AHEAD = 2
 def worked_ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """`map(work, items)`, the next `AHEAD` items being worked on in a thread meanwhile.
 
-    Results come in the order of the items, and do not depend on the number of cores as long as
-    `work` depends on its item alone. Items are taken in the caller's thread, because readers of
-    files may not leave the thread that opened them. On a single core nothing is done ahead.
-
-    Args:
-        work: on an item; releases the interpreter's lock for most of its time.
-        items: any number of them.
-
-    Raises:
-        Whatever `work` raises, when the turn of its item comes.
+    Results come in the order of the items, whatever the number of cores. Items are taken in the
+    caller's thread, because readers of files may not leave the thread that opened them. `work`
+    should release the interpreter's lock; what it raises comes when the turn of its item comes.
     """
     if cores() < 2:
         yield from map(work, items)

@@ -1,15 +1,9 @@
 """ROS 1 and ROS 2 bags through `rosbags`: topics, raw messages, and one kind of error.
 
-The readers of `rosbags` for one file (`rosbag1.Reader`, `rosbag2.Reader`) read here. Its
-`AnyReader`, for several files, does not:
-
-- It parses the message definitions of all topics when it opens a bag, and refuses the bag for one
-  that is damaged or does not fit its digest, also of a topic that nobody reads. Some drivers record
-  such definitions (rslidar_sdk of RoboSense, issue 38). Here a type is looked up when the first
-  message of it is decoded, and a standard type needs no definition.
-- It needs the metadata.yaml of a folder, and yields no message of a topic whose QoS differs between
-  metadata.yaml and the file.
-- It opens a small bag in 130 ms instead of 45 ms.
+The readers of `rosbags` for one file read here. Its `AnyReader` refuses a bag for one damaged
+message definition, also of a topic that nobody reads (rslidar_sdk of RoboSense records such, issue
+38), needs the metadata.yaml of a folder, yields no message of a topic whose QoS differs between
+metadata.yaml and the file, and opens a small bag in 130 ms instead of 45 ms.
 """
 
 from __future__ import annotations
@@ -50,13 +44,7 @@ _RECOVERY = {
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag.
-
-    Attributes:
-        name: as recorded.
-        type: of its messages in ROS 2 spelling, such as sensor_msgs/msg/Imu.
-        messages: how many there are.
-    """
+    """One topic of a bag; `type` in ROS 2 spelling, such as sensor_msgs/msg/Imu."""
 
     name: str
     type: str
@@ -65,12 +53,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Header:
-    """The `std_msgs/Header` that a message begins with.
-
-    Attributes:
-        stamp_ns: its stamp, 0 if the sender did not set it.
-        frame_id: its frame.
-    """
+    """The `std_msgs/Header` that a message begins with; a stamp that was not set is 0."""
 
     stamp_ns: int
     frame_id: str
@@ -92,15 +75,11 @@ def is_bag(path: Path) -> bool:
 class Bag:
     """A recorded bag: a ROS 2 folder (MCAP or sqlite3), a bare .mcap or .db3, ROS 1 .bag file(s).
 
-    Opening a bag reads only its index. Messages come out raw, one at a time: most are skipped, and
-    at first only the stamp of a cloud is needed.
+    Opening a bag reads only its index. Messages come out raw: of most, only the stamp is needed.
     """
 
     def __init__(self, path: Path) -> None:
-        """Opens a bag.
-
-        Args:
-            path: a file; or the folder of a ROS 2 bag, or of the parts of a split bag.
+        """Opens a file; or the folder of a ROS 2 bag, or of the parts of a split bag.
 
         Raises:
             RecordingError: it is missing, not a bag, damaged, or in a form that is not supported.
@@ -157,13 +136,8 @@ class Bag:
     ) -> Iterator[tuple[str, int, bytes]]:
         """Raw messages of some topics, in the order of their record times within each file.
 
-        Args:
-            topics: names of topics of this bag.
-            start_ns: only messages recorded at or after this time, nanoseconds.
-            stop_ns: only messages recorded before this time, nanoseconds.
-
-        Yields:
-            Topic, record time in nanoseconds, the serialised message.
+        Yields topic, record time in nanoseconds and the serialised message; with `start_ns` only
+        those recorded at or after it, with `stop_ns` only those before it.
 
         Raises:
             RecordingError: the bag is damaged.
@@ -327,10 +301,7 @@ def _close_all(idle: list[list[_Reader]]) -> None:
 
 
 def _check_index(reader: _Reader) -> None:
-    """Raises ValueError for values that `rosbags` reads from a damaged file without a check.
-
-    SQLite keeps a value of any type in a column of any other.
-    """
+    """Raises ValueError for values that `rosbags` reads from a damaged file without a check."""
     for connection in reader.connections:
         names = (connection.topic, connection.msgtype)
         if not all(isinstance(name, str) for name in names):

@@ -50,17 +50,13 @@ one pose written twice, below what a calibration can see (about 1 mm and 1 mrad)
 class CalivFolder:
     """A drive in a CaLiV folder (products.Recording).
 
-    Opening it reads the poses and lists the clouds; clouds are read one at a time in `scans`. Poses
-    of frames without a cloud are skipped, and counted in `warnings`.
+    Opening it reads the poses and lists the clouds. Poses of frames without a cloud are skipped.
     """
 
     def __init__(self, path: Path, lidars: Mapping[str, LidarConfig]) -> None:
-        """Opens the folder.
+        """Opens the folder that holds `input`, or `input` itself.
 
-        Args:
-            path: the folder that holds `input`, or `input` itself.
-            lidars: LiDARs of the config by the user's name; `topic` is the sensor's folder. Other
-                sensors are not looked at.
+        The `topic` of a LiDAR is the sensor's folder. Other sensors are not looked at.
 
         Raises:
             RecordingError: folder, poses or a LiDAR are missing; a pose is damaged, is given twice
@@ -114,12 +110,9 @@ class CalivFolder:
         return [frame * FRAME_PERIOD_NS for frame in self._clouds[lidar]]
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """Reads the clouds of one LiDAR in order of their frames, never more than a few ahead.
+        """The clouds of one LiDAR in order of their frames (see `Recording`), read a few ahead.
 
-        Those whose stamp is not in `wanted` are not read, unless it is None.
-
-        NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
-        than its `max_range`. A scan without returns is still yielded.
+        A scan without returns is still yielded.
 
         Raises:
             RecordingError: a cloud is missing, empty, cut off or damaged.

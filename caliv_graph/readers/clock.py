@@ -57,11 +57,9 @@ def effective_stamps(header_ns: IntArray, record_ns: IntArray) -> IntArray:
 
 
 def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
-    """Summarises the stamps of a topic.
+    """Summarises the stamps (n,) of a topic, in the order of the recording.
 
-    Args:
-        header_ns: (n,) as recorded, 0 where unset.
-        record_ns: (n,) in the order of the recording.
+    A header stamp is 0 where it is not set.
     """
     stamps_ns = effective_stamps(header_ns, record_ns)
     distinct = np.unique(stamps_ns)
@@ -88,12 +86,7 @@ def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
 
 
 def clock_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
-    """Warnings about the stamps of some topics, one line each.
-
-    Args:
-        name: of the bag.
-        clocks: by topic.
-    """
+    """Warnings about the stamps of some topics of the bag `name`, one line each."""
     return [*_offset_warnings(name, clocks), *_order_warnings(name, clocks)]
 
 

@@ -67,11 +67,8 @@ class LidarTopics:
 def drive_folder(path: Path) -> Path:
     """The folder of a CaLiV drive that holds the poses and a folder of clouds per sensor.
 
-    Args:
-        path: that folder, or the one around it.
-
     Raises:
-        RecordingError: the path is missing, or no CaLiV folder.
+        RecordingError: the path is missing, or neither that folder nor the one around it.
     """
     # Without LiDARs this checks the poses alone.
     CalivFolder(path, {})
@@ -150,19 +147,13 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
     Raises:
         RecordingError: the bag is damaged, or has no clouds.
     """
-    from caliv_graph.readers.bag import DamagedMessageError
-    from caliv_graph.readers.frames import clean_frame
     from caliv_graph.readers.pointcloud2 import CLOUD_TYPES
 
     frames: dict[str, str] = {}
     for topic in bag.topics.values():
-        raw = bag.first_message(topic.name) if topic.type in CLOUD_TYPES else None
-        if raw is None:
-            continue
-        try:
-            frames[topic.name] = clean_frame(bag.header(raw).frame_id)
-        except DamagedMessageError:
-            frames[topic.name] = ""
+        frame = first_frame(bag, topic.name) if topic.type in CLOUD_TYPES else None
+        if frame is not None:
+            frames[topic.name] = frame
     if not frames:
         shown = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values())
         raise RecordingError(
@@ -184,6 +175,18 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
     own = [name for name in own if name not in others]
     names = lidar_names(own)
     return LidarTopics(names, {name: frames[topic] for name, topic in names.items()}, others)
+
+
+def first_frame(bag: Bag, topic: str) -> str | None:
+    """The frame of the first message of a topic; empty: it is damaged; None: there is none."""
+    from caliv_graph.readers.bag import DamagedMessageError
+    from caliv_graph.readers.frames import clean_frame
+
+    raw = bag.first_message(topic)
+    try:
+        return None if raw is None else clean_frame(bag.header(raw).frame_id)
+    except DamagedMessageError:
+        return ""
 
 
 def choose_motion_topics(bag: Bag) -> MotionTopics:

@@ -10,11 +10,7 @@ from caliv_graph.products import LidarScan, MotionData, Recording
 
 @dataclass(frozen=True)
 class ForwardingRecording:
-    """Answers as another recording does (`products.Recording`).
-
-    Attributes:
-        recording: the one that is passed on.
-    """
+    """Answers as another recording does (`products.Recording`)."""
 
     recording: Recording
 

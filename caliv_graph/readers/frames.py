@@ -32,13 +32,7 @@ _NORM_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class FrameTransform:
-    """One link of a tree of frames.
-
-    Attributes:
-        parent: frame.
-        child: frame.
-        T_parent_child: its pose.
-    """
+    """One link of a tree of frames."""
 
     parent: str
     child: str
@@ -49,11 +43,7 @@ class FrameTree:
     """Frames that are fixed to each other."""
 
     def __init__(self, transforms: Iterable[FrameTransform]) -> None:
-        """Builds the tree.
-
-        Args:
-            transforms: of two with the same child the later one counts, as in tf.
-        """
+        """Of two transforms with the same child the later one counts, as in tf."""
         self._up = {link.child: link for link in transforms if link.child != link.parent}
         self._frames = dict.fromkeys(
             frame for link in self._up.values() for frame in (link.parent, link.child)
@@ -81,6 +71,10 @@ class FrameTree:
         T_common_child = self._compose(to_child[: to_child.index(common)])
         T_common_parent = self._compose(to_parent[: to_parent.index(common)])
         return T_common_parent.between(T_common_child)
+
+    def links_to(self, frame: str) -> list[FrameTransform]:
+        """The links from the root down to a frame; empty if the frame is not known."""
+        return [self._up[child] for child in reversed(self._chain(frame)[:-1])]
 
     def _chain(self, frame: str) -> list[str]:
         """The frame, its parent, that one's parent, ...; empty if the frame is not known."""
@@ -152,12 +146,9 @@ def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
         raise ConfigError(
             f"{path}: is a xacro. Expand it first: 'xacro {path.name} > vehicle.urdf'"
         )
-    return tuple(_joint(joint, path) for joint in root.iter("joint") if _is_fixed(joint))
-
-
-def _is_fixed(joint: ET.Element) -> bool:
-    # Transmissions name joints too, without their poses.
-    return joint.get("type") == "fixed"
+    # Transmissions name joints too, without their type and poses.
+    fixed = [joint for joint in root.iter("joint") if joint.get("type") == "fixed"]
+    return tuple(_joint(joint, path) for joint in fixed)
 
 
 def _joint(joint: ET.Element, path: Path) -> FrameTransform:

@@ -120,12 +120,8 @@ class _Rows:
         self._stamps.append(stamp_ns)
         self._values.extend(values)
 
-    def sorted(self) -> tuple[IntArray, Array]:
-        """Stamps (n,) strictly increasing and their rows (n, width); of equal stamps the first."""
-        return self.ordered()[:2]
-
     def ordered(self) -> tuple[IntArray, Array, IntArray]:
-        """As `sorted`, and which of the rows that were added they are, (n,)."""
+        """Stamps (n,) strictly increasing, of equal ones the first; their rows; their indices."""
         # Views for a moment: the results are copies.
         stamps = np.frombuffer(self._stamps, dtype=np.int64)
         values = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
@@ -134,11 +130,7 @@ class _Rows:
 
 
 class _Stated:
-    """Rows of numbers that mostly repeat the row before, as covariances in messages do.
-
-    A row is kept only if it differs: at 200 Hz the repetitions would take most of the memory of a
-    long drive.
-    """
+    """Rows of numbers that mostly repeat the row before, as covariances do: kept once."""
 
     def __init__(self, width: int) -> None:
         self._width = width
@@ -179,13 +171,37 @@ class _Losses:
         return [f"of {total} messages not used: {', '.join(lost)}"] * bool(lost) + self._others
 
 
-class ImuCollector:
-    """`sensor_msgs/Imu`."""
+class _RowCollector:
+    """Keeps a row of numbers of each message."""
+
+    _WIDTH: ClassVar[int]
 
     def __init__(self) -> None:
-        self._rows = _Rows(10)
-        self._stated = _Stated(27)
+        self._rows = _Rows(self._WIDTH)
         self._losses = _Losses()
+
+    def _usable(self, *reasons: _Reason) -> tuple[IntArray, Array, IntArray]:
+        """Stamps and rows without those to leave out, and which of the added rows they are."""
+        self._losses = _Losses()
+        stamps, rows, added = self._rows.ordered()
+        for why, test in reasons:
+            kept = self._losses.keep(test(rows), why)
+            stamps, rows, added = stamps[kept], rows[kept], added[kept]
+        return stamps, rows, added
+
+    def notes(self) -> list[str]:
+        """What was left out, one line each."""
+        return self._losses.notes(len(self._rows))
+
+
+class ImuCollector(_RowCollector):
+    """`sensor_msgs/Imu`."""
+
+    _WIDTH = 10
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._stated = _Stated(27)
 
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
@@ -199,16 +215,16 @@ class ImuCollector:
 
     def finish(self) -> ImuSamples | None:
         """The samples; None if there are none."""
-        self._losses = _Losses()
-        stamps, rows, added = self._rows.ordered()
-        stated, which = self._stated.distinct()
-        kept = self._losses.keep(np.isfinite(rows[:, :6]).all(axis=1), "with NaN or infinity")
-        stamps, rows, added = stamps[kept], rows[kept], added[kept]
-        possible = _below(rows[:, :3], _MOST_RAD_S) & _below(rows[:, 3:6], _MOST_M_S2)
-        kept = self._losses.keep(possible, f"beyond {_MOST_RAD_S:g} rad/s or {_MOST_M_S2:g} m/s^2")
-        stamps, rows, added = stamps[kept], rows[kept], added[kept]
+        stamps, rows, added = self._usable(
+            ("with NaN or infinity", lambda r: np.isfinite(r[:, :6]).all(axis=1)),
+            (
+                f"beyond {_MOST_RAD_S:g} rad/s or {_MOST_M_S2:g} m/s^2",
+                lambda r: _below(r[:, :3], _MOST_RAD_S) & _below(r[:, 3:6], _MOST_M_S2),
+            ),
+        )
         if not len(stamps):
             return None
+        stated, which = self._stated.distinct()
         which = which[added]
         orientation, cov = self._orientation(rows[:, 6:10].copy(), stated[:, :9], which)
         return ImuSamples(
@@ -253,17 +269,11 @@ class ImuCollector:
         cov[~good] = np.nan
         return q, _or_none(cov)
 
-    def notes(self) -> list[str]:
-        """What was left out, one line each."""
-        return self._losses.notes(len(self._rows))
 
-
-class GnssCollector:
+class GnssCollector(_RowCollector):
     """`sensor_msgs/NavSatFix`."""
 
-    def __init__(self) -> None:
-        self._rows = _Rows(14)
-        self._losses = _Losses()
+    _WIDTH = 14
 
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
@@ -278,9 +288,7 @@ class GnssCollector:
 
     def finish(self) -> GnssFixes | None:
         """The fixes; None if there are none."""
-        self._losses = _Losses()
-        stamps, rows = self._rows.sorted()
-        reasons: tuple[_Reason, ...] = (
+        stamps, rows, _ = self._usable(
             ("without a fix (status < 0)", lambda r: r[:, 3] >= 0),
             ("without latitude, longitude or altitude", lambda r: np.isfinite(r[:, :3]).all(1)),
             (
@@ -292,9 +300,6 @@ class GnssCollector:
                 lambda r: _below(r[:, 2:3], _MOST_ALTITUDE_M),
             ),
         )
-        for why, test in reasons:
-            kept = self._losses.keep(test(rows), why)
-            stamps, rows = stamps[kept], rows[kept]
         if not len(stamps):
             return None
         cov = _covariances(rows[:, 5:14])
@@ -307,23 +312,19 @@ class GnssCollector:
         found = self.finish()
         return 0 if found is None else len(found.stamps_ns)
 
-    def notes(self) -> list[str]:
-        """What was left out, one line each."""
-        return self._losses.notes(len(self._rows))
 
-
-class TwistCollector:
+class TwistCollector(_RowCollector):
     """`TwistStamped`, `TwistWithCovarianceStamped`, or the twist of an `Odometry`.
 
     The twist of an odometry is in its child frame, which is taken for the vehicle's, as is the
     frame of the others.
     """
 
+    _WIDTH = 12
     _LINEAR: ClassVar[list[int]] = [0, 1, 2, 6, 7, 8, 12, 13, 14]
 
     def __init__(self) -> None:
-        self._rows = _Rows(12)
-        self._losses = _Losses()
+        super().__init__()
         self._frames: set[str] = set()
 
     def add(self, stamp_ns: int, message: Any) -> None:
@@ -338,36 +339,28 @@ class TwistCollector:
 
     def finish(self) -> TwistSamples | None:
         """The velocities; None if there are none."""
-        self._losses = _Losses()
-        stamps, rows = self._rows.sorted()
-        kept = self._losses.keep(np.isfinite(rows[:, :3]).all(axis=1), "with NaN or infinity")
-        stamps, rows = stamps[kept], rows[kept]
-        kept = self._losses.keep(_below(rows[:, :3], _MOST_M_S), f"beyond {_MOST_M_S:g} m/s")
+        stamps, rows, _ = self._usable(
+            ("with NaN or infinity", lambda r: np.isfinite(r[:, :3]).all(axis=1)),
+            (f"beyond {_MOST_M_S:g} m/s", lambda r: _below(r[:, :3], _MOST_M_S)),
+        )
         for frame in sorted(self._frames):
             if frame.strip("/").lower() in _FIXED_AXES:
                 self._losses.say(
                     f"its velocity is stated in the frame '{frame}', but is taken to be in the "
                     "vehicle's axes: check it"
                 )
-        stamps, rows = stamps[kept], rows[kept]
         if not len(stamps):
             return None
         return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
 
-    def notes(self) -> list[str]:
-        """What was left out, one line each."""
-        return self._losses.notes(len(self._rows))
 
-
-class PoseCollector:
+class PoseCollector(_RowCollector):
     """`Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`: the vehicle in the map.
 
     The header's frame is taken for the map, the child frame of an odometry for the vehicle.
     """
 
-    def __init__(self) -> None:
-        self._rows = _Rows(43)
-        self._losses = _Losses()
+    _WIDTH = 43
 
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
@@ -380,9 +373,7 @@ class PoseCollector:
 
     def finish(self) -> GivenPoses | None:
         """The poses; None if there are none."""
-        self._losses = _Losses()
-        stamps, rows = self._rows.sorted()
-        reasons: tuple[_Reason, ...] = (
+        stamps, rows, _ = self._usable(
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :7]).all(1)),
             (f"beyond {_MOST_M:g} m from the origin", lambda r: _below(r[:, :3], _MOST_M)),
             (
@@ -390,21 +381,13 @@ class PoseCollector:
                 lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
             ),
         )
-        for why, test in reasons:
-            kept = self._losses.keep(test(rows), why)
-            stamps, rows = stamps[kept], rows[kept]
         if not len(stamps):
             return None
         poses = _poses(rows[:, :3], rows[:, 3:7])
         cov = _or_none(_covariances(rows[:, 7:]))
         if cov is not None:
-            R = Rotation.from_quat(rows[:, 3:7]).as_matrix()
-            cov = right_perturbations(R, cov)
+            cov = right_perturbations(Rotation.from_quat(rows[:, 3:7]).as_matrix(), cov)
         return GivenPoses(stamps, poses, cov)
-
-    def notes(self) -> list[str]:
-        """What was left out, one line each."""
-        return self._losses.notes(len(self._rows))
 
 
 class TfCollector:
@@ -443,9 +426,8 @@ class TfCollector:
         still = [link for link in self._static.values() if link.child not in rows]
         moving = [FrameTransform(*names, gtsam.Pose3()) for names in self._moving]
         tree = FrameTree([*still, *moving])
-        up = {link.child: link for link in (*still, *moving)}
         for vehicle in VEHICLE_FRAMES:
-            chain = _chain_to(tree.root(vehicle), vehicle, up) if vehicle in tree.frames else []
+            chain = tree.links_to(vehicle)
             if any(link.child in rows for link in chain):
                 break
         else:
@@ -458,7 +440,7 @@ class TfCollector:
             "poses are those of the chain "
             + " -> ".join([chain[0].parent, *(link.child for link in chain)])
         )
-        sampled = {link.child: rows[link.child].sorted() for link in chain if link.child in rows}
+        sampled = {c: rows[c].ordered()[:2] for c in (link.child for link in chain) if c in rows}
         stamps = max((stamps for stamps, _ in sampled.values()), key=len)
         # A frame that was sent once, as a latched map -> odom is, holds throughout.
         several = [s for s, _ in sampled.values() if len(s) > 1]
@@ -511,17 +493,10 @@ def check_imu(samples: ImuSamples) -> ImuCheck:
 
 
 def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
-    """Covariances of poses from ROS's convention into ours.
+    """Covariances (n, 6, 6) of poses from ROS's convention into ours, rad and m.
 
     ROS: x, y, z, then rotation about the fixed axes, all in the parent's axes. Ours: right
     perturbation, rotation then translation. `cov_ros = B cov B^T`, `B = [[0, R], [R, 0]]`.
-
-    Args:
-        R_map_vehicle: (n, 3, 3).
-        cov_ros: (n, 6, 6) m^2, m rad, rad^2.
-
-    Returns:
-        (n, 6, 6) rad^2, rad m, m^2.
     """
     B = np.zeros((len(R_map_vehicle), 6, 6))
     B[:, :3, 3:] = R_map_vehicle
@@ -532,8 +507,7 @@ def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:
 def _covariances(flat: Array) -> Array:
     """(n, k, k) of (n, k * k), symmetric; NaN where a message states none.
 
-    In ROS all zeros mean unknown; some drivers write a negative value instead. A single zero on the
-    diagonal also means unknown: no measurement is without error.
+    In ROS all zeros mean unknown; some drivers write a negative value or a single zero.
     """
     size = round(flat.shape[1] ** 0.5)
     cov = flat.reshape(-1, size, size)
@@ -548,12 +522,7 @@ def _or_none(cov: Array) -> Array | None:
 
 
 def _common(kinds: Array, which: IntArray) -> Array | None:
-    """One covariance for all samples: the median of each element.
-
-    Args:
-        kinds: (d, 3, 3) that were stated.
-        which: (n,) of them each sample has.
-    """
+    """One covariance for all samples: the median of each element of the `which` (n,) of `kinds`."""
     cov = kinds[which[:1]] if (which == which[0]).all() else kinds[which]
     known = cov[np.isfinite(cov).all(axis=(1, 2))]
     return np.asarray(np.median(known, axis=0)) if len(known) else None
@@ -570,15 +539,6 @@ def _poses(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:
         gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), ti)
         for ti, (x, y, z, w) in zip(t, q, strict=True)
     )
-
-
-def _chain_to(root: str, frame: str, up: Mapping[str, FrameTransform]) -> list[FrameTransform]:
-    """Links from the root down to a frame."""
-    chain: list[FrameTransform] = []
-    while frame != root:
-        chain.append(up[frame])
-        frame = up[frame].parent
-    return chain[::-1]
 
 
 def _interpolated(stamps: IntArray, rows: Array, at_ns: IntArray) -> tuple[Rotation, Array]:

@@ -1,11 +1,9 @@
 """Reading PCD clouds: ascii, binary and binary_compressed.
 
-The header is read and held against the file's size here, because the libraries that read PCD do
-not do so: Open3D 0.20 makes up points for a cut-off ascii file, warns on stdout, and its legacy
-reader returns zeros for float64 coordinates; pypcd4 1.5 wants columns one space apart and a COUNT
-line. The bodies are left to numpy and liblzf.
-
-The format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+The header is held against the file's size here, as no library does: Open3D 0.20 makes up points for
+a cut-off ascii file and returns zeros for float64 coordinates; pypcd4 1.5 wants columns one space
+apart and a COUNT line. The bodies are left to numpy and liblzf. The format:
+https://pointclouds.org/documentation/tutorials/pcd_file_format.html
 """
 
 from __future__ import annotations
@@ -50,15 +48,9 @@ class _Unreadable(Exception):
 
 @dataclass(frozen=True)
 class _Field:
-    """One field of a point.
+    """One field of a point, of `count` numbers of `size` bytes; `kind` is F, I or U.
 
-    Attributes:
-        name: x, y, z, rgb, ...
-        kind: F, I or U: float, signed, unsigned.
-        size: bytes of one number.
-        count: numbers in the field.
-        offset: bytes of the fields before it in a point.
-        column: numbers in the fields before it in a point.
+    The fields before it take `offset` bytes of a point and `column` numbers.
     """
 
     name: str
@@ -76,16 +68,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Header:
-    """The expected content of the body.
-
-    Attributes:
-        xyz: the three coordinates.
-        points: number of points, at least 1.
-        point_size: bytes of one point.
-        columns: numbers of one point.
-        encoding: ascii, binary or binary_compressed.
-        size: bytes of the header itself.
-    """
+    """The expected content of the body: bytes and numbers of one point; and the header's size."""
 
     xyz: tuple[_Field, _Field, _Field]
     points: int
@@ -96,16 +79,10 @@ class _Header:
 
 
 def read_pcd(path: Path) -> Array:
-    """Reads all points of a PCD file, NaN and zero returns included.
+    """Reads all points of a PCD file, NaN and zero returns included: (N, 3) float64, metres.
 
-    VIEWPOINT is not applied: as in PCL and Open3D, it is the place of the sensor, and the points
-    are the sensor's.
-
-    Args:
-        path: the file, with float x, y, z among its fields, in any order, organised or not.
-
-    Returns:
-        (N, 3) float64, metres, frame of the cloud, N >= 1.
+    Float x, y, z may stand among its fields in any order. VIEWPOINT is not applied: as in PCL and
+    Open3D, it is the place of the sensor, and the points are the sensor's.
 
     Raises:
         RecordingError: the file is missing, empty, cut off or damaged, or has no x, y, z.
@@ -324,7 +301,4 @@ def _read_ascii(data: bytes, header: _Header) -> Array:
 
 
 def _stack(coordinates: list[npt.NDArray[np.floating]]) -> Array:
-    points = np.empty((len(coordinates[0]), 3))
-    for axis, values in enumerate(coordinates):
-        points[:, axis] = values
-    return points
+    return np.stack(coordinates, axis=1).astype(np.float64, order="C")

@@ -28,13 +28,6 @@ CLOUD_TYPES = (POINTCLOUD2, *LIVOX_TYPES)
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of the types of `sensor_msgs/PointField`."""
 
-_TYPE_NAMES = {"i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16"} | {
-    "i4": "int32",
-    "u4": "uint32",
-    "f4": "float32",
-    "f8": "float64",
-}
-
 _TIME_FIELDS = (
     "t",
     "time",
@@ -59,13 +52,7 @@ class UnusableCloudsError(Exception):
 
 @dataclass(frozen=True)
 class TimeField:
-    """The field with the times of a cloud's points.
-
-    Attributes:
-        name: of the field.
-        type: of the field, such as uint32.
-        unit: such as `ns after the stamp`.
-    """
+    """The field with the times of a cloud's points; `unit` is such as `ns after the stamp`."""
 
     name: str
     type: str
@@ -94,11 +81,7 @@ def decode_pointcloud2(
 ) -> DecodedCloud:
     """Decodes a `sensor_msgs/PointCloud2`: any order of fields, padding and endianness.
 
-    Args:
-        message: with the fields of that type.
-        stamp_ns: stamp of the cloud, which times are related to.
-        min_range: metres; nearer returns are dropped.
-        max_range: metres; farther returns are dropped.
+    Times are related to `stamp_ns`; returns outside the ranges (metres) are dropped.
 
     Raises:
         DamagedMessageError: the data do not fit the fields.
@@ -110,11 +93,8 @@ def decode_pointcloud2(
         raise UnusableCloudsError(
             f"x, y, z as float32 or float64 are needed, its fields are {shown}"
         )
-    # Before room is made for the points: a damaged size can be any.
     columns = [_column(message, fields[axis]) for axis in "xyz"]
-    points = np.empty((len(columns[0]), 3))
-    for axis_number, values in enumerate(columns):
-        points[:, axis_number] = values
+    points = np.stack(columns, axis=1).astype(np.float64, order="C")
     kept = is_return(points, min_range, max_range)
     times = [
         (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name])[kept])
@@ -130,14 +110,9 @@ def decode_livox(
     """Decodes a Livox `CustomMsg` from its bytes: as objects, 30,000 points would take 0.3 s.
 
     `std_msgs/Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd;
-    CustomPoint[] points`, of `uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line`.
-
-    Args:
-        raw: the serialised message.
-        is_ros1: whether as in ROS 1; else CDR, which aligns each value to its size.
-        stamp_ns: stamp of the cloud, which times are related to.
-        min_range: metres; nearer returns are dropped.
-        max_range: metres; farther returns are dropped.
+    CustomPoint[] points`, of `uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line`,
+    as in ROS 1 or as CDR, which aligns each value to its size. Further arguments as in
+    `decode_pointcloud2`.
 
     Raises:
         DamagedMessageError: its size does not fit the number of its points.
@@ -174,7 +149,8 @@ def decode_livox(
 
 
 def _type_name(field: Any) -> str:
-    return _TYPE_NAMES.get(_TYPES.get(field.datatype, ""), f"type {field.datatype}")
+    known = _TYPES.get(field.datatype)
+    return np.dtype(known).name if known else f"type {field.datatype}"
 
 
 def _column(message: Any, field: Any) -> npt.NDArray[Any]:

@@ -11,7 +11,8 @@ import textwrap
 from array import array
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -89,14 +90,9 @@ class TimesSeen:
 
 @dataclass(frozen=True)
 class _Index:
-    """The result of the first pass over the bag.
+    """The result of the first pass over the bag; `scans` has per LiDAR the record time by stamp.
 
-    Attributes:
-        clocks: by topic.
-        frame_ids: of the first message of each topic.
-        scans: per LiDAR the record time by stamp, in the order of the stamps.
-        collectors: by kind of motion data and topic.
-        damaged: messages that do not decode as their type, by topic.
+    `collectors` are by kind and topic; `damaged` counts messages that do not decode, by topic.
     """
 
     clocks: Mapping[str, Clock]
@@ -118,11 +114,7 @@ class RosbagRecording:
     ) -> None:
         """Opens the bag and checks that it has the topics; reads its index only.
 
-        Args:
-            path: the bag.
-            lidars: LiDARs of the config by the user's name.
-            topics: of the motion data.
-            also: further topics of motion data to look at, which `motion` does not use.
+        `also` names further topics of motion data to look at, which `motion` does not use.
 
         Raises:
             RecordingError: the bag is missing or damaged; a topic is missing, of the wrong type, or
@@ -145,12 +137,11 @@ class RosbagRecording:
             for kind, topic in topics.model_dump().items()
             if topic is not None
         }
-        self._motion_topics = dict.fromkeys((kind, topic) for kind, topic in self._used.items())
+        self._motion_topics = dict.fromkeys(self._used.items())
         for name in also:
             for kind, types in MOTION_TYPES.items():
                 if self._bag.topics[name].type in types:
                     self._motion_topics.setdefault((kind, name))
-        self._indexed: _Index | None = None
         self._motion: MotionData | None = None
         self._times: dict[str, TimesSeen] = {name: TimesSeen() for name in self._lidars}
         self._damaged_clouds: dict[str, set[int]] = {name: set() for name in self._lidars}
@@ -183,11 +174,11 @@ class RosbagRecording:
 
     def clocks(self) -> Mapping[str, Clock]:
         """The stamps of each topic that was read, summarised."""
-        return self._index().clocks
+        return self._index.clocks
 
     def frame_ids(self) -> Mapping[str, str]:
         """The frame in the header of the first message of each topic that was read."""
-        return self._index().frame_ids
+        return self._index.frame_ids
 
     def times_seen(self, lidar: str) -> TimesSeen:
         """The times of the points in the clouds decoded so far."""
@@ -196,7 +187,7 @@ class RosbagRecording:
     def imu_checks(self) -> Mapping[str, ImuCheck]:
         """The units of each IMU that has samples, by topic."""
         found = {}
-        for (_, topic), collector in self._index().collectors.items():
+        for (_, topic), collector in self._index.collectors.items():
             samples = collector.finish() if isinstance(collector, ImuCollector) else None
             if samples is not None:
                 found[topic] = check_imu(samples)
@@ -206,7 +197,7 @@ class RosbagRecording:
         """Messages with a fix of each GNSS receiver, by topic."""
         return {
             topic: collector.fixes
-            for (_, topic), collector in self._index().collectors.items()
+            for (_, topic), collector in self._index.collectors.items()
             if isinstance(collector, GnssCollector)
         }
 
@@ -216,19 +207,13 @@ class RosbagRecording:
         Raises:
             RecordingError: the bag is damaged.
         """
-        return list(self._index().scans[lidar])
+        return list(self._index.scans[lidar])
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        """The clouds of one LiDAR in the order of their stamps, never more than a few decoded.
+        """The clouds of one LiDAR in the order of their stamps, a few decoded ahead (`Recording`).
 
-        NaN and zero returns are left out, and those nearer than the LiDAR's `min_range` or farther
-        than its `max_range`. A cloud that is damaged is left out and counted in `warnings`. Clouds
-        recorded out of order are kept until their turn.
-
-        Args:
-            lidar: its name.
-            wanted: stamps of the clouds that are asked for, None: all. The others are not decoded,
-                and parts of the bag without a wanted cloud are not read.
+        A damaged cloud is left out and counted in `warnings`. Clouds recorded out of order are kept
+        until their turn. Parts of the bag without a wanted cloud are not read.
 
         Raises:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.
@@ -237,7 +222,7 @@ class RosbagRecording:
         queue = _Queue(
             {
                 stamp_ns: record_ns
-                for stamp_ns, record_ns in self._index().scans[lidar].items()
+                for stamp_ns, record_ns in self._index.scans[lidar].items()
                 if wanted is None or stamp_ns in wanted
             }
         )
@@ -276,11 +261,7 @@ class RosbagRecording:
         return list(dict.fromkeys([*self._warnings, *self._cloud_warnings()]))
 
     def _topic(self, name: str, key: str, what: str, types: Sequence[str]) -> Topic:
-        """The topic of the bag that a key of the config names.
-
-        Raises:
-            RecordingError: it is missing, or of a type that does not fit.
-        """
+        """The topic of the bag that a key of the config names; RecordingError: none that fits."""
         there = self._bag.topics
         fitting = [topic.name for topic in there.values() if topic.type in types]
         topic = there.get(name) or there.get(f"/{name.strip('/')}")
@@ -298,14 +279,12 @@ class RosbagRecording:
             )
         return topic
 
+    @cached_property
     def _index(self) -> _Index:
-        if self._indexed is None:
-            self._indexed = self._read_index()
-        return self._indexed
-
-    def _read_index(self) -> _Index:
         collectors = {
-            (kind, topic): _collector(kind, self._bag.topics[topic])
+            (kind, topic): TfCollector()
+            if self._bag.topics[topic].type in TF_TYPES
+            else _COLLECTORS[kind]()
             for kind, topic in self._motion_topics
         }
         taking: dict[str, list[Collector]] = {}
@@ -371,7 +350,7 @@ class RosbagRecording:
         return Header(stamp_ns, first.frame_id)
 
     def _read_motion(self) -> MotionData:
-        index = self._index()
+        index = self._index
         found: dict[str, Any] = {}
         for kind, topic in self._used.items():
             collector: Any = index.collectors[kind, topic]
@@ -488,10 +467,6 @@ class _Queue:
             yield turn, self._early.pop(turn)
 
 
-def _collector(kind: str, topic: Topic) -> Collector:
-    return TfCollector() if topic.type in TF_TYPES else _COLLECTORS[kind]()
-
-
 def _by_stamp(header_ns: Any, record_ns: Any) -> dict[int, int]:
     """Record time by stamp, in the order of the stamps; of equal stamps the first recorded."""
     stamps, first = np.unique(effective_stamps(header_ns, record_ns), return_index=True)
@@ -511,22 +486,15 @@ def _windows(records_ns: Iterable[int]) -> list[tuple[int, int]]:
 def _also_seen(seen: TimesSeen, cloud: DecodedCloud) -> TimesSeen:
     times_s = cloud.times_s
     if cloud.time_problem:
-        return TimesSeen(
-            seen.field,
-            seen.first_s,
-            seen.last_s,
-            seen.clouds,
-            seen.problems + 1,
-            seen.problem or cloud.time_problem,
-        )
+        problem = seen.problem or cloud.time_problem
+        return replace(seen, problems=seen.problems + 1, problem=problem)
     if times_s is None or cloud.time_field is None or not len(times_s):
         return seen
     first_s, last_s = float(times_s.min()), float(times_s.max())
     if seen.field is not None:
         first_s, last_s = min(first_s, seen.first_s), max(last_s, seen.last_s)
-    return TimesSeen(
-        cloud.time_field, first_s, last_s, seen.clouds + 1, seen.problems, seen.problem
-    )
+    clouds = seen.clouds + 1
+    return replace(seen, field=cloud.time_field, first_s=first_s, last_s=last_s, clouds=clouds)
 
 
 def _seconds(stamp_ns: int) -> str:

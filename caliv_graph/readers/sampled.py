@@ -26,10 +26,7 @@ RANGE_M = 40.0
 
 @dataclass(frozen=True)
 class SampledRecording(ForwardingRecording):
-    """Passes a recording on, and keeps a few thinned clouds of each LiDAR.
-
-    No cloud is read twice, and memory stays bounded: `SCANS` clouds of `POINTS` points per LiDAR.
-    """
+    """Passes a recording on, and keeps `SCANS` clouds of `POINTS` points of each LiDAR."""
 
     _kept: dict[tuple[str, int], LidarScan] = field(default_factory=dict, init=False, repr=False)
 

@@ -61,6 +61,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         ValueError: a pose or a covariance is not finite: such a file is never written.
     """
     _check_finite(calibration)
+    gradient = calibration.gradient_data
     document = {
         "schema": SCHEMA,
         "status": calibration.status,
@@ -76,7 +77,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
             "order": list(calibration.lidars),
             "covariance": _symmetric(calibration.cov_joint),
             "data_information": _symmetric(calibration.information_data),
-            **_gradient_document(calibration),
+            **({} if gradient is None else {"data_gradient": gradient.tolist()}),
             **_earlier_documents(calibration),
         },
         "observability": {
@@ -90,11 +91,6 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 
 def write_calibration(calibration: Calibration, path: Path, force: bool = False) -> None:
     """Writes calibration.yaml in one step. The same calibration gives the same bytes.
-
-    Args:
-        calibration: what to write.
-        path: the file.
-        force: replace an older one.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
@@ -149,10 +145,7 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
     return {
         "T_vehicle_lidar": _pose_document(result.T_vehicle_lidar),
         "covariance": _symmetric(result.cov),
-        "sigma_vehicle_axes": {
-            "rpy_deg": np.degrees(sigma[:3]).tolist(),
-            "xyz": sigma[3:].tolist(),
-        },
+        "sigma_vehicle_axes": _sigma_document(sigma),
         "determined": {axis: bool(result.determined[axis]) for axis in AXES},
         **offset,
         **({} if result.guess is None else {"guess": _guess_document(result.guess)}),
@@ -162,15 +155,13 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
 
 
 def _guess_document(guess: Guess) -> dict[str, Any]:
-    sigma = {"rpy_deg": np.degrees(guess.sigmas[:3]).tolist(), "xyz": guess.sigmas[3:].tolist()}
+    sigma = _sigma_document(guess.sigmas)
     fixed = {"fixed": True} if guess.fixed else {}
     return {**_pose_document(guess.T_vehicle_lidar), "sigma_vehicle_axes": sigma, **fixed}
 
 
-def _gradient_document(calibration: Calibration) -> dict[str, Any]:
-    if calibration.gradient_data is None:
-        return {}
-    return {"data_gradient": calibration.gradient_data.tolist()}
+def _sigma_document(sigmas: Array) -> dict[str, Any]:
+    return {"rpy_deg": np.degrees(sigmas[:3]).tolist(), "xyz": sigmas[3:].tolist()}
 
 
 def _earlier_documents(calibration: Calibration) -> dict[str, Any]:

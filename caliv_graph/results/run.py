@@ -35,15 +35,7 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """The result of a run, and its inputs.
-
-    Attributes:
-        calibration: the result to write.
-        solution: the solved graph.
-        observations: the target's clouds.
-        warnings: one line each.
-        record: further inputs for the report; None: none were kept.
-    """
+    """The result of a run, and its inputs; `record` has those that only the report shows."""
 
     calibration: Calibration
     solution: Solution

@@ -12,10 +12,7 @@ from caliv_graph.products import Mixture
 def write_target(mixture: Mixture, path: Path, name: str) -> None:
     """Writes a reconstructed target as ASCII PLY: component means (metres) and unit normals.
 
-    Args:
-        mixture: the target, in the target frame.
-        path: the file.
-        name: what the target is called, for a comment in the file.
+    `name` of the target goes to a comment in the file.
 
     Raises:
         OSError: it cannot be written.

@@ -29,8 +29,7 @@ def assemble_matrices(
 
     Args:
         solved: extrinsics of the n LiDARs in the graph, in the order of the matrices.
-        guesses: initial guess of every LiDAR, in the order of the result. A LiDAR that is not in
-            the graph is reported by it.
+        guesses: of every LiDAR, in the order of the result; one that is not in the graph keeps it.
         cov: (6n, 6n) vehicle axes.
         information: (6n, 6n) of the data alone, vehicle axes.
         uncertainty: verdicts on the solved LiDARs.

@@ -1,9 +1,7 @@
 """Do the data contradict the guesses, or each other? Tests, and what they find, as numbers.
 
-Each test has a known distribution if nothing is wrong, and a false-alarm probability of
-`CONTRADICTION_P`. What the models leave out by construction widens the distribution as an
-allowance; the limit stays. `caliv_graph/uncertainty/README.md`, "Consistency tests", derives them;
-`wording.contradictions` says what was found.
+Each test has a known distribution if nothing is wrong (`caliv_graph/uncertainty/README.md`,
+"Consistency tests"). `wording.contradictions` says what was found.
 """
 
 from __future__ import annotations
@@ -73,16 +71,16 @@ AssumedKind = Literal["height", "tilt_x", "tilt_y"]
 class ScoreTest:
     """A parameter that the model leaves out, linearised at the estimate (Rao 1948).
 
-    Minus the log-likelihood of a difference d is `d^T information d / 2 - gradient^T d`, all other
-    variables eliminated. `halves`, `turns`: extrinsic in the first half less that in the second, in
-    left turns less in right turns; `trust`: extrinsic that the clouds ask for less the trusted one
-    ((6,), vehicle axes); `clock`: stamps less true time ((1,) seconds).
+    `halves`, `turns`: extrinsic in the first half less that in the second, in left turns less in
+    right turns; `trust`: extrinsic that the clouds ask for less the trusted one ((6,), vehicle
+    axes); `clock`: stamps less true time ((1,) seconds).
 
     Attributes:
         lidar: its name.
         kind: what is compared with what.
-        information: (k, k).
-        gradient: (k,).
+        information: (k, k) and
+        gradient: (k,) of `d^T information d / 2 - gradient^T d`, minus the log-likelihood of a
+            difference d, all other variables eliminated.
     """
 
     lidar: str
@@ -246,20 +244,15 @@ def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
     )
 
 
-# ------------------------------------------------------------------ guesses
-
-
 def against_guesses(
     lidars: Mapping[str, LidarResult], speed_m_s: float = 0.0
 ) -> Iterator[GuessContradiction]:
     """Estimates that differ from the guess by more than 5 sigma on a determined axis.
 
     The variance of the difference is the sum of both variances if the guess has no weight in the
-    estimate (`auto`); where it has (`joint`) the sum is too large, and the test cautious.
-
-    Args:
-        lidars: the result; those that are trusted or saw nothing are not tested.
-        speed_m_s: of the vehicle, to say how late stamps would have to be.
+    estimate (`auto`); where it has (`joint`) the sum is too large, and the test cautious. LiDARs
+    that are trusted or saw nothing are not tested. `speed_m_s` says how late stamps would have to
+    be.
     """
     for name, lidar in lidars.items():
         guess = lidar.guess
@@ -304,15 +297,8 @@ def _late_s(off: Array, wrong: Sequence[int], speed_m_s: float) -> float | None:
     return float(-off[3] / speed_m_s)
 
 
-# ------------------------------------------------------------------ clouds
-
-
 def too_many_outliers(count: CloudCount) -> bool:
-    """Whether a LiDAR has more outliers than `OUTLIERS` explains.
-
-    Their number is at most binomial with that fraction. Robust weights drop the outliers, and the
-    result looks fine; but which part of the data is right nobody knows.
-    """
+    """Whether a LiDAR has more outliers than `OUTLIERS` explains; their number is binomial."""
     return bool(bdtrc(count.outliers - 1, count.clouds, OUTLIERS) < CONTRADICTION_P)
 
 
@@ -338,15 +324,8 @@ def coarse_registrations(inputs: CheckInputs) -> tuple[CoarseRegistrations, ...]
     )
 
 
-# ------------------------------------------------------------------ score tests
-
-
 def p_value(test: ScoreTest) -> float:
-    """Probability of a larger difference if nothing is wrong; 1 if nothing is determined.
-
-    Chi-square of the difference along the determined directions, with the allowance for
-    the registrations' common error; the normal distribution for a clock.
-    """
+    """Probability of a larger difference if nothing is wrong; 1 if nothing is determined."""
     if test.kind == "clock":
         late_s, sigma_s = lateness(test)
         return float(2.0 * ndtr(-abs(late_s) / sigma_s))
@@ -362,9 +341,8 @@ def p_value(test: ScoreTest) -> float:
 def difference(test: ScoreTest) -> tuple[Array, Array, Array]:
     """The difference of extrinsics that a score test estimates, one Newton step from zero.
 
-    Returns:
-        (6,) difference along the determined directions, vehicle axes, rad and m; (6, 6) its
-        covariance with the allowance; (6, k) the determined directions, scaled, orthonormal.
+    Returns (6,) the difference along the determined directions, vehicle axes, rad and m; (6, 6) its
+    covariance with the allowance; (6, k) the determined directions, scaled, orthonormal.
     """
     unit = scaling(1)
     values, vectors = np.linalg.eigh(test.information * np.outer(unit, unit))
@@ -383,14 +361,8 @@ def lateness(test: ScoreTest) -> tuple[float, float]:
     return float(test.gradient[0]) / information, math.hypot(information**-0.5, CLOCK_BIAS_S)
 
 
-# ------------------------------------------------------------------ vehicle
-
-
 def assumption_contradicted(assumed: Assumed) -> bool:
-    """Whether an assumed quantity was estimated beyond 5 sigma of its assumption.
-
-    The assumption takes part in the estimate and pulls it: the test is cautious.
-    """
+    """Whether an assumed quantity was estimated beyond 5 sigma of its assumption."""
     return abs(assumed.value) > CONTRADICTION_SIGMAS * assumed.sigma
 
 

@@ -21,14 +21,10 @@ def evaluate(
     truth: Mapping[str, gtsam.Pose3],
     cov_pairs: Mapping[tuple[str, str], Array] | None = None,
 ) -> dict[str, Any]:
-    """Errors in vehicle axes and their consistency with the covariance.
+    """Errors in vehicle axes and NEES, as the paper's Evaluation section defines them.
 
-    The S2V error is the translation `t_est - t_true` and roll, pitch, yaw of `R_est R_true^T`.
-
-    The error of a pair (from a, to b) is that of `T_vehicle_a` against
-    `T_vehicle_b T_b_a(true)`, with both extrinsics as estimated: they share the error of
-    `T_vehicle_b`, so that the difference is the pair's own error (the paper's Evaluation section).
-    NEES is `e^T C^-1 e` with `e = Log(T_est^-1 T_true)`, 6 degrees of freedom.
+    S2V: `t_est - t_true` and roll, pitch, yaw of `R_est R_true^T`. A pair (from a, to b):
+    `T_vehicle_a` against `T_vehicle_b T_b_a(true)`, both extrinsics as estimated.
 
     Args:
         calibration: the estimate.

@@ -1,8 +1,7 @@
 """What the data determine: spectrum, the projection of `auto`, directions and verdicts per axis.
 
-Works on information matrices over the extrinsics, in vehicle axes, six coordinates per LiDAR; knows
-no graph and makes no sentences (`caliv_graph.wording` does). Directions are looked at in scaled
-coordinates, so that 1 mrad and 10 mm compare. `caliv_graph/uncertainty/README.md` derives it.
+Works on information matrices over the extrinsics, in vehicle axes, six coordinates per LiDAR.
+`caliv_graph/uncertainty/README.md` derives it.
 """
 
 from __future__ import annotations
@@ -73,8 +72,7 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
     Args:
         D: (6n, 6n) data information, vehicle axes, all other variables eliminated.
         prior: (6n, 6n) information of the guesses, vehicle axes.
-        undetermined: number of undetermined directions if it was decided before: those with the
-            largest ratio of sigmas.
+        undetermined: their number if it was decided before: those of the largest ratio of sigmas.
     """
     unit = scaling(len(D) // 6)
     values, vectors = np.linalg.eigh(D * np.outer(unit, unit))
@@ -99,10 +97,10 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
 def step_with_prior_in_null_space(
     D: Array, c: Array, prior: Array, offset: Array, split: Spectrum
 ) -> Array:
-    """The step of `auto`: the prior has weight in the undetermined subspace only.
+    """The step (6n,) of `auto`: the prior has weight in the undetermined subspace only.
 
     With W the determined and U the undetermined directions, minimises `e^T D e / 2 - c^T e` over
-    W; along U the step minimises the prior's cost given that: `U^T P (offset + e) = 0`.
+    W; along U the prior's cost given that: `U^T P (offset + e) = 0`.
 
     Args:
         D: (6n, 6n) quadratic of the data in a step e, vehicle axes.
@@ -110,9 +108,6 @@ def step_with_prior_in_null_space(
         prior: (6n, 6n) information P of the guesses.
         offset: (6n,) current estimate less the guesses.
         split: of D.
-
-    Returns:
-        (6n,) the step e, rad and m.
     """
     unit = scaling(len(D) // 6)
     W, U = split.vectors[:, ~split.undetermined], split.vectors[:, split.undetermined]
@@ -124,11 +119,7 @@ def step_with_prior_in_null_space(
 
 
 def covariance_with_prior_in_null_space(prior: Array, split: Spectrum) -> Array:
-    """Covariance (6n, 6n) of the estimate at which `step_with_prior_in_null_space` converges.
-
-    The data's covariance along W; along U that of the guesses given W, and the part of the data's
-    errors that the condition `U^T P (offset + e) = 0` transfers from W to U.
-    """
+    """Covariance (6n, 6n) of the estimate at which `step_with_prior_in_null_space` converges."""
     unit = scaling(len(prior) // 6)
     W, U = split.vectors[:, ~split.undetermined], split.vectors[:, split.undetermined]
     cov = (W / split.information[~split.undetermined]) @ W.T
@@ -146,9 +137,7 @@ def assess(
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     held: Sequence[str] = (),
 ) -> Uncertainty:
-    """Verdicts per direction and per axis.
-
-    Directions come without text; `wording.directions.named` adds it.
+    """Verdicts per direction and per axis. `wording.directions.named` adds texts.
 
     Args:
         D: (6n, 6n) data information, vehicle axes, LiDARs in the order of `T_vehicle_lidar`.
@@ -207,10 +196,9 @@ def _directions(
 
 
 def simplified(basis: Array) -> Array:
-    """Rotates a basis (6n, k) of a subspace so that each vector has few coordinates (varimax).
+    """Rotates a basis (6n, k) of a subspace so that each vector has few coordinates.
 
-    Eigenvectors of equal eigenvalues are any mixture of each other; a reader wants "height" and
-    "rotation about the turn centre", not 0.7 of one and 0.7 of the other. (Kaiser 1958.)
+    Eigenvectors of equal eigenvalues are any mixture of each other (varimax, Kaiser 1958).
     """
     k = basis.shape[1]
     turn = np.eye(k)
@@ -234,12 +222,8 @@ def rigid_twist(
 ) -> Array | None:
     """The twist (6,) of the whole sensor set that a direction amounts to.
 
-    Args:
-        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: the extrinsics.
-
-    Returns:
-        Rotation about and shift at the vehicle's origin; None if the LiDARs move apart.
+    `parts` has per LiDAR (6,), vehicle axes, rad and m, at any common scale. Returns rotation about
+    and shift at the vehicle's origin; None if the LiDARs move apart.
     """
     A = _by_twist(T_vehicle_lidar[name] for name in parts)
     y = np.concatenate([part / UNIT for part in parts.values()])
@@ -251,14 +235,9 @@ def rigid_twist(
 def undetermined_twists(
     undetermined: Sequence[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
 ) -> tuple[int, Array]:
-    """How many rigid motions of the whole sensor set against the vehicle are undetermined.
+    """How many rigid motions of the whole sensor set against the vehicle are undetermined, 0 to 6.
 
-    Args:
-        undetermined: the directions, of all LiDARs.
-        T_vehicle_lidar: the extrinsics.
-
-    Returns:
-        Their number, 0 to 6; and the best determined motion as a twist (6,), any scale.
+    And the best determined motion as a twist (6,), any scale.
     """
     if not undetermined:
         return 0, np.zeros(6)

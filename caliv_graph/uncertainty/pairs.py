@@ -38,7 +38,8 @@ def sensor_pairs(lidars: Iterable[str], reference: str) -> tuple[tuple[str, str]
 def pair_covariance(calibration: Calibration, source: str, to: str) -> Array:
     """Covariance of `T_to_from`, (6, 6), right perturbation (frame of `from`), priors included."""
     a, b = (calibration.lidars[name].T_vehicle_lidar for name in (source, to))
-    return relative_covariance(a, b, _block(calibration, calibration.cov_joint, source, to))
+    rows = _rows(calibration, source, to)
+    return relative_covariance(a, b, calibration.cov_joint[np.ix_(rows, rows)])
 
 
 def sigmas_s2v(calibration: Calibration, name: str) -> Array:
@@ -57,11 +58,8 @@ def sigmas_s2s(calibration: Calibration, source: str, to: str) -> Array:
 def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
     """Which axes of `T_to_from` the data determine, by the rule of `observability.assess`.
 
-    The undetermined subspace is mapped to the pair: a direction in which both LiDARs move
-    together, such as the rotation about the turn centre, does not change the pair.
-
-    Returns:
-        Per axis of `conventions.AXES`: rotation about, shift along the axes of `to`.
+    The undetermined subspace is mapped to the pair. Per axis of `conventions.AXES`: rotation about,
+    shift along the axes of `to`.
     """
     results = [calibration.lidars[name] for name in (source, to)]
     if not all(result.saw_target for result in results):
@@ -89,8 +87,3 @@ def _rows(calibration: Calibration, *lidars: str) -> list[int]:
     """Rows of the joint matrices that belong to these LiDARs, in the order of the arguments."""
     names = list(calibration.lidars)
     return [6 * names.index(lidar) + axis for lidar in lidars for axis in range(6)]
-
-
-def _block(calibration: Calibration, matrix: Array, *lidars: str) -> Array:
-    rows = _rows(calibration, *lidars)
-    return np.asarray(matrix[np.ix_(rows, rows)])

@@ -1,7 +1,4 @@
-"""Covariance that a calibration will have, from the information of the data alone.
-
-Shared by `observability`, which looks at a recorded drive before it is calibrated, and by `plan`.
-"""
+"""Covariance that a calibration will have, from the information of the data alone."""
 
 from __future__ import annotations
 

@@ -175,27 +175,14 @@ def _score_test(test: ScoreTest) -> str:
     return f"lidar '{test.lidar}': {what}: {size} ({overall:.0f} sigma in total)"
 
 
-_ASSUMED = {
-    "height": (
-        "the height of the vehicle frame above the ground",
-        "m",
-        "Check ground.vehicle_height and ground.sigma",
-    ),
-    "tilt_x": (
-        "the tilt of the vehicle against the ground (x)",
-        "rad",
-        "Check ground.parallel_sigma_deg and imu.T_vehicle_imu",
-    ),
-    "tilt_y": (
-        "the tilt of the vehicle against the ground (y)",
-        "rad",
-        "Check ground.parallel_sigma_deg and imu.T_vehicle_imu",
-    ),
-}
-
-
 def _assumed(found: Assumed) -> str:
-    what, unit, remedy = _ASSUMED[found.kind]
+    if found.kind == "height":
+        what, unit = "the height of the vehicle frame above the ground", "m"
+        remedy = "Check ground.vehicle_height and ground.sigma"
+    else:
+        axis = found.kind.removeprefix("tilt_")
+        what, unit = f"the tilt of the vehicle against the ground ({axis})", "rad"
+        remedy = "Check ground.parallel_sigma_deg and imu.T_vehicle_imu"
     return (
         f"{found.drive}: {what} differs from the config by {found.value:+.3g} {unit} (sigma "
         f"{found.sigma:.2g} {unit}): {abs(found.value) / found.sigma:.0f} sigma. {remedy}"

@@ -51,12 +51,7 @@ REMEDY_SYMMETRY = (
 
 
 def named(uncertainty: Uncertainty, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Uncertainty:
-    """The same findings, each direction with its text and its remedy.
-
-    Args:
-        uncertainty: of `uncertainty.observability.assess`.
-        T_vehicle_lidar: the extrinsics that it was assessed at.
-    """
+    """The same findings, each direction with its text and its remedy, at the given extrinsics."""
     stationary = stationary_text(uncertainty.undetermined, T_vehicle_lidar)
     undetermined = []
     for direction in _each_named(uncertainty.undetermined, T_vehicle_lidar, weak=False):
@@ -89,12 +84,7 @@ def _each_named(
 
 
 def describe(parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> str:
-    """The name of a direction.
-
-    Args:
-        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: the extrinsics.
-    """
+    """The name of a direction: per LiDAR (6,), vehicle axes, rad and m, any common scale."""
     twist = rigid_twist(parts, T_vehicle_lidar)
     if twist is None:
         return _describe_apart(parts)
@@ -106,13 +96,7 @@ def describe(parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pos
 def remedy(
     parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool = False
 ) -> str:
-    """What would determine a direction: a manoeuvre, or a setting.
-
-    Args:
-        parts: per LiDAR (6,), vehicle axes, rad and m, any common scale.
-        T_vehicle_lidar: the extrinsics.
-        weak: the data determine it, but weakly.
-    """
+    """What would determine a direction (as in `describe`): a manoeuvre, or a setting."""
     twist = rigid_twist(parts, T_vehicle_lidar)
     if twist is None and weak:
         return REMEDY_MORE
@@ -132,12 +116,7 @@ def remedy(
 def stationary_text(
     undetermined: Sequence[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3]
 ) -> str:
-    """The name of every common direction of a vehicle that did not move; empty if it moved.
-
-    Args:
-        undetermined: all directions.
-        T_vehicle_lidar: the extrinsics.
-    """
+    """The name of every common direction of a vehicle that did not move; empty if it moved."""
     lost, best = undetermined_twists(undetermined, T_vehicle_lidar)
     if lost < STATIONARY_TWISTS:
         return ""

@@ -6,12 +6,7 @@ from collections.abc import Iterator, Mapping
 
 
 def undetermined_offset_sentences(sigmas_s: Mapping[str, float], limit_s: float) -> Iterator[str]:
-    """A sentence per LiDAR whose time offset was asked for and is undetermined.
-
-    Args:
-        sigmas_s: LiDAR -> 1 sigma of its offset in seconds.
-        limit_s: sigma from which an offset is undetermined.
-    """
+    """A sentence per LiDAR whose time offset has a sigma (seconds) of the limit or more."""
     for name, sigma in sigmas_s.items():
         if sigma >= limit_s:
             yield (

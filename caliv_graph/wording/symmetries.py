@@ -8,12 +8,9 @@ from caliv_graph.registration.symmetry import Symmetry
 
 
 def symmetry_sentence(symmetry: Symmetry, name: str, sigma_rad: float) -> str:
-    """What a symmetry means for the calibration.
+    """What a symmetry of the target `name` means for the calibration.
 
-    Args:
-        symmetry: of the target.
-        name: of the target.
-        sigma_rad: 1 sigma of the initial guess of a LiDAR's rotation, the largest of all LiDARs.
+    `sigma_rad` is that of the initial guess of a LiDAR's rotation, the largest of all LiDARs.
     """
     about = "the vertical" if symmetry.upright else "a level axis"
     compared = ""

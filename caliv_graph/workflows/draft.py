@@ -25,6 +25,7 @@ from caliv_graph.readers.discover import (
     choose_lidar_topics,
     choose_motion_topics,
     drive_folder,
+    first_frame,
     is_recorded_bag,
     recorded_sensors,
 )
@@ -32,7 +33,6 @@ from caliv_graph.readers.frames import (
     TF_TYPES,
     FrameTransform,
     FrameTree,
-    clean_frame,
     message_transforms,
     read_urdf,
 )
@@ -81,13 +81,7 @@ class _Bounds(BaseModel):
 
 @dataclass(frozen=True)
 class _Original:
-    """The values of a config of the CaLiV authors' program.
-
-    Attributes:
-        path: the file.
-        extrinsics: per sensor, metres and roll, pitch, yaw in degrees of T_vehicle_lidar.
-        target: lower and upper corner in the map, metres; None if absent.
-    """
+    """The values of a config of the CaLiV authors' program, in the units of our config."""
 
     path: Path
     extrinsics: Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -95,20 +89,15 @@ class _Original:
 
 
 def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
-    """Drafts the config of a drive.
+    """Drafts the config of a drive; paths in it are relative to the folder of `config`.
 
     Of a bag: LiDARs and motion data by the types of the topics, initial guesses from
     `/tf_static` or a URDF. Of a CaLiV folder: initial guesses and the target's region from a config
     of the CaLiV authors' program (`transform_sensor_N`, `min_bound`, `max_bound`) beside the data.
 
-    Args:
-        data: the drive.
-        config: where the config will be written: paths in it are relative to its folder.
-        urdf: of the vehicle; for a bag only, whose messages name the frames of the sensors.
-
     Raises:
         RecordingError: the drive is missing, no recording, or has no clouds.
-        ConfigError: the URDF, or the CaLiV config beside the data, is damaged.
+        ConfigError: the URDF, or the CaLiV config beside the data, is damaged; a URDF for a folder.
     """
     if is_recorded_bag(data):
         draft = _draft_of_bag(data, config, urdf)
@@ -177,7 +166,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
         ("gnss", "gnss.lever_arm", _GNSS_TEMPLATE),
     ):
         if kind in motion.chosen:
-            guess = frames.extrinsic(_frame_of(bag, motion.chosen[kind]))
+            guess = frames.extrinsic(first_frame(bag, motion.chosen[kind]) or "")
             if guess.T_vehicle_sensor is None:
                 unknown.append(key)
             xyz, rpy_deg = guess.numbers()
@@ -199,12 +188,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
 
 @dataclass(frozen=True)
 class _Guess:
-    """The extrinsic of a sensor, if it is known.
-
-    Attributes:
-        T_vehicle_sensor: None if it is not.
-        origin: its source, or why it is not known.
-    """
+    """`T_vehicle_sensor`, None if it is not known, and its source or why it is not known."""
 
     T_vehicle_sensor: gtsam.Pose3 | None
     origin: str
@@ -221,13 +205,7 @@ class _Guess:
 
 @dataclass(frozen=True)
 class _Frames:
-    """The frames of the sensors.
-
-    Attributes:
-        tree: frames that are fixed to each other.
-        vehicle: the frame of the vehicle; None if it is not among them.
-        source: of the transforms.
-    """
+    """Frames that are fixed to each other, the vehicle's frame (None: unknown) and their source."""
 
     tree: FrameTree
     vehicle: str | None
@@ -292,14 +270,6 @@ def _still_links(bag: Bag, topic: str) -> Iterable[FrameTransform]:
         if count >= _STILL_MESSAGES:
             break
     return [first[key] for key, same in repeated.items() if same]
-
-
-def _frame_of(bag: Bag, topic: str) -> str:
-    raw = bag.first_message(topic)
-    try:
-        return "" if raw is None else clean_frame(bag.header(raw).frame_id)
-    except DamagedMessageError:
-        return ""
 
 
 def _topics_text(bag: Bag, motion: MotionTopics) -> str:

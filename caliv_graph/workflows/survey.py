@@ -1,7 +1,6 @@
 """What a recorded drive determines, before it is calibrated.
 
-The early stages of `pipeline.calibrate`: trajectory, target, ground, a rough registration and one
-solve of the graph, which puts the extrinsics near enough to read the information off. Shape and
+The early stages of `pipeline.calibrate`, a rough registration and one solve of the graph. Shape and
 extrinsics are not refined together, which is what takes the time.
 """
 
@@ -16,23 +15,13 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.rough import RoughSolve, rough_solve
-from caliv_graph.calibration.solve import (
-    reduced_registered,
-)
+from caliv_graph.calibration.solve import reduced_registered
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.pipeline import prepare
-from caliv_graph.products import (
-    Array,
-    GroundObservation,
-    Recording,
-    TargetObservation,
-)
+from caliv_graph.products import Array, GroundObservation, Recording, TargetObservation
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.uncertainty.predicted import (
-    PredictedCovariance,
-    predict_covariance,
-)
+from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import named_prediction
 
 ROUGH_ITERATIONS = 40
@@ -59,12 +48,7 @@ class Survey:
 
 
 def survey(recordings: Sequence[Recording], config: Config, progress: Progress) -> Survey:
-    """Finds out what recorded drives of one vehicle determine.
-
-    Args:
-        recordings: opened drives (`readers.open_recording`).
-        config: as for `calibrate`.
-        progress: reports every stage.
+    """Finds out what recorded drives (`readers.open_recording`) of one vehicle determine.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -90,13 +74,6 @@ def survey_observations(
     progress: Progress,
 ) -> Survey:
     """The same from extracted targets and grounds; without names and the warnings before it.
-
-    Args:
-        observations: clouds of each target placement.
-        trajectories: one per drive.
-        grounds: the ground as the LiDARs saw it.
-        config: modes, kernels, priors.
-        progress: reports every stage.
 
     Raises:
         RegistrationError, SolveError: it could not be done.

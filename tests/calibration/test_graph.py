@@ -374,13 +374,13 @@ def test_what_the_graph_does_not_touch_has_zero_rows() -> None:
     assert np.diag(system.H)[touched].min() > 0.0
     np.testing.assert_array_equal(system.H[~touched], 0.0)
     np.testing.assert_array_equal(system.H[:, ~touched], 0.0)
-    with pytest.raises(SolveError, match="a pose or a target is has no measurement"):
+    with pytest.raises(SolveError, match="a pose or a target has no measurement"):
         system.schur()
 
 
 def test_lidars_that_share_nothing_know_nothing_of_each_other() -> None:
     # Each LiDAR has a drive of its own and no target in common: without priors the extrinsics are
-    # known, each by itself. With the target frames has no measurement else, no covariance between.
+    # known, each by itself. With the target frames tied to nothing else, no covariance between.
     case = make_case(count=10, drives=2)
     keep = [j for j in range(40) if case.problem.cloud_lidar[j] == case.problem.cloud_placement[j]]
     problem = replace(

@@ -24,7 +24,7 @@ It is 20 MB on a quiet machine, 33 on a busy one, where arenas of threads come a
 _STAGES = """
 import json, sys
 from pathlib import Path
-from caliv_graph.config.model import load_config
+from caliv_graph.config.load import load_config
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.sampled import SampledRecording

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -46,7 +47,9 @@ def start(*arguments: object, pipeline: str = "", cwd: Path = ROOT) -> subproces
         stderr=subprocess.PIPE,
         text=True,
         cwd=cwd,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+        # OpenBLAS rounds by the kernel that it is told to use: the same one as in this process.
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
+        | {name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")},
     )
 
 

@@ -41,14 +41,10 @@ def ros_jacobian(T_parent_child: gtsam.Pose3) -> Array:
 
 
 def ros_covariance(T_parent_child: Sequence[gtsam.Pose3], cov: Array) -> Array:
-    """A joint covariance of poses in ROS's order.
+    """A joint covariance (6n, 6n) of n poses in one parent, in ROS's order, parent's axes; m, rad.
 
-    Args:
-        T_parent_child: n poses in one parent.
-        cov: (6n, 6n) right perturbations, rotation then translation, rad and m.
-
-    Returns:
-        (6n, 6n) per pose x, y, z, rotation about fixed x, y, z; the parent's axes; m and rad.
+    `cov` has right perturbations, rotation then translation. The result has per pose x, y, z and
+    rotations about fixed x, y, z.
     """
     B = np.zeros(cov.shape)
     for i, T in enumerate(T_parent_child):

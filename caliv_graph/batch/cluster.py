@@ -52,6 +52,8 @@ _MEMORY = re.compile(r"\(pid=(\d+)\) exceeded (\d+)% memory")
 class Workers:
     """A connection to the workers of a batch.
 
+    The scheduler is asked for the number of workers if it may change (`count` None).
+
     Attributes:
         client: the Dask client.
         deaths: per process of the local cluster that died, the reason.
@@ -60,14 +62,6 @@ class Workers:
     def __init__(
         self, client: Any, count: int | None, most: int | None, deaths: dict[int, str]
     ) -> None:
-        """Initialises the connection.
-
-        Args:
-            client: the Dask client.
-            count: number of workers; None: the number may change, so the scheduler is asked.
-            most: largest number of jobs at a time.
-            deaths: filled while the batch runs.
-        """
         self.client = client
         self.deaths = deaths
         self._count, self._most = count, most
@@ -90,11 +84,7 @@ class Workers:
 
 @contextmanager
 def connect(address: str, most: int | None = None) -> Iterator[Workers]:
-    """The workers of an existing scheduler.
-
-    Args:
-        address: such as tcp://host:8786.
-        most: largest number of jobs at a time; None: the number of workers.
+    """The workers of an existing scheduler such as tcp://host:8786; at most `most` jobs at a time.
 
     Raises:
         BatchError: Dask is not installed, no scheduler answers within CONNECT_S, or it has no
@@ -132,11 +122,8 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
 def start(count: int, scratch: Path) -> Iterator[Workers]:
     """Workers of a local cluster: processes on this machine, one thread each.
 
-    They end with the context, even during a job, and when this process is killed.
-
-    Args:
-        count: number of workers.
-        scratch: folder for the files of Dask.
+    They end with the context, even during a job, and when this process is killed. Dask has its
+    files in `scratch`.
 
     Raises:
         BatchError: Dask is not installed, or no worker starts.
@@ -199,12 +186,7 @@ def default_workers() -> int:
 
 
 def check_workers(workers: Workers, token: Path, version: str) -> None:
-    """Checks that the workers of a scheduler can run the jobs.
-
-    Args:
-        workers: the connection.
-        token: a file in the folder of the batch.
-        version: of this program.
+    """Checks that the workers can run the jobs; `token` is a file in the folder of the batch.
 
     Raises:
         BatchError: a worker cannot; the message names it and the reason.

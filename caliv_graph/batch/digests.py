@@ -27,16 +27,10 @@ again within one tick of the file system's clock (2 s on FAT, 1 s on some others
 
 @dataclass(frozen=True)
 class FileState:
-    """Metadata of a file, which changes whenever the file is written.
+    """Size, times (nanoseconds) and inode of a file, which change when the file is written.
 
-    It includes the time of the last change of the entry (ctime), which tools that restore the time
+    They include the time of the last change of the entry (ctime), which tools that restore the time
     of the content (cp -p, rsync -t, tar) cannot set.
-
-    Attributes:
-        size: bytes.
-        mtime_ns: last change of the content, nanoseconds.
-        ctime_ns: last change of content or entry, nanoseconds.
-        inode: number of the file in its file system.
     """
 
     size: int
@@ -153,13 +147,9 @@ class Inputs:
 def job_inputs(
     config: Config, data: Sequence[Path], prior: Path | None, out: Path | None = None
 ) -> Inputs | None:
-    """The input files of a job.
+    """The input files of a job; without `data`, its drive is `data.path` of the config.
 
-    Args:
-        config: the effective config.
-        data: drives; empty: `data.path` of the config.
-        prior: the earlier calibration.
-        out: folder of the results, which is not input.
+    Files in `out`, the folder of the results, are no inputs.
 
     Returns:
         None if a drive does not exist or has no files of its format.
@@ -179,15 +169,9 @@ def job_inputs(
 
 
 def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
-    """Digest of the inputs of a job: equal digests mean equal results.
+    """Digest of the inputs of a job, 64 hexadecimal digits: equal digests mean equal results.
 
-    Args:
-        config: the effective config.
-        inputs: the input files; those without a known digest are read.
-        cache: known digests; new ones are added.
-
-    Returns:
-        64 hexadecimal digits.
+    Files without a known digest are read, and their digests are added to the cache.
 
     Raises:
         OSError: a file cannot be read.

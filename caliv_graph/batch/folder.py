@@ -1,13 +1,8 @@
 """The folder of a batch: one result per job, the summary, and the state for a resume.
 
-    DIR/index.html, summary.csv, summary.json      all jobs, rewritten when a job finishes
-    DIR/<job>/                                     the result as `calibrate` writes it, and job.json
-    DIR/.digests.json, .lock, .work/               internal
-
-The folder of a job has the job's name, so that people and scripts find `monday/report.html`.
-job.json holds the digest of the inputs. Result and job.json appear together, by one rename, so that
-no result exists without its digest. Workers write below `.work/`; only the process that holds the
-lock moves results to their folders.
+The folder of a job also has job.json with the digest of its inputs. Both appear together, by one
+rename, so that no result exists without its digest. Workers write below `.work/`; only the process
+that holds `.lock` moves results to their folders.
 """
 
 from __future__ import annotations
@@ -68,7 +63,7 @@ class JobRecord:
 
 
 class BatchFolder:
-    """The folder of a batch; a context manager that locks it against other batches.
+    """The folder of a batch; a context manager that creates it and locks it against other batches.
 
     Attributes:
         path: the folder, absolute.
@@ -77,11 +72,6 @@ class BatchFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Initialises the object without accessing the disk.
-
-        Args:
-            path: the folder; created if necessary, with its parents.
-        """
         self._given = path
         self.path = path.absolute()
         self.work = self.path / _WORK / secrets.token_hex(6)
@@ -164,16 +154,7 @@ class BatchFolder:
         warnings: tuple[str, ...],
         written: str,
     ) -> JobRecord:
-        """Moves a result to the folder of its job in one step.
-
-        Args:
-            job: name of the job.
-            staged: folder with the files of the worker; empty afterwards.
-            digest: see `JobRecord`.
-            exit_code: see `JobRecord`.
-            seconds: see `JobRecord`.
-            warnings: see `JobRecord`.
-            written: see `JobRecord`.
+        """Moves the files in `staged` to the folder of their job in one step; see `JobRecord`.
 
         Raises:
             OutputError: the folder cannot be written.

@@ -60,11 +60,7 @@ class FinishedJob:
 
 
 def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
-    """Opens the drives of a job.
-
-    Args:
-        config: the configuration.
-        data: drives; empty: `data.path` of the config.
+    """Opens the drives of a job; without `data`, the one at `data.path` of the config.
 
     Raises:
         ConfigError: a drive is given twice, or there is none.
@@ -75,11 +71,7 @@ def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
 
 
 def check_guesses(config: Config, path: Path) -> None:
-    """Refuses a draft of `init` whose initial guesses are still zeros.
-
-    Args:
-        config: the configuration.
-        path: its file.
+    """Refuses a draft of `init`, read from `path`, whose initial guesses are still zeros.
 
     Raises:
         ConfigError: two LiDARs have the zeros that `init` writes for unknown guesses.
@@ -101,12 +93,6 @@ def run_job(
     prior: Calibration | None = None,
 ) -> FinishedJob:
     """Calibrates, and collects all warnings.
-
-    Args:
-        recordings: opened drives.
-        config: the configuration.
-        progress: shows the stages.
-        prior: an earlier calibration of the vehicle.
 
     Raises:
         CalivError: the input is invalid or insufficient.

@@ -34,11 +34,8 @@ class Job:
         name: of the job and of its folder.
         config: the config.
         vehicle: jobs of the same vehicle are compared; None: with no other job.
-        data: drives instead of the config's; empty: the config's.
         prior: an earlier calibration; None: none.
-        mode: instead of the config's `solve.mode`.
-        require: instead of the config's.
-        limits: instead of the config's.
+        data, mode, require, limits: instead of the config's; empty or None: the config's.
     """
 
     name: str
@@ -116,10 +113,9 @@ class _Manifest(Section):
 
 
 def load_manifest(path: Path) -> tuple[Job, ...]:
-    """Reads a manifest. Each job checks its config and drives when it runs.
+    """Reads a manifest, in which paths are relative to its folder.
 
-    Args:
-        path: the file; paths in it are relative to its folder.
+    Each job checks its config and drives when it runs.
 
     Raises:
         ConfigError: it is missing, not YAML, not a manifest, or two jobs would share a folder.

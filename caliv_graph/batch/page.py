@@ -26,11 +26,7 @@ FAR_SIGMAS = 3.0
 def render_index(summary: Summary) -> str:
     """The page: every job with its extrinsics, and per vehicle the differences between its drives.
 
-    Args:
-        summary: of the batch.
-
-    Returns:
-        An HTML document with relative links, so that the folder can be moved.
+    Its links are relative, so that the folder can be moved.
     """
     template = environment().get_template("batch.html.j2")
     return template.render(

@@ -66,7 +66,9 @@ def run_batch(
     force: bool = False,
     manifest: str = "",
 ) -> Summary:
-    """Runs all jobs of a batch that are not done yet.
+    """Runs all jobs of a batch that are not done yet, and writes its summary while they run.
+
+    An earlier batch in `out` is resumed: results from the same inputs, config and version are kept.
 
     Args:
         jobs: of the manifest.
@@ -77,9 +79,6 @@ def run_batch(
         workers: number of workers; None: the number of processors, or of jobs if smaller.
         force: run all jobs again, and replace results of `calibrate` in their folders.
         manifest: path of the manifest, for the summary.
-
-    Returns:
-        The results of all jobs, which are also written to `out` while the jobs run.
 
     Raises:
         OutputError: `out` is not the folder of a batch, or cannot be written.
@@ -111,13 +110,7 @@ def _workers(
 
 
 class _Batch:
-    """The state of a batch.
-
-    Attributes:
-        folder: the locked folder.
-        rows: the state of each job, in the order of the manifest.
-        todo: jobs for the workers.
-    """
+    """The state of a batch: its locked folder, a row per job of the manifest, and what is to do."""
 
     def __init__(
         self, jobs: Sequence[Job], folder: BatchFolder, force: bool, manifest: str

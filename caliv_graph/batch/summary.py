@@ -35,17 +35,12 @@ class Row:
     """One job.
 
     Attributes:
-        job: name of the job and of its folder.
         vehicle: name shared by the jobs of one vehicle; None: not given.
         state: `waiting`, `done` (the result is written) or `failed`.
         exit: exit code of `calibrate` for this job; None: not known, or not yet.
-        message: reason of the failure, one line.
         seconds: duration of the calibration.
         digest: of the inputs of the result (`digests.job_digest`).
-        warnings: one line each.
-        calibration: the result.
         reused: whether an earlier batch made the result.
-        trace: lines of the traceback of a defect.
     """
 
     job: str
@@ -77,12 +72,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Deviation:
-    """The largest difference between one drive and the other drives of the vehicle.
-
-    Attributes:
-        sigmas: the difference in standard deviations.
-        job: the job of this drive.
-    """
+    """The largest difference of one drive from the others of the vehicle, in sigmas."""
 
     sigmas: float
     job: str
@@ -114,13 +104,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Summary:
-    """A batch.
-
-    Attributes:
-        rows: one per job, in the order of the manifest.
-        manifest: path of the manifest.
-        written: time of writing, UTC, ISO 8601.
-    """
+    """A batch: a row per job in the order of the manifest, its path, and the time (UTC)."""
 
     rows: tuple[Row, ...]
     manifest: str

@@ -43,16 +43,11 @@ class Task:
     """The description of a job for a worker. All paths are absolute.
 
     Attributes:
-        name: of the job.
-        config: the effective config.
         config_file: path of the config, for messages.
         data: drives; empty: `data.path` of the config.
         prior: an earlier calibration.
         recorded: digest of the existing result; None: there is none, or it is made again.
         cache: known digests of the input files (`DigestCache.dump`).
-        out: folder of the batch.
-        work: work folder of this run.
-        version: version of the program that runs the batch.
     """
 
     name: str
@@ -84,11 +79,7 @@ class Outcome:
             attempts ended with the death of the worker.
         exit: exit code of `calibrate` for this job; None if a worker died.
         message: reason of the failure, one line.
-        trace: lines of the traceback of a defect.
-        digest: of the inputs.
         staged: folder of the result.
-        warnings: one line each.
-        seconds: duration of the calibration.
         cache: digests of the input files.
     """
 
@@ -190,8 +181,8 @@ _MALLOPT = {-1: 512 << 20, -3: 32 << 20}
 def _keep_freed_memory() -> None:
     """Lets the C library keep freed memory for the next array.
 
-    Dask sets M_TRIM_THRESHOLD for its workers, which disables glibc's dynamic thresholds. A quarter
-    of the run time was then spent on zeroing pages.
+    Dask sets M_TRIM_THRESHOLD, which disables glibc's dynamic thresholds: a quarter of the run time
+    was then spent on zeroing pages.
     """
     with suppress(OSError, AttributeError):
         for option, value in _MALLOPT.items():
@@ -267,14 +258,9 @@ def _mark_attempt(task: Task, number: int) -> None:
 
 
 def probe(token: str, version: str) -> str:
-    """Checks that a worker can run the jobs of a batch.
+    """The reason why a worker cannot run the jobs of a batch of this version; empty: none.
 
-    Args:
-        token: a file in the folder of the batch, which every worker must be able to read.
-        version: version of the program that runs the batch.
-
-    Returns:
-        The problem as text; empty: none.
+    `token` is a file in the folder of the batch, which every worker must be able to read.
     """
     if version != caliv_graph.__version__:
         return f"has caliv-graph {caliv_graph.__version__}, not {version}: install the same version"

@@ -83,10 +83,7 @@ def _options(
 
 
 class _Interrupts:
-    """Turns SIGINT and SIGTERM into KeyboardInterrupt, and records it.
-
-    Native code may turn the exception into another one.
-    """
+    """Turns SIGINT and SIGTERM into KeyboardInterrupt, which native code may replace."""
 
     def __init__(self) -> None:
         self.came = False
@@ -107,14 +104,7 @@ class _Interrupts:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Runs a command line and turns all exceptions into messages.
-
-    Args:
-        arguments: without the program's name.
-
-    Returns:
-        The exit code, one of `common.exits`.
-    """
+    """Runs a command line, turns all exceptions into messages, and returns the exit code."""
     with _Interrupts() as interrupts, warnings.catch_warnings():
         if not sys.warnoptions:
             # Python warnings are for developers; a user cannot act upon them.

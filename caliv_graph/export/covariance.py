@@ -41,14 +41,10 @@ def ros_jacobian(T_parent_child: gtsam.Pose3) -> Array:
 
 
 def ros_covariance(T_parent_child: Sequence[gtsam.Pose3], cov: Array) -> Array:
-    """A joint covariance of poses in ROS's order.
+    """A joint covariance (6n, 6n) of n poses in one parent, in ROS's order, parent's axes; m, rad.
 
-    Args:
-        T_parent_child: n poses in one parent.
-        cov: (6n, 6n) right perturbations, rotation then translation, rad and m.
-
-    Returns:
-        (6n, 6n) per pose x, y, z, rotation about fixed x, y, z; the parent's axes; m and rad.
+    `cov` has right perturbations, rotation then translation. The result has per pose x, y, z and
+    rotations about fixed x, y, z.
     """
     B = np.zeros(cov.shape)
     for i, T in enumerate(T_parent_child):
@@ -59,15 +55,20 @@ def ros_covariance(T_parent_child: Sequence[gtsam.Pose3], cov: Array) -> Array:
 
 def joint_covariance(request: Request) -> Array:
     """(6n, 6n) of the exported LiDARs, marginalised over the others; GTSAM's order."""
-    return _rows(request, request.calibration.cov_joint)
-
-
-def _rows(request: Request, matrix: Array) -> Array:
     names = list(request.calibration.lidars)
     rows = [6 * names.index(name) + axis for name in request.lidars for axis in range(6)]
-    return np.asarray(matrix[np.ix_(rows, rows)])
+    return np.asarray(request.calibration.cov_joint[np.ix_(rows, rows)])
 
 
-def axes_order(lidars: Sequence[str], axes: Sequence[str]) -> list[str]:
-    """The names of the rows of a joint covariance."""
-    return [f"{name}.{axis}" for name in lidars for axis in axes]
+def covariances(request: Request) -> dict[str, tuple[list[str], str, Array]]:
+    """Per convention, `gtsam` and `ros`, names of the rows, side, and the joint covariance."""
+    cov = joint_covariance(request)
+    poses = [request.T_vehicle_lidar(name) for name in request.lidars]
+    return {
+        "gtsam": (_rows(request, GTSAM_AXES), GTSAM_SIDE, cov),
+        "ros": (_rows(request, ROS_AXES), ROS_SIDE, ros_covariance(poses, cov)),
+    }
+
+
+def _rows(request: Request, axes: Sequence[str]) -> list[str]:
+    return [f"{name}.{axis}" for name in request.lidars for axis in axes]

@@ -22,13 +22,7 @@ _MOST_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Edit:
-    """The replacement of a piece of text.
-
-    Attributes:
-        start: index of the first character replaced.
-        stop: index after the last character replaced; `start` for an insertion.
-        text: the new text.
-    """
+    """The replacement of the characters from `start` to before `stop`, equal for an insertion."""
 
     start: int
     stop: int
@@ -77,13 +71,7 @@ def line_end(text: str) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """A key of a YAML file and its value.
-
-    Attributes:
-        path: the keys above it and its own key.
-        key: the node of the key.
-        value: the node of its value.
-    """
+    """A key of a YAML file and its value; `path` has the keys above it and its own."""
 
     path: tuple[str, ...]
     key: yaml.ScalarNode
@@ -91,17 +79,12 @@ class Entry:
 
 
 class YamlFile:
-    """A YAML file whose numbers can be replaced in place.
+    """A YAML file whose numbers can be replaced in place, without the comment of an earlier export.
 
-    The comment of an earlier export is removed.
+    Raises ExportError if the file is not YAML, or has no keys.
     """
 
     def __init__(self, base: Base) -> None:
-        """Parses a file.
-
-        Raises:
-            ExportError: the file is not YAML, or has no keys.
-        """
         self._base = base = Base(base.path, without_notice(base.text))
         try:
             root = yaml.compose(base.text, Loader=yaml.SafeLoader)

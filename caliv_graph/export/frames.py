@@ -27,9 +27,7 @@ _HOUSING = "base"
 def parse_pose(text: str, what: str) -> gtsam.Pose3:
     """A pose of `x,y,z` or `x,y,z,roll,pitch,yaw`, metres and radians as in URDF.
 
-    Args:
-        text: the numbers, between commas or blanks.
-        what: the option, for the message.
+    The numbers are between commas or blanks; `what` is the option, for the message.
 
     Raises:
         ExportError: the text is not three or six finite numbers.
@@ -65,18 +63,11 @@ def parse_named(texts: Sequence[str], what: str) -> dict[str, str]:
 
 
 def match_frame(lidar: str, candidates: Iterable[str], housing: bool) -> str | None:
-    """The frame of a LiDAR among the frames of a file, by its name.
+    """The frame of a LiDAR among the frames of a file, by its name; None if none fits.
 
     A frame fits if its name equals that of the LiDAR apart from words for a LiDAR in general:
-    `lidar_front` and `velodyne_front_link` fit `front`.
-
-    Args:
-        lidar: name of the LiDAR.
-        candidates: names of frames.
-        housing: whether to find the frame of its housing (`<sensor>_base_link`).
-
-    Returns:
-        The frame, or None if none fits.
+    `lidar_front` and `velodyne_front_link` fit `front`. With `housing`, frames of housings
+    (`<sensor>_base_link`) are searched.
 
     Raises:
         ExportError: several fit equally well.

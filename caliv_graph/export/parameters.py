@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-
-import gtsam
+from dataclasses import dataclass, replace
 
 from caliv_graph.errors import ExportError
 from caliv_graph.export.edit import YamlFile, with_comment
@@ -18,62 +16,45 @@ _ROS2 = "ros__parameters"
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a consumer.
+    """The parameters of a consumer in one version of ROS.
 
     Attributes:
-        consumer: name of the consumer.
-        lidar: name of the LiDAR.
-        parent: parent frame of the transform.
-        child: child frame of the transform.
-        T_parent_child: the transform.
-        meaning: direction of the transform, as an equation of the parameters.
-        ros1: per parameter its numbers, for ROS 1.
-        ros2: per parameter its numbers, for ROS 2.
-        above_ros1: keys above the parameters in a new file for ROS 1.
-        above_ros2: keys above the parameters in a new file for ROS 2.
-        optional: parameters that `--base` need not have.
-        extra_ros1: further lines of the comment for ROS 1.
-        extra_ros2: further lines of the comment for ROS 2.
+        above: keys above the parameters in a new file.
+        values: per parameter its numbers.
+        extra: further lines of the comment.
     """
 
-    consumer: str
-    lidar: str
-    parent: str
-    child: str
-    T_parent_child: gtsam.Pose3
-    meaning: str
-    ros1: Mapping[str, Sequence[float]]
-    ros2: Mapping[str, Sequence[float]]
-    above_ros1: tuple[str, ...]
-    above_ros2: tuple[str, ...]
-    optional: tuple[str, ...] = ()
-    extra_ros1: tuple[str, ...] = ()
-    extra_ros2: tuple[str, ...] = ()
+    above: tuple[str, ...]
+    values: Mapping[str, Sequence[float]]
+    extra: tuple[str, ...] = ()
 
 
-def parameter_export(request: Request, parameters: Parameters, warnings: tuple[str, ...]) -> Export:
+def parameter_export(
+    request: Request,
+    consumer: str,
+    transform: Transform,
+    ros1: Parameters,
+    ros2: Parameters,
+    warnings: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+) -> Export:
     """A new parameter file, or `--base` with new values of the parameters.
+
+    The transform's remark states its direction as an equation of the parameters; `optional` are
+    parameters that `--base` need not have.
 
     Raises:
         ExportError: `--base` lacks the parameters.
     """
     assert request.imu is not None
-    remark = f"{parameters.meaning} T_vehicle_imu is from {request.imu.origin}."
-    transform = Transform(
-        parameters.lidar,
-        parameters.parent,
-        parameters.child,
-        parameters.T_parent_child,
-        remark,
-    )
-    is_ros1 = _is_ros1(request)
-    values = parameters.ros1 if is_ros1 else parameters.ros2
-    extra = parameters.extra_ros1 if is_ros1 else parameters.extra_ros2
-    comment = with_hash(notice(request, [transform], extra))
+    remark = f"{transform.remark} T_vehicle_imu is from {request.imu.origin}."
+    transform = replace(transform, remark=remark)
+    parameters = ros1 if _is_ros1(request) else ros2
+    comment = with_hash(notice(request, [transform], parameters.extra))
     if request.base is None:
-        text = _new(parameters.above_ros1 if is_ros1 else parameters.above_ros2, values)
+        text = _new(parameters)
     else:
-        text = _changed(request.base, parameters, values)
+        text = _changed(request.base, consumer, parameters.values, optional)
     return Export(with_comment(comment, text).encode(), (transform,), warnings)
 
 
@@ -85,25 +66,26 @@ def _is_ros1(request: Request) -> bool:
     return _ROS2 not in request.base.text
 
 
-def _new(above: tuple[str, ...], values: Mapping[str, Sequence[float]]) -> str:
-    lines = [f"{'  ' * depth}{key}:" for depth, key in enumerate(above)]
-    indent = "  " * len(above)
-    for key, items in values.items():
+def _new(parameters: Parameters) -> str:
+    lines = [f"{'  ' * depth}{key}:" for depth, key in enumerate(parameters.above)]
+    indent = "  " * len(parameters.above)
+    for key, items in parameters.values.items():
         start = f"{indent}{key}: ["
         rows = [numbers(items[i : i + 3], ", ") for i in range(0, len(items), 3)]
         lines.append(start + f",\n{' ' * len(start)}".join(rows) + "]")
     return "\n".join(lines) + "\n"
 
 
-def _changed(base: Base, parameters: Parameters, values: Mapping[str, Sequence[float]]) -> str:
+def _changed(
+    base: Base, consumer: str, values: Mapping[str, Sequence[float]], optional: tuple[str, ...]
+) -> str:
     file = YamlFile(base)
     for key, items in values.items():
         entry = file.entry(key)
         if entry is not None:
             file.set_numbers(entry, items)
-        elif key not in parameters.optional:
+        elif key not in optional:
             raise ExportError(
-                f"{base.path}: has no '{key}'. Give the parameters of {parameters.consumer} as "
-                "--base"
+                f"{base.path}: has no '{key}'. Give the parameters of {consumer} as --base"
             )
     return file.edited()

@@ -27,19 +27,12 @@ class Options:
     """The options of `export`; empty or None: not given.
 
     Attributes:
-        consumer: one of `consumers.consumer_names`.
-        out: path of the output.
         base: an existing file to change.
         lidars: names of the LiDARs to export; empty: all.
         frames: NAME=FRAME each.
         housings: NAME=x,y,z,roll,pitch,yaw each, `T_housing_lidar`, metres and radians.
         parents: FRAME=x,y,z,roll,pitch,yaw each, `T_vehicle_frame`.
-        vehicle_frame: name of the vehicle frame.
         imu: x,y,z,roll,pitch,yaw of `T_vehicle_imu`.
-        config: the config of the calibration.
-        bag: a recording with frames.
-        letter: of the keys of a factor graph.
-        form: one of the forms of a consumer.
     """
 
     consumer: str
@@ -58,11 +51,7 @@ class Options:
 
 
 def prepare(path: Path, options: Options) -> Request:
-    """Reads all inputs of an export.
-
-    Args:
-        path: a calibration.yaml.
-        options: of the command line.
+    """Reads all inputs of an export of the calibration.yaml at `path`.
 
     Raises:
         ExportError: an option is invalid, or names an unknown LiDAR.

@@ -17,8 +17,6 @@ class RecordedFrames:
 
     Attributes:
         clouds: per LiDAR the frame of its clouds.
-        links: transforms of /tf_static.
-        start_ns: start of the recording.
     """
 
     clouds: Mapping[str, str]
@@ -36,11 +34,7 @@ class RecordedFrames:
 
 
 def read_frames(path: Path, topics: Mapping[str, str]) -> RecordedFrames:
-    """Reads the frames of a recording.
-
-    Args:
-        path: a bag.
-        topics: per LiDAR the topic of its clouds.
+    """Reads the frames of the bag at `path`; `topics` has per LiDAR the topic of its clouds.
 
     Raises:
         RecordingError: the path is not a bag, or the bag is damaged.

@@ -27,7 +27,6 @@ class ImuExtrinsic:
     """The pose of the IMU.
 
     Attributes:
-        T_vehicle_imu: the pose.
         origin: file or option that states it, for comments and messages.
         stated: False if it is only the default of the config.
     """
@@ -39,12 +38,7 @@ class ImuExtrinsic:
 
 @dataclass(frozen=True)
 class Base:
-    """An existing file of the consumer, whose other content is kept.
-
-    Attributes:
-        path: of the file.
-        text: its content, with unchanged line ends.
-    """
+    """An existing file of the consumer; `text` has its line ends unchanged."""
 
     path: Path
     text: str
@@ -52,14 +46,9 @@ class Base:
 
 @dataclass(frozen=True)
 class Transform:
-    """One transform of an export: `p_parent = T_parent_child p_child`.
+    """One transform of a LiDAR as it is written: `p_parent = T_parent_child p_child`.
 
-    Attributes:
-        lidar: the LiDAR it comes from.
-        parent: frame.
-        child: frame.
-        T_parent_child: the pose as written.
-        remark: a sentence for the comment; may be empty.
+    The remark is a sentence for the comment, or empty.
     """
 
     lidar: str
@@ -74,10 +63,8 @@ class Request:
     """A calibration to export, with all options of the command line.
 
     Attributes:
-        calibration: the result.
         source: name of its file, for comments.
         lidars: names of the LiDARs to export, in the order of the calibration.
-        out: path of the output.
         frames: per LiDAR the name of its frame, given by the user.
         recorded: per LiDAR the name of its frame in a recording.
         housings: per LiDAR `T_housing_lidar`, the frame of its clouds in the frame of its housing.
@@ -134,11 +121,7 @@ class Request:
         return T_vehicle_lidar if housing is None else T_vehicle_lidar.compose(housing.inverse())
 
     def vehicle_transforms(self, remark: str = "") -> tuple[Transform, ...]:
-        """The exported frame of every LiDAR in the vehicle frame.
-
-        Args:
-            remark: for the comment.
-        """
+        """The exported frame of every LiDAR in the vehicle frame."""
         return tuple(
             Transform(
                 name, self.parent, self.frame(name) or name, self.T_vehicle_child(name), remark
@@ -147,11 +130,7 @@ class Request:
         )
 
     def one_lidar(self, consumer: str) -> tuple[str, tuple[str, ...]]:
-        """The LiDAR for a consumer of a single LiDAR: the reference if there are several.
-
-        Returns:
-            Its name, and a warning if there are several.
-        """
+        """The LiDAR for a consumer of one: the reference of several, then with a warning."""
         if len(self.lidars) == 1:
             return self.lidars[0], ()
         reference = self.calibration.reference
@@ -185,14 +164,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Export:
-    """The files of an export.
-
-    Attributes:
-        content: of the file at `Request.out`.
-        transforms: in the file.
-        warnings: one line each.
-        beside: content of further files, by their paths.
-    """
+    """The file at `Request.out`, its transforms, warnings, and further files by their paths."""
 
     content: bytes
     transforms: tuple[Transform, ...]

@@ -76,15 +76,9 @@ def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
 
 
 def notice(request: Request, transforms: Sequence[Transform], extra: Sequence[str] = ()) -> str:
-    """The comment of a file, several lines.
+    """The comment of a file with these transforms, several lines without comment marks.
 
-    Args:
-        request: the request.
-        transforms: in the file.
-        extra: further lines.
-
-    Returns:
-        Lines without comment marks; `without_notice` finds the first and the last.
+    `without_notice` finds its first and its last line.
     """
     lines = [f"{_FIRST} {__version__} of {request.source}, status {request.calibration.status}"]
     lines.append("Metres and radians unless stated otherwise; R = Rz(yaw) Ry(pitch) Rx(roll).")

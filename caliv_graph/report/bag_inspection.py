@@ -45,8 +45,6 @@ class TopicSummary:
     """One topic.
 
     Attributes:
-        type: message type.
-        messages: number of messages.
         rate_hz: from the median interval between stamps; of a topic that was not read, the mean
             over the bag; None with fewer than two messages.
         read: whether the topic was read; if not, the attributes below are unknown.
@@ -75,15 +73,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class PointTimes:
-    """The times of a LiDAR's points.
-
-    Attributes:
-        field: name of the field.
-        type: type of the field.
-        unit: unit found from its values.
-        first_s: earliest time, seconds after the stamp.
-        last_s: latest time, seconds after the stamp.
-    """
+    """The times of a LiDAR's points after the stamp; the unit is that found from the values."""
 
     field: str
     type: str
@@ -97,9 +87,6 @@ class BagLidarSummary:
     """The clouds of one LiDAR.
 
     Attributes:
-        topic: of its clouds.
-        frame_id: frame in the header of its first cloud.
-        clouds: number of clouds.
         rate_hz: from the median interval; None with fewer than two clouds.
         sampled: number of clouds decoded for the attributes below.
         points: points per cloud, without NaN, zero returns and points outside the ranges; None if
@@ -138,15 +125,8 @@ class BagInspection:
     """The content of a bag.
 
     Attributes:
-        data: the bag.
-        start_ns: first record time.
-        duration_s: from the first to the last record time.
-        topics: all topics.
-        lidars: per LiDAR.
-        imus: per IMU topic that was read.
         gnss_fixes: number of messages with a fix, per GNSS topic that was read.
         drive: the motion according to given poses; None without poses.
-        targets: sightings per target; None if no target was searched.
     """
 
     data: str
@@ -179,12 +159,7 @@ def inspect_any(recording: Recording, progress: Progress) -> Inspection | BagIns
 def add_any_targets(
     inspection: Inspection | BagInspection, observations: Iterable[TargetObservation]
 ) -> Inspection | BagInspection:
-    """Adds when each LiDAR sees each target.
-
-    Args:
-        inspection: of the recording.
-        observations: the targets found in it.
-    """
+    """Adds when each LiDAR sees each target."""
     if isinstance(inspection, Inspection):
         return add_targets(inspection, observations)
     rates_hz = {lidar: summary.rate_hz for lidar, summary in inspection.lidars.items()}

@@ -24,10 +24,7 @@ from caliv_graph.report.tables import calibration_table
 def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: float) -> Group:
     """Movements with their sigmas, and the verdict.
 
-    Args:
-        comparison: the result of the comparison.
-        labels: names of the earlier and the later calibration.
-        p_value: the limit applied.
+    The labels name the earlier and the later calibration; `p_value` is the limit applied.
     """
     table = new_table("", *axis_headings("mm", "mrad"), "chi2\ndof", "p\ncorrected", "moved")
     for movement in comparison.movements:

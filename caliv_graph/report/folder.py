@@ -32,21 +32,11 @@ def write_result(
     warnings: Sequence[str],
     record: RunRecord | None = None,
 ) -> None:
-    """Writes all files of a result into a folder (`common.files.output_folder`).
+    """Writes all files of a result into an empty folder (`common.files.output_folder`).
 
-    Args:
-        folder: an empty folder.
-        calibration: for calibration.yaml and, as priors for GTSAM, graph.gtsam and
-            graph.values.gtsam.
-        solution: for target.ply, target_2.ply, ... (the reconstructed targets) and log.jsonl.
-        config: the effective config, for config.yaml.
-        stages: with their durations, for log.jsonl.
-        warnings: for log.jsonl.
-        record: for report.html and log.jsonl; None: no report.html.
-
-    Raises:
-        OSError: a file cannot be written.
-        OutputError: a file cannot be written.
+    The files are calibration.yaml, graph.gtsam and graph.values.gtsam (the extrinsics as priors for
+    GTSAM), target.ply, target_2.ply, ... (the reconstructed targets), config.yaml, log.jsonl and,
+    with a record, report.html.
     """
     write_calibration(calibration, folder / CALIBRATION_FILE)
     write_archive(*calibration_graph(calibration), folder / GRAPH_FILE)

@@ -53,19 +53,7 @@ def render_report(
     warnings: Sequence[str],
     record: RunRecord,
 ) -> str:
-    """The page.
-
-    Args:
-        calibration: the result.
-        solution: the solved graph.
-        config: the effective config.
-        stages: stages of the run, with their durations.
-        warnings: one line each.
-        record: drives, trajectories, ground and scans of the run.
-
-    Returns:
-        An HTML document of a few megabytes, most of them plotly.js.
-    """
+    """The page, an HTML document of a few megabytes, most of them plotly.js."""
     # Imported here: a run that writes no report does not need plotly.
     from plotly.offline import get_plotlyjs
 

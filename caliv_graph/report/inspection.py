@@ -26,13 +26,7 @@ Run = tuple[int, int]
 
 @dataclass(frozen=True)
 class Points:
-    """Points per cloud, without NaN, zero returns and points outside the ranges of the config.
-
-    Attributes:
-        min: minimum over the clouds.
-        median: median over the clouds.
-        max: maximum over the clouds.
-    """
+    """Points per cloud, without NaN, zero returns and points outside the ranges of the config."""
 
     min: int
     median: int
@@ -44,12 +38,10 @@ class LidarSummary:
     """The clouds of one LiDAR.
 
     Attributes:
-        clouds: number of clouds.
         frames: first and last frame number.
         step: usual difference of frame numbers between clouds.
         gaps: frames before and after each larger difference.
         rate_hz: nominal, since the files have no stamps; None with one cloud.
-        points: points per cloud.
     """
 
     clouds: int
@@ -65,7 +57,6 @@ class DriveSummary:
     """The vehicle's motion according to the given poses.
 
     Attributes:
-        poses: number of poses.
         duration_s: nominal, from the first pose to the last.
         path_length_m: sum of the distances between poses.
         climb_m: height of the highest pose above the lowest.
@@ -104,13 +95,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class TargetSummary:
-    """One target placement.
-
-    Attributes:
-        name: of the placement.
-        centre_map_m: approximate centre in the map.
-        lidars: sightings per LiDAR, including LiDARs that never see the target.
-    """
+    """One target placement: its approximate centre in the map, and the sightings of every LiDAR."""
 
     name: str
     centre_map_m: tuple[float, float, float]
@@ -119,14 +104,7 @@ class TargetSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a recording.
-
-    Attributes:
-        data: the recording.
-        lidars: per LiDAR.
-        drive: the vehicle's motion.
-        targets: sightings per target; None if no target was searched.
-    """
+    """The content of a recording; `targets` is None if no target was searched."""
 
     data: str
     lidars: dict[str, LidarSummary]
@@ -161,12 +139,7 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
 
 
 def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
-    """Adds when each LiDAR sees each target.
-
-    Args:
-        inspection: of the recording.
-        observations: the targets found in it.
-    """
+    """Adds when each LiDAR sees each target."""
     targets = summarise_targets(
         observations,
         inspection.lidars,

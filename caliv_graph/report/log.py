@@ -49,13 +49,8 @@ def log_documents(
 ) -> Iterator[dict[str, Any]]:
     """The lines as plain values. SI units, named in the keys.
 
-    Args:
-        calibration: the result.
-        solution: the solved graph.
-        robust: the robust kernel, for the reasons of down-weighted clouds.
-        stages: of the run.
-        warnings: one line each.
-        record: drives, trajectories and ground of the run; None: without their lines.
+    `robust` is for the reasons of down-weighted clouds. Without a record, the lines of drives,
+    trajectories and ground are left out.
     """
     yield from stage_documents(stages)
     if record is not None:

@@ -39,13 +39,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class PairCells:
-    """The extrinsic of one LiDAR in the frame of another, in a table.
-
-    Attributes:
-        source: LiDAR `from`.
-        to: LiDAR `to`.
-        cells: `T_to_from`, a cell per axis of `SHOWN_AXES`, sigmas in the axes of `to`.
-    """
+    """The extrinsic `T_to_from` of a pair, a cell per axis of `SHOWN_AXES`, in the axes of `to`."""
 
     source: str
     to: str
@@ -53,14 +47,9 @@ class PairCells:
 
 
 def pose_and_sigmas(T_parent_child: gtsam.Pose3, cov: Array) -> tuple[Array, Array]:
-    """A pose as six numbers, and their sigmas.
+    """(6,) roll, pitch, yaw, x, y, z of a pose and (6,) sigmas in the parent's axes; rad and m.
 
-    Args:
-        T_parent_child: the pose.
-        cov: (6, 6) covariance of the pose, right perturbation, rad and m.
-
-    Returns:
-        (6,) roll, pitch, yaw, x, y, z and (6,) sigmas in the parent's axes; rad and m.
+    `cov` is (6, 6), right perturbation, rad and m.
     """
     sigmas = np.sqrt(np.diag(parent_axes_covariance(T_parent_child, cov)))
     values = np.concatenate([T_parent_child.rotation().rpy(), T_parent_child.translation()])
@@ -72,10 +61,7 @@ def pose_cells(
 ) -> list[Cell]:
     """A pose as a cell per axis of `SHOWN_AXES`, in metres and degrees.
 
-    Args:
-        T_parent_child: the pose.
-        cov: (6, 6) covariance of the pose, right perturbation, rad and m.
-        determined: per axis, whether the drive determined it.
+    `cov` is (6, 6), right perturbation, rad and m.
     """
     values, sigmas = pose_and_sigmas(T_parent_child, cov)
     values[:3], sigmas[:3] = np.degrees(values[:3]), np.degrees(sigmas[:3])

@@ -63,14 +63,10 @@ def survey_document(survey: Survey) -> dict[str, Any]:
 def plan_table(
     prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> RenderableType:
-    """The result of `plan` as tables.
+    """The result of `plan` as tables; `goals` has per limit the largest sigma allowed.
 
-    Args:
-        prediction: of the planned drive.
-        goals: per limit, the largest sigma allowed.
-        met: whether the planned drive keeps all limits.
-        suggestion: the drive that keeps them in the least space, or comes nearest; None: no drive
-            was found.
+    The suggestion is the drive that keeps all limits in the least space, or comes nearest; None:
+    none was found.
     """
     predicted = prediction.covariance
     x, y = prediction.space_m

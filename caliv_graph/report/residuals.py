@@ -81,11 +81,6 @@ class CloudVerdict:
     """A down-weighted cloud of a target.
 
     Attributes:
-        lidar: name.
-        target: name of the placement.
-        drive: index of the drive.
-        stamp_ns: stamp of the scan.
-        source: name of the scan.
         weight: robust weight: 1 is full weight, 0 is dropped.
         rotation_rad: norm of the rotation residual.
         position_m: norm of the position residual, at the target.

@@ -23,15 +23,10 @@ STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "
 def calibration_table(
     calibration: Calibration, stages: Sequence[StageRecord] = (), seconds: float | None = None
 ) -> RenderableType:
-    """The result of `calibrate` as tables.
+    """The result of `calibrate` as tables; without `seconds`, no table of the times of its stages.
 
     An axis that the drive does not determine is marked `held`. Its value is in brackets, with the
     precision of the initial guess.
-
-    Args:
-        calibration: the result.
-        stages: of the run, for the table of times.
-        seconds: duration of the run; None: no table of times.
     """
     parts: list[RenderableType] = [_status_line(calibration)]
     parts += sentences("Contradictions:", calibration.contradictions)
@@ -61,12 +56,7 @@ def calibration_table(
 
 
 def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) -> RenderableType:
-    """Errors of a calibration as a table.
-
-    Args:
-        evaluation: the result of `uncertainty.evaluation.evaluate`.
-        calibration: the evaluated calibration, with its determined axes.
-    """
+    """Errors of a calibration as a table: the result of `uncertainty.evaluation.evaluate`."""
     table = new_table("", *axis_headings("mm", "mrad"))
     table.add_column("NEES\n6 dof", justify="right")
     any_held = False

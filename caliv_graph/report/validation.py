@@ -31,10 +31,7 @@ MOST_SHOWN = 12
 def validation_table(found: Validation, repeated: Repeatability | None, p_value: float) -> Group:
     """Distances between LiDARs, thicknesses, objects, repeatability, and the verdict.
 
-    Args:
-        found: the validation.
-        repeated: split-half repeatability; None: not tested.
-        p_value: limit of its tests.
+    `p_value` is the limit of the tests of repeatability; `repeated` None: not tested.
     """
     parts: list[RenderableType] = []
     for title, headings, rows in tables(found):
@@ -53,9 +50,8 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
 def validation_status(found: Validation) -> str:
     """The status of a validation, in the words of a calibration's status.
 
-    Returns:
-        `partial` without structure, `inconsistent` if the calibration contradicts the structure or
-        fits it worse than the initial guesses, else `ok`.
+    `partial` without structure, `inconsistent` if the calibration contradicts the structure or fits
+    it worse than the initial guesses, else `ok`.
     """
     if not found.has_structure:
         return "partial"

@@ -1,8 +1,4 @@
-"""validation.html: one self-contained page with figures before and after, coloured by LiDAR.
-
-The figures are interactive, so that a reader can zoom in on two millimetres. They need no packages
-beyond those of report.html.
-"""
+"""validation.html: one self-contained page with figures before and after, coloured by LiDAR."""
 
 from __future__ import annotations
 
@@ -18,15 +14,9 @@ from caliv_graph.workflows.repeatability import Repeatability
 
 
 def render_validation(found: Validation, repeated: Repeatability | None, p_value: float) -> str:
-    """The page.
+    """The page, an HTML document of a few megabytes, most of them plotly.js.
 
-    Args:
-        found: the validation.
-        repeated: split-half repeatability; None: not tested.
-        p_value: limit of its tests.
-
-    Returns:
-        An HTML document of a few megabytes, most of them plotly.js.
+    `p_value` is the limit of the tests of repeatability; `repeated` None: not tested.
     """
     from plotly.offline import get_plotlyjs
 

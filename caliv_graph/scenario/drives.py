@@ -1,11 +1,9 @@
 """Drives: the pose of the vehicle at any time, analytic in time and in path length.
 
-The model is the single-track model with a steered front axle (Ackermann). The vehicle frame is on
-the ground at the rear axle: it moves along its own x axis, and its heading changes by the curvature
-per metre. The speed is a function of time and the curvature a function of path length, so the path
-does not depend on the speed. Distance and heading are closed-form. The position is their integral
-by quadrature, exact to a micrometre. On a ramp (`terrain`) the frame follows the ground. Velocity,
-acceleration and angular velocity are analytic derivatives, not differences.
+The model is a single track with a steered front axle (Ackermann) and the frame on the ground at the
+rear axle. The speed is a function of time and the curvature one of path length, so the path does
+not depend on the speed. Position is an integral by quadrature, exact to a micrometre; all
+derivatives are analytic.
 """
 
 from __future__ import annotations
@@ -223,10 +221,9 @@ class Drive:
         return start + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
 
     def motion(self, stamps_ns: IntArray) -> Motion:
-        """The state at any times; before the start and after the end the vehicle stands.
+        """The state at (n,) stamps in any order, in nanoseconds since the start of the drive.
 
-        Args:
-            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
+        Before the start and after the end the vehicle stands.
         """
         time_s = np.asarray(stamps_ns, dtype=np.int64) / NANOSECONDS_PER_SECOND
         distance_m = self.speed.distance_m(time_s)
@@ -245,12 +242,10 @@ class Drive:
         )
 
     def states(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> VehicleStates:
-        """Pose and derivatives at any times.
+        """Pose and derivatives at (n,) stamps in any order, in nanoseconds since the drive's start.
 
-        Args:
-            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
-            z_map: height of the vehicle frame in the map where the ground is level, in metres, a
-                number or (n,). The height of ramps is added. The derivatives assume it constant.
+        `z_map` is the height of the vehicle frame in the map where the ground is level, in metres,
+        a number or (n,). The height of ramps is added. The derivatives assume it constant.
         """
         motion = self.motion(stamps_ns)
         n = len(motion.stamps_ns)
@@ -286,12 +281,7 @@ class Drive:
         )
 
     def poses(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> tuple[gtsam.Pose3, ...]:
-        """T_map_vehicle at any times.
-
-        Args:
-            stamps_ns: (n,) nanoseconds since the start of the drive, in any order.
-            z_map: see `states`.
-        """
+        """T_map_vehicle at (n,) stamps; see `states`."""
         states = self.states(stamps_ns, z_map)
         return tuple(
             gtsam.Pose3(gtsam.Rot3(R), t)
@@ -326,12 +316,7 @@ def _figure_eight(model: FigureEightDrive) -> tuple[SpeedProfile, float]:
 
 
 def make_drive(model: DriveModel, terrain: Terrain | None = None) -> Drive:
-    """The drive that a scenario describes.
-
-    Args:
-        model: the drive.
-        terrain: the ground under it; None: flat.
-    """
+    """The drive that a scenario describes, on this ground; None: flat."""
     start_yaw_rad = math.radians(model.start_yaw_deg)
     if isinstance(model, StandstillDrive):
         speed = SpeedProfile(0.0, 0.0, 1.0, model.duration_s)
@@ -358,17 +343,10 @@ def make_drive(model: DriveModel, terrain: Terrain | None = None) -> Drive:
 def sample_stamps(
     what: str, rate_hz: float, phase_s: float, duration_s: float, last_s: float = 0.0
 ) -> IntArray:
-    """Stamps of periodic samples, in nanoseconds since the start of the drive.
+    """(n,) increasing stamps of periodic samples, at least one, ns since the drive's start.
 
-    Args:
-        what: the sensor's place in the scenario, for messages.
-        rate_hz: samples per second.
-        phase_s: first stamp.
-        duration_s: duration of the drive.
-        last_s: shortest time between the last stamp and the end of the drive.
-
-    Returns:
-        (n,) strictly increasing, n at least 1.
+    The first is at `phase_s`, and the last at least `last_s` before the end of the drive. `what` is
+    the sensor's place in the scenario, for messages.
 
     Raises:
         ConfigError: the drive ends before the first one.
@@ -386,10 +364,7 @@ def sample_stamps(
 def cloud_stamps(lidar: str, model: LidarModel, duration_s: float) -> IntArray:
     """(n,) stamps of the clouds of a LiDAR, in nanoseconds since the start of the drive.
 
-    Args:
-        lidar: its name, for messages.
-        model: its rate, phase and sweep.
-        duration_s: duration of the drive. Every sweep ends before it.
+    Every sweep ends before the drive does.
 
     Raises:
         ConfigError: the drive ends before the first cloud.

@@ -1,8 +1,7 @@
 """A drive past a target, described: vehicle, sensors, world, noise.
 
-`Scenario` is a frozen pydantic model; the units stand in the `Field` descriptions.
-`configs/scenarios/` holds commented examples. The models describe only. `planning` predicts from
-them what a drive determines, and `simulation` draws measurements.
+`configs/scenarios/` holds commented examples. `planning` predicts from these models what a drive
+determines, and `simulation` draws measurements.
 """
 
 from __future__ import annotations
@@ -122,11 +121,7 @@ class Scenario(Section):
 
 
 def parse_scenario(raw: Any, source: str) -> Scenario:
-    """Validates a scenario.
-
-    Args:
-        raw: what the YAML file held.
-        source: the name of the file in messages.
+    """Validates a scenario from the YAML file `source`.
 
     Raises:
         ConfigError: with the first problem, in one line.

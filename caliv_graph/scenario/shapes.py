@@ -74,12 +74,7 @@ def _grid_quads(index: IntArray) -> IntArray:
 
 
 def solid_between(one: Array, other: Array) -> Mesh:
-    """The closed solid between two grids of points and the rim that joins their borders.
-
-    Args:
-        one: (r, c, 3) points of one side, r and c at least 2.
-        other: (r, c, 3) points of the other side.
-    """
+    """The closed solid between two grids (r, c, 3) of points and the rim between their borders."""
     rows, columns = one.shape[:2]
     n = rows * columns
     index = np.arange(n).reshape(rows, columns)

@@ -20,9 +20,8 @@ COARSE_STEP_M = 4.0
 def _rise(u: Array) -> tuple[Array, Array, Array]:
     """0 below 0, 1 above 1, between them 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7; two derivatives.
 
-    The step has three continuous derivatives, one more than the steps of the drives. The second
-    derivative of the height is the pitch rate. With a kink in the pitch rate, an IMU at 100 Hz
-    would measure the pitch with an error of 10 microradians, which is decimetres after a minute.
+    A kink in the second derivative of the height, the pitch rate, would give the pitch of an IMU at
+    100 Hz an error of 10 microradians, which is decimetres after a minute.
     """
     v = np.clip(u, 0.0, 1.0)
     w = v * (1.0 - v)
@@ -54,22 +53,14 @@ def _ramp_heights(ramp: RampModel, xy_map: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Level ground with ramps. Where ramps overlap, their heights add up.
-
-    Attributes:
-        ramps: the ramps.
-    """
+    """Level ground with ramps. Where ramps overlap, their heights add up."""
 
     ramps: tuple[RampModel, ...]
 
     def heights(self, xy_map: Array) -> tuple[Array, Array, Array]:
-        """Height above the level ground and its derivatives.
+        """Height (n,) above the level ground at places (n, 2), metres, and its derivatives.
 
-        Args:
-            xy_map: (n, 2) metres.
-
-        Returns:
-            (n,) metres, (n, 2) gradient, and (n, 2, 2) second derivatives in 1/m, map axes.
+        These are the (n, 2) gradient and (n, 2, 2) second derivatives in 1/m, map axes.
         """
         n = len(xy_map)
         height, gradient, hessian = np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2))

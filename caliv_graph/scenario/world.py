@@ -146,12 +146,7 @@ class World:
 
 
 def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> World:
-    """The world that a scenario describes.
-
-    Args:
-        model: ground, objects and walkers.
-        vehicle_body: the boxes that make up the vehicle.
-    """
+    """The world that a scenario describes, with the boxes that make up the vehicle."""
     z = model.ground.height_m
     terrain = make_terrain(model.ground)
     T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))

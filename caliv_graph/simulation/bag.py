@@ -62,11 +62,7 @@ def frame_of_lidar(name: str) -> str:
 
 
 def cloud_layout(model: LidarModel) -> tuple[np.dtype[Any], list[tuple[str, int, int]]]:
-    """Memory layout of a point in a PointCloud2.
-
-    Returns:
-        The type of a point, and name, offset and type number of each of its fields.
-    """
+    """The type of a point in a PointCloud2, and name, offset and type number per field."""
     fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
     formats, size = ["<f4", "<f4", "<f4"], 12
     if model.sweep is not None:
@@ -103,18 +99,12 @@ def cloud_bytes(scan: LidarScan, model: LidarModel) -> npt.NDArray[np.uint8]:
 
 
 class BagWriter:
-    """Writes the messages of a recording in the order in which a recorder receives them."""
+    """Writes the messages of a recording in the order in which a recorder receives them.
+
+    The folder must not exist. Raises ConfigError if the name of a LiDAR cannot be part of a topic.
+    """
 
     def __init__(self, folder: Path, recording: SimulatedRecording) -> None:
-        """Creates the bag and its topics.
-
-        Args:
-            folder: the bag's folder; must not exist.
-            recording: the recording.
-
-        Raises:
-            ConfigError: a LiDAR whose name cannot be part of a topic.
-        """
         self._recording = recording
         self._scenario: Scenario = recording.scenario
         self._store = get_typestore(Stores.ROS2_HUMBLE)
@@ -154,11 +144,7 @@ class BagWriter:
             self._writer.abort()
 
     def write(self, scan: LidarScan) -> None:
-        """Writes a cloud, after all other messages that were recorded before it.
-
-        Args:
-            scan: complete no earlier than the scans before it.
-        """
+        """Writes a cloud that is complete no earlier than those before, and what came before it."""
         model = self._scenario.lidars[scan.lidar]
         record_ns = self._recording.complete_ns(scan)
         self._write_others(record_ns)

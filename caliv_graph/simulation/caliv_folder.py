@@ -60,15 +60,9 @@ def sensor_folders(scenario: Scenario) -> tuple[str, ...]:
 
 
 class CalivWriter:
-    """Writes clouds, and at the end noisy poses, as a CaLiV folder."""
+    """Writes clouds, and at the end noisy poses, as a CaLiV folder: `input/` in `folder`."""
 
     def __init__(self, folder: Path, recording: SimulatedRecording) -> None:
-        """Creates the folders.
-
-        Args:
-            folder: the folder above `input/`.
-            recording: the recording.
-        """
         self._clouds = folder / "input"
         self._start_ns = recording.truth.start_ns
         self._sensors = dict(zip(recording.lidars, sensor_folders(recording.scenario), strict=True))
@@ -108,11 +102,7 @@ class CalivWriter:
 
 
 def frame_poses(recording: SimulatedRecording) -> tuple[IntArray, tuple[gtsam.Pose3, ...]]:
-    """True T_map_vehicle of all frames of a CaLiV folder, heave included.
-
-    Returns:
-        (n,) nanoseconds since the start of the drive, and n poses.
-    """
+    """Stamps (n,) since the start and true T_map_vehicle, with heave, of all frames."""
     truth = recording.truth
     stamps_ns: IntArray = np.arange(
         0, truth.end_ns - truth.start_ns + 1, FRAME_PERIOD_NS, dtype=np.int64
@@ -121,12 +111,7 @@ def frame_poses(recording: SimulatedRecording) -> tuple[IntArray, tuple[gtsam.Po
 
 
 def write_pcd(path: Path, points: Array) -> None:
-    """Writes a cloud as binary PCD v0.7 with fields x y z, float32.
-
-    Args:
-        path: the file.
-        points: (n, 3) metres, every value finite.
-    """
+    """Writes a cloud (n, 3) of finite metres as binary PCD v0.7 with fields x y z, float32."""
     n = len(points)
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\n"
@@ -147,12 +132,7 @@ def pose_values(pose: gtsam.Pose3) -> list[str]:
 
 
 def write_ego_poses(path: Path, poses: Mapping[str, Sequence[tuple[int, gtsam.Pose3]]]) -> None:
-    """Writes `ego_poses.yaml` of a CaLiV folder.
-
-    Args:
-        path: the file.
-        poses: per sensor (`sensor_1`, ...) its frame numbers with T_map_vehicle.
-    """
+    """Writes `ego_poses.yaml`: per sensor (`sensor_1`, ...) its frames with T_map_vehicle."""
     lines = []
     for sensor, entries in poses.items():
         lines.append(f"{sensor}:" if entries else f"{sensor}: []")

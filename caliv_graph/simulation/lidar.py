@@ -89,7 +89,7 @@ class LidarReturns:
 
 
 class SimulatedLidar:
-    """A LiDAR on the vehicle.
+    """A LiDAR on the vehicle. Its random generator is the source of its noise only.
 
     Attributes:
         T_vehicle_lidar: its true extrinsic.
@@ -106,15 +106,6 @@ class SimulatedLidar:
         crop: CropModel | None,
         rng: np.random.Generator,
     ) -> None:
-        """Lays out the beams.
-
-        Args:
-            model: its characteristics and true extrinsic.
-            world: the world around it.
-            caster: casts rays into that world.
-            crop: which beams to keep; None: all.
-            rng: source of its noise only.
-        """
         self.T_vehicle_lidar = model.mounting.pose()
         self._model = model
         self._caster = caster
@@ -143,12 +134,7 @@ class SimulatedLidar:
         )
 
     def scan(self, T_map_vehicle: gtsam.Pose3, time_s: float = 0.0) -> LidarReturns:
-        """One cloud, taken from one pose. The points are in the order of the beams.
-
-        Args:
-            T_map_vehicle: true pose of the vehicle.
-            time_s: since the start of the drive, for the walkers.
-        """
+        """One cloud from one pose, in the order of the beams; `time_s` is for the walkers."""
         return self.sweep(
             T_map_vehicle.rotation().matrix()[None],
             T_map_vehicle.translation()[None],
@@ -217,13 +203,7 @@ class SimulatedLidar:
     def beams_towards(
         self, R_map_vehicle: Array, t_map_vehicle: Array, spheres_map: Sequence[tuple[Array, float]]
     ) -> BoolArray:
-        """(beams,) which beams pass through one of the spheres.
-
-        Args:
-            R_map_vehicle: see `sweep`.
-            t_map_vehicle: see `sweep`.
-            spheres_map: centre (3,) in the map and radius of each, metres.
-        """
+        """(beams,) which beams pass through one of the spheres: centre (3,) in the map, radius."""
         R_map_lidar, t_map_lidar = self._poses(R_map_vehicle, t_map_vehicle)
         kept = np.zeros(len(self._directions_lidar), np.bool_)
         for centre_map, radius_m in spheres_map:
@@ -311,14 +291,7 @@ class SimulatedLidar:
 
 
 def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Array) -> Array:
-    """(n,) range to ground that is offset by a plane; exact where the ground is level.
-
-    Args:
-        wave: see `SimulatedLidar.sweep_of`.
-        distance_m: (n,) range to the ground without the offset, metres.
-        directions_map: (n, 3) of length 1.
-        origins: (n, 3) or (1, 3) metres, map axes, relative to the LiDAR's mean position.
-    """
+    """(n,) range to ground that is offset by `wave`; exact where the ground is level."""
     xy = origins[:, :2] + distance_m[:, None] * directions_map[:, :2]
     higher_m = xy @ wave[:2] + wave[2]
     # Rate at which a beam approaches the raised ground.
@@ -353,16 +326,10 @@ def _at_edges(
     same_face_m: Array,
     draws: SingleArray,
 ) -> tuple[Array, IntArray]:
-    """Distance and object of each beam, given the range of a second part of the beam.
+    """(n,) range and object of each beam, given the range `aside_m` of a second part of the beam.
 
-    Args:
-        edges: parameters of returns at edges.
-        distance_m: (n,) range of the middle of each beam.
-        objects: (n,) object that the middle of each beam hits.
-        aside_m: (n,) range of the second part.
-        same_face_m: (n,) range of the second part if the face in the middle were infinite. With it
-            the long spot of a beam that grazes the ground does not count as an edge.
-        draws: (n, 3) uniform.
+    `same_face_m` is that range if the face in the middle were infinite. With it the long spot of a
+    beam that grazes the ground does not count as an edge. `draws` (n, 3) are uniform.
     """
     # Infinite minus infinite is NaN, which is not an edge.
     with np.errstate(invalid="ignore"):

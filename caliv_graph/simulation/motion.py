@@ -26,13 +26,7 @@ ANGULAR_ACCELERATION_STEP_NS = 50_000
 
 @dataclass(frozen=True)
 class SimulatedImu:
-    """Measurements of an IMU, and its true biases.
-
-    Attributes:
-        samples: the measurements.
-        accelerometer_bias: (n, 3) m/s^2, imu frame, part of the samples.
-        gyroscope_bias: (n, 3) rad/s, imu frame, part of the samples.
-    """
+    """Measurements of an IMU, and its true biases (n, 3) in m/s^2 and rad/s, imu frame."""
 
     samples: ImuSamples
     accelerometer_bias: Array
@@ -41,12 +35,7 @@ class SimulatedImu:
 
 @dataclass(frozen=True)
 class SimulatedGnss:
-    """Fixes of a GNSS receiver, and the times without a fix.
-
-    Attributes:
-        fixes: the fixes.
-        lost_ns: (m,) stamps at which it reports no fix.
-    """
+    """Fixes of a GNSS receiver, and (m,) stamps without a fix."""
 
     fixes: GnssFixes
     lost_ns: IntArray
@@ -65,13 +54,7 @@ def angular_acceleration(drive: Drive, stamps_ns: IntArray) -> Array:
 def true_imu(
     drive: Drive, model: ImuModel, gravity_m_s2: float, stamps_ns: IntArray
 ) -> tuple[Array, Array, Rotation]:
-    """Measurements of a perfect IMU.
-
-    Args:
-        drive: the drive.
-        model: its mounting.
-        gravity_m_s2: towards map -z.
-        stamps_ns: (n,) since the start of the drive.
+    """Measurements of a perfect IMU at (n,) stamps since the start of the drive.
 
     Returns:
         (n, 3) angular velocity in rad/s and (n, 3) specific force in m/s^2, both in the imu frame,
@@ -104,11 +87,6 @@ def _bias(
 
 def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
     """Measurements of the scenario's IMU during the drive.
-
-    Args:
-        drive: the drive.
-        scenario: the IMU, gravity, and the stamp of the start.
-        seed: seed of the noise.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.
@@ -160,11 +138,7 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
 def simulate_gnss(drive: Drive, scenario: Scenario, z_map: float, seed: int) -> SimulatedGnss:
     """Fixes of the scenario's GNSS receiver during the drive.
 
-    Args:
-        drive: the drive.
-        scenario: the receiver, and the stamp of the start.
-        z_map: height of the vehicle frame in the map where the ground is level, in metres.
-        seed: seed of the noise.
+    `z_map` is the height of the vehicle frame in the map where the ground is level, in metres.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.
@@ -213,11 +187,6 @@ def antenna_positions(states: VehicleStates, model: GnssModel) -> Array:
 
 def simulate_velocity(drive: Drive, scenario: Scenario, seed: int) -> TwistSamples:
     """Velocities that the scenario's odometry measures during the drive.
-
-    Args:
-        drive: the drive.
-        scenario: the sensor, and the stamp of the start.
-        seed: seed of the noise.
 
     Raises:
         ConfigError: the seed is negative, or the drive is shorter than the phase.

@@ -52,13 +52,10 @@ def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator
 def height_and_heave(
     model: SuspensionModel, count: int, rng: np.random.Generator
 ) -> tuple[float, Array]:
-    """Errors of the vehicle frame's height above the ground: one per drive, one per frame.
+    """Error of the vehicle's height for the drive, and (count,) heave per frame, in metres.
 
     Heave is white from frame to frame: frames are 0.1 s apart, longer than the correlation time of
     a sprung body.
-
-    Returns:
-        The height error of the drive in metres, and (count,) heave of each frame in metres.
     """
     height_m = model.height_sigma_m * float(rng.standard_normal())
     heave_m: Array = model.heave_sigma_m * rng.standard_normal(count)
@@ -73,16 +70,8 @@ def noisy_poses(
 ) -> tuple[gtsam.Pose3, ...]:
     """Poses with the errors of a filter: white errors and a random walk.
 
-    Args:
-        stamps_ns: (n,) strictly increasing.
-        T_map_vehicle: n true poses.
-        model: sizes of the errors.
-        rng: source of the errors.
-
-    Returns:
-        n poses. Position errors are along map axes. The white rotation error is a right
-        perturbation (vehicle axes). The walk is a left perturbation (map axes), like the heading
-        drift of a filter.
+    Position errors are along map axes. The white rotation error is a right perturbation (vehicle
+    axes). The walk is a left perturbation (map axes), like the heading drift of a filter.
     """
     n = len(stamps_ns)
     white = rng.standard_normal((n, 6)) * np.repeat(
@@ -107,10 +96,7 @@ def perturbed_extrinsic(
     """An initial guess with uniform errors of position per vehicle axis, and of rotation.
 
     The rotation is R_true Rxyz, with roll, pitch and yaw of Rxyz drawn uniformly (CaLiV, section
-    IV, Evaluation).
-
-    Returns:
-        The guess, to a micrometre and a microdegree.
+    IV, Evaluation). The guess is rounded to a micrometre and a microdegree.
     """
     shift_m = rng.uniform(-1.0, 1.0, 3) * model.translation_m
     turn_rad = rng.uniform(-1.0, 1.0, 3) * math.radians(model.rotation_deg)

@@ -17,18 +17,12 @@ NO_OBJECT = -1
 
 
 class RayCaster:
-    """Casts rays at a world with Embree."""
+    """Casts rays at a world with Embree; the results do not depend on the number of threads.
+
+    Raises CalivError if open3d cannot be loaded.
+    """
 
     def __init__(self, world: World, threads: int = 1) -> None:
-        """Builds the scenes.
-
-        Args:
-            world: the world.
-            threads: number of threads; the results do not depend on it.
-
-        Raises:
-            CalivError: open3d cannot be loaded.
-        """
         self._o3d: Any = import_open3d()
         self._threads = threads
         # float32 resolves 1 micrometre at 10 m, but only 30 mm at the 500 km of a UTM grid.
@@ -105,15 +99,9 @@ class RayCaster:
         return distance_m, objects, normals
 
     def cast_at_vehicle(self, origin: Array, directions: Array) -> tuple[Array, int]:
-        """Casts rays at the vehicle's body.
+        """(n,) range of the vehicle's body, infinite without a hit, and its index in `World.names`.
 
-        Args:
-            origin: (3,) metres, vehicle frame.
-            directions: (n, 3) of length 1, vehicle frame.
-
-        Returns:
-            (n,) distance in metres, infinite without a hit, and the index of the vehicle in
-            `World.names`.
+        `origin` (3,) is in metres, `directions` (n, 3) are of length 1; vehicle frame.
         """
         if self._vehicle is None:
             return np.full(len(directions), np.inf), self._vehicle_index

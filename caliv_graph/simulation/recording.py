@@ -96,20 +96,12 @@ class SimulatedRecording:
     """A simulated drive (products.Recording). It casts rays only when clouds are requested.
 
     Attributes:
-        scenario: the scenario.
         seed: seed of all draws.
-        world: the world around the drive.
-        truth: the truth.
         guesses: initial guess of T_vehicle_lidar per LiDAR.
     """
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
-        """Draws the errors that hold for the whole drive.
-
-        Args:
-            scenario: the drive.
-            seed: seed of all draws.
-            threads: threads that cast rays; the result does not depend on it.
+        """Draws the errors that hold for the whole drive; the result does not depend on `threads`.
 
         Raises:
             ConfigError: the seed is negative.
@@ -287,9 +279,7 @@ class SimulatedRecording:
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in order of their stamps. They do not depend on each other.
 
-        Args:
-            lidar: its name.
-            wanted: stamps of the requested clouds; None: all.
+        `wanted` has the stamps of the requested clouds; None: all.
 
         Raises:
             CalivError: open3d cannot be loaded.
@@ -301,11 +291,6 @@ def simulate_drive(scenario: Scenario, seed: int, threads: int = 1) -> Simulated
     """Simulates a drive in memory: motion data at once, clouds on request.
 
     The numbers equal those that `write_drive` writes for the same scenario and seed.
-
-    Args:
-        scenario: the drive.
-        seed: seed of all draws.
-        threads: threads that cast rays; the result does not depend on it.
 
     Raises:
         ConfigError: the seed is negative.

@@ -46,12 +46,7 @@ CONTENT = (
 
 @dataclass(frozen=True)
 class SimulatedScans:
-    """Sizes of the clouds of one LiDAR.
-
-    Attributes:
-        points: number of points of each written scan, in the order of the stamps.
-        target_points: number of points of each scan on a target.
-    """
+    """Points per written scan of one LiDAR, and those on a target, in the order of stamps."""
 
     points: tuple[int, ...]
     target_points: tuple[int, ...]
@@ -59,13 +54,7 @@ class SimulatedScans:
 
 @dataclass(frozen=True)
 class SimulatedDrive:
-    """A drive that was written.
-
-    Attributes:
-        folder: its folder.
-        duration_s: duration of the drive.
-        scans: sizes of the clouds per LiDAR.
-    """
+    """A drive that was written, with the sizes of the clouds per LiDAR."""
 
     folder: Path
     duration_s: float

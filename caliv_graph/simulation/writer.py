@@ -55,12 +55,7 @@ def topic_of_lidar(name: str) -> str:
 def truth_of(
     T_vehicle_lidar: Mapping[str, gtsam.Pose3], time_offset_s: Mapping[str, float]
 ) -> dict[str, Any]:
-    """The content of `truth.yaml`.
-
-    Args:
-        T_vehicle_lidar: true extrinsic per LiDAR.
-        time_offset_s: per LiDAR, stamp minus true acquisition time.
-    """
+    """The content of `truth.yaml`; a time offset is stamp minus true acquisition time."""
     return {
         "lidars": {
             name: {
@@ -174,11 +169,7 @@ def _motion_sections(scenario: Scenario) -> dict[str, Any]:
 
 
 def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
-    """The content of a `config.yaml` with which the written drive can be calibrated.
-
-    Args:
-        recording: the drive.
-        has_bag: whether it is written as a bag; else as a CaLiV folder.
+    """The content of a `config.yaml` with which the written bag or CaLiV folder can be calibrated.
 
     Raises:
         ConfigError: a LiDAR whose name cannot be part of a topic.
@@ -249,11 +240,7 @@ def write_tum(
 ) -> None:
     """Writes a trajectory in the TUM format: stamp in seconds, x y z qx qy qz qw.
 
-    Args:
-        path: the file.
-        stamps_ns: (n,) nanoseconds.
-        T_map_vehicle: n poses.
-        comment: a first line, after `#`.
+    The comment is the first line, after `#`.
     """
     lines = [f"# {comment}"] if comment else []
     for stamp_ns, pose in zip(stamps_ns.tolist(), T_map_vehicle, strict=True):

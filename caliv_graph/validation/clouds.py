@@ -58,12 +58,7 @@ CREEP_M_S = 0.02
 
 @dataclass(frozen=True)
 class Extrinsics:
-    """A set of extrinsics to measure.
-
-    Attributes:
-        T_vehicle_lidar: extrinsic per LiDAR.
-        time_offset_s: per LiDAR, stamp minus true time; absent: zero.
-    """
+    """A set of extrinsics to measure; a time offset is stamp minus true time, zero if absent."""
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
     time_offset_s: Mapping[str, float]
@@ -79,7 +74,6 @@ class Placed:
     """The points under one set of extrinsics.
 
     Attributes:
-        extrinsics: the extrinsics.
         taken_ns: (S,) true time of each scan.
         R_map_vehicle: (S, 3, 3) the vehicle's attitude at these times.
         t_map_vehicle: (S, 3) metres, the vehicle's position.
@@ -114,12 +108,7 @@ class Clouds:
     target_points: int = 0
 
     def points_vehicle(self, placed: Placed, poses: Sequence[gtsam.Pose3] | None = None) -> Array:
-        """(N, 3) metres, vehicle frame.
-
-        Args:
-            placed: the points.
-            poses: T_vehicle_lidar in the order of `lidars` instead of those of `placed`.
-        """
+        """(N, 3) metres, vehicle frame; `poses` replace the T_vehicle_lidar of `placed`."""
         if poses is None:
             poses = [placed.extrinsics.T_vehicle_lidar[name] for name in self.lidars]
         R, t = stack(poses)
@@ -143,12 +132,7 @@ class Clouds:
 
 
 def choose_scans(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> IntArray:
-    """At most `SCANS` stamps, evenly spread over path length and turns.
-
-    Args:
-        stamps_ns: ascending.
-        trajectory: trajectory of the drive; stamps outside its span are left out.
-    """
+    """At most `SCANS` of ascending stamps in the trajectory, evenly over path and turns."""
     begin, end = trajectory.span_ns
     stamps = np.array([t for t in stamps_ns if begin <= t <= end], dtype=np.int64)
     if len(stamps) <= SCANS:

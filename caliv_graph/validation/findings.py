@@ -27,7 +27,6 @@ class SurfaceResult:
     Attributes:
         name: its name, such as "wall 1".
         surface: its geometry under the best alignment, with its points.
-        points: number of points per LiDAR.
         thickness: thickness by stage (`STAGES`).
         apart: distances by stage, per pair of LiDARs that both see it.
         expected: expected values after calibration, from known errors alone.
@@ -47,8 +46,6 @@ class ThingResult:
 
     Attributes:
         name: its name, such as "object 1".
-        thing: its geometry and points.
-        points: number of points per LiDAR.
         distance_m: by stage, per pair of LiDARs, mean distance from the other's nearest point.
     """
 
@@ -110,20 +107,13 @@ class Validation:
     """Result of a validation.
 
     Attributes:
-        drive: name of the drive.
-        lidars: names of the LiDARs.
-        scans: number of scans used per LiDAR.
         surfaces: walls, then poles, the largest first.
-        things: objects.
         pairs: pairs of LiDARs with a common surface or overlapping clouds.
         thickness_m: by stage, thickness of merged clouds, root mean square over the surfaces.
         alone_m: by stage, per LiDAR, likewise of its cloud alone.
         expected_thickness_m: after calibration, from known errors alone.
         expected_alone_m: likewise per LiDAR.
-        verdict: the verdict.
-        clouds: the points, for figures.
         best: extrinsics with the best alignment, in the order of `lidars`; no calibration.
-        warnings: warnings for the user, one line each.
     """
 
     drive: str

@@ -84,7 +84,6 @@ class Apart:
     """Distance between the surfaces of two LiDARs on one wall or pole.
 
     Attributes:
-        lidars: the two.
         distance_m: root mean square distance between their surfaces, over the part that both see;
             for poles the distance between their axes at middle height.
         offset_m: (k,) signed distance in the middle: along the normal of a wall, x and y of a pole.
@@ -124,15 +123,12 @@ class _Refitted:
 
 
 class SurfaceMeter:
-    """Measures one surface under any extrinsics, always with the same points."""
+    """Measures one surface under any extrinsics, always with the same points.
+
+    The surface is that of the best alignment, with its points.
+    """
 
     def __init__(self, clouds: Clouds, surface: Wall | Pole) -> None:
-        """Selects the points.
-
-        Args:
-            clouds: all points.
-            surface: the surface under the best alignment, with its points.
-        """
         self._clouds = clouds
         self._surface = surface
         self._lidar = clouds.lidar[surface.members]
@@ -147,12 +143,7 @@ class SurfaceMeter:
     def measure(
         self, placed: Placed, poses: Sequence[gtsam.Pose3] | None = None
     ) -> tuple[Thickness, dict[tuple[str, str], Apart]]:
-        """Thickness and distances between LiDARs.
-
-        Args:
-            placed: the points under one set of extrinsics.
-            poses: T_vehicle_lidar instead of these, in the order of the LiDARs.
-        """
+        """Thickness and distances between LiDARs; `poses` replace those of `placed`."""
         points = self._clouds.points_map(placed, poses)[self._surface.members]
         beams = self._clouds.beams_map(placed, poses)[self._surface.members]
         merged = _refitted(points, beams, self._surface)
@@ -379,17 +370,9 @@ def cloud_distances(
 def thing_distance(points: Array, lidar: IntArray, a: int, b: int) -> float | None:
     """Mean distance of each point of an object from the other LiDAR's nearest point, metres.
 
-    It is the mean over both directions (chamfer distance). It is never zero, because beams of two
-    LiDARs do not hit the same points.
-
-    Args:
-        points: (n, 3) metres, map.
-        lidar: (n,) index of each point's LiDAR.
-        a: index of a LiDAR.
-        b: index of another LiDAR.
-
-    Returns:
-        None if one of them has fewer than `OWN_POINTS` points.
+    It is the mean over both directions (chamfer distance) for LiDARs a and b, of points (n, 3) with
+    LiDAR (n,). It is never zero, because beams of two LiDARs do not hit the same points. None if
+    one of them has fewer than `OWN_POINTS` points.
     """
     p, q = points[lidar == a], points[lidar == b]
     if min(len(p), len(q)) < OWN_POINTS:

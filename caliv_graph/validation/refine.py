@@ -1,10 +1,8 @@
 """Assigns points to surfaces: aligns the extrinsics until walls and poles are thinnest.
 
 A measure on points that are already near each other would rate every calibration as good. So the
-extrinsics are optimised, with a gate that shrinks from 0.6 m, until the structure is as thin as
-possible. The assignment of points to surfaces at this optimum is used for every set of extrinsics
-that is measured. The optimum is a bound for the alignment of this structure. It is no calibration,
-because it follows the errors of the trajectory.
+assignment at this optimum, found with a gate that shrinks from 0.6 m, is used for every set of
+extrinsics. The optimum is no calibration, because it follows the errors of the trajectory.
 """
 
 from __future__ import annotations
@@ -94,17 +92,10 @@ def _found(
 def extrinsic_jacobian(
     clouds: Clouds, placed: Placed, poses: Sequence[gtsam.Pose3], members: IntArray, normal: Array
 ) -> Array:
-    """Derivative of points along a direction with respect to the extrinsic of their LiDAR.
+    """(n, 6) derivative of points along a direction by the extrinsic of their LiDAR.
 
-    Args:
-        clouds: the points.
-        placed: the points under one set of extrinsics.
-        poses: T_vehicle_lidar instead of these.
-        members: (n,) indices of the points.
-        normal: (n, 3) the direction, map.
-
-    Returns:
-        (n, 6) by the vehicle-axes perturbation of the extrinsic of each point's LiDAR.
+    The perturbation is in vehicle axes. `members` (n,) are the indices of the points, `normal` (n,
+    3) is the direction in the map, and `poses` replace the T_vehicle_lidar of `placed`.
     """
     R_map_vehicle = placed.R_map_vehicle[clouds.scan[members]]
     normal_vehicle = np.einsum("nji,nj->ni", R_map_vehicle, normal)
@@ -169,14 +160,9 @@ def linearised(surface: Wall | Pole, points: Array) -> tuple[Array, Array, Array
 def pose_jacobian(
     clouds: Clouds, placed: Placed, points_vehicle: Array, members: IntArray, normal: Array
 ) -> Array:
-    """Derivative of points along a direction by the vehicle's pose, (n, 6) right perturbation.
+    """(n, 6) derivative of points along a direction by the vehicle's pose, right perturbation.
 
-    Args:
-        clouds: the points.
-        placed: the points under one set of extrinsics.
-        points_vehicle: (n, 3) the points, vehicle frame.
-        members: (n,) indices of the points.
-        normal: (n, 3) the direction, map.
+    `points_vehicle` (n, 3) are the points in the vehicle frame; see `extrinsic_jacobian`.
     """
     R = placed.R_map_vehicle[clouds.scan[members]]
     normal_vehicle = np.einsum("nji,nj->ni", R, normal)

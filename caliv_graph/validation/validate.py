@@ -59,14 +59,9 @@ def validate(
     """Measures the alignment of all LiDARs' clouds of a drive, before and after calibration.
 
     The trajectory and the extrinsics transform the clouds into the map. Points in a target's region
-    are left out, and the ground too, unless the solve did not use it.
-
-    Args:
-        recording: the drive that was calibrated, or another one of the same vehicle.
-        calibration: the calibration to validate.
-        config: initial guesses, topics, noise, target and ground as for `calibrate`.
-        progress: advanced at every scan.
-        motion: the recording's motion data, if they have been read already.
+    are left out, and the ground too, unless the solve did not use it. The drive is the calibrated
+    one or another one of the same vehicle, and the config is as for `calibrate`. Motion data that
+    have been read already are not read again.
 
     Raises:
         ConfigError: calibration and config have no LiDAR in common.

@@ -44,12 +44,7 @@ def judge(
 ) -> Verdict:
     """The verdict on what was measured.
 
-    Args:
-        surfaces: walls and poles.
-        things: objects.
-        pairs: pairs of LiDARs.
-        alone: thickness by stage and LiDAR, and its expected value by LiDAR.
-        errors: the known errors.
+    `alone` has the thickness by stage and LiDAR, and its expected value by LiDAR.
     """
     tested = _tested(surfaces)
     chi2, p_value = 0.0, None

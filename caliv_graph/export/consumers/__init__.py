@@ -30,11 +30,7 @@ def find_consumer(name: str) -> Consumer:
 
 
 def check_options(name: str, given: Iterable[str]) -> None:
-    """Refuses options that a consumer does not use.
-
-    Args:
-        name: of the consumer.
-        given: options of the command line.
+    """Refuses options of the command line that a consumer does not use.
 
     Raises:
         ExportError: an option is not one of this consumer.
@@ -50,10 +46,6 @@ def check_options(name: str, given: Iterable[str]) -> None:
 
 def export(name: str, request: Request) -> Export:
     """A calibration in the form of a consumer.
-
-    Args:
-        name: of the consumer.
-        request: the calibration and the options.
 
     Raises:
         ExportError: an input of the consumer is missing or invalid.

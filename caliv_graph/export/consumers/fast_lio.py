@@ -6,7 +6,7 @@ The LiDAR's pose in the IMU's frame (hku-mars/FAST_LIO, README): `p_imu = R p_li
 from __future__ import annotations
 
 from caliv_graph.export.parameters import Parameters, parameter_export
-from caliv_graph.export.request import IMU_OPTIONS, Consumer, Export, Request
+from caliv_graph.export.request import IMU_OPTIONS, Consumer, Export, Request, Transform
 
 
 def export(request: Request) -> Export:
@@ -22,20 +22,13 @@ def export(request: Request) -> Export:
         "extrinsic_T": T_imu_lidar.translation().tolist(),
         "extrinsic_R": T_imu_lidar.rotation().matrix().ravel().tolist(),
     }
+    meaning = "extrinsic_T and extrinsic_R (row-major): p_imu = R p_lidar + T."
     return parameter_export(
         request,
-        Parameters(
-            consumer="fast-lio",
-            lidar=lidar,
-            parent="imu",
-            child=lidar,
-            T_parent_child=T_imu_lidar,
-            meaning="extrinsic_T and extrinsic_R (row-major): p_imu = R p_lidar + T.",
-            ros1=values,
-            ros2=values,
-            above_ros1=("mapping",),
-            above_ros2=("/**", "ros__parameters", "mapping"),
-        ),
+        "fast-lio",
+        Transform(lidar, "imu", lidar, T_imu_lidar, meaning),
+        Parameters(("mapping",), values),
+        Parameters(("/**", "ros__parameters", "mapping"), values),
         (*several, *assumed),
     )
 

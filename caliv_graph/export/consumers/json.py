@@ -5,15 +5,7 @@ from __future__ import annotations
 import json
 
 from caliv_graph.conventions import AXES
-from caliv_graph.export.covariance import (
-    GTSAM_AXES,
-    GTSAM_SIDE,
-    ROS_AXES,
-    ROS_SIDE,
-    axes_order,
-    joint_covariance,
-    ros_covariance,
-)
+from caliv_graph.export.covariance import covariances
 from caliv_graph.export.request import Consumer, Export, Request
 from caliv_graph.export.text import notice, quaternion_xyzw, undetermined_axes
 
@@ -21,7 +13,6 @@ from caliv_graph.export.text import notice, quaternion_xyzw, undetermined_axes
 def export(request: Request) -> Export:
     """Poses, determined axes and covariances as one JSON document."""
     transforms = request.vehicle_transforms()
-    cov = joint_covariance(request)
     poses = [request.T_vehicle_lidar(name) for name in request.lidars]
     document = {
         "comment": notice(request, transforms).splitlines(),
@@ -40,15 +31,9 @@ def export(request: Request) -> Export:
             }
             for name, pose in zip(request.lidars, poses, strict=True)
         },
-        "covariance_gtsam": {
-            "order": axes_order(request.lidars, GTSAM_AXES),
-            "side": GTSAM_SIDE,
-            "matrix": cov.tolist(),
-        },
-        "covariance_ros": {
-            "order": axes_order(request.lidars, ROS_AXES),
-            "side": ROS_SIDE,
-            "matrix": ros_covariance(poses, cov).tolist(),
+        **{
+            f"covariance_{name}": {"order": order, "side": side, "matrix": cov.tolist()}
+            for name, (order, side, cov) in covariances(request).items()
         },
     }
     return Export((json.dumps(document, indent=1, allow_nan=False) + "\n").encode(), transforms)

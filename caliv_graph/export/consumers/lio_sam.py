@@ -11,7 +11,7 @@ and inverts it, the ROS 2 branch takes R_imu_lidar and does not invert it.
 from __future__ import annotations
 
 from caliv_graph.export.parameters import Parameters, parameter_export
-from caliv_graph.export.request import IMU_OPTIONS, Consumer, Export, Request
+from caliv_graph.export.request import IMU_OPTIONS, Consumer, Export, Request, Transform
 
 
 def export(request: Request) -> Export:
@@ -27,30 +27,32 @@ def export(request: Request) -> Export:
         "extrinsicTrans": T_lidar_imu.translation().tolist(),
         "extrinsicRot": R_lidar_imu.ravel().tolist(),
     }
+    own_axes = "if the IMU reports the orientation of its own axes."
     return parameter_export(
         request,
+        "lio-sam",
+        Transform(
+            lidar,
+            lidar,
+            "imu",
+            T_lidar_imu,
+            "extrinsicTrans and extrinsicRot (row-major): p_lidar = R p_imu + t.",
+        ),
         Parameters(
-            consumer="lio-sam",
-            lidar=lidar,
-            parent=lidar,
-            child="imu",
-            T_parent_child=T_lidar_imu,
-            meaning="extrinsicTrans and extrinsicRot (row-major): p_lidar = R p_imu + t.",
-            ros1={**shared, "extrinsicRPY": R_lidar_imu.ravel().tolist()},
-            ros2={**shared, "extrinsicRPY": R_lidar_imu.T.ravel().tolist()},
-            optional=("extrinsicRPY",),
-            above_ros1=("lio_sam",),
-            above_ros2=("/**", "ros__parameters"),
-            extra_ros1=(
-                "extrinsicRPY is R_lidar_imu, which LIO-SAM's main branch (ROS 1) inverts, if the "
-                "IMU reports the orientation of its own axes.",
-            ),
-            extra_ros2=(
-                "extrinsicRPY is R_imu_lidar, as LIO-SAM's ROS 2 branch expects it, if the IMU "
-                "reports the orientation of its own axes.",
+            ("lio_sam",),
+            {**shared, "extrinsicRPY": R_lidar_imu.ravel().tolist()},
+            (
+                "extrinsicRPY is R_lidar_imu, which LIO-SAM's main branch (ROS 1) inverts, "
+                f"{own_axes}",
             ),
         ),
+        Parameters(
+            ("/**", "ros__parameters"),
+            {**shared, "extrinsicRPY": R_lidar_imu.T.ravel().tolist()},
+            (f"extrinsicRPY is R_imu_lidar, as LIO-SAM's ROS 2 branch expects it, {own_axes}",),
+        ),
         (*several, *assumed),
+        optional=("extrinsicRPY",),
     )
 
 

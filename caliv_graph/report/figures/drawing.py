@@ -51,8 +51,6 @@ class Figure:
 
     Attributes:
         name: unique on the page; names the element.
-        caption: what the figure shows, and how to read it.
-        figure: the plotly figure.
         solid: whether it is a 3-D view.
     """
 
@@ -109,12 +107,7 @@ def colours(lidars: Sequence[str]) -> dict[str, str]:
 
 
 def finish(figure: go.Figure, height: int) -> None:
-    """Sets size, margins, font and legend of a figure.
-
-    Args:
-        figure: changed in place.
-        height: pixels.
-    """
+    """Sets size (the height in pixels), margins, font and legend of a figure in place."""
     figure.update_layout(
         width=WIDTH,
         height=height,

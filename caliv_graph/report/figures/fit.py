@@ -33,9 +33,7 @@ from caliv_graph.report.residuals import Residuals
 def residual_figure(residuals: Residuals, number: int) -> Figure:
     """Whitened residuals compared with N(0, 1), and residuals in millimetres and milliradians.
 
-    Args:
-        residuals: of one kind of measurement.
-        number: makes the figure's name unique.
+    The number makes the figure's name unique.
     """
     count = 1 + len(residuals.physical)
     titles = ["whitened, all axes", *(f"{q} ({u})" for q, (u, _) in residuals.physical.items())]

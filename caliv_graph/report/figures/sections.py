@@ -25,16 +25,7 @@ MOST_SOLID = 2
 def report_figures(
     calibration: Calibration, solution: Solution, record: RunRecord
 ) -> dict[str, list[Figure]]:
-    """The figures per section.
-
-    Args:
-        calibration: the result.
-        solution: the solved graph.
-        record: drives, trajectories and scans of the run.
-
-    Returns:
-        Per section its figures, in the order of the page; a section may be empty.
-    """
+    """Per section its figures, in the order of the page; a section may be empty."""
     with without_template():
         kinds = all_residuals(solution, record)
         sections: dict[str, Sequence[Figure | None]] = {

@@ -37,6 +37,9 @@ from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 MOST_SAMPLES = 3000
 """Points of a line over time."""
 
+_AXIS_STYLES = ((BLUE, "circle"), (VERMILLION, "square"), (GREEN, "diamond"))
+"""Colour and marker of x, y, z."""
+
 
 def path_figure(
     drive: int,
@@ -46,76 +49,36 @@ def path_figure(
     lidars: Sequence[str],
 ) -> Figure:
     """The drive from above: path, scans that see the target, the target, GNSS fixes."""
-    stamps = stamps_along(trajectory, 1500)
-    _, t = trajectory.poses_at(stamps)
+    _, t = trajectory.poses_at(stamps_along(trajectory, 1500))
     origin = t[0]
+    begin_ns, end_ns = trajectory.span_ns
     figure = go.Figure()
-    _line(figure, t[:, 0] - origin[0], t[:, 1] - origin[1], "vehicle", BLACK)
+    x, y, _ = small(t - origin).T
+    figure.add_scatter(x=x, y=y, mode="lines", line={"color": BLACK, "width": 1}, name="vehicle")
     if isinstance(trajectory, SmoothedTrajectory):
         fixes, residuals = gnss_residuals(trajectory)
         if len(fixes):
             # The residual is the predicted position minus the fix.
-            _, at = trajectory.poses_at(np.clip(fixes, *trajectory.span_ns))
-            place = at - residuals - origin
-            _dots(
-                figure,
-                place[:, 0],
-                place[:, 1],
-                "GNSS fixes",
-                GREY,
-                "circle-open",
-                5,
-            )
+            _, at = trajectory.poses_at(np.clip(fixes, begin_ns, end_ns))
+            _dots(figure, at - residuals - origin, "GNSS fixes", GREY, "circle-open", 5)
         rejected = trajectory.gnss_rejected
-        rejected = rejected[
-            (rejected >= trajectory.span_ns[0]) & (rejected <= trajectory.span_ns[1])
-        ]
+        rejected = rejected[(rejected >= begin_ns) & (rejected <= end_ns)]
         if len(rejected):
             _, at = trajectory.poses_at(rejected)
-            place = at - origin
-            _dots(
-                figure,
-                place[:, 0],
-                place[:, 1],
-                "dropped GNSS fixes",
-                VERMILLION,
-                "x",
-                10,
-            )
+            _dots(figure, at - origin, "dropped GNSS fixes", VERMILLION, "x", 10)
     colour, shown = colours(lidars), labels(lidars)
+    clouds = [c for r in solution.registrations for c in r.observation.clouds if c.drive == drive]
     for i, lidar in enumerate(lidars):
-        seen = np.unique(
-            [
-                c.stamp_ns
-                for r in solution.registrations
-                for c in r.observation.clouds
-                if c.lidar == lidar and c.drive == drive
-            ]
-        ).astype(np.int64)
+        seen = np.unique([c.stamp_ns for c in clouds if c.lidar == lidar]).astype(np.int64)
         if len(seen):
-            _, at = trajectory.poses_at(np.clip(seen, *trajectory.span_ns))
-            side = 0.12 * i
-            _dots(
-                figure,
-                at[:, 0] - origin[0],
-                at[:, 1] - origin[1] + side,
-                f"{shown[lidar]} sees a target ({len(seen)} scans)",
-                colour[lidar],
-                SYMBOLS[i % len(SYMBOLS)],
-                6,
-            )
+            _, at = trajectory.poses_at(np.clip(seen, begin_ns, end_ns))
+            beside = at - origin + np.array([0.0, 0.12 * i, 0.0])
+            sees = f"{shown[lidar]} sees a target ({len(seen)} scans)"
+            _dots(figure, beside, sees, colour[lidar], SYMBOLS[i % len(SYMBOLS)], 6)
     for r in solution.registrations:
         if any(c.drive == drive for c in r.observation.clouds):
-            x, y, _ = r.observation.centre_map - origin
-            _dots(
-                figure,
-                np.array([x]),
-                np.array([y]),
-                label(r.observation.name),
-                PURPLE,
-                "star",
-                15,
-            )
+            place = (r.observation.centre_map - origin)[None]
+            _dots(figure, place, label(r.observation.name), PURPLE, "star", 15)
     figure.update_yaxes(scaleanchor="x", title="m")
     figure.update_xaxes(title="m, from the first pose, map axes", constrain="domain")
     finish(figure, 480)
@@ -145,7 +108,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
     for row, (values, sigma) in enumerate(
         ((states.force_bias, force_sigma), (states.gyro_bias, gyro_sigma)), start=1
     ):
-        for axis, colour in enumerate((BLUE, VERMILLION, GREEN)):
+        for axis, (colour, _) in enumerate(_AXIS_STYLES):
             value, spread = 1e3 * values[some, axis], 1e3 * sigma[some, axis]
             figure.add_scatter(
                 x=np.concatenate([seconds, seconds[::-1]]),
@@ -172,9 +135,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
             )
     if len(fixes):
         few = evenly(len(fixes), MOST_SAMPLES // 3)
-        for axis, (colour, symbol) in enumerate(
-            ((BLUE, "circle"), (VERMILLION, "square"), (GREEN, "diamond"))
-        ):
+        for axis, (colour, symbol) in enumerate(_AXIS_STYLES):
             figure.add_scatter(
                 x=to_seconds(fixes[few] - begin),
                 y=small(1e3 * r[few, axis]),
@@ -219,9 +180,7 @@ def correction_figure(
     )
     seconds = to_seconds(stamps - first_stamp(stamps))
     for row, values in enumerate((rotation, translation), start=1):
-        for axis, (colour, symbol) in enumerate(
-            ((BLUE, "circle"), (VERMILLION, "square"), (GREEN, "diamond"))
-        ):
+        for axis, (colour, symbol) in enumerate(_AXIS_STYLES):
             figure.add_scatter(
                 x=seconds,
                 y=small(1e3 * values[:, axis]),
@@ -243,19 +202,11 @@ def correction_figure(
     )
 
 
-def _line(figure: go.Figure, x: Array, y: Array, name: str, colour: str) -> None:
+def _dots(figure: go.Figure, points: Array, name: str, colour: str, symbol: str, size: int) -> None:
+    some = small(points[evenly(len(points), MOST_SAMPLES)])
     figure.add_scatter(
-        x=small(x), y=small(y), mode="lines", line={"color": colour, "width": 1}, name=name
-    )
-
-
-def _dots(
-    figure: go.Figure, x: Array, y: Array, name: str, colour: str, symbol: str, size: int
-) -> None:
-    some = evenly(len(x), MOST_SAMPLES)
-    figure.add_scatter(
-        x=small(x[some]),
-        y=small(y[some]),
+        x=some[:, 0],
+        y=some[:, 1],
         mode="markers",
         marker={"color": colour, "symbol": symbol, "size": size},
         name=name,

@@ -117,7 +117,10 @@ def write_drive(
         with ExitStack() as stack:
             writers: list[BagWriter | CalivWriter] = []
             if has_bag:
-                writers.append(stack.enter_context(_bag_writer(folder, recording)))
+                # rosbags takes 0.25 s to import, and a CaLiV folder does not need it.
+                from caliv_graph.simulation.bag import BagWriter
+
+                writers.append(stack.enter_context(BagWriter(folder / BAG_FOLDER, recording)))
             if has_caliv:
                 caliv = CalivWriter(folder / CALIV_FOLDER, recording)
                 writers.append(stack.enter_context(caliv))
@@ -154,13 +157,6 @@ def _write_scans(
         name: SimulatedScans(tuple(n for n, _ in of), tuple(n for _, n in of))
         for name, of in counts.items()
     }
-
-
-def _bag_writer(folder: Path, recording: SimulatedRecording) -> BagWriter:
-    # rosbags takes 0.25 s to import, and a CaLiV folder does not need it.
-    from caliv_graph.simulation.bag import BagWriter
-
-    return BagWriter(folder / BAG_FOLDER, recording)
 
 
 def simulate_caliv(

@@ -124,10 +124,10 @@ def attempts(work: Path, job: str) -> list[tuple[str, int]]:
     out: list[tuple[str, int]] = []
     for number in range(1, MOST_ATTEMPTS + 1):
         try:
-            host, pid = json.loads(_attempt_file(work, job, number).read_text("utf-8"))
-        except (OSError, ValueError, TypeError):
+            found = json.loads(_attempt_file(work, job, number).read_text("utf-8"))
+            out.append((found["host"], found["pid"]))
+        except (OSError, ValueError, TypeError, KeyError):
             break
-        out.append((host, pid))
     return out
 
 
@@ -243,7 +243,7 @@ def _attempt_file(work: Path, job: str, number: int) -> Path:
 
 def _mark_attempt(task: Task, number: int) -> None:
     """Records the process of an attempt before the job starts."""
-    attempt = (socket.gethostname(), os.getpid())
+    attempt = {"host": socket.gethostname(), "pid": os.getpid()}
     try:
         _attempt_file(task.work, task.name, number).write_text(json.dumps(attempt), "utf-8")
     except FileNotFoundError:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -46,14 +46,6 @@ _MOST_SUBMISSIONS = 6
 
 _WRITING_SHARE = 0.05
 """Largest fraction of the time for rewriting the summary while jobs run."""
-
-
-@dataclass
-class _Flight:
-    """A job that is submitted to the workers."""
-
-    future: Any
-    submissions: int
 
 
 def run_batch(
@@ -188,7 +180,7 @@ class _Batch:
     def work(self, workers: cluster.Workers, progress: Progress) -> None:
         """Runs the remaining jobs on the workers."""
         queue = deque((name, 0) for name in self.todo)
-        flying: dict[str, _Flight] = {}
+        flying: dict[str, tuple[Any, int]] = {}  # the future, and the number of submissions
         count, counted_s, alive_s = workers.count(), time.monotonic(), time.monotonic()
         with progress.stage("calibrating", len(self._jobs)) as advance:
             finished = len(self._jobs) - len(self.todo)
@@ -212,15 +204,15 @@ class _Batch:
                     except OSError:  # the connection was lost a moment ago
                         queue.append((name, submissions))
                         break
-                    flying[name] = _Flight(future, submissions + 1)
+                    flying[name] = (future, submissions + 1)
                 time.sleep(_POLL_S)
-                for name in [name for name, flight in flying.items() if flight.future.done()]:
-                    flight = flying.pop(name)
-                    if self._land(name, flight, workers):
+                for name in [name for name, (future, _) in flying.items() if future.done()]:
+                    future, submissions = flying.pop(name)
+                    if self._land(name, future, submissions, workers):
                         advance(1, self._note(flying))
                         self._write_now_and_then()
                     else:
-                        queue.append((name, flight.submissions))
+                        queue.append((name, submissions))
                 advance(0, self._note(flying))
 
     def _task(self, name: str) -> Task:
@@ -230,9 +222,8 @@ class _Batch:
         cache = DigestCache({path: entries[path] for path in known})
         return replace(self.todo[name], cache=cache.dump())
 
-    def _land(self, name: str, flight: _Flight, workers: cluster.Workers) -> bool:
+    def _land(self, name: str, future: Any, submissions: int, workers: cluster.Workers) -> bool:
         """Records the outcome of a job; False if the job must be submitted again."""
-        future = flight.future
         if future.status == "finished":
             outcome: Outcome = future.result()
         else:
@@ -242,7 +233,7 @@ class _Batch:
                 outcome = Outcome("failed", DEFECT, f"its worker could not run it: {error!r}")
             elif len(attempts(self.folder.work, name)) >= MOST_ATTEMPTS:
                 outcome = Outcome("died")
-            elif flight.submissions < _MOST_SUBMISSIONS:
+            elif submissions < _MOST_SUBMISSIONS:
                 return False
             else:
                 outcome = Outcome(
@@ -318,9 +309,9 @@ class _Batch:
 
     def _death(self, name: str, workers: cluster.Workers) -> str:
         parts = []
-        for attempt in attempts(self.folder.work, name):
-            how = workers.deaths.get(attempt.pid, "ended without a message")
-            parts.append(f"process {attempt.pid} on {attempt.host} {how}")
+        for host, pid in attempts(self.folder.work, name):
+            how = workers.deaths.get(pid, "ended without a message")
+            parts.append(f"process {pid} on {host} {how}")
         return (
             f"its worker died {len(parts)} times: {'; '.join(parts)}. Signal 9 usually means that "
             "the system is out of memory: give the batch fewer --workers"
@@ -335,7 +326,7 @@ class _Batch:
         for name in names:
             self._fail(name, None, f"{what}. Run the batch again")
 
-    def _note(self, flying: dict[str, _Flight]) -> str:
+    def _note(self, flying: Iterable[str]) -> str:
         """The jobs that run now, with their stages."""
         parts = []
         for name in flying:

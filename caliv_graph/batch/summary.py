@@ -20,7 +20,7 @@ from caliv_graph.batch.folder import SUMMARY_SCHEMA
 from caliv_graph.common.exits import DONE, INCONSISTENT, UNMET
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.fusion.compare import Comparison, Movement
+from caliv_graph.fusion.compare import Comparison
 from caliv_graph.fusion.merge import merge
 from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.report.numbers import SHOWN_AXES, pose_and_sigmas, rounded
@@ -324,14 +324,10 @@ def _deviations(
         for movement in comparison.movements:
             axes = out.setdefault(movement.lidars, dict.fromkeys(SHOWN_AXES))
             for axis in SHOWN_AXES:
-                sigmas = _sigmas(movement, AXES.index(axis))
-                before = axes[axis]
-                if sigmas is not None and (before is None or sigmas > before.sigmas):
+                i, before = AXES.index(axis), axes[axis]
+                if not movement.determined[i]:
+                    continue
+                sigmas = float(abs(movement.movement[i]) / movement.sigma[i])
+                if before is None or sigmas > before.sigmas:
                     axes[axis] = Deviation(sigmas, job)
     return out
-
-
-def _sigmas(movement: Movement, axis: int) -> float | None:
-    if not movement.determined[axis]:
-        return None
-    return float(abs(movement.movement[axis]) / movement.sigma[axis])

@@ -63,14 +63,6 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """The process of one attempt at a job."""
-
-    host: str
-    pid: int
-
-
-@dataclass(frozen=True)
 class Outcome:
     """The outcome of a job.
 
@@ -127,13 +119,14 @@ def stage_file(work: Path, job: str) -> Path:
     return work / f"{job}.stage"
 
 
-def attempts(work: Path, job: str) -> list[Attempt]:
-    """The attempts at a job in this run, in order."""
-    out = []
+def attempts(work: Path, job: str) -> list[tuple[str, int]]:
+    """Host and process of the attempts at a job in this run, in order."""
+    out: list[tuple[str, int]] = []
     for number in range(1, MOST_ATTEMPTS + 1):
         try:
-            out.append(Attempt(**json.loads(_attempt_file(work, job, number).read_text("utf-8"))))
-        except (OSError, ValueError, TypeError):
+            found = json.loads(_attempt_file(work, job, number).read_text("utf-8"))
+            out.append((found["host"], found["pid"]))
+        except (OSError, ValueError, TypeError, KeyError):
             break
     return out
 

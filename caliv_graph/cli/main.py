@@ -128,9 +128,12 @@ def _explain(problem: BaseException) -> int:
     if isinstance(problem, KeyboardInterrupt | typer.Abort):
         return INTERRUPTED
     if isinstance(problem, CalivError):
-        return _fail(str(problem))
+        streams.error(str(problem))
+        return USAGE
     if isinstance(problem, _UsageError):
-        return _fail(_usage_message(problem))
+        command = problem.ctx.command_path if problem.ctx else _PROGRAM
+        streams.error(f"{problem.format_message().rstrip('.')}. See '{command} --help'")
+        return USAGE
     if not isinstance(problem, Exception):
         raise problem
     traceback.print_exception(problem)
@@ -139,16 +142,6 @@ def _explain(problem: BaseException) -> int:
         "the command"
     )
     return DEFECT
-
-
-def _fail(message: str) -> int:
-    streams.error(message)
-    return USAGE
-
-
-def _usage_message(problem: Any) -> str:
-    command = problem.ctx.command_path if problem.ctx else _PROGRAM
-    return f"{problem.format_message().rstrip('.')}. See '{command} --help'"
 
 
 def main() -> None:

@@ -64,7 +64,11 @@ def validate(
     from caliv_graph.common.json_text import without_infinities
     from caliv_graph.config.load import load_config
     from caliv_graph.readers import open_recording
-    from caliv_graph.report.validation import validation_document, validation_table
+    from caliv_graph.report.validation import (
+        render_validation,
+        validation_document,
+        validation_table,
+    )
     from caliv_graph.results.calibration_file import read_calibration
     from caliv_graph.validation import validate as validate_calibration
     from caliv_graph.workflows.repeatability import split_halves
@@ -84,8 +88,6 @@ def validate(
             repeated = split_halves(recording, settings, progress, p_value, motion)
     document = without_infinities(validation_document(found, repeated, p_value))
     if out is not None:
-        from caliv_graph.report.validation_page import render_validation
-
         page = render_validation(found, repeated, p_value)
         with output_folder(out, content, force) as folder:
             text = json.dumps(document, indent=2, allow_nan=False)

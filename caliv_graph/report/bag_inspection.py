@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -22,9 +22,7 @@ from caliv_graph.report.inspection import (
     TargetSummary,
     add_targets,
     inspect_recording,
-    nearest_and_farthest,
     runs_of,
-    stamps_seen,
     summarise_drive,
     summarise_points,
     summarise_targets,
@@ -162,13 +160,19 @@ def add_any_targets(
     """Adds when each LiDAR sees each target."""
     if isinstance(inspection, Inspection):
         return add_targets(inspection, observations)
-    rates_hz = {lidar: summary.rate_hz for lidar, summary in inspection.lidars.items()}
-    start_ns = inspection.start_ns
-    targets = summarise_targets(
-        observations,
-        inspection.lidars,
-        lambda seen, lidar: _summarise_sighting(seen, lidar, rates_hz[lidar], start_ns),
-    )
+    lidars, start_ns = inspection.lidars, inspection.start_ns
+
+    def sighting(lidar: str, stamps_ns: Sequence[int]) -> Sighting:
+        rate_hz = lidars[lidar].rate_hz
+        period_ns = NANOSECONDS_PER_SECOND / rate_hz if rate_hz else 0.0
+        if len(stamps_ns) > 2:
+            # Not every scan of a long drive is searched for the target.
+            period_ns = max(period_ns, float(np.median(np.diff(stamps_ns))))
+        runs = runs_of(stamps_ns, round(_RUN_FACTOR * period_ns))
+        times_s = tuple(_span_s(run, start_ns) for run in runs)
+        return Sighting(len(stamps_ns), frames=(), times_s=times_s)
+
+    targets = summarise_targets(observations, sighting, lidars)
     return replace(inspection, targets=targets)
 
 
@@ -271,27 +275,6 @@ def _summarise_lidar(
         points=summarise_points(counts) if counts else None,
         times=times,
         times_problem=seen.problem,
-    )
-
-
-def _summarise_sighting(
-    observation: TargetObservation, lidar: str, rate_hz: float | None, start_ns: int
-) -> Sighting:
-    clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
-    if not clouds:
-        return Sighting(scans=0, frames=(), points=None, range_m=None, times_s=())
-    stamps_ns = stamps_seen(observation, lidar)
-    period_ns = NANOSECONDS_PER_SECOND / rate_hz if rate_hz else 0.0
-    if len(stamps_ns) > 2:
-        # Not every scan of a long drive is searched for the target.
-        period_ns = max(period_ns, float(np.median(np.diff(stamps_ns))))
-    runs = runs_of(stamps_ns, round(_RUN_FACTOR * period_ns))
-    return Sighting(
-        scans=len(stamps_ns),
-        frames=(),
-        points=summarise_points([len(cloud.points_lidar) for cloud in clouds]),
-        range_m=nearest_and_farthest([cloud.points_lidar for cloud in clouds]),
-        times_s=tuple(_span_s(run, start_ns) for run in runs),
     )
 
 

@@ -43,7 +43,8 @@ def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: f
     parts += sentences(
         "Not compared:", (f"LiDAR '{n}': {why}" for n, why in comparison.not_compared.items())
     )
-    style = "bold red" if comparison.moved else "bold green" if _any(comparison) else "bold yellow"
+    tested = any(movement.dof for movement in comparison.movements)
+    style = "bold red" if comparison.moved else "bold green" if tested else "bold yellow"
     together = (
         f" (joint test: chi2 {comparison.chi2:.1f} with {comparison.dof} dof, p "
         f"{comparison.p_value:.3g}; limit {p_value:g} after correction for {_tests(comparison)} "
@@ -163,10 +164,6 @@ def _verdict(movement: Movement) -> list[Text]:
         Text(f"{movement.p_value:.2g}\n{movement.p_corrected:.2g}"),
         moved,
     ]
-
-
-def _any(comparison: Comparison) -> bool:
-    return any(m.dof for m in comparison.movements)
 
 
 def _tests(comparison: Comparison) -> int:

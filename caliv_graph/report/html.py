@@ -200,22 +200,19 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
 
 def _cloud_row(cloud: CloudVerdict, record: RunRecord) -> dict[str, str]:
     begin, _ = record.trajectories[cloud.drive].span_ns
+    source = cloud.source
     return {
         "lidar": cloud.lidar,
         "target": cloud.target,
         "drive": record.drives[cloud.drive],
         "at": f"{(cloud.stamp_ns - begin) / NANOSECONDS_PER_SECOND:.2f}",
-        "source": _short_source(cloud.source),
+        # Of a file, its folder and name; the name of a scan from a topic as it is.
+        "source": "/".join(source.split("/")[-2:]) if source.endswith(".pcd") else source,
         "weight": f"{cloud.weight:.2f}",
         "rotation": f"{1e3 * cloud.rotation_rad:.3g}",
         "position": f"{1e3 * cloud.position_m:.3g}",
         "reason": cloud.reason,
     }
-
-
-def _short_source(source: str) -> str:
-    """Folder and name of a file; the name of a scan from a topic is returned unchanged."""
-    return "/".join(source.split("/")[-2:]) if source.endswith(".pcd") else source
 
 
 def _weight_rows(solution: Solution) -> list[dict[str, Any]]:
@@ -271,11 +268,11 @@ def _noise_rows(solution: Solution, record: RunRecord) -> list[tuple[str, str]]:
 
 def _inputs(calibration: Calibration) -> list[tuple[str, str]]:
     """The provenance, one row per value; digests in full, so that they can be compared."""
-    rows = []
-    for key, value in calibration.provenance.items():
-        shown = value if isinstance(value, list) else [value]
-        rows += [(key, str(item)) for item in shown]
-    return rows
+    return [
+        (key, str(item))
+        for key, value in calibration.provenance.items()
+        for item in (value if isinstance(value, list) else [value])
+    ]
 
 
 def _versions() -> list[tuple[str, str]]:

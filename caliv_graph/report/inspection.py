@@ -17,7 +17,7 @@ import numpy as np
 from caliv_graph.common.progress import Progress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Array, GivenPoses, Recording, TargetObservation
+from caliv_graph.products import GivenPoses, Recording, TargetObservation
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 
 Run = tuple[int, int]
@@ -88,8 +88,8 @@ class Sighting:
 
     scans: int
     frames: tuple[Run, ...]
-    points: Points | None
-    range_m: tuple[float, float] | None
+    points: Points | None = None
+    range_m: tuple[float, float] | None = None
     times_s: tuple[tuple[float, float], ...] | None = None
 
 
@@ -131,7 +131,8 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
             for scan in recording.scans(lidar):
                 counts.append(len(scan.points_lidar))
                 advance()
-            lidars[lidar] = _summarise_lidar(_frames(recording, lidar), counts)
+            frames = [stamp_ns // FRAME_PERIOD_NS for stamp_ns in recording.scan_stamps_ns(lidar)]
+            lidars[lidar] = _summarise_lidar(frames, counts)
     given = recording.motion().poses
     if given is None:
         raise TrajectoryError(f"{recording.name}: has no vehicle poses")
@@ -140,37 +141,48 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
 
 def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
     """Adds when each LiDAR sees each target."""
+
+    def frames(lidar: str, stamps_ns: Sequence[int]) -> tuple[Run, ...]:
+        numbers = [stamp_ns // FRAME_PERIOD_NS for stamp_ns in stamps_ns]
+        return runs_of(numbers, inspection.lidars[lidar].step)
+
     targets = summarise_targets(
         observations,
+        lambda lidar, stamps_ns: Sighting(len(stamps_ns), frames(lidar, stamps_ns)),
         inspection.lidars,
-        lambda seen, lidar: _summarise_sighting(seen, lidar, inspection.lidars[lidar].step),
     )
     return replace(inspection, targets=targets)
 
 
 def summarise_targets(
     observations: Iterable[TargetObservation],
+    sighting: Callable[[str, Sequence[int]], Sighting],
     lidars: Iterable[str],
-    sighting: Callable[[TargetObservation, str], Sighting],
 ) -> tuple[TargetSummary, ...]:
     """Sightings of every target by every LiDAR.
 
-    Args:
-        observations: the targets found.
-        lidars: names.
-        sighting: summarises the scans of one LiDAR that see one target.
+    `sighting` gives the number and the runs of the scans of a LiDAR at these stamps.
     """
     names = list(lidars)
     out = []
     for observation in observations:
         x, y, z = (float(v) for v in observation.centre_map)
-        seen = {lidar: sighting(observation, lidar) for lidar in names}
+        seen = {}
+        for lidar in names:
+            clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
+            if not clouds:
+                seen[lidar] = sighting(lidar, ())
+                continue
+            # Including the scans that a calibration would not use.
+            stamps = {cloud.stamp_ns for cloud in clouds}.union(observation.seen_ns.get(lidar, ()))
+            ranges_m = [float(np.linalg.norm(c.points_lidar.mean(axis=0))) for c in clouds]
+            seen[lidar] = replace(
+                sighting(lidar, sorted(stamps)),
+                points=summarise_points([len(cloud.points_lidar) for cloud in clouds]),
+                range_m=(min(ranges_m), max(ranges_m)),
+            )
         out.append(TargetSummary(observation.name, (x, y, z), seen))
     return tuple(out)
-
-
-def _frames(recording: Recording, lidar: str) -> list[int]:
-    return [stamp_ns // FRAME_PERIOD_NS for stamp_ns in recording.scan_stamps_ns(lidar)]
 
 
 def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSummary:
@@ -208,32 +220,6 @@ def summarise_drive(given: GivenPoses) -> DriveSummary:
         heading_change_deg=math.degrees(float(np.sum(turns))),
         turned_deg=math.degrees(float(np.sum(np.abs(turns)))),
     )
-
-
-def _summarise_sighting(observation: TargetObservation, lidar: str, step: int) -> Sighting:
-    clouds = [cloud for cloud in observation.clouds if cloud.lidar == lidar]
-    if not clouds:
-        return Sighting(scans=0, frames=(), points=None, range_m=None)
-    clouds_lidar = [cloud.points_lidar for cloud in clouds]
-    stamps_ns = stamps_seen(observation, lidar)
-    return Sighting(
-        scans=len(stamps_ns),
-        frames=runs_of([stamp_ns // FRAME_PERIOD_NS for stamp_ns in stamps_ns], step),
-        points=summarise_points([len(points) for points in clouds_lidar]),
-        range_m=nearest_and_farthest(clouds_lidar),
-    )
-
-
-def stamps_seen(observation: TargetObservation, lidar: str) -> list[int]:
-    """Stamps of the scans of a LiDAR that see a target, including those of the clouds."""
-    of_clouds = {cloud.stamp_ns for cloud in observation.clouds if cloud.lidar == lidar}
-    return sorted(of_clouds.union(observation.seen_ns.get(lidar, ())))
-
-
-def nearest_and_farthest(clouds_lidar: Sequence[Array]) -> tuple[float, float]:
-    """Minimum and maximum distance of the centres of clouds (N, 3) from the LiDAR, metres."""
-    ranges_m = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds_lidar]
-    return min(ranges_m), max(ranges_m)
 
 
 def runs_of(values: Sequence[int], step: int) -> tuple[Run, ...]:

@@ -137,15 +137,11 @@ def _sighting_document(sighting: Sighting) -> dict[str, Any]:
         "scans": seen,
         "scans_used": len(sighting.used),
         "seconds": [list(run) for run in _times(sighting)],
-        "range_m": [_rounded(sighting.range_m.min()), _rounded(sighting.range_m.max())]
+        "range_m": [round(float(r), 3) for r in (sighting.range_m.min(), sighting.range_m.max())]
         if seen
         else None,
         "points": [int(sighting.points.min()), int(sighting.points.max())] if seen else None,
     }
-
-
-def _rounded(value: float) -> float:
-    return round(float(value), 3)
 
 
 def _sightings(prediction: Prediction) -> Table:
@@ -184,13 +180,8 @@ def _times(sighting: Sighting) -> list[tuple[float, float]]:
     cuts = np.flatnonzero(steps > LONGEST_PAUSE * period)
     first = np.concatenate([[0], cuts + 1])
     last = np.concatenate([cuts, [len(stamps) - 1]])
-    return [
-        (
-            _rounded(stamps[a] / NANOSECONDS_PER_SECOND),
-            _rounded(stamps[b] / NANOSECONDS_PER_SECOND),
-        )
-        for a, b in zip(first.tolist(), last.tolist(), strict=True)
-    ]
+    seconds = [round(float(stamp / NANOSECONDS_PER_SECOND), 3) for stamp in stamps]
+    return [(seconds[a], seconds[b]) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
 
 
 def _suggestion_parts(
@@ -202,12 +193,12 @@ def _suggestion_parts(
     smaller = x * y < 0.95 * prediction.space_m[0] * prediction.space_m[1]
     if met and not (suggestion.met and smaller):
         return []
-    wanted = "all limits" if goals else "all axes"
-    if suggestion.met:
-        heading = f"Smallest drive that {'keeps' if goals else 'determines'} {wanted}:"
-    else:
-        verb = "keeps" if goals else "determines"
-        heading = f"None of the manoeuvres tried {verb} {wanted}. The nearest:"
+    keeps = "keeps all limits" if goals else "determines all axes"
+    heading = (
+        f"Smallest drive that {keeps}:"
+        if suggestion.met
+        else f"None of the manoeuvres tried {keeps}. The nearest:"
+    )
     lines: list[RenderableType] = [
         "",
         Text(heading, style="bold"),

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.conventions import AXES
-from caliv_graph.products import Calibration, Direction, LidarResult
+from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import SHOWN_AXES, Cell, fixed, pair_cells, pose_cells
 
@@ -28,7 +28,11 @@ def calibration_table(
     An axis that the drive does not determine is marked `held`. Its value is in brackets, with the
     precision of the initial guess.
     """
-    parts: list[RenderableType] = [_status_line(calibration)]
+    status = Text(calibration.status, style=STATUS_STYLES.get(calibration.status, "bold"))
+    names = ", ".join(calibration.lidars)
+    parts: list[RenderableType] = [
+        Text.assemble("Status: ", status, f". LiDARs: {names}; reference {calibration.reference}.")
+    ]
     parts += sentences("Contradictions:", calibration.contradictions)
     parts += titled(
         "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _extrinsics(calibration)
@@ -38,7 +42,7 @@ def calibration_table(
             "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
             _sensor_to_sensor(calibration),
         )
-    if not _all_determined(calibration):
+    if not all(all(result.determined.values()) for result in calibration.lidars.values()):
         parts.append(
             Text(
                 f"{_HELD}: this drive does not determine the axis; the value in brackets comes "
@@ -47,7 +51,13 @@ def calibration_table(
             )
         )
     parts += sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
-    parts += sentences("Not determined by this drive:", _undetermined_texts(calibration))
+    unseen = [
+        f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess"
+        for name, result in calibration.lidars.items()
+        if not result.saw_target
+    ]
+    undetermined = direction_texts(calibration.undetermined)
+    parts += sentences("Not determined by this drive:", [*undetermined, *unseen])
     parts += sentences("Weakly determined:", direction_texts(calibration.weak))
     parts += sentences("Required by the config, but not reached:", calibration.unmet)
     if seconds is not None:
@@ -88,26 +98,14 @@ def direction_texts(directions: Iterable[Direction]) -> list[str]:
     ]
 
 
-def _status_line(calibration: Calibration) -> Text:
-    names = ", ".join(calibration.lidars)
-    status = Text(calibration.status, style=STATUS_STYLES.get(calibration.status, "bold"))
-    return Text.assemble(
-        "Status: ", status, f". LiDARs: {names}; reference {calibration.reference}."
-    )
-
-
 def _extrinsics(calibration: Calibration) -> Table:
     table = new_table("LiDAR", *axis_headings("m", "deg"), "scans\nused")
     for name, result in calibration.lidars.items():
         cells = pose_cells(result.T_vehicle_lidar, result.cov, result.determined)
-        table.add_row(Text(name), *map(_text, cells), _scans_cell(result))
+        no_target = Text("no\ntarget", style="bold yellow")
+        scans = Text(str(result.scans_used)) if result.saw_target else no_target
+        table.add_row(Text(name), *map(_text, cells), scans)
     return table
-
-
-def _scans_cell(result: LidarResult) -> Text:
-    if result.saw_target:
-        return Text(str(result.scans_used))
-    return Text("no\ntarget", style="bold yellow")
 
 
 def _sensor_to_sensor(calibration: Calibration) -> Table:
@@ -123,25 +121,12 @@ def _text(cell: Cell) -> Text:
     return Text(f"{cell.value}\n{_HELD}", style="yellow")
 
 
-def _all_determined(calibration: Calibration) -> bool:
-    return all(all(result.determined.values()) for result in calibration.lidars.values())
-
-
 def _offset_texts(calibration: Calibration) -> list[str]:
     return [
         f"LiDAR '{name}': {1e3 * result.time_offset[0]:+.2f} ms, sigma "
         f"{1e3 * result.time_offset[1]:.2f} ms"
         for name, result in calibration.lidars.items()
         if result.time_offset is not None
-    ]
-
-
-def _undetermined_texts(calibration: Calibration) -> list[str]:
-    texts = direction_texts(calibration.undetermined)
-    return texts + [
-        f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess"
-        for name, result in calibration.lidars.items()
-        if not result.saw_target
     ]
 
 

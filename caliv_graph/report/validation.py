@@ -1,13 +1,15 @@
-"""A validation as tables in millimetres, and as plain values in metres."""
+"""A validation as tables in millimetres, as plain values in metres, and as a page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from typing import Any
 
+from markupsafe import Markup
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+import caliv_graph
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
 from caliv_graph.report.layout import UNKNOWN, new_table, sentences, titled
@@ -16,7 +18,6 @@ from caliv_graph.validation.findings import (
     AFTER,
     BEFORE,
     STAGES,
-    Pair,
     SurfaceResult,
     ThingResult,
     Validation,
@@ -77,7 +78,13 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
             ("Distance between LiDARs: on walls and poles, and from cloud to cloud", headings, rows)
         )
     if found.surfaces:
-        rows = [["merged", *_stages(found.thickness_m), _mm(found.expected_thickness_m)]]
+        rows = [
+            [
+                "merged",
+                *(_mm(found.thickness_m[stage]) for stage in STAGES),
+                _mm(found.expected_thickness_m),
+            ]
+        ]
         rows += [
             [
                 f"{name} alone",
@@ -150,13 +157,15 @@ def repeatability_sentences(repeated: Repeatability, p_value: float) -> list[str
 def _repeats(comparison: Comparison, p_value: float) -> str:
     if not any(m.dof for m in comparison.movements):
         return "no direction is determined by both halves"
-    together = f"joint test: chi2 {comparison.chi2:.1f} with {comparison.dof} dof"
-    if comparison.moved:
-        return (
-            f"the halves differ by more than their sigmas explain ({together}; limit p {p_value:g} "
-            "over all tests)"
-        )
-    return f"the halves agree within their sigmas ({together}; limit p {p_value:g} over all tests)"
+    verdict = (
+        "differ by more than their sigmas explain"
+        if comparison.moved
+        else "agree within their sigmas"
+    )
+    return (
+        f"the halves {verdict} (joint test: chi2 {comparison.chi2:.1f} with {comparison.dof} dof; "
+        f"limit p {p_value:g} over all tests)"
+    )
 
 
 def validation_document(
@@ -235,7 +244,7 @@ def _surface_document(found: SurfaceResult) -> dict[str, Any]:
                 },
                 "expected_distance_m": found.expected.distance_m.get((a, b)),
             }
-            for a, b in _pairs_of(found)
+            for a, b in found.apart[AFTER]
         ],
     }
 
@@ -279,22 +288,24 @@ def place_of(surface: Wall | Pole | Thing) -> tuple[float, float, tuple[float, .
     return float(surface.centre[0]), float(surface.centre[1]), (surface.extent_m,)
 
 
-def _pairs_of(found: SurfaceResult) -> list[Pair]:
-    return list(found.apart[AFTER])
-
-
-def _surface_row(found: SurfaceResult) -> list[str]:
-    x, y, size = place_of(found.surface)
-    pairs = _pairs_of(found)
-    apart = [
-        _lines(_mm(found.apart[s][p].distance_m if p in found.apart[s] else None) for p in pairs)
-        for s in (BEFORE, AFTER)
-    ]
+def _place_cells(found: SurfaceResult | ThingResult, where: Wall | Pole | Thing) -> list[str]:
+    x, y, size = place_of(where)
     return [
         found.name,
         f"{x:.1f} {y:.1f}",
         " x ".join(f"{v:.2f}" for v in size),
         _lines(str(n) for n in found.points.values()),
+    ]
+
+
+def _surface_row(found: SurfaceResult) -> list[str]:
+    pairs = list(found.apart[AFTER])
+    apart = [
+        _lines(_mm(found.apart[s][p].distance_m if p in found.apart[s] else None) for p in pairs)
+        for s in (BEFORE, AFTER)
+    ]
+    return [
+        *_place_cells(found, found.surface),
         _mm(found.thickness[BEFORE].merged),
         _mm(found.thickness[AFTER].merged),
         *apart,
@@ -303,25 +314,41 @@ def _surface_row(found: SurfaceResult) -> list[str]:
 
 
 def _thing_row(found: ThingResult) -> list[str]:
-    x, y, size = place_of(found.thing)
     pairs = list(found.distance_m[AFTER])
-    return [
-        found.name,
-        f"{x:.1f} {y:.1f}",
-        " x ".join(f"{v:.2f}" for v in size),
-        _lines(str(n) for n in found.points.values()),
-        *(_lines(_mm(found.distance_m[s].get(p)) for p in pairs) for s in STAGES),
-    ]
+    apart = (_lines(_mm(found.distance_m[s].get(p)) for p in pairs) for s in STAGES)
+    return [*_place_cells(found, found.thing), *apart]
 
 
-def _stages(values: Mapping[str, float]) -> list[str]:
-    return [_mm(values[stage]) for stage in STAGES]
-
-
-def _lines(texts: Any) -> str:
-    shown: Sequence[str] = list(texts)
-    return "\n".join(shown) or UNKNOWN
+def _lines(texts: Iterable[str]) -> str:
+    return "\n".join(texts) or UNKNOWN
 
 
 def _mm(value: float | None) -> str:
     return UNKNOWN if value is None else f"{1e3 * value:.1f}"
+
+
+def render_validation(found: Validation, repeated: Repeatability | None, p_value: float) -> str:
+    """validation.html: one self-contained page with figures before and after, coloured by LiDAR.
+
+    `p_value` is the limit of the tests of repeatability; `repeated` None: not tested.
+    """
+    # Imported here: the tables need no plotly.
+    from plotly.offline import get_plotlyjs
+
+    from caliv_graph.report.figures.drawing import without_template
+    from caliv_graph.report.figures.structure import validation_figures
+    from caliv_graph.report.page import environment, script_data
+
+    with without_template():
+        figures = validation_figures(found)
+    template = environment().get_template("validation.html.j2")
+    return template.render(
+        found=found,
+        status=validation_status(found),
+        tables=tables(found),
+        repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
+        figures=figures,
+        data={figure.name: script_data(figure) for figure in figures},
+        plotlyjs=Markup(get_plotlyjs()),
+        version=caliv_graph.__version__,
+    )

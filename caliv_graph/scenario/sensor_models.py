@@ -1,11 +1,9 @@
 """The sensors that a scenario can describe, and their noise, as frozen pydantic models.
 
-The units stand in the `Field` descriptions. The default noise of IMU, GNSS, velocity and
-orientation is that of table I of the CaLiV paper, read as follows. All figures are 1 sigma of white
-noise per sample and axis, at 100 Hz for IMU and orientation and at 10 Hz for GNSS and velocity. The
-table gives the GPS noise as 1.5e-7 degrees of latitude and longitude. This is an angle at the
-centre of the earth: 1.5e-7 pi / 180 x 6378 km = 16.7 mm, used for north and east alike, as on the
-equator. The orientation noise of 0.005 rad is a rotation about each axis of the IMU.
+The default noise of IMU, GNSS, velocity and orientation is that of table I of the CaLiV paper, read
+as 1 sigma of white noise per sample and axis, at 100 Hz for IMU and orientation and at 10 Hz for
+GNSS and velocity. Its GPS noise of 1.5e-7 degrees is read as an angle at the centre of the earth:
+1.5e-7 pi / 180 x 6378 km = 16.7 mm, north and east alike.
 """
 
 from __future__ import annotations
@@ -233,11 +231,9 @@ class OutageModel(Section):
     duration_s: Positive = Field(description="seconds")
 
 
-class JumpModel(Section):
+class JumpModel(OutageModel):
     """A time during which all fixes have the same offset, as with a reflected signal."""
 
-    start_s: NonNegative = Field(description="seconds since the start of the drive")
-    duration_s: Positive = Field(description="seconds")
     offset_enu_m: tuple[Finite, Finite, Finite] = Field(description="metres east, north, up")
 
 

@@ -243,12 +243,10 @@ def object_mesh(model: ObjectModel) -> Mesh:
         return chair()
     if isinstance(model, BoxModel):
         return box(model.size_m)
-    if isinstance(model, PoleModel):
+    if isinstance(model, PoleModel | CylinderModel):
         top = (0.0, 0.0, model.height_m)
-        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m)
-    if isinstance(model, CylinderModel):
-        top = (0.0, 0.0, model.height_m)
-        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, DRUM_SIDES)
+        sides = 24 if isinstance(model, PoleModel) else DRUM_SIDES
+        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, sides)
     if isinstance(model, TableModel):
         return table(model.size_m, model.top_m, model.leg_m)
     assert_never(model)

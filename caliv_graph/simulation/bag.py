@@ -12,15 +12,8 @@ from typing import Any, Literal, Self
 import gtsam
 import numpy as np
 import numpy.typing as npt
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces as ros
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -49,7 +42,7 @@ TIME_FIELDS: dict[str, tuple[str, int, int, int]] = {
 }
 """Per time field: its type, its offset, its type's number in a PointField, and bytes per point."""
 
-_NEVER = QosTime(sec=9_223_372_036, nsec=854_775_807)
+_NEVER = ros.QosTime(sec=9_223_372_036, nsec=854_775_807)
 """No deadline, as rosbag2 writes it."""
 
 UNKNOWN_VARIANCE = 1e9
@@ -184,14 +177,14 @@ class BagWriter:
         self._writer.write(connection, record_ns, data)
 
     def _connection(self, topic: str, message_type: str, latched: bool = False) -> Connection:
-        qos = Qos(
-            history=QosHistory.KEEP_LAST,
+        qos = ros.Qos(
+            history=ros.QosHistory.KEEP_LAST,
             depth=1 if latched else 10,
-            reliability=QosReliability.RELIABLE,
-            durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+            reliability=ros.QosReliability.RELIABLE,
+            durability=ros.QosDurability.TRANSIENT_LOCAL if latched else ros.QosDurability.VOLATILE,
             deadline=_NEVER,
             lifespan=_NEVER,
-            liveliness=QosLiveliness.AUTOMATIC,
+            liveliness=ros.QosLiveliness.AUTOMATIC,
             liveliness_lease_duration=_NEVER,
             avoid_ros_namespace_conventions=False,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,18 +61,6 @@ class SimulatedDrive:
     scans: dict[str, SimulatedScans]
 
 
-def _scans(recording: SimulatedRecording) -> Iterator[tuple[int, Iterator[SimulatedScan]]]:
-    """The clouds of all LiDARs in the order of their completion, grouped by that time."""
-
-    def complete_ns(taken: SimulatedScan) -> int:
-        return recording.complete_ns(taken.scan)
-
-    merged = heapq.merge(
-        *(recording.scans_with_truth(name) for name in recording.lidars), key=complete_ns
-    )
-    return itertools.groupby(merged, key=complete_ns)
-
-
 def write_drive(
     scenario: Scenario,
     out_dir: Path,
@@ -117,7 +105,10 @@ def write_drive(
         with ExitStack() as stack:
             writers: list[BagWriter | CalivWriter] = []
             if has_bag:
-                writers.append(stack.enter_context(_bag_writer(folder, recording)))
+                # rosbags takes 0.25 s to import, and a CaLiV folder does not need it.
+                from caliv_graph.simulation.bag import BagWriter
+
+                writers.append(stack.enter_context(BagWriter(folder / BAG_FOLDER, recording)))
             if has_caliv:
                 caliv = CalivWriter(folder / CALIV_FOLDER, recording)
                 writers.append(stack.enter_context(caliv))
@@ -141,8 +132,14 @@ def _write_scans(
     is_target = np.isin(recording.world.names, recording.world.targets)
     counts: dict[str, list[tuple[int, int]]] = {name: [] for name in recording.lidars}
     times = {stamp for name in recording.lidars for stamp in recording.complete_stamps_ns(name)}
+
+    def complete_ns(taken: SimulatedScan) -> int:
+        return recording.complete_ns(taken.scan)
+
+    by_lidar = (recording.scans_with_truth(name) for name in recording.lidars)
+    merged = heapq.merge(*by_lidar, key=complete_ns)
     with progress.stage("simulating", len(times)) as advance:
-        for _, together in _scans(recording):
+        for _, together in itertools.groupby(merged, key=complete_ns):
             for taken in together:
                 for writer in writers:
                     writer.write(taken.scan)
@@ -154,13 +151,6 @@ def _write_scans(
         name: SimulatedScans(tuple(n for n, _ in of), tuple(n for _, n in of))
         for name, of in counts.items()
     }
-
-
-def _bag_writer(folder: Path, recording: SimulatedRecording) -> BagWriter:
-    # rosbags takes 0.25 s to import, and a CaLiV folder does not need it.
-    from caliv_graph.simulation.bag import BagWriter
-
-    return BagWriter(folder / BAG_FOLDER, recording)
 
 
 def simulate_caliv(

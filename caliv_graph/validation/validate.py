@@ -43,7 +43,7 @@ from caliv_graph.validation.measure import (
     thing_distance,
 )
 from caliv_graph.validation.refine import align, sharper
-from caliv_graph.validation.surfaces import Pole, Structure, Thing, Wall
+from caliv_graph.validation.surfaces import Structure, Thing, Wall
 from caliv_graph.validation.verdict import is_shared, judge
 
 Stages = Mapping[str, tuple[Placed, Sequence[gtsam.Pose3] | None]]
@@ -70,47 +70,37 @@ def validate(
     """
     # Thousands of small matrices: threads of the linear algebra library would make this slower.
     with threadpool_limits(limits=1):
-        return _validate(recording, calibration, config, progress, motion)
-
-
-def _validate(
-    recording: Recording,
-    calibration: Calibration,
-    config: Config,
-    progress: Progress,
-    motion: MotionData | None,
-) -> Validation:
-    names, notes = _common_lidars(recording, calibration, config)
-    extrinsics = _extrinsics(names, calibration, config)
-    motions = {0: recording.motion() if motion is None else motion}
-    with progress.stage("smoothing the trajectory", None):
-        (rough,) = smooth_trajectories([recording], config, [[]], motions)
-    regions, no_target = target_regions(recording, rough, config, progress)
-    chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
-    nodes = _nodes(chosen, extrinsics[AFTER], rough.span_ns)
-    with progress.stage("smoothing the trajectory at the scans", None):
-        (trajectory,) = smooth_trajectories([recording], config, [nodes], motions)
-    # The calibration comes first: it decides which points are target and ground.
-    clouds = read_clouds(
-        recording, trajectory, chosen, extrinsics, regions, not config.ground.use, progress
-    )
-    errors = Errors(
-        extrinsic_covariance(names, calibration),
-        pose_covariance(clouds.placed[AFTER].taken_ns, nodes, trajectory, calibration, config),
-        config.noise.lidar_range_m,
-        HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
-    )
-    sigmas = np.array([config.lidars[n].sigma.sigmas() for n in names])
-    with progress.stage("measuring the alignment", None):
-        start = sharper(clouds, (AFTER, BEFORE))
-        structure, best = align(clouds, clouds.placed[start], sigmas, not config.ground.use)
-        return _measured(
-            recording.name,
-            clouds,
-            (start, structure, best),
-            errors,
-            (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
+        names, notes = _common_lidars(recording, calibration, config)
+        extrinsics = _extrinsics(names, calibration, config)
+        motions = {0: recording.motion() if motion is None else motion}
+        with progress.stage("smoothing the trajectory", None):
+            (rough,) = smooth_trajectories([recording], config, [[]], motions)
+        regions, no_target = target_regions(recording, rough, config, progress)
+        chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
+        nodes = _nodes(chosen, extrinsics[AFTER], rough.span_ns)
+        with progress.stage("smoothing the trajectory at the scans", None):
+            (trajectory,) = smooth_trajectories([recording], config, [nodes], motions)
+        # The calibration comes first: it decides which points are target and ground.
+        clouds = read_clouds(
+            recording, trajectory, chosen, extrinsics, regions, not config.ground.use, progress
         )
+        errors = Errors(
+            extrinsic_covariance(names, calibration),
+            pose_covariance(clouds.placed[AFTER].taken_ns, nodes, trajectory, calibration, config),
+            config.noise.lidar_range_m,
+            HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
+        )
+        sigmas = np.array([config.lidars[n].sigma.sigmas() for n in names])
+        with progress.stage("measuring the alignment", None):
+            start = sharper(clouds, (AFTER, BEFORE))
+            structure, best = align(clouds, clouds.placed[start], sigmas, not config.ground.use)
+            return _measured(
+                recording.name,
+                clouds,
+                (start, structure, best),
+                errors,
+                (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
+            )
 
 
 def _common_lidars(
@@ -233,23 +223,19 @@ def _surfaces(
         if isinstance(surface, Wall):
             kind = "ground" if surface.is_level else "wall"
         numbers[kind] = numbers.get(kind, 0) + 1
-        out.append(_surface(clouds, f"{kind} {numbers[kind]}", surface, stages, errors))
+        meter = SurfaceMeter(clouds, surface)
+        found = {stage: meter.measure(placed, poses) for stage, (placed, poses) in stages.items()}
+        out.append(
+            SurfaceResult(
+                f"{kind} {numbers[kind]}",
+                surface,
+                meter.points,
+                {stage: thickness for stage, (thickness, _) in found.items()},
+                {stage: apart for stage, (_, apart) in found.items()},
+                meter.expect(stages[AFTER][0], errors),
+            )
+        )
     return out
-
-
-def _surface(
-    clouds: Clouds, name: str, surface: Wall | Pole, stages: Stages, errors: Errors
-) -> SurfaceResult:
-    meter = SurfaceMeter(clouds, surface)
-    found = {stage: meter.measure(placed, poses) for stage, (placed, poses) in stages.items()}
-    return SurfaceResult(
-        name,
-        surface,
-        meter.points,
-        {stage: thickness for stage, (thickness, _) in found.items()},
-        {stage: apart for stage, (_, apart) in found.items()},
-        meter.expect(stages[AFTER][0], errors),
-    )
 
 
 def _thing(clouds: Clouds, name: str, thing: Thing, stages: Stages) -> ThingResult:

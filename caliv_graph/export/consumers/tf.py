@@ -96,28 +96,21 @@ def _launch(request: Request, transforms: tuple[Transform, ...]) -> str:
 
 def _mcap(request: Request, transforms: tuple[Transform, ...]) -> bytes:
     """A single MCAP file with one latched message; the comment is in its rosbag2 metadata."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces as ros
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types
-    never = QosTime(sec=9_223_372_036, nsec=854_775_807)
-    qos = Qos(
-        history=QosHistory.KEEP_LAST,
+    never = ros.QosTime(sec=9_223_372_036, nsec=854_775_807)
+    qos = ros.Qos(
+        history=ros.QosHistory.KEEP_LAST,
         depth=1,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL,
+        reliability=ros.QosReliability.RELIABLE,
+        durability=ros.QosDurability.TRANSIENT_LOCAL,
         deadline=never,
         lifespan=never,
-        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness=ros.QosLiveliness.AUTOMATIC,
         liveliness_lease_duration=never,
         avoid_ros_namespace_conventions=False,
     )

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gtsam
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array, Calibration, LidarScan, Solution
+from caliv_graph.products import Array, Calibration, LidarResult, LidarScan, Solution
 from caliv_graph.report.figures.drawing import (
     BLACK,
     SYMBOLS,
@@ -125,15 +126,16 @@ def _target_points(
     out: dict[str, list[Array]] = {}
     budget = max(MOST_POINTS // max(len(registration.observation.clouds), 1), 20)
     for cloud in registration.observation.clouds:
-        lidar = calibration.lidars[cloud.lidar]
-        extrinsic = lidar.T_vehicle_lidar
-        if guess and lidar.guess is not None:
-            extrinsic = lidar.guess.T_vehicle_lidar
+        extrinsic = _extrinsic(calibration.lidars[cloud.lidar], guess)
         T_map_vehicle = solution.T_map_vehicle[cloud.drive, cloud.stamp_ns]
         R, t = stack([T_map_vehicle.compose(extrinsic)])
         points = cloud.points_lidar[evenly(len(cloud.points_lidar), budget)]
         out.setdefault(cloud.lidar, []).append(points @ R[0].T + t[0] - centre_map)
     return {name: np.concatenate(points) for name, points in out.items()}
+
+
+def _extrinsic(lidar: LidarResult, guess: bool) -> gtsam.Pose3:
+    return lidar.guess.T_vehicle_lidar if guess and lidar.guess else lidar.T_vehicle_lidar
 
 
 def _scene_points(
@@ -148,10 +150,7 @@ def _scene_points(
     _, origin = trajectory.poses_at([begin])
     out: dict[str, list[Array]] = {}
     for scan in scans:
-        lidar = calibration.lidars[scan.lidar]
-        extrinsic = lidar.T_vehicle_lidar
-        if guess and lidar.guess is not None:
-            extrinsic = lidar.guess.T_vehicle_lidar
+        extrinsic = _extrinsic(calibration.lidars[scan.lidar], guess)
         if not begin <= scan.stamp_ns <= end:
             continue
         try:

@@ -28,7 +28,7 @@ def packed_solution(
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
 ) -> Solution:
-    """Packs the result, the whole graph and its linearisation.
+    """Packs the result, the whole graph and its linearisation: long for the fields of a record.
 
     Args:
         state: after its last step.

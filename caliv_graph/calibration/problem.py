@@ -204,7 +204,7 @@ def pose_problem(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
 ) -> Problem:
-    """Lists LiDARs, poses and clouds that take part.
+    """Lists LiDARs, poses and clouds that take part: long for the fields of a record.
 
     Raises:
         SolveError: there is no cloud.

@@ -7,123 +7,47 @@ two sides agree on a surface that a real chair does not have.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import assert_never
 
-import gtsam
 import numpy as np
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.solids import (
+    Mesh,
+    Point,
+    bar,
+    box,
+    cylinder,
+    grid_quads,
+    join,
+    rectangle,
+    solid_between,
+)
+from caliv_graph.scenario.street_shapes import (
+    bicycle,
+    boxes,
+    cones,
+    kerbside_bin,
+    stroller,
+    thin_chair,
+)
 from caliv_graph.scenario.terrain import Terrain
 from caliv_graph.scenario.world_models import (
+    BicycleModel,
+    BinModel,
+    BoxesModel,
     BoxModel,
     ChairModel,
+    ConesModel,
     CylinderModel,
     ObjectModel,
     PoleModel,
+    StrollerModel,
     TableModel,
+    ThinChairModel,
 )
 
 DRUM_SIDES = 360
 """Sides of a cylinder's mesh. With 24 sides its yaw would be observable to some milliradians."""
-
-Point = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles.
-
-    Attributes:
-        vertices: (n, 3) metres, frame by context.
-        triangles: (m, 3) indices of vertices, counter-clockwise seen from outside.
-    """
-
-    vertices: Array
-    triangles: IntArray
-
-    def moved(self, T_a_b: gtsam.Pose3) -> Mesh:
-        """The mesh with its vertices transformed from frame b into frame a."""
-        vertices = self.vertices @ T_a_b.rotation().matrix().T + T_a_b.translation()
-        return Mesh(vertices, self.triangles)
-
-    def signed_volume(self) -> float:
-        """Volume in cubic metres of a closed mesh; positive if its faces point outwards."""
-        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
-
-def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one. Solids may overlap: a ray from outside hits the outer skin first."""
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return Mesh(
-        np.vstack([mesh.vertices for mesh in meshes]),
-        np.vstack([mesh.triangles + o for mesh, o in zip(meshes, offsets[:-1], strict=True)]),
-    )
-
-
-def _quads(a: IntArray, b: IntArray, c: IntArray, d: IntArray) -> IntArray:
-    """Two triangles for each quadrilateral a b c d."""
-    a, b, c, d = (x.reshape(-1) for x in (a, b, c, d))
-    return np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-
-
-def _grid_quads(index: IntArray) -> IntArray:
-    return _quads(index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
-
-
-def solid_between(one: Array, other: Array) -> Mesh:
-    """The closed solid between two grids (r, c, 3) of points and the rim between their borders."""
-    rows, columns = one.shape[:2]
-    n = rows * columns
-    index = np.arange(n).reshape(rows, columns)
-    border = np.concatenate(
-        [index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0], index[0, :1]]
-    )
-    triangles = np.vstack(
-        [
-            _grid_quads(index)[:, ::-1],
-            _grid_quads(index + n),
-            _quads(border[1:], border[:-1], border[:-1] + n, border[1:] + n),
-        ]
-    )
-    mesh = Mesh(np.vstack([one.reshape(-1, 3), other.reshape(-1, 3)]), triangles)
-    # The orientation of the faces depends on the side of `one` on which `other` lies.
-    return mesh if mesh.signed_volume() > 0.0 else Mesh(mesh.vertices, triangles[:, ::-1])
-
-
-def _rectangle(centre: Point, size: tuple[float, float], axes: tuple[int, int]) -> Array:
-    """(2, 2, 3) corners of a rectangle that spans two of the axes x, y, z (0, 1, 2)."""
-    corners = np.tile(np.array(centre, dtype=np.float64), (2, 2, 1))
-    corners[:, :, axes[0]] += np.array([[-0.5], [0.5]]) * size[0]
-    corners[:, :, axes[1]] += np.array([-0.5, 0.5]) * size[1]
-    return corners
-
-
-def bar(
-    begin: Point,
-    end: Point,
-    begin_size: tuple[float, float],
-    end_size: tuple[float, float],
-    axes: tuple[int, int] = (0, 1),
-) -> Mesh:
-    """A tapered bar between two rectangles in parallel planes.
-
-    Args:
-        begin: centre of one end in metres.
-        end: centre of the other end.
-        begin_size: sides of the rectangle at `begin` along the two axes.
-        end_size: sides at `end`.
-        axes: the two axes of x, y, z (0, 1, 2) that the rectangles span.
-    """
-    return solid_between(_rectangle(begin, begin_size, axes), _rectangle(end, end_size, axes))
-
-
-def box(size_m: Point) -> Mesh:
-    """A box of this size; the origin is in the middle of its bottom face."""
-    x, y, z = size_m
-    return bar((0.0, 0.0, 0.0), (0.0, 0.0, z), (x, y), (x, y))
 
 
 def _seat() -> Mesh:
@@ -173,28 +97,6 @@ def chair() -> Mesh:
     return join([_seat(), _backrest(), *_side(1.0), *_side(-1.0)])
 
 
-def cylinder(
-    begin: Point, end: Point, begin_radius_m: float, end_radius_m: float, sides: int = 24
-) -> Mesh:
-    """An upright round solid between two levels, tapered if the radii differ."""
-    angle = np.linspace(0.0, 2.0 * math.pi, sides, endpoint=False)
-    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
-    low = np.array(begin) + begin_radius_m * rim
-    high = np.array(end) + end_radius_m * rim
-    n = len(angle)
-    i = np.arange(n)
-    j = (i + 1) % n
-    low_centre, high_centre = np.full(n, 2 * n), np.full(n, 2 * n + 1)
-    triangles = np.vstack(
-        [
-            _quads(i, j, j + n, i + n),
-            np.column_stack([j, i, low_centre]),
-            np.column_stack([i + n, j + n, high_centre]),
-        ]
-    )
-    return Mesh(np.vstack([low, high, [begin], [end]]), triangles)
-
-
 def table(size_m: Point, top_m: float, leg_m: float) -> Mesh:
     """A table: a top and four square legs at its corners; the origin is on the ground below it."""
     x, y, z = size_m
@@ -229,24 +131,37 @@ def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
     """
     if terrain is None:
         side_m = 2.0 * half_size_m
-        square = _rectangle((0.0, 0.0, 0.0), (side_m, side_m), (0, 1))
-        return Mesh(square.reshape(-1, 3), _grid_quads(np.arange(4).reshape(2, 2)))
+        square = rectangle((0.0, 0.0, 0.0), (side_m, side_m), (0, 1))
+        return Mesh(square.reshape(-1, 3), grid_quads(np.arange(4).reshape(2, 2)))
     x, y = np.meshgrid(*terrain.grid_lines(half_size_m), indexing="ij")
     xy = np.column_stack([x.ravel(), y.ravel()])
     vertices = np.column_stack([xy, terrain.heights(xy)[0]])
-    return Mesh(vertices, _grid_quads(np.arange(len(xy)).reshape(x.shape)))
+    return Mesh(vertices, grid_quads(np.arange(len(xy)).reshape(x.shape)))
 
 
 def object_mesh(model: ObjectModel) -> Mesh:
     """The mesh of an object, in its own frame: origin on the ground, front along +x."""
-    if isinstance(model, ChairModel):
-        return chair()
-    if isinstance(model, BoxModel):
-        return box(model.size_m)
-    if isinstance(model, PoleModel | CylinderModel):
-        top = (0.0, 0.0, model.height_m)
-        sides = 24 if isinstance(model, PoleModel) else DRUM_SIDES
-        return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, sides)
-    if isinstance(model, TableModel):
-        return table(model.size_m, model.top_m, model.leg_m)
+    match model:
+        case ChairModel():
+            return chair()
+        case ThinChairModel():
+            return thin_chair()
+        case BoxesModel():
+            return boxes()
+        case ConesModel():
+            return cones()
+        case BicycleModel():
+            return bicycle()
+        case StrollerModel():
+            return stroller()
+        case BinModel():
+            return kerbside_bin()
+        case BoxModel():
+            return box(model.size_m)
+        case PoleModel() | CylinderModel():
+            top = (0.0, 0.0, model.height_m)
+            sides = 24 if isinstance(model, PoleModel) else DRUM_SIDES
+            return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, sides)
+        case TableModel():
+            return table(model.size_m, model.top_m, model.leg_m)
     assert_never(model)

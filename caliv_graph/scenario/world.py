@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.products import Array
-from caliv_graph.scenario.shapes import Mesh, box, ground, join, object_mesh, person
+from caliv_graph.scenario.shapes import ground, object_mesh, person
+from caliv_graph.scenario.solids import Mesh, box, join
 from caliv_graph.scenario.terrain import Terrain, make_terrain
 from caliv_graph.scenario.world_models import BodyBoxModel, WalkerModel, WorldModel
 

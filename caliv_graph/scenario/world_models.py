@@ -79,6 +79,42 @@ class ChairModel(_ObjectSection):
     shape: Literal["chair"] = "chair"
 
 
+class ThinChairModel(_ObjectSection):
+    """A chair of legs of 4 x 4 cm and slats of 2 x 5 cm: 0.6 m wide, 0.6 m deep, 0.95 m high."""
+
+    shape: Literal["thin_chair"] = "thin_chair"
+
+
+class BoxesModel(_ObjectSection):
+    """Three cardboard boxes, two side by side and one on top: 0.65 x 1.07 x 0.65 m."""
+
+    shape: Literal["boxes"] = "boxes"
+
+
+class ConesModel(_ObjectSection):
+    """Three traffic cones and a bag that lies beside them: 0.78 x 1.13 x 0.75 m."""
+
+    shape: Literal["cones"] = "cones"
+
+
+class BicycleModel(_ObjectSection):
+    """A bicycle that stands upright: 1.7 m long, 0.6 m wide, 1.02 m high."""
+
+    shape: Literal["bicycle"] = "bicycle"
+
+
+class StrollerModel(_ObjectSection):
+    """A pram with a seat and a hood of cloth: 0.97 m long, 0.58 m wide, 1.05 m high."""
+
+    shape: Literal["stroller"] = "stroller"
+
+
+class BinModel(_ObjectSection):
+    """A kerbside bin, its wheels and handle behind: 0.74 m deep, 0.58 m wide, 1.07 m high."""
+
+    shape: Literal["bin"] = "bin"
+
+
 class BoxModel(_ObjectSection):
     """A box. A long flat one is a wall."""
 
@@ -121,7 +157,18 @@ class TableModel(_ObjectSection):
 
 
 ObjectModel = Annotated[
-    ChairModel | BoxModel | PoleModel | CylinderModel | TableModel, Field(discriminator="shape")
+    ChairModel
+    | ThinChairModel
+    | BoxesModel
+    | ConesModel
+    | BicycleModel
+    | StrollerModel
+    | BinModel
+    | BoxModel
+    | PoleModel
+    | CylinderModel
+    | TableModel,
+    Field(discriminator="shape"),
 ]
 
 

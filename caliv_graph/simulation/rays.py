@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from caliv_graph._open3d import import_open3d
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.shapes import Mesh
+from caliv_graph.scenario.solids import Mesh
 from caliv_graph.scenario.world import GROUND, World
 
 NO_OBJECT = -1

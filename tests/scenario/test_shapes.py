@@ -6,30 +6,36 @@ from collections import Counter
 import gtsam
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from caliv_graph.scenario.shapes import (
-    Mesh,
     _backrest,
     _seat,
     _side,
-    bar,
-    box,
     chair,
-    cylinder,
     ground,
-    join,
+    object_mesh,
     person,
 )
+from caliv_graph.scenario.solids import Mesh, bar, box, cylinder, join, tube
 from caliv_graph.scenario.terrain import Terrain
 from caliv_graph.scenario.world import GROUND, World, make_world
 from caliv_graph.scenario.world_models import (
+    BicycleModel,
+    BinModel,
     BodyBoxModel,
+    BoxesModel,
     BoxModel,
     ChairModel,
+    ConesModel,
     GroundModel,
     ObjectModel,
     PoleModel,
     RampModel,
+    StrollerModel,
+    ThinChairModel,
     WalkerModel,
     WorldModel,
 )
@@ -42,8 +48,35 @@ SOLIDS: dict[str, Mesh] = {
     "cylinder": cylinder((0.0, 0.0, 0.0), (0.1, 0.0, 2.0), 0.2, 0.1),
     "seat": _seat(),
     "backrest": _backrest(),
+    "upright ring": tube(
+        np.array([[math.cos(a), 0.0, math.sin(a)] for a in np.arange(0.0, 6.2, 0.2)]),
+        0.1,
+        closed=True,
+    ),
+    "bent tube": tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.5, 1.0]]), 0.1),
     **{f"side {i}": part for i, part in enumerate([*_side(1.0), *_side(-1.0)])},
 }
+
+STREET: dict[str, tuple[ObjectModel, tuple[float, float, float]]] = {
+    "thin_chair": (ThinChairModel(xy_m=(0.0, 0.0)), (0.60, 0.60, 0.95)),
+    "boxes": (BoxesModel(xy_m=(0.0, 0.0)), (0.65, 1.07, 0.65)),
+    "cones": (ConesModel(xy_m=(0.0, 0.0)), (0.78, 1.13, 0.75)),
+    "bicycle": (BicycleModel(xy_m=(0.0, 0.0)), (1.70, 0.60, 1.03)),
+    "stroller": (StrollerModel(xy_m=(0.0, 0.0)), (0.96, 0.58, 1.05)),
+    "bin": (BinModel(xy_m=(0.0, 0.0)), (0.74, 0.58, 1.07)),
+}
+"""Targets by the name of their shape, with their size along x, y, z in metres."""
+
+
+def surface(mesh: Mesh, count: int, seed: int = 0) -> np.ndarray:
+    """(count, 3) points, evenly spread over the triangles."""
+    rng = np.random.default_rng(seed)
+    a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    which = rng.choice(len(area), count, p=area / area.sum())
+    u, v = np.sort(rng.uniform(size=(2, count)), axis=0)[:, :, None]
+    points: np.ndarray = u * a[which] + (v - u) * b[which] + (1.0 - v) * c[which]
+    return points
 
 
 def cast_one(
@@ -73,6 +106,87 @@ def test_solids_are_closed_and_look_outwards(name: str) -> None:
     assert set(edges.values()) == {1}
     assert all((b, a) in edges for a, b in edges)
     assert mesh.signed_volume() > 0.0
+
+
+@pytest.mark.parametrize("name", STREET)
+def test_every_part_of_a_target_is_closed_and_looks_outwards(name: str) -> None:
+    model, _ = STREET[name]
+    mesh = object_mesh(model)
+    assert model.shape == name
+    edges = Counter((int(t[i]), int(t[(i + 1) % 3])) for t in mesh.triangles for i in range(3))
+    assert set(edges.values()) == {1}
+    assert all((b, a) in edges for a, b in edges)
+    rows, columns = np.array(list(edges)).T
+    n = len(mesh.vertices)
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    count, part = connected_components(links, directed=False)
+    assert count > 2
+    for i in range(count):
+        solid = Mesh(mesh.vertices, mesh.triangles[part[mesh.triangles[:, 0]] == i])
+        assert solid.signed_volume() > 0.0
+
+
+@pytest.mark.parametrize("name", STREET)
+def test_target_has_its_size_and_stands_on_the_ground_about_its_origin(name: str) -> None:
+    model, size_m = STREET[name]
+    vertices = object_mesh(model).vertices
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    np.testing.assert_allclose(high - low, size_m, atol=0.015)
+    assert low[2] == pytest.approx(0.0, abs=1e-9)
+    assert np.abs(low + high)[:2].max() < 0.12
+
+
+@pytest.mark.parametrize("name", STREET)
+def test_target_turned_about_its_middle_does_not_match_itself(name: str) -> None:
+    mesh = object_mesh(STREET[name][0])
+    one, other = surface(mesh, 20_000), surface(mesh, 2_000, seed=1)
+    middle = one.mean(axis=0) * [1.0, 1.0, 0.0]
+    tree = cKDTree(one - middle)
+    itself = float(np.median(tree.query(other - middle)[0]))
+    for degrees in range(30, 331, 10):
+        R = gtsam.Rot3.Yaw(math.radians(degrees)).matrix()
+        distance = tree.query((other - middle) @ R.T)[0]
+        assert np.mean(distance) > 0.015, degrees
+        assert np.percentile(distance, 95) > 8.0 * itself, degrees
+
+
+def test_tubes_have_their_thickness_and_length() -> None:
+    straight = tube(np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), 0.1, 64)
+    assert straight.signed_volume() == pytest.approx(math.pi * 0.1**2 * 2.0, rel=0.005)
+    angle = np.linspace(0.0, 2.0 * math.pi, 90, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(90)])
+    ring = tube(circle, 0.1, 64, closed=True)
+    # Pappus: the section's area times the way of its middle.
+    assert ring.signed_volume() == pytest.approx(math.pi * 0.1**2 * 2.0 * math.pi, rel=0.005)
+
+
+def test_slats_of_the_thin_chair_have_gaps() -> None:
+    world = make_world(
+        WorldModel(objects={"chair": ThinChairModel(xy_m=(0.0, 0.0))}, targets=("chair",))
+    )
+    # Across the back at 0.7 m, every 5 mm: four slats of 5 cm, and two posts of 4 cm.
+    y = np.arange(-0.4, 0.4, 0.005) + 0.0025
+    origins = np.column_stack([np.full(len(y), -2.0), y, np.full(len(y), 0.7)])
+    ahead = np.tile([1.0, 0.0, 0.0], (len(y), 1))
+    caster = RayCaster(world)
+    distance, _ = caster.cast(origins, ahead)
+    on_back = distance < 1.8
+    assert on_back.sum() * 0.005 == pytest.approx(4 * 0.05 + 2 * 0.04, abs=0.011)
+    assert np.count_nonzero(np.diff(on_back.astype(int)) == 1) == 6
+
+
+@pytest.mark.parametrize(("x", "y", "z"), [(-0.4, 0.0, 0.74), (0.0, 0.0, 0.95)])
+def test_hood_of_the_stroller_is_cloth_seen_from_both_sides(x: float, y: float, z: float) -> None:
+    world = make_world(
+        WorldModel(objects={"pram": StrollerModel(xy_m=(0.0, 0.0))}, targets=("pram",))
+    )
+    centre = np.array([-0.11, 0.0, 0.71])
+    way = np.array([x, y, z]) - centre
+    way /= np.linalg.norm(way)
+    begin, end = centre + 0.2 * way, centre + 0.5 * way
+    out, _ = cast_one(world, tuple(begin.tolist()), tuple(way.tolist()))
+    back, _ = cast_one(world, tuple(end.tolist()), tuple((-way).tolist()))
+    assert 0.3 - out - back == pytest.approx(0.015, abs=0.001)
 
 
 def test_box_has_its_size_and_stands_on_its_origin() -> None:

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -55,6 +56,27 @@ class Line:
     code: str = ""
 
 
+def line_of(raw: Mapping[str, Any]) -> Line:
+    """A run, from the line of a file."""
+    return Line(
+        seed=raw["seed"],
+        failure=raw["failure"],
+        status=raw.get("status", ""),
+        undetermined=tuple(raw.get("undetermined", ())),
+        seconds=raw.get("seconds", {}),
+        quantities={
+            name: Errors(
+                tuple(e["error"]),
+                None if e["sigma"] is None else tuple(e["sigma"]),
+                tuple(e["determined"]),
+                e["nees"],
+            )
+            for name, e in raw.get("quantities", {}).items()
+        },
+        code=raw.get("code", ""),
+    )
+
+
 @dataclass(frozen=True)
 class Statistics:
     """Statistics of one quantity over the runs of a row; (6,) in the order of `SHOWN`, mm and mrad.
@@ -64,6 +86,8 @@ class Statistics:
     Attributes:
         runs: number of runs.
         determined: (6,) number of runs that determined an axis.
+        mean: mean error, with its sign.
+        spread: standard deviation of the error about its mean; NaN with less than two runs.
         mean_abs: mean absolute error.
         rmse: root mean square error.
         largest: largest absolute error.
@@ -75,6 +99,8 @@ class Statistics:
 
     runs: int
     determined: Array
+    mean: Array
+    spread: Array
     mean_abs: Array
     rmse: Array
     largest: Array
@@ -87,6 +113,17 @@ class Statistics:
     def ratio(self) -> Array:
         """(6,) RMSE over sigma."""
         return np.asarray(self.rmse / self.sigma)
+
+    @property
+    def mean_over_sigma(self) -> Array:
+        """(6,) absolute mean error over sigma."""
+        return np.asarray(np.abs(self.mean) / self.sigma)
+
+    @property
+    def bias(self) -> Array:
+        """(6,) mean error in standard errors of this mean; NaN if the errors do not scatter."""
+        error = self.spread / np.sqrt(np.maximum(self.determined, 1.0))
+        return np.asarray(self.mean / np.where(error > 0.0, error, NONE))
 
     def ratio_limits(self) -> Array:
         """(6,) limits of `ratio`: that of n normal draws has a standard error of 1 / sqrt(2 n)."""
@@ -109,7 +146,8 @@ def nees_is_right(mean: float, runs: int) -> bool:
 def statistics(runs: Sequence[Errors]) -> Statistics:
     """Statistics of one quantity."""
     scale = np.array([1e3] * 6)
-    error = np.abs(np.array([run.error for run in runs]))[:, _ORDER] * scale
+    signed = np.array([run.error for run in runs])[:, _ORDER] * scale
+    error = np.abs(signed)
     determined = np.array([run.determined for run in runs], bool)[:, _ORDER]
     stated = [run.sigma or (NONE,) * 6 for run in runs]
     sigma = np.array(stated)[:, _ORDER] * scale
@@ -117,6 +155,8 @@ def statistics(runs: Sequence[Errors]) -> Statistics:
     return Statistics(
         runs=len(runs),
         determined=determined.sum(axis=0).astype(np.float64),
+        mean=_per_axis(np.mean, signed, determined),
+        spread=_per_axis(_spread, signed, determined),
         mean_abs=_per_axis(np.mean, error, determined),
         rmse=_per_axis(_rms, error, determined),
         largest=_per_axis(np.max, error, determined),
@@ -125,6 +165,10 @@ def statistics(runs: Sequence[Errors]) -> Statistics:
         nees=float(np.mean(nees)) if nees else NONE,
         nees_runs=len(nees),
     )
+
+
+def _spread(values: Array) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else NONE
 
 
 def _rms(values: Array) -> float:
@@ -340,7 +384,8 @@ def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def _cells(values: Array | Sequence[float], marks: Sequence[str] = ("",) * 6) -> str:
+def axis_cells(values: Array | Sequence[float], marks: Sequence[str] = ("",) * 6) -> str:
+    """Values per axis in the columns of `HEADING`, each with a mark behind it."""
     out = ""
     for i, (value, mark) in enumerate(zip(np.asarray(values).tolist(), marks, strict=True)):
         # Millimetres to hundredths, milliradians to thousandths.
@@ -412,7 +457,7 @@ def _quantity(
     judged: bool,
 ) -> Iterator[str]:
     yield f"  {name + f', n = {s.runs}':26}{HEADING}"
-    yield f"    {'mean absolute error':22}{_cells(s.mean_abs)}"
+    yield f"    {'mean absolute error':22}{axis_cells(s.mean_abs)}"
     if np.isfinite(s.held).any():
         counts = [f"{round(s.runs - n)}x" if n < s.runs else "" for n in s.determined]
         yield f"    {'  not determined':22}" + "".join(f"{c:>13}" for c in counts)
@@ -425,21 +470,21 @@ def _quantity(
         marks = [
             "" if math.isnan(m) else _verdict(v <= m) for v, m in zip(values, limit, strict=True)
         ]
-        yield f"    {'  limit':22}{_cells(limit, marks)}"
-    yield f"    {'RMSE':22}{_cells(s.rmse)}"
-    yield f"    {'largest':22}{_cells(s.largest)}"
+        yield f"    {'  limit':22}{axis_cells(limit, marks)}"
+    yield f"    {'RMSE':22}{axis_cells(s.rmse)}"
+    yield f"    {'largest':22}{axis_cells(s.largest)}"
     if np.isfinite(s.sigma).any():
-        yield f"    {'sigma, rms':22}{_cells(s.sigma)}"
+        yield f"    {'sigma, rms':22}{axis_cells(s.sigma)}"
         marks = [
             "" if not judged or math.isnan(v) else _verdict(v <= m)
             for v, m in zip(s.ratio, s.ratio_limits(), strict=True)
         ]
-        yield f"    {'RMSE / sigma':22}{_cells(s.ratio, marks)}"
+        yield f"    {'RMSE / sigma':22}{axis_cells(s.ratio, marks)}"
     if predicted is not None:
         planned = np.array(predicted)[_ORDER] * 1e3
         planned = np.where(s.determined > 0, planned, NONE)
-        yield f"    {'sigma as planned':22}{_cells(planned)}"
-        yield f"    {'RMSE / planned':22}{_cells(s.rmse / planned)}"
+        yield f"    {'sigma as planned':22}{axis_cells(planned)}"
+        yield f"    {'RMSE / planned':22}{axis_cells(s.rmse / planned)}"
     if s.nees_runs:
         low, high = nees_interval(s.nees_runs)
         yield (
@@ -464,7 +509,7 @@ def comparison(scenario: str, rows: Mapping[str, tuple[str, Sequence[Line]]]) ->
         if scenario == "paper_arc":
             for name, figures in PUBLISHED.items():
                 if quantity in figures:
-                    out.append(f"    {name + ', n = 100':42}{_cells(figures[quantity])}")
+                    out.append(f"    {name + ', n = 100':42}{axis_cells(figures[quantity])}")
         for name, of_row in found.items():
             if quantity not in of_row:
                 continue

@@ -17,7 +17,6 @@ given.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -39,13 +38,13 @@ from caliv_graph.products import LidarScan, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.scenario.model import load_scenario
 from scripts._command import add_beams
+from scripts._runs import add_line, code_digest, json_lines
 from scripts._tables_rows import config_for
 from scripts._thinned import (
     GroundWaves,
     ThinnedRecording,
     cached_selection,
 )
-from scripts.benchmark_tables import code_digest
 
 OUT = REPOSITORY / "out" / "consistency"
 SCENARIOS = ("figure_eight", "s_curve", "paper_arc", "tri_lidar")
@@ -153,8 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for task in tasks(asked.seeds, faults=asked.faults):
             if task not in done:
                 line = perform(task, asked.beams)
-                with path.open("a", encoding="utf-8") as file:
-                    file.write(f"{json.dumps(line)}\n")
+                add_line(path, line)
                 what = task.fault or "clean"
                 print(f"{task.scenario}, {what}, seed {task.seed}: {line['status']}", flush=True)
     text, failures = summary(lines_of(path, asked.any_version))
@@ -195,15 +193,7 @@ def perform(task: Task, beams: Path) -> dict[str, Any]:
 
 def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
     """The runs of a file that count, without incomplete lines."""
-    out = []
-    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            continue
-        if any_version or line["code"] == code_digest():
-            out.append(line)
-    return out
+    return [line for line in json_lines(path) if any_version or line["code"] == code_digest()]
 
 
 def summary(lines: Sequence[Mapping[str, Any]]) -> tuple[str, int]:

@@ -22,10 +22,8 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +37,12 @@ from caliv_graph.config.load import dump_config
 from caliv_graph.errors import CalivError
 from caliv_graph.scenario.model import InitialGuessModel, Scenario, dump_scenario, load_scenario
 from caliv_graph.simulation.recording import simulate_drive
-from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, Errors, config_for, run_row
+from scripts._runs import code_digest, json_lines, performed
+from scripts._tables_rows import ROWS, ROWS_OF, RUNS_OF, config_for, run_row
 from scripts._tables_statistics import (
     Line,
     comparison,
+    line_of,
     other_systems,
     row_table,
 )
@@ -185,7 +185,7 @@ def run_missing(tasks: Sequence[Task], jobs: int, *, fresh: bool = False) -> lis
             if (t.scenario, t.row, t.out) == (scenario, row, out) and t.seed not in kept
         ]
     defects = []
-    for number, (task, line) in enumerate(_performed(missing, jobs), 1):
+    for number, (task, line) in enumerate(performed(perform, missing, jobs), 1):
         where = f"{task.scenario} {task.row} seed {task.seed}"
         if isinstance(line, Exception):
             defects.append(f"{where}: {type(line).__name__}: {line}")
@@ -196,32 +196,6 @@ def run_missing(tasks: Sequence[Task], jobs: int, *, fresh: bool = False) -> lis
         said = line["failure"] or f"{line['seconds']['total']:.1f} s"
         print(f"{number}/{len(missing)} {where}: {said}", flush=True)
     return defects
-
-
-def _performed(
-    tasks: Sequence[Task], jobs: int
-) -> Iterator[tuple[Task, dict[str, Any] | Exception]]:
-    """Tasks and their lines, in the order in which they end."""
-    if jobs == 1:
-        for task in tasks:
-            try:
-                yield task, perform(task)
-            except Exception as e:
-                yield task, e
-        return
-    # Spawned, because threads of open3d do not survive a fork.
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        futures = {pool.submit(perform, task): task for task in tasks}
-        try:
-            for future in as_completed(futures):
-                error = future.exception()
-                if isinstance(error, Exception):
-                    yield futures[future], error
-                else:
-                    yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 # ------------------------------------------------------------------ files
@@ -253,29 +227,9 @@ def digest(scenario: str, row: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-@functools.cache
-def code_digest() -> str:
-    """Digest of the program's text, to distinguish runs before and after a change."""
-    files = [*(REPOSITORY / "caliv_graph").rglob("*.py"), *(REPOSITORY / "scripts").glob("_*.py")]
-    out = hashlib.sha256()
-    for path in sorted(files):
-        out.update(path.read_bytes())
-    return out.hexdigest()[:8]
-
-
 def _usable(path: Path, scenario: str, row: str) -> list[dict[str, Any]]:
     """The lines of a file with the current digest, without incomplete lines."""
-    if not path.exists():
-        return []
-    lines = []
-    for text in path.read_text(encoding="utf-8").splitlines():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            continue
-        if line.get("digest") == digest(scenario, row):
-            lines.append(line)
-    return lines
+    return [line for line in json_lines(path) if line.get("digest") == digest(scenario, row)]
 
 
 def read_lines(scenario: str, row: str, out: Path, runs: int | None = None) -> list[Line]:
@@ -285,27 +239,7 @@ def read_lines(scenario: str, row: str, out: Path, runs: int | None = None) -> l
         for line in _usable(file_of(scenario, row, out), scenario, row)
         if runs is None or line["seed"] <= runs
     }
-    return [_line(found[seed]) for seed in sorted(found)]
-
-
-def _line(raw: Mapping[str, Any]) -> Line:
-    return Line(
-        seed=raw["seed"],
-        failure=raw["failure"],
-        status=raw.get("status", ""),
-        undetermined=tuple(raw.get("undetermined", ())),
-        seconds=raw.get("seconds", {}),
-        quantities={
-            name: Errors(
-                tuple(e["error"]),
-                None if e["sigma"] is None else tuple(e["sigma"]),
-                tuple(e["determined"]),
-                e["nees"],
-            )
-            for name, e in raw.get("quantities", {}).items()
-        },
-        code=raw.get("code", ""),
-    )
+    return [line_of(found[seed]) for seed in sorted(found)]
 
 
 # ------------------------------------------------------------------ summary

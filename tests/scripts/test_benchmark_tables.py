@@ -47,6 +47,11 @@ def test_statistics_are_as_by_hand_in_mm_and_mrad() -> None:
     assert s.runs == 2
     # x y z, roll pitch yaw.
     np.testing.assert_allclose(s.mean_abs, [6.0, 5.0, 6.0, 2.0, 2.0, 3.0])
+    # Errors of 4 and -8 in x, -5 and 5 in y, 6 and 6 in z.
+    np.testing.assert_allclose(s.mean, [-2.0, 0.0, 6.0, -1.0, 0.0, 3.0])
+    np.testing.assert_allclose(s.spread[:3], [math.sqrt(72.0), math.sqrt(50.0), 0.0])
+    np.testing.assert_allclose(s.bias[:3], [-2.0 / 6.0, 0.0, math.nan])
+    np.testing.assert_allclose(s.mean_over_sigma[:3], [0.4, 0.0, 1.2])
     root_of_40, root_of_5 = math.sqrt(40.0), math.sqrt(5.0)
     np.testing.assert_allclose(s.rmse, [root_of_40, 5.0, 6.0, root_of_5, 2.0, 3.0])
     np.testing.assert_allclose(s.largest, [8.0, 5.0, 6.0, 3.0, 2.0, 3.0])

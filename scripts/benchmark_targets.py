@@ -163,7 +163,10 @@ def summary(lines: Mapping[Task, Mapping[str, Any]]) -> str:
         by_cell.setdefault((task.object, task.lidar, task.drive), []).append(line)
     if not by_cell:
         return "no runs yet"
-    ordered = sorted(by_cell, key=lambda c: (DRIVES.index(c[2]), [*OBJECTS].index(c[0]), c[1]))
+    lidars, things = list(LIDARS), list(OBJECTS)
+    ordered = sorted(
+        by_cell, key=lambda c: (DRIVES.index(c[2]), things.index(c[0]), lidars.index(c[1]))
+    )
     out = [text for cell in ordered for text in cell_table(cell, by_cell[cell])]
     return "\n".join([*out, "", *overview({cell: by_cell[cell] for cell in ordered})])
 
@@ -300,7 +303,8 @@ def _print_recorded(option: str) -> bool:
 def recorded_table(name: str, result: Result) -> Iterator[str]:
     """Errors of one drive beside the stated sigmas; axes that are not determined in neither."""
     yield f"\n{name}: exit {result.exit}, {result.failure or result.status}"
-    yield from (f"  {said}" for said in (*result.contradictions, *result.undetermined))
+    said = dict.fromkeys((*result.contradictions, *result.undetermined))
+    yield from (f"  {text}" for text in said)
     if result.failure:
         return
     used = ", ".join(f"{lidar} {number}" for lidar, number in result.clouds.items())

@@ -290,19 +290,17 @@ class GroundObservation:
 
 @dataclass(frozen=True)
 class Mixture:
-    """The reconstructed target: oriented, anisotropic Gaussian components in the target frame.
+    """The reconstructed target: surfels, small pieces of plane, in the target frame.
 
     Attributes:
         means_target: (K, 3) metres.
         normals_target: (K, 3) unit vectors, towards the side the surface was seen from.
-        var_normal: (K,) m^2, variance along the normal.
-        var_tangent: (K,) m^2, variance along each tangent.
-        weights: (K,) priors of the components given a point is no outlier; they add up to one.
+        var_tangent: (K,) m^2, squared width along each tangent.
+        weights: (K,) part of the points that are target; they add up to one.
     """
 
     means_target: Array
     normals_target: Array
-    var_normal: Array
     var_tangent: Array
     weights: Array
 
@@ -321,6 +319,8 @@ class Registration:
         information_joint: (6 J, 6 J) of all poses together, the shape eliminated: it was estimated
             from the same points.
         mixture: the reconstructed target.
+        view_weights: (J,) weight of each cloud in these for what it shares with others of the same
+            view.
         inlier_ratio: (J,) part of each cloud's points that the mixture explains.
         iterations: EM iterations done.
         converged: whether the last step was below the tolerance.
@@ -332,6 +332,7 @@ class Registration:
     T_target_lidar: tuple[gtsam.Pose3, ...]
     information: Array
     information_joint: Array
+    view_weights: Array
     mixture: Mixture
     inlier_ratio: Array
     iterations: int

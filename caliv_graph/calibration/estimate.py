@@ -81,7 +81,7 @@ def _estimate(
             _deskewed(o, extrinsics, trajectories),
             config,
             normals=False,
-            view_weights=problem.view_weights(m),
+            views=problem.views_of(m),
         )
         for m, o in enumerate(observations)
     ]

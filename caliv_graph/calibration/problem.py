@@ -22,7 +22,7 @@ from caliv_graph.conventions import (
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
-from caliv_graph.targets.cloud.views import view_weights
+from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -58,8 +58,8 @@ class Problem:
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
             it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
             one.
-        weights_of_views: (J,) weight of each cloud for repeated views of one place, 0 to 1
-            (`targets.cloud.views`); None: all one.
+        views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
+            all differ.
     """
 
     lidars: tuple[str, ...]
@@ -78,18 +78,17 @@ class Problem:
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
     stated_cov: Array | None = None
-    weights_of_views: Array | None = None
+    views: Array | None = None
 
     @property
     def clouds(self) -> int:
         """Number of clouds."""
         return len(self.cloud_lidar)
 
-    def view_weights(self, placement: int | None = None) -> Array:
-        """Weights for repeated views, of all clouds (J,) or of those of one placement."""
-        weights = self.weights_of_views
-        weights = np.ones(self.clouds) if weights is None else weights
-        return weights if placement is None else weights[self.cloud_placement == placement]
+    def views_of(self, placement: int) -> Array:
+        """How many clouds have the view of each of the clouds of a placement."""
+        own = self.cloud_placement == placement
+        return np.ones(own.sum()) if self.views is None else self.views[own]
 
     def extrinsic_keys_of(self, lidar: str) -> tuple[int, ...]:
         """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""
@@ -258,16 +257,16 @@ def pose_problem(
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
-        weights_of_views=np.concatenate([_view_weights(o, of_pose, config) for o in observations]),
+        views=np.concatenate([_views(o, of_pose, config) for o in observations]),
     )
 
 
-def _view_weights(
+def _views(
     observation: TargetObservation,
     T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3],
     config: Config,
 ) -> Array:
-    """Weights for repeated views of a placement, at the guesses: their errors are common."""
+    """How many clouds have the view of each, at the guesses: a part of their errors is shared."""
     out = np.ones(len(observation.clouds))
     names = np.array([c.lidar for c in observation.clouds])
     for name in dict.fromkeys(names.tolist()):
@@ -278,7 +277,7 @@ def _view_weights(
             cloud = observation.clouds[i]
             T = T_map_vehicle[cloud.drive, cloud.stamp_ns].compose(guess)
             places.append(T.transformTo(observation.centre_map))
-        out[own] = view_weights(np.array(places))
+        out[own] = views(np.array(places))
     return out
 
 

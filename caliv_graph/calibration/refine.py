@@ -155,7 +155,8 @@ class _Loop:
         """(J,) squared residuals of the clouds, to weigh them by."""
         state = self.state
         pull, information = _single_clouds(state, shapes)
-        single = information / state.problem.view_weights()[:, None, None]
+        views = np.concatenate([shape.view_weights for shape in self.states])
+        single = information / views[:, None, None]
         return squares_without_own_pose(
             state.problem, lines, -pull, single, state.values, state.noise
         )

@@ -80,7 +80,7 @@ def rough_solve(
     with progress.stage("registering the clouds", len(observations)) as advance:
         for m, observation in enumerate(observations):
             state = JointRegistration(
-                observation, config, rough=True, view_weights=problem.view_weights(m)
+                observation, config, rough=True, views=problem.views_of(m)
             )
             registrations.append(register_jointly(state, prealigned(problem, m), iterations))
             advance()

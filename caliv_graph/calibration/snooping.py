@@ -20,6 +20,7 @@ from caliv_graph.calibration.solve import (
     guessed_graph,
     joint_information,
     measured_poses,
+    of_single_clouds,
     settle,
     step_of_all,
 )
@@ -62,7 +63,7 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     problem, fitted = state.problem, (state.noise, state.scale)
     sound, weights, values = state.sound, state.weights.values, state.values
     measured, information = measured_poses(registrations, state.turns)
-    single = information / problem.view_weights()[:, None, None]
+    single = of_single_clouds(information, registrations)
     explained = explained_parts(registrations)
     whole = np.maximum(explained, MIN_WEIGHT)
     state.weights.values = whole

@@ -116,23 +116,23 @@ def solve_registered(
     robust = state.weights
     state.weights = RobustWeights(RobustConfig(kernel="none"), problem.clouds)
     explained = explained_parts(registrations)
-    _reweight(state, measured, information, explained, 1)
+    _reweight(state, registrations, measured, information, explained, 1)
     given = with_given_poses(problem, state.values)
-    # Of a cloud by itself, with the error that it has in common with others from its place.
-    single = information / problem.view_weights()[:, None, None]
+    single = of_single_clouds(information, registrations)
     state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
     state.noise, state.scale = fit_pose_noise(
         problem, measured, single, state.sound, given, config.noise
     )
     state.weights = robust
     rounds = REWEIGHTINGS * state.weights.kernel.patience
-    _reweight(state, measured, information, explained, rounds)
+    _reweight(state, registrations, measured, information, explained, rounds)
     state.graph_seconds += time.perf_counter() - begun
     return state
 
 
 def _reweight(
     state: SolveState,
+    registrations: Sequence[Registration],
     measured: Sequence[gtsam.Pose3],
     information: Array,
     explained: Array,
@@ -141,7 +141,7 @@ def _reweight(
     """Alternates graph solves and robust weights until the weights stay."""
     problem = state.problem
     scaled = information / state.scale**2
-    single = scaled / problem.view_weights()[:, None, None]
+    single = of_single_clouds(scaled, registrations)
     for _ in range(rounds):
         clouds = cloud_graph(problem, measured, scaled * state.weights.values[:, None, None])
         state.values = optimise(merged(guessed_graph(state), clouds), state.values, 10)
@@ -257,6 +257,12 @@ def measured_poses(
             blocks = blocks + ridge[:, None, None] * np.eye(6)
         information.append(blocks)
     return poses, np.concatenate(information)
+
+
+def of_single_clouds(information: Array, registrations: Sequence[Registration]) -> Array:
+    """(J, 6, 6) of clouds by themselves, without the weights for what scans of a view share."""
+    weights = np.concatenate([r.view_weights for r in registrations])
+    return np.asarray(information / weights[:, None, None])
 
 
 def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) -> Array:

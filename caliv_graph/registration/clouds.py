@@ -64,6 +64,7 @@ class CloudStack:
         points: (N, 3) metres, each in the frame of its own LiDAR at its own stamp.
         cloud: (N,) index of the cloud of each point, ascending.
         starts: (J,) index of the first point of each cloud.
+        lidar: (J,) index of the LiDAR of each cloud, in the order in which they first come.
         beams: (N, 3) unit vectors from the sensor to the point, lidar frame.
         normals: (N, 3) unit vectors, lidar frame, towards the sensor.
         flatness: (N,) reliability of the normal, 0 to 1. It is 0 where the neighbourhood is sparse
@@ -75,6 +76,7 @@ class CloudStack:
     points: Array
     cloud: IntArray
     starts: IntArray
+    lidar: IntArray
     beams: Array
     normals: Array
     flatness: Array
@@ -85,6 +87,11 @@ class CloudStack:
     def count(self) -> int:
         """Number of clouds."""
         return len(self.starts)
+
+    @property
+    def lidars(self) -> int:
+        """Number of LiDARs."""
+        return int(self.lidar.max()) + 1
 
     @property
     def sizes(self) -> IntArray:
@@ -195,6 +202,7 @@ def stack_clouds(
         points=stacked,
         cloud=np.repeat(np.arange(len(points)), sizes),
         starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+        lidar=_indices([cloud.lidar for cloud in observation.clouds]),
         beams=beams,
         normals=_towards_sensor(np.concatenate(normal), flat, beams),
         flatness=flat,
@@ -203,18 +211,20 @@ def stack_clouds(
     )
 
 
-def merged_normals(stack: CloudStack, R: Array, t: Array, lidar: IntArray) -> CloudStack:
+def _indices(names: Sequence[str]) -> IntArray:
+    """(J,) number of each name, in the order in which they first come."""
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return np.array([index[name] for name in names], dtype=np.int64)
+
+
+def merged_normals(stack: CloudStack, R: Array, t: Array) -> CloudStack:
     """The same clouds, with normals and flatness from the aligned clouds of each LiDAR, merged.
 
     One cloud has one or two columns of points on the leg of a chair; a dozen clouds show its faces.
-
-    Args:
-        stack: the clouds.
-        R: (J, 3, 3) rotations of `T_target_lidar`, right to a few millimetres at the target.
-        t: (J, 3) translations of it, metres.
-        lidar: (J,) index of the LiDAR of each cloud. Clouds of different LiDARs are not merged:
-            their alignment is what is estimated.
+    Clouds of different LiDARs are not merged: their alignment is what is estimated. `T_target_lidar`
+    (rotations (J, 3, 3), translations (J, 3), metres) are right to a few millimetres at the target.
     """
+    lidar = stack.lidar
     points = stack.moved(R, t)
     beams = stack.rotated(R, stack.beams)
     views = stack.sum_per_cloud(beams)

@@ -15,12 +15,13 @@ from caliv_graph.common.cores import share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, second_moments
+from caliv_graph.registration.heights import HeightSums
 
 PART_CLOUDS = 8
 """Clouds whose points are summed together: their sums stay in the processor's cache."""
 
-PRIOR_COUNT = 1e-12
-"""Weight, in points, that keeps a component without points defined. More would add up over all
+PRIOR_COUNT = 1e-8
+"""Weight, per square metre, that keeps a component without points defined. More would add up over all
 components to information on the place of the target, which no cloud has."""
 
 MOMENTS = slice(0, 10)
@@ -47,25 +48,29 @@ JACOBIAN[1:, :, :3] = -skew(np.eye(3))
 
 @dataclass(frozen=True)
 class Responsibilities:
-    """Which components explain which points: the result of the E-step.
+    """Which surfels the beams returned from: the result of the E-step.
 
     Attributes:
-        component: (N, k) indices of components.
-        alpha: (N, k) responsibilities times the weight of the point's cloud; the rest of each row
-            belongs to the outlier class.
-        inlier_ratio: (J,) part of each cloud's points that components explain.
+        component: (N, k) indices of surfels.
+        weight: (N, k) responsibilities over the variance of the height, times the weight of the
+            point's cloud, per square metre.
+        counts: (K,) points of each surfel.
+        inlier_ratio: (J,) part of each cloud's points that surfels explain.
         levers: (J, 3) correction of the rotation part of each cloud's gradient: the lever of a
             residual ends where the beam meets the surface, not at the point (`mixture.expect`).
-        component_levers: (K, 3) the same, summed over the points of each component.
+        component_levers: (K, 3) the same, summed over the points of each surfel.
         slides_m: (N,) distance along the beam from each point to the surface, metres.
+        heights: sums over the heights of the points, for their noise.
     """
 
     component: IntArray
-    alpha: Array
+    weight: Array
+    counts: Array
     inlier_ratio: Array
     levers: Array
     component_levers: Array
     slides_m: Array
+    heights: HeightSums
 
 
 def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:
@@ -85,7 +90,7 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
         # A column per point, an entry per component it may belong to: the product is one pass.
         belongs = scipy.sparse.csc_array(
             (
-                who.alpha[own].ravel(),
+                who.weight[own].ravel(),
                 cells.ravel().astype(np.int32),
                 np.arange(0, count * width + 1, width, dtype=np.int32),
             ),

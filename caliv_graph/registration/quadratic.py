@@ -1,8 +1,8 @@
 """The quadratic that the points of all clouds put on the poses of the clouds.
 
-The M-step of the poses, with places and orientations of the components eliminated. It is an
-estimating equation: residuals are those of the points, levers are those of where the beams meet the
-surface. `README.md` of this folder derives each term.
+The M-step of the poses, with places and orientations of the surfels eliminated. Residuals are
+heights of points over the surfels, levers are those of where the beams meet the surface: the
+gradient of the likelihood of the ranges. `README.md` of this folder derives each term.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from caliv_graph.common.cores import parts, share_out
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
-from caliv_graph.registration.mixture import information_weights
 from caliv_graph.registration.moments import (
     COLUMN,
     HALF_DIAGONAL,
     JACOBIAN,
     MOMENTS,
+    NORMALS,
     ROW,
     SURFACE_MOMENTS,
     Responsibilities,
@@ -36,62 +36,60 @@ ORIENTATION_PARTS = 2
 """Parts in which the information lost to the components' orientations is summed. The same on any
 number of cores: so are the bits of the sums."""
 
-LEAST_LEVER_M = 1e-5
-"""Keeps the orientation of a component defined whose points are on a line, or one alone."""
+NORMAL_SIGMA_RAD = 0.2
+"""Prior of a surfel's normal about the mean normal of its points, 1 sigma, where these are reliable
+and agree. Normals are blurred near edges, and their noise is that of the same points."""
+
+SEEN_SIGMA_RAD = 1.0
+"""The same where they are not: a surfel faces the beams that it was seen by."""
 
 
 @dataclass(frozen=True)
 class ShapeQuadratic:
     """Information and gradient over the poses of all clouds, the shape eliminated.
 
-    An estimating equation (`caliv_graph/registration/README.md`), not one likelihood: a step d of
+    Of the likelihood of the ranges (`caliv_graph/registration/README.md`): a step d of
     left perturbations `Exp(d_j) T_target_lidar_j` (target frame; rotation then translation)
     minimises `d^T H d / 2 + g^T d`. H is `blocks` on the diagonal minus what
-    is lost since mean and orientation of each component are estimated from the same points: two
-    Schur complements, which couple clouds. Clouds that share no component are independent of each
+    is lost since place and orientation of each surfel are estimated from the same points: two
+    Schur complements, which couple clouds. Clouds that share no surfel are independent of each
     other.
 
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
-        gradient: (J, 6) g of the estimating equation.
-        across: (K, 6 J) root of the loss to the means across the surface.
-        sign: (K,) of a, negative where `var_normal > var_tangent / ALONG_SURFACE`.
-        along: (K, 4 J) root of the rest of the loss to the means.
-        moments: (J, K, 10) sums of alpha h h^T, h = (1, y), target frame.
-        coupling: (K, 10, 3, 6) linear map from the moments of a cloud and component to the coupling
+        gradient: (J, 6) g.
+        across: (K, 6 J) root of the loss to the places of the surfels.
+        moments: (J, K, 10) sums of weight h h^T, h = (1, m), target frame.
+        coupling: (K, 10, 3, 6) linear map from the moments of a cloud and surfel to the coupling
             of its orientation and the cloud.
-        orientation_information: (K, 3, 3) of each component.
-        torque: (K, 3) negative gradient with respect to the rotation of each component.
+        orientation_information: (K, 3, 3) of each surfel, the prior of its normal included.
+        turns: (K, 3) rotation of each surfel that it asks for at these poses.
+        normal_information: (K,) of the prior of each normal.
     """
 
     blocks: Array
     gradient: Array
     across: Array
-    sign: Array
-    along: Array
     moments: Array
     coupling: Array
     orientation_information: Array
-    torque: Array
+    turns: Array
+    normal_information: Array
 
     def joint(self, given_orientations: bool = False) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite.
 
-        With `given_orientations` the means alone are eliminated: half the work, and never less
+        With `given_orientations` the places alone are eliminated: half the work, and never less
         information, so that a step is the same or shorter.
         """
         count = len(self.blocks)
-        flat = self.sign > 0.0
-        lost: list[Callable[[], Array]] = [
-            lambda: self.along,
-            lambda: self.across if flat.all() else self.across[flat],
-        ]
+        lost: list[Callable[[], Array]] = [lambda: self.across]
         if not given_orientations:
             root = np.linalg.inv(np.linalg.cholesky(self.orientation_information))
             whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 10, 18)
             lost += [
                 partial(self._lost_to_orientations, whitened, own)
-                for own in parts(len(flat), ORIENTATION_PARTS)
+                for own in parts(len(self.across), ORIENTATION_PARTS)
             ]
         squares = [np.empty(0)] * len(lost)
 
@@ -102,24 +100,27 @@ class ShapeQuadratic:
 
         # The longest first: the others fill the gaps.
         share_out(square, range(len(lost))[::-1])
-        along, H, *orientations = squares
-        for square_of_part in orientations:
+        H = squares[0]
+        for square_of_part in squares[1:]:
             H += square_of_part
-        if not flat.all():
-            H -= self.across[~flat].T @ self.across[~flat]
-        pairs = along.reshape(count, 4, count, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
         np.negative(H, out=H)
         H4 = H.reshape(count, 6, count, 6)
-        H4 -= (pairs @ _PAIRS).reshape(count, count, 6, 6).transpose(0, 2, 1, 3)
         j = np.arange(count)
         H4[j, :, j, :] += self.blocks
         return np.asarray(H)
 
-    def _lost_to_orientations(self, whitened: Array, components: slice) -> Array:
-        """(3 k, 6 J) root of what is lost to the orientations of k components."""
-        moments = self.moments[:, components].transpose(1, 0, 2)
-        P = np.matmul(moments, whitened[components]).reshape(-1, len(self.blocks), 3, 6)
+    def _lost_to_orientations(self, whitened: Array, surfels: slice) -> Array:
+        """(3 k, 6 J) root of what is lost to the orientations of k surfels."""
+        moments = self.moments[:, surfels].transpose(1, 0, 2)
+        P = np.matmul(moments, whitened[surfels]).reshape(-1, len(self.blocks), 3, 6)
         return np.asarray(P.transpose(0, 2, 1, 3).reshape(-1, 6 * len(self.blocks)))
+
+    def shape_parameters(self) -> float:
+        """How many parameters of the shape the points determine, of three per surfel."""
+        known = np.linalg.inv(self.orientation_information)
+        prior = self.normal_information * np.trace(known, axis1=1, axis2=2)
+        # The turn about the normal itself has the prior alone.
+        return float(np.sum(1.0 + 3.0 - prior))
 
 
 # Constant tensors: what the M-step sums over points, as linear maps of moments and weights.
@@ -145,10 +146,6 @@ _JWY = (_JWY + np.swapaxes(_JWY, 0, 1))[ROW, COLUMN]
 _GRADIENTS = (HALF_DIAGONAL[:, None, None] * _JWY).reshape(60, 6)
 """`J^T W y` of the ten moments times the six entries of W."""
 
-_PAIRS = np.einsum("ace,bcf->abef", JACOBIAN, JACOBIAN).reshape(16, 36)
-"""`A_j^T A_j'` of the first moments of two clouds."""
-
-
 def shape_quadratic(
     stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, who: Responsibilities
 ) -> ShapeQuadratic:
@@ -158,7 +155,7 @@ def shape_quadratic(
         stack: the clouds.
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of it.
-        mixture: the components of the E-step.
+        mixture: the surfels of the E-step.
         cells: (J, K, 23) `cell_moments` of the responsibilities.
         who: the responsibilities; their lever corrections enter.
     """
@@ -169,8 +166,7 @@ def shape_quadratic(
     total = points.sum(axis=0)
     mass, means = mass_and_means(total, mixture)
     n = mixture.normals_target
-    a, b = information_weights(mixture)
-    W = a[:, None, None] * n[:, :, None] * n[:, None, :] + b[:, None, None] * np.eye(3)
+    W = n[:, :, None] * n[:, None, :]
     halves = W[:, *np.triu_indices(3)]
     by_cloud = np.swapaxes(points, 1, 2)
     pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
@@ -182,13 +178,18 @@ def shape_quadratic(
     coupling = _coupling(W, surface_means)
     both = scatter_about(total, means) @ W
     torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + who.component_levers
-    C = _orientation_information(scatter_about(on_surface, surface_means), mass, W)
-    rotation = np.linalg.solve(C, torque[..., None])[..., 0]
-    lost = np.einsum("kqae,ka->kqe", coupling, rotation)
+    C = _orientation_information(scatter_about(on_surface, surface_means), W)
+    towards, reliability = _normal_prior(cells, R, mass, mixture)
+    known = reliability / NORMAL_SIGMA_RAD**2
+    torque += known[:, None] * towards
+    prior = known + 1.0 / SEEN_SIGMA_RAD**2
+    C += prior[:, None, None] * np.eye(3)
+    turns = np.linalg.solve(C, torque[..., None])[..., 0]
+    lost = np.einsum("kqae,ka->kqe", coupling, turns)
     gradient -= moments.reshape(count, 10 * K) @ lost.reshape(10 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
     across = np.empty((K, count, 6))
-    root = n * np.sqrt(np.abs(a) / mass)[:, None]
+    root = n / np.sqrt(mass)[:, None]
     across[..., :3] = cross(sums[..., 1:], root[:, None])
     across[..., 3:] = sums[..., :1] * root[:, None]
     return ShapeQuadratic(
@@ -197,13 +198,26 @@ def shape_quadratic(
         ),
         gradient=np.asarray(gradient),
         across=across.reshape(K, 6 * count),
-        sign=np.sign(a),
-        along=(np.sqrt(b / mass)[:, None, None] * sums).reshape(K, 4 * count),
         moments=moments,
         coupling=coupling,
         orientation_information=C,
-        torque=np.asarray(torque),
+        turns=np.asarray(turns),
+        normal_information=prior,
     )
+
+
+def _normal_prior(cells: Array, R: Array, mass: Array, mixture: Mixture) -> tuple[Array, Array]:
+    """(K, 3) rotation of each normal to the mean of its points' normals; (K,) their reliability.
+
+    That is 0 to 1: the mean flatness, less where the normals differ.
+    """
+    summed = np.matmul(cells[..., NORMALS], np.swapaxes(R, 1, 2)).sum(axis=0)
+    size = np.linalg.norm(summed, axis=1)
+    mean = summed / np.maximum(size, 1e-300)[:, None]
+    axis = cross(mixture.normals_target, mean)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, np.einsum("ka,ka->k", mixture.normals_target, mean))
+    return axis * (angle / np.maximum(sine, 1e-300))[:, None], size / mass
 
 
 def _coupling(W: Array, means: Array) -> Array:
@@ -216,10 +230,8 @@ def _coupling(W: Array, means: Array) -> Array:
     return np.asarray(P)
 
 
-def _orientation_information(scatter: Array, mass: Array, W: Array) -> Array:
-    """(K, 3, 3) of `ShapeQuadratic`, from the scatter (K, 3, 3) about the mean and mass (K,)."""
-    K = len(mass)
+def _orientation_information(scatter: Array, W: Array) -> Array:
+    """(K, 3, 3) information of the points on the orientations, scatter (K, 3, 3) about the mean."""
+    K = len(W)
     C = scatter.reshape(K, 1, 9) @ (W.reshape(K, 9) @ _SKEW_W_SKEW).reshape(K, 9, 9)
-    C = C.reshape(K, 3, 3)
-    C += (LEAST_LEVER_M**2 * mass * np.trace(W, axis1=1, axis2=2))[:, None, None] * np.eye(3)
-    return np.asarray(C)
+    return np.asarray(C.reshape(K, 3, 3))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -20,12 +21,14 @@ from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Mixture, Registration, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
+from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
 from caliv_graph.registration.moments import cell_moments
 from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
+from caliv_graph.targets.cloud.views import TYPICAL_SHARED, weights_of_views
 
 COARSE_SIGMA_M = 0.05
-"""Initial standard deviation of the components. 3 degrees at the rim of a chair are 2 cm."""
+"""Initial roughness, and width of the surfels. 3 degrees at the rim of a chair are 2 cm."""
 
 FINE_SIGMA_M = 0.02
 """The same from poses of a solved graph, which are right to some millimetres."""
@@ -33,11 +36,12 @@ FINE_SIGMA_M = 0.02
 ROUGH_POINTS = 400
 """Points of a cloud at most in the coarse pass."""
 
-ANNEALING = 0.85
-"""Factor on the floor of the standard deviation, per iteration."""
+ANNEALING = 0.8
+"""Factor on the floor of the roughness, per iteration."""
 
-FLOOR_PER_RANGE_SIGMA = 0.6
-"""Final floor of the standard deviation, over the sigma of the noise along the beam."""
+FLOOR_PER_RANGE_SIGMA = 0.2
+"""Final floor of the roughness, over the sigma of the noise along the beam: from then on the
+roughness is what the heights say."""
 
 DAMPING = 1e-3
 """Levenberg-Marquardt damping, relative to the block of each cloud. Clouds that share no component
@@ -57,7 +61,7 @@ ROUGH_TOLERANCE = (1e-3, 6e-4)
 
 
 def annealing_steps(sigma_m: float, sigma_range_m: float) -> int:
-    """Number of E-steps from width `sigma_m` of the components to the final floor."""
+    """Number of E-steps from a roughness of `sigma_m` to the final floor."""
     factor = FLOOR_PER_RANGE_SIGMA * sigma_range_m / sigma_m
     return max(math.ceil(math.log(factor) / math.log(ANNEALING)), 0)
 
@@ -73,6 +77,7 @@ class JointRegistration:
         clouds: the same, thinned and stacked.
         tolerance: (rad, m) of `register_jointly`.
         weights: (J,) robust weight of each cloud, set from outside.
+        noise: of the heights of the points of each LiDAR, estimated at the end of annealing.
         inlier_ratio: (J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step.
     """
 
@@ -82,7 +87,7 @@ class JointRegistration:
         config: Config,
         rough: bool = False,
         normals: bool = True,
-        view_weights: Array | None = None,
+        views: Array | None = None,
     ) -> None:
         """Stacks the clouds of `observation`.
 
@@ -91,7 +96,7 @@ class JointRegistration:
             config: size of the mixture and of the clouds.
             rough: the coarse pass: fewer points, half the components, a wider tolerance.
             normals: False if `refine_normals` follows.
-            view_weights: (J,) weight of each cloud (`targets.cloud.views`); None: all 1.
+            views: (J,) clouds that have the view of each (`targets.cloud.views`); None: 1.
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -113,19 +118,21 @@ class JointRegistration:
         self.tolerance = ROUGH_TOLERANCE if rough else STEP_TOLERANCE
         self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
         self._floor = COARSE_SIGMA_M
-        self._volume = 1.0
+        self._depth_m = 1.0
         self._mixture: Mixture | None = None
         self._expected: tuple[Array, Array, Array] | None = None
         self.inlier_ratio: Array = np.ones(self.clouds.count)
-        self._view_weights = np.ones(self.clouds.count) if view_weights is None else view_weights
+        self._views = np.ones(self.clouds.count) if views is None else views
+        self.noise = self._configured = HeightNoise.configured(
+            self.clouds.lidars, config.noise.lidar_range_m, self._floor
+        )
+        # Until the noise is known, as much is taken to be shared as is typical.
+        self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)
         self.weights: Array = np.ones(self.clouds.count)
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
-        names = [cloud.lidar for cloud in self.observation.clouds]
-        index = {name: i for i, name in enumerate(dict.fromkeys(names))}
-        lidar = np.array([index[name] for name in names])
-        self.clouds = merged_normals(self.clouds, R, t, lidar)
+        self.clouds = merged_normals(self.clouds, R, t)
 
     @property
     def mixture(self) -> Mixture:
@@ -139,24 +146,36 @@ class JointRegistration:
         """Whether annealing has reached the noise level."""
         return self._floor <= self._floor_end
 
+    @property
+    def view_weights(self) -> Array:
+        """(J,) weight of each cloud for what it shares with others of the same view."""
+        return weights_of_views(self._views, self._shared[self.clouds.lidar])
+
     def seed(self, R: Array, t: Array, sigma_m: float) -> None:
         """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
         points = self.clouds.moved(R, t)
         low, high = np.percentile(points, [1, 99], axis=0)
-        self._volume = float(np.prod(np.maximum(high - low, 0.05)))
+        self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
         self._floor = max(sigma_m, self._floor_end)
-        self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor)
+        distinct = float((self.clouds.sizes / self._views).sum())
+        self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor, distinct)
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
-        density = self._gamma / (self._volume * (self._gamma + 1.0))
-        who = expect(self.clouds, R, t, self.mixture, density, self.weights * self._view_weights)
+        noise = replace(self.noise, floor_m=self._floor)
+        density = self._gamma / (self._depth_m * (self._gamma + 1.0))
+        weights = self.weights * self.view_weights
+        who = expect(self.clouds, R, t, self.mixture, noise, density, weights)
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
+        if self.finest:
+            taken_up = quadratic.shape_parameters()
+            self.noise = noise.fitted(who.heights, taken_up, self._configured)
+            self._shared = self.noise.shared_part(who.heights)
         # Not the quadratic itself: it is as large as all the rest.
-        self._expected = cells, quadratic.orientation_information, quadratic.torque
+        self._expected = cells, who.counts, quadratic.turns
         return quadratic
 
     def maximise(self, R: Array, t: Array) -> None:
@@ -190,6 +209,7 @@ class JointRegistration:
             T_target_lidar=unstack(R, t),
             information=blocks + ridge,
             information_joint=joint,
+            view_weights=self.view_weights,
             mixture=self.mixture,
             inlier_ratio=self.inlier_ratio,
             iterations=iterations,

@@ -1,0 +1,153 @@
+"""The noise of the heights of points over the surface, estimated from them.
+
+The range of LiDAR a has noise `sigma_a` along the beam, which is `f sigma_a` across a surface that
+the beam meets at the cosine f. What a plane does not show of the surface, and what a footprint of
+a beam averages, is across the surface: the roughness. Variances of a LiDAR's heights are
+`f^2 sigma_a^2 + rho_a^2`, and both are fitted to the squares of the heights
+(`README.md` of this folder).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.products import Array, IntArray
+
+LEAST_SIGMA_M = 1e-3
+"""Smallest roughness and noise of the range, metres: below what ranges are quantised to."""
+
+PRIOR_POINTS = 50.0
+"""Points that the configured noise of the range counts as when it is estimated."""
+
+
+@dataclass(frozen=True)
+class HeightNoise:
+    """Noise of the heights of the points of L LiDARs.
+
+    Attributes:
+        range_m2: (L,) variance along the beam, m^2.
+        roughness_m2: (L,) variance across the surface, m^2.
+        floor_m: smallest roughness, metres; annealed while poses and shape are coarse.
+    """
+
+    range_m2: Array
+    roughness_m2: Array
+    floor_m: float
+
+    @classmethod
+    def configured(cls, lidars: int, sigma_range_m: float, floor_m: float) -> HeightNoise:
+        """The configured noise along the beam, and the smallest roughness."""
+        variance = max(sigma_range_m, LEAST_SIGMA_M) ** 2
+        return cls(np.full(lidars, variance), np.full(lidars, LEAST_SIGMA_M**2), floor_m)
+
+    def largest_m(self) -> float:
+        """The largest standard deviation along a beam, metres."""
+        return float(np.sqrt(self.range_m2.max()))
+
+    def variance(self, cosine: Array, lidar: IntArray) -> Array:
+        """(n, k) variance of heights at cosines of incidence (n, k), of points of LiDARs (n,)."""
+        roughness = np.maximum(self.roughness_m2, self.floor_m**2)
+        return np.asarray(
+            cosine**2 * self.range_m2[lidar][:, None] + roughness[lidar][:, None]
+        )
+
+    def shared_part(self, heights: HeightSums) -> Array:
+        """(L,) part of a height's variance that scans from one place share.
+
+        Their beams meet the same spots: the noise of the range is new in each scan, what the plane
+        does not show is the same.
+        """
+        roughness = np.maximum(self.roughness_m2, self.floor_m**2)
+        return np.asarray(roughness / (heights.mean_cosine2() * self.range_m2 + roughness))
+
+    def fitted(self, heights: HeightSums, parameters: float, before: HeightNoise) -> HeightNoise:
+        """The noise that the squares of the heights ask for, by weighted least squares.
+
+        Args:
+            heights: of the E-step.
+            parameters: what the shape has taken up, in points.
+            before: configured noise, a prior of `PRIOR_POINTS`.
+        """
+        points = heights.points.sum()
+        # Heights over planes that were fitted to them are too small.
+        inflation = points / max(points - parameters, 0.2 * points)
+        prior = PRIOR_POINTS / np.maximum(heights.points, 1.0)
+        range_m2, roughness_m2 = self.range_m2.copy(), self.roughness_m2.copy()
+        for a in np.flatnonzero(heights.points > 0.0).tolist():
+            A = heights.normal[a]
+            b = inflation * heights.right[a]
+            pull = prior[a] * np.diag(A)
+            A = A + np.diag(pull)
+            b = b + pull * [before.range_m2[a], before.roughness_m2[a]]
+            both = np.linalg.solve(A, b)
+            if both[0] < LEAST_SIGMA_M**2:
+                both = np.array([LEAST_SIGMA_M**2, (b[1] - A[1, 0] * LEAST_SIGMA_M**2) / A[1, 1]])
+            elif both[1] < LEAST_SIGMA_M**2:
+                both = np.array([(b[0] - A[0, 1] * LEAST_SIGMA_M**2) / A[0, 0], LEAST_SIGMA_M**2])
+            range_m2[a], roughness_m2[a] = np.maximum(both, LEAST_SIGMA_M**2)
+        return replace(self, range_m2=range_m2, roughness_m2=roughness_m2)
+
+
+@dataclass(frozen=True)
+class HeightSums:
+    """Sums over heights that their noise is fitted to, for L LiDARs.
+
+    Attributes:
+        points: (L,) points that are target.
+        cosine2: (L,) sum of the squared cosines of incidence.
+        normal: (L, 2, 2) normal matrix of squared heights by (f^2, 1), each of weight 1/variance^2.
+        right: (L, 2) its right-hand side, m^2.
+    """
+
+    points: Array
+    cosine2: Array
+    normal: Array
+    right: Array
+
+    @classmethod
+    def none(cls, lidars: int) -> HeightSums:
+        """Zero."""
+        return cls(
+            np.zeros(lidars), np.zeros(lidars), np.zeros((lidars, 2, 2)), np.zeros((lidars, 2))
+        )
+
+    @classmethod
+    def of(
+        cls,
+        alpha: Array,
+        height: Array,
+        cosine: Array,
+        variance: Array,
+        lidar: IntArray,
+        lidars: int,
+    ) -> HeightSums:
+        """Of responsibilities, heights, cosines and variances (n, k) of points of LiDARs (n,)."""
+        weight, f2 = alpha / variance**2, cosine**2
+
+        def summed(values: Array) -> Array:
+            return np.asarray(np.bincount(lidar, values.sum(axis=1), lidars))
+
+        normal = np.empty((lidars, 2, 2))
+        normal[:, 0, 0] = summed(weight * f2 * f2)
+        normal[:, 0, 1] = normal[:, 1, 0] = summed(weight * f2)
+        normal[:, 1, 1] = summed(weight)
+        square = weight * height**2
+        right = np.column_stack([summed(square * f2), summed(square)])
+        return cls(summed(alpha), summed(alpha * f2), normal, right)
+
+    @classmethod
+    def total(cls, pieces: Sequence[HeightSums]) -> HeightSums:
+        """The sum of several."""
+        return cls(
+            np.sum([p.points for p in pieces], axis=0),
+            np.sum([p.cosine2 for p in pieces], axis=0),
+            np.sum([p.normal for p in pieces], axis=0),
+            np.sum([p.right for p in pieces], axis=0),
+        )
+
+    def mean_cosine2(self) -> Array:
+        """(L,) mean squared cosine of incidence."""
+        return np.asarray(self.cosine2 / np.maximum(self.points, 1e-12))

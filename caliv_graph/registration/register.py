@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -154,15 +155,6 @@ class JointRegistration:
         self._volume = float(np.prod(np.maximum(high - low, 0.05)))
         self._floor = max(sigma_m, self._floor_end)
         self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor)
-
-    @property
-    def floor(self) -> float:
-        """Smallest standard deviation of the components so far, metres."""
-        return self._floor
-
-    def restore(self, mixture: Mixture, floor: float) -> None:
-        """Goes back to the components and the `floor` of an earlier state."""
-        self._mixture, self._floor = mixture, floor
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
@@ -361,15 +353,13 @@ def _from_other_starts(state: JointRegistration, run: _Run, max_iterations: int)
     found = suspicious(state.clouds, run.R, run.t)
     if not len(found.clouds):
         return run
-    mixture, floor, weights = state.mixture, state.floor, state.weights
-    state.weights = weights.copy()
-    state.weights[found.clouds] *= LEFT_OUT
-    state.seed(run.R, run.t, COARSE_SIGMA_M)
-    others = _alternated(state, run.R, run.t, max_iterations)
-    R, t, moved = best_starts(state.clouds, state.mixture, others.R, others.t, found)
-    state.weights = weights
+    trial = copy(state)
+    trial.weights = state.weights.copy()
+    trial.weights[found.clouds] *= LEFT_OUT
+    trial.seed(run.R, run.t, COARSE_SIGMA_M)
+    others = _alternated(trial, run.R, run.t, max_iterations)
+    R, t, moved = best_starts(trial.clouds, trial.mixture, others.R, others.t, found, left_step)
     if not moved.any():
-        state.restore(mixture, floor)
         return run
     R_all, t_all = others.R.copy(), others.t.copy()
     R_all[found.clouds], t_all[found.clouds] = R, t

@@ -7,6 +7,7 @@ a cloud is tried at several places on the shape of the others; the best explanat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,8 +68,15 @@ LEAST_WEIGHT = 1e-3
 """Components with less than this part of the mean weight were seeded on clouds that are left out:
 each of them would explain its own cloud where that is now."""
 
+LARGEST_STEP = 0.1
+"""Largest step of a cloud in one iteration, rad and m."""
+
 STEP_RIDGE = 1e-3
 """Levenberg-Marquardt damping of the steps of a single cloud, relative to its information."""
+
+
+Move = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""From rotations (J, 3, 3), translations (J, 3) and left perturbations (J, 6) to moved ones."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ def suspicious(clouds: CloudStack, R: Array, t: Array) -> Suspicion:
 
 
 def best_starts(
-    clouds: CloudStack, mixture: Mixture, R: Array, t: Array, found: Suspicion
+    clouds: CloudStack, mixture: Mixture, R: Array, t: Array, found: Suspicion, move: Move
 ) -> tuple[Array, Array, BoolArray]:
     """Where the suspicious clouds fit the shape of the others best.
 
@@ -133,6 +141,7 @@ def best_starts(
         R: (J, 3, 3) rotations of `T_target_lidar`.
         t: (J, 3) translations of it, metres.
         found: the suspicious clouds, S of them.
+        move: applies left perturbations to poses (`register.left_step`).
 
     Returns:
         R (S, 3, 3) and t (S, 3) of them, and (S,) whether that is another place than before.
@@ -142,7 +151,7 @@ def best_starts(
     R_now, t_now = R[found.clouds], t[found.clouds]
     best_R, best_t, best = R_now, t_now, np.full(part.count, -np.inf)
     for shift in _shifts(found):
-        R_end, t_end = _fitted(part, mixture, R_now, t_now + shift)
+        R_end, t_end = _fitted(part, mixture, R_now, t_now + shift, move)
         compared = _widened(mixture, COMPARED_SIGMA_M)
         score = _log_likelihood(part, compared, R_end, t_end)
         score -= MISSING_NATS * _missing(part, mixture, R_end, t_end)
@@ -211,11 +220,10 @@ def _widened(mixture: Mixture, sigma_m: float) -> Mixture:
     )
 
 
-def _fitted(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> tuple[Array, Array]:
+def _fitted(
+    clouds: CloudStack, mixture: Mixture, R: Array, t: Array, move: Move
+) -> tuple[Array, Array]:
     """The poses of the clouds, each for itself, on a shape that stays."""
-    # Here, as `register` uses this module.
-    from caliv_graph.registration.register import MAX_STEP, left_step
-
     ones = np.ones(clouds.count)
     for i in range(ITERATIONS):
         shape = _widened(mixture, START_SIGMA_M * NARROWER**i)
@@ -227,8 +235,8 @@ def _fitted(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> tuple[A
         H = H + (STEP_RIDGE * size + 1e-9)[:, None, None] * np.eye(6)
         d = -np.linalg.solve(H, quadratic.gradient[..., None])[..., 0]
         largest = np.abs(d).max(axis=1, keepdims=True)
-        d = d * np.minimum(1.0, MAX_STEP / np.maximum(largest, 1e-12))
-        R, t = left_step(R, t, d)
+        d = d * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-12))
+        R, t = move(R, t, d)
     return R, t
 
 

@@ -80,7 +80,7 @@ def rough_solve(
         RegistrationError, SolveError: it could not be done.
     """
     begun = time.perf_counter()
-    problem, observations = _roughly_used(problem, observations, config.extraction.min_scans)
+    problem, observations = roughly_used(problem, observations, config.extraction.min_scans)
     registrations = []
     with progress.stage("registering the clouds", len(observations)) as advance:
         for m, observation in enumerate(observations):
@@ -106,7 +106,7 @@ def rough_solve(
     )
 
 
-def _roughly_used(
+def roughly_used(
     problem: Problem, observations: Sequence[TargetObservation], fewest: int
 ) -> tuple[Problem, list[TargetObservation]]:
     """Problem and observations with whole clouds only, of LiDARs that have at least `fewest`.

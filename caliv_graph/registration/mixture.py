@@ -221,11 +221,13 @@ def expect(
     share_out(of_part, range(len(pieces)))
     moved = [(forces * direction[:, None]).ravel() for direction in directions.T]
     on_surfels = [np.bincount(near.ravel(), m, len(mixture.weights)) for m in moved]
+    explained = alpha.sum(axis=1)
     return Responsibilities(
         component=near,
         weight=weights,
         counts=np.bincount(near.ravel(), alpha.ravel(), len(mixture.weights)),
-        inlier_ratio=stack.sum_per_cloud(alpha.sum(axis=1)) / stack.sizes,
+        explained=explained,
+        inlier_ratio=stack.sum_per_cloud(explained) / stack.sizes,
         levers=stack.sum_per_cloud(levers),
         component_levers=cross(np.column_stack(on_surfels), mixture.normals_target),
         slides_m=slides,

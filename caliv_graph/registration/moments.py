@@ -55,7 +55,8 @@ class Responsibilities:
         weight: (N, k) responsibilities over the variance of the height, times the weight of the
             point's cloud, per square metre.
         counts: (K,) points of each surfel.
-        inlier_ratio: (J,) part of each cloud's points that surfels explain.
+        explained: (N,) probability that the point is target.
+        inlier_ratio: (J,) its mean over each cloud.
         levers: (J, 3) correction of the rotation part of each cloud's gradient: the lever of a
             residual ends where the beam meets the surface, not at the point (`mixture.expect`).
         component_levers: (K, 3) the same, summed over the points of each surfel.
@@ -66,6 +67,7 @@ class Responsibilities:
     component: IntArray
     weight: Array
     counts: Array
+    explained: Array
     inlier_ratio: Array
     levers: Array
     component_levers: Array

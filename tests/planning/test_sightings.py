@@ -68,7 +68,8 @@ def test_points_fall_with_the_square_of_the_range() -> None:
         ((5.0, 7.8), True),  # 57 degrees to the left, the field of view ends at 60
         ((5.0, 9.5), False),  # 62
         ((5.0, 8.55), False),  # 59.7: the edge cuts the chair
-        ((40.0, 0.0), False),  # 30 points
+        ((40.0, 0.0), True),  # 28 points
+        ((80.0, 0.0), False),  # 7 points
         ((1.0, 0.0), False),  # below the lowest channel
     ],
     ids=str,

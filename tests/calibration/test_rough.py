@@ -1,0 +1,46 @@
+"""Which clouds the rough solve works with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caliv_graph.calibration.rough import roughly_used
+from caliv_graph.products import Side, TargetCloud, TargetObservation
+from tests.calibration.problems import make_case
+
+WHOLE: frozenset[Side] = frozenset()
+CUT: frozenset[Side] = frozenset({"top"})
+
+
+def observation(front: list[frozenset[Side]], rear: list[frozenset[Side]]) -> TargetObservation:
+    clouds = [
+        TargetCloud(name, 0, j, np.zeros((8, 3)), "", cut)
+        for name, cuts in (("front", front), ("rear", rear))
+        for j, cut in enumerate(cuts)
+    ]
+    return TargetObservation(0, "target", np.zeros(3), tuple(clouds))
+
+
+def test_cut_clouds_wait_where_there_are_enough_whole_ones() -> None:
+    problem = make_case(count=6).problem
+    seen = observation([WHOLE, CUT, WHOLE, WHOLE, CUT, WHOLE], [CUT, CUT, CUT, WHOLE, CUT, WHOLE])
+
+    fewer, (used,) = roughly_used(problem, [seen], fewest=4)
+
+    # Of the front LiDAR the whole ones; of the rear one, which has two of them, all.
+    front = [0, 2, 3, 5]
+    assert [c.stamp_ns for c in used.clouds if c.lidar == "front"] == front
+    assert [c.stamp_ns for c in used.clouds if c.lidar == "rear"] == list(range(6))
+    assert fewer.cloud_pose.tolist() == [*front, *range(6)]
+    assert fewer.cloud_lidar.tolist() == [0] * 4 + [1] * 6
+    assert len(fewer.view_weights()) == fewer.clouds == 10
+    # The graph predicts the poses of the others.
+    assert fewer.poses == problem.poses
+
+
+def test_whole_clouds_are_used_as_they_are() -> None:
+    problem = make_case(count=6).problem
+    seen = observation([WHOLE] * 6, [WHOLE] * 6)
+    fewer, (used,) = roughly_used(problem, [seen], fewest=4)
+    assert fewer is problem
+    assert used == seen

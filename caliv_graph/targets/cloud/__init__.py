@@ -1,7 +1,8 @@
 """The target's points in each scan.
 
 `extract` is the whole of it. `scans`: which scans are decoded and which clouds are used. `region`:
-candidates in one scan. `track`: the static object among them. `moved`: a target that somebody
+candidates in one scan. `track`: the static objects among them. `constellation`: several objects in
+one region, matched between LiDARs. `moved`: a target that somebody
 carries from place to place. `views`: weights of clouds with the same view. `field_of_view`: of a
 LiDAR, from its scans.
 

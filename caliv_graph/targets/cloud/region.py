@@ -42,6 +42,10 @@ views are smaller, tilt errors of the ground and noise make them larger."""
 OUTSIDE_M = 0.2
 """Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
 
+RIM_M = 0.1
+"""Width of the rim of the widened region: beams of common LiDARs are 2 to 10 cm apart at 10 m, and
+what is cut off there has points in it."""
+
 MOST_CANDIDATES = 4
 """Objects of one scan that are kept until the static one is known."""
 
@@ -67,6 +71,7 @@ class Candidate:
         R_region_lidar: (3, 3) at the guess.
         t_region_lidar: (3,) metres, at the guess.
         cut: whether the edge of the field of view may cut it off.
+        top_m: height of its highest point above the ground; inf without ground in the region.
     """
 
     cloud: TargetCloud
@@ -74,6 +79,12 @@ class Candidate:
     R_region_lidar: Array
     t_region_lidar: Array
     cut: bool
+    top_m: float = math.inf
+
+    @property
+    def points_region(self) -> Array:
+        """(N, 3) metres, region frame, at the guess."""
+        return self.cloud.points_lidar @ self.R_region_lidar.T + self.t_region_lidar
 
 
 def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
@@ -164,7 +175,7 @@ class RegionExtractor:
         else:
             height = height_above(plane, points)
         above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
-        points, near = points[above], near[above]
+        points, near, height = points[above], near[above], height[above]
         objects = self._objects(points, range_m)
         if not objects:
             tally.rejected["nothing above the ground that is 0.2 to 2 m wide"] += 1
@@ -183,7 +194,8 @@ class RegionExtractor:
             swept = None if times is None else compact
             cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
             cut = is_cut(target, edges, len(scan.points_lidar))
-            out.append(Candidate(cloud, 0.5 * (low + high), R, t, cut))
+            top_m = math.inf if plane is None else float(height[chosen].max())
+            out.append(Candidate(cloud, 0.5 * (low + high), R, t, cut, top_m=top_m))
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
         return out
@@ -255,6 +267,22 @@ class RegionExtractor:
         scans = [candidates for candidates in found if candidates]
         if not scans:
             return []
+        flat, candidate_set = self.candidate_set(scans, lidar)
+        best = candidate_set.longest_track()
+        return self.clouds([flat[n] for n in best.tolist()], len(scans), lidar)
+
+    def clouds(self, chosen: Sequence[Candidate], scans: int, lidar: str) -> list[TargetCloud]:
+        """The clouds of the candidates of one object, at most one per scan, of so many scans."""
+        lost = scans - len(chosen)
+        if lost:
+            self.tallies[lidar].rejected["something else stood there"] += lost
+        clouds = [self.accept(candidate) for candidate in chosen]
+        return [cloud for cloud in clouds if cloud is not None]
+
+    def candidate_set(
+        self, scans: Sequence[Sequence[Candidate]], lidar: str
+    ) -> tuple[list[Candidate], CandidateSet]:
+        """The candidates of a LiDAR's scans, none of them empty, in one list; and as a set."""
         sigma = self._config.lidars[lidar].sigma
         prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
         if self._config.lidars[lidar].fixed:
@@ -264,9 +292,19 @@ class RegionExtractor:
         centres = np.array([c.centre_lidar for c in flat])
         R = np.array([c.R_region_lidar for c in flat])
         t = np.array([c.t_region_lidar for c in flat])
-        best = CandidateSet(centres, R, t, index, prior).longest_track()
-        lost = len(scans) - len(best)
-        if lost:
-            self.tallies[lidar].rejected["something else stood there"] += lost
-        clouds = [self.accept(flat[n]) for n in best.tolist()]
-        return [cloud for cloud in clouds if cloud is not None]
+        return flat, CandidateSet(centres, R, t, index, prior)
+
+    def outside_m(self, places: Array) -> Array:
+        """(n,) metres, distance of places (n, 3), region frame, from the region."""
+        off = np.maximum(np.maximum(self._low - places, places - self._high), 0.0)
+        return np.asarray(np.linalg.norm(off, axis=1))
+
+    def reaches_rim(self, candidate: Candidate) -> bool:
+        """Whether a candidate may go on where the points near the region end."""
+        range_m = float(np.linalg.norm(self.centre - candidate.t_region_lidar))
+        margin = widened_margin_m(self._config, candidate.cloud.lidar, range_m)
+        return float(self.outside_m(candidate.points_region).max()) > margin - RIM_M
+
+    def in_map(self, place: Array) -> Array:
+        """(3,) metres, a place (3,) of the region frame in the map."""
+        return np.asarray(self._R_map_region @ place + self._t_map_region)

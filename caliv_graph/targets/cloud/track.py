@@ -40,6 +40,27 @@ class CandidateSet:
         self.moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)
         self.reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
         self.prior = prior
+        self._poses = centres_lidar, R, t
+
+    def subset(self, index: IntArray) -> CandidateSet:
+        """The candidates at these indices."""
+        centres_lidar, R, t = (part[index] for part in self._poses)
+        return CandidateSet(centres_lidar, R, t, self.scan[index], self.prior)
+
+    def tracks(self, fewest: int) -> list[IntArray]:
+        """Indices of the candidates of each static object with at least `fewest` scans.
+
+        The object of `longest_track` comes first, then that of the longest among the others.
+        """
+        out: list[IntArray] = []
+        free = np.arange(len(self.scan), dtype=np.int64)
+        while len(free) >= max(fewest, 1):
+            found = free[self.subset(free).longest_track()]
+            if len(found) < fewest:
+                break
+            out.append(found)
+            free = np.setdiff1d(free, found)
+        return out
 
     def longest_track(self) -> IntArray:
         """Indices of the candidates of the object that is static in most scans, one per scan."""

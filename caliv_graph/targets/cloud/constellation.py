@@ -48,6 +48,16 @@ AMBIGUOUS = 9.0
 """A matching is ambiguous if another one costs less than this more: 3 sigmas, a likelihood ratio of
 90."""
 
+UNSEEN = 3.0
+"""Cost of an object that only one of two LiDARs sees where doubts are concerned: probability 20 %.
+LiDARs with different fields of view miss an object more often than by occlusion."""
+
+
+DIFFERENT = 30.0
+"""Squared sigmas, 5.5 sigmas of one axis, from which two LiDARs that see one object each see two
+different ones: an initial guess may be wrong by more than its sigma says, and a result that
+contradicts it by more than 5 sigmas is reported as inconsistent."""
+
 
 @dataclass(frozen=True)
 class LidarObjects:
@@ -176,6 +186,16 @@ def _extent_m(candidate: Candidate) -> float:
     return float(np.ptp(candidate.cloud.points_lidar, axis=0).max())
 
 
+def one_object(lidars: Sequence[LidarObjects]) -> bool:
+    """Whether all LiDARs see one and the same object, as far as their guesses can say."""
+    if any(len(seen.places) != 1 for seen in lidars):
+        return False
+    return all(
+        _misfit(((0, 0),), a.places, a.cov, b.places, b.cov) < DIFFERENT
+        for a, b in itertools.combinations(lidars, 2)
+    )
+
+
 def match_objects(lidars: Sequence[LidarObjects]) -> Constellation:
     """Matches the objects of all LiDARs, LiDAR by LiDAR; first the one that sees the most."""
     if not lidars:
@@ -226,27 +246,30 @@ def _best_matching(
     places_a: Array, cov_a: Array, places_b: Array, cov_b: Array
 ) -> tuple[tuple[tuple[int, int], ...], bool]:
     """The cheapest matching of objects a and b, and whether another one is about as cheap."""
-    costs = {
-        pairs: _cost(pairs, places_a, cov_a, places_b, cov_b)
+    count = len(places_a) + len(places_b)
+    misfits = {
+        pairs: _misfit(pairs, places_a, cov_a, places_b, cov_b)
         for pairs in _matchings(len(places_a), len(places_b))
     }
-    best = min(costs, key=lambda pairs: costs[pairs])
-    limit = costs[best] + AMBIGUOUS
-    return best, any(cost < limit and _contradict(pairs, best) for pairs, cost in costs.items())
+    best = min(misfits, key=lambda pairs: misfits[pairs] + UNMATCHED * (count - 2 * len(pairs)))
+    limit = misfits[best] + UNSEEN * (count - 2 * len(best)) + AMBIGUOUS
+    return best, any(
+        misfit + UNSEEN * (count - 2 * len(pairs)) < limit and _contradict(pairs, best)
+        for pairs, misfit in misfits.items()
+    )
 
 
-def _cost(
+def _misfit(
     pairs: Sequence[tuple[int, int]], places_a: Array, cov_a: Array, places_b: Array, cov_b: Array
 ) -> float:
-    """Squared sigmas of a matching: of the displacements, and of what only one LiDAR sees."""
-    cost = UNMATCHED * (len(places_a) + len(places_b) - 2 * len(pairs))
+    """Squared sigmas of the displacements of a matching."""
     if not pairs:
-        return cost
+        return 0.0
     of_a, of_b = [a for a, _ in pairs], [b for _, b in pairs]
     at_a, at_b = _coordinates(of_a), _coordinates(of_b)
     apart = (places_a[of_a] - places_b[of_b]).ravel()
     cov = cov_a[np.ix_(at_a, at_a)] + cov_b[np.ix_(at_b, at_b)]
-    return cost + float(apart @ np.linalg.solve(cov, apart))
+    return float(apart @ np.linalg.solve(cov, apart))
 
 
 def _coordinates(objects: Sequence[int]) -> IntArray:

@@ -13,7 +13,7 @@ from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
 from caliv_graph.products import IntArray, Recording, TargetCloud, TargetObservation
-from caliv_graph.targets.cloud.constellation import match_objects, static_objects
+from caliv_graph.targets.cloud.constellation import match_objects, one_object, static_objects
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
 from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor, Tally
 from caliv_graph.targets.cloud.scans import scans_to_decode, thinned
@@ -157,8 +157,13 @@ def _objects(
     fewest = config.extraction.min_scans
     found = [static_objects(extractor, scans, name, fewest) for name, scans in seen.items()]
     lidars = {objects.lidar: objects for objects in found if objects is not None}
-    if all(len(objects.places) == 1 for objects in lidars.values()):
-        clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
+    if one_object(tuple(lidars.values())):
+        clouds = []
+        for name, scans in seen.items():
+            if name in lidars:
+                clouds += extractor.clouds(lidars[name].candidates[0], lidars[name].scans, name)
+            else:
+                clouds += extractor.choose(scans, name)
         return [_observation(label, extractor, clouds, config, hints)]
     matched = match_objects(tuple(lidars.values()))
     outside_m = extractor.outside_m(np.array([shared.place for shared in matched.objects]))

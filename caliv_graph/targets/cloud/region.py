@@ -43,8 +43,8 @@ OUTSIDE_M = 0.2
 """Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
 
 RIM_M = 0.1
-"""Width of the rim of the widened region: beams of common LiDARs are 2 to 10 cm apart at 10 m, and
-what is cut off there has points in it."""
+"""Width of the rim of the widened region, half its margin at most: beams of common LiDARs are 2 to
+10 cm apart at 10 m, and what is cut off there has points in it."""
 
 MOST_CANDIDATES = 4
 """Objects of one scan that are kept until the static one is known."""
@@ -303,7 +303,8 @@ class RegionExtractor:
         """Whether a candidate may go on where the points near the region end."""
         range_m = float(np.linalg.norm(self.centre - candidate.t_region_lidar))
         margin = widened_margin_m(self._config, candidate.cloud.lidar, range_m)
-        return float(self.outside_m(candidate.points_region).max()) > margin - RIM_M
+        rim_m = min(RIM_M, 0.5 * margin)
+        return float(self.outside_m(candidate.points_region).max()) > margin - rim_m
 
     def in_map(self, place: Array) -> Array:
         """(3,) metres, a place (3,) of the region frame in the map."""

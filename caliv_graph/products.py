@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 import gtsam
 import numpy as np
@@ -18,6 +18,9 @@ import scipy.sparse
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+Side = Literal["left", "right", "top", "bottom"]
+"""A side of what a LiDAR sees, in its frame: azimuth grows to the left, elevation to the top."""
 
 
 @dataclass(frozen=True)
@@ -215,8 +218,8 @@ class TargetCloud:
         stamp_ns: stamp of the scan.
         points_lidar: (N, 3) float64, metres, lidar frame.
         source: what to call the scan in messages.
-        cut: True if the edge of the field of view may cut the target off: its points determine
-            the position less well than they seem to.
+        cut: the sides, as the LiDAR sees it, on which the edge of its field of view may cut the
+            target off: there the cloud ends before the target does. Empty: it is whole.
         swept: the points as they were measured, each at its own time, if the LiDAR gives times:
             for a new motion compensation once the extrinsic is known better.
     """
@@ -226,7 +229,7 @@ class TargetCloud:
     stamp_ns: int
     points_lidar: Array
     source: str
-    cut: bool = False
+    cut: frozenset[Side] = frozenset()
     swept: LidarScan | None = None
 
 

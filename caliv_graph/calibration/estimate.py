@@ -69,7 +69,10 @@ def _estimate(
     """The stages of `estimate`, timed."""
     limit = config.registration.max_iterations
     rough = rough_solve(problem, observations, grounds, config, progress, limit)
-    problem, times = rough.state.problem, {"registration": rough.registration_s}
+    solved = rough.state.problem
+    # All clouds from here on: those that the field of view cuts off have predicted poses now.
+    problem = replace(problem, offsets=solved.offsets, twists=solved.twists)
+    times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
     # depend on the data, not on the initial guess. Aligned clouds also give better normals.

@@ -1,14 +1,17 @@
 """The rough solve: registration from the initial guesses, and the graph of registered clouds.
 
 It brings the extrinsics near enough to read the information off (`workflows.survey`) and to
-register again from (`calibration.estimate`).
+register again from (`calibration.estimate`). Clouds that the edge of the field of view cuts off
+take part from there on.
 """
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import compress
 
 import gtsam
 import numpy as np
@@ -35,8 +38,9 @@ class RoughSolve:
     """The outcome of the rough solve.
 
     Attributes:
-        state: the solved graph; its problem has the time offsets that the drive determines.
-        registrations: of each placement.
+        state: the solved graph; its problem has the time offsets that the drive determines, and
+            the clouds that took part.
+        registrations: of those clouds, a placement each.
         offsets_s: LiDAR -> 1 sigma in seconds of each time offset that was asked for.
         warnings: time offsets that the drive does not determine, and symmetric targets.
         registration_s: seconds that the registration took.
@@ -76,6 +80,7 @@ def rough_solve(
         RegistrationError, SolveError: it could not be done.
     """
     begun = time.perf_counter()
+    problem, observations = _roughly_used(problem, observations, config.extraction.min_scans)
     registrations = []
     with progress.stage("registering the clouds", len(observations)) as advance:
         for m, observation in enumerate(observations):
@@ -99,6 +104,33 @@ def rough_solve(
     return RoughSolve(
         solve, tuple(registrations), offsets_s, (*offsets, *alike), registration_s, graph_s
     )
+
+
+def _roughly_used(
+    problem: Problem, observations: Sequence[TargetObservation], fewest: int
+) -> tuple[Problem, list[TargetObservation]]:
+    """Problem and observations with whole clouds only, of LiDARs that have at least `fewest`.
+
+    A cloud that the edge of the field of view cuts off may be registered to a wrong place while the
+    guesses are all that is known. All poses stay: once the graph is solved, it predicts where those
+    clouds are.
+    """
+    kept: list[bool] = []
+    out = []
+    for observation in observations:
+        whole = Counter(cloud.lidar for cloud in observation.clouds if not cloud.cut)
+        used = [not cloud.cut or whole[cloud.lidar] < fewest for cloud in observation.clouds]
+        out.append(replace(observation, clouds=tuple(compress(observation.clouds, used))))
+        kept += used
+    if all(kept):
+        return problem, out
+    return replace(
+        problem,
+        cloud_lidar=problem.cloud_lidar[kept],
+        cloud_pose=problem.cloud_pose[kept],
+        cloud_placement=problem.cloud_placement[kept],
+        weights_of_views=problem.view_weights()[kept],
+    ), out
 
 
 def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:

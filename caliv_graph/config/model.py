@@ -281,8 +281,8 @@ class ExtractionConfig(Section):
         3.0,
         description="standard deviations by which the neighbours of a dropped point are too far",
     )
-    min_points: Annotated[int, Field(ge=10)] = Field(
-        50, description="a scan with fewer target points does not see the target"
+    min_points: Annotated[int, Field(ge=6)] = Field(
+        8, description="a scan with fewer target points does not see the target"
     )
     min_scans: Annotated[int, Field(ge=2)] = Field(
         8, description="a LiDAR with fewer scans of the target does not see it"

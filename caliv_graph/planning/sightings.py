@@ -221,7 +221,7 @@ def sight(
     stamps = scan_stamps(scenario, lidar, drive.duration_s)
     states = drive.states(stamps, scenario.world.ground.height_m)
     # The part of a grid over the target's box that is within the field of view. Clouds that a side
-    # of the field of view cuts are left out, as in `targets.cloud.extract`.
+    # of the field of view cuts are left out: they have less information, and the plan is to hold.
     offsets = np.stack(
         np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [-0.9, -0.45, 0.0, 0.45, 0.9]), axis=-1
     ).reshape(-1, 3)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,11 +19,12 @@ import scipy.linalg
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
-from caliv_graph.products import Array, Mixture, Registration, TargetObservation
+from caliv_graph.products import Array, Mixture, Registration, Side, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
 from caliv_graph.registration.moments import cell_moments
 from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
+from caliv_graph.registration.starts import best_starts, suspicious
 
 COARSE_SIGMA_M = 0.05
 """Initial standard deviation of the components. 3 degrees at the rim of a chair are 2 cm."""
@@ -42,6 +44,12 @@ FLOOR_PER_RANGE_SIGMA = 0.6
 DAMPING = 1e-3
 """Levenberg-Marquardt damping, relative to the block of each cloud. Clouds that share no component
 (two LiDARs that saw different skins) keep the relative pose of the pre-alignment."""
+
+LEFT_OUT = 1e-9
+"""Weight of a cloud that shall neither shape the target nor move."""
+
+UP = np.array([0.0, 0.0, 1.0])
+"""Axis of the target frame."""
 
 UNSEEN = 1e-6
 """Damping of directions in which a cloud has no information, relative to the mean of all."""
@@ -147,6 +155,15 @@ class JointRegistration:
         self._floor = max(sigma_m, self._floor_end)
         self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor)
 
+    @property
+    def floor(self) -> float:
+        """Smallest standard deviation of the components so far, metres."""
+        return self._floor
+
+    def restore(self, mixture: Mixture, floor: float) -> None:
+        """Goes back to the components and the `floor` of an earlier state."""
+        self._mixture, self._floor = mixture, floor
+
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
@@ -198,18 +215,43 @@ class JointRegistration:
         )
 
 
-def centre_clouds(clouds: CloudStack, R: Array, t: Array) -> Array:
+def centre_clouds(
+    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
+) -> Array:
     """(J, 3) translations that put the middle of every cloud's extent at the origin.
 
     An initial guess displaces the target by up to 1 m (3 degrees at 20 m). All clouds of a target
-    have about the same extent, whatever the density of their points.
+    have about the same extent, whatever the density of their points. Where the edge of the field of
+    view cuts a cloud off (`cut`, of each cloud; empty: of none), its middle is half the median
+    extent of the others away from the side that is whole.
     """
     points = clouds.moved(R, t)
+    beams = clouds.rotated(R, clouds.beams)
     out = t.copy()
     ends = np.append(clouds.starts, len(points))
-    for j in range(clouds.count):
-        low, high = np.percentile(points[ends[j] : ends[j + 1]], [2, 98], axis=0)
+    sides = cut or [frozenset()] * clouds.count
+    # Per cloud, at right angles to the view and upwards: direction, low, high, which ends are cut.
+    spans = []
+    for j, own_sides in enumerate(sides):
+        own = slice(ends[j], ends[j + 1])
+        low, high = np.percentile(points[own], [2, 98], axis=0)
         out[j] -= 0.5 * (low + high)
+        view = beams[own].mean(axis=0)
+        left = np.array([-view[1], view[0], 0.0]) / max(float(np.hypot(*view[:2])), 1e-9)
+        across = np.percentile(points[own] @ left, [2, 98])
+        spans.append(
+            (
+                (left, across, ("right" in own_sides, "left" in own_sides)),
+                (UP, np.array([low[2], high[2]]), ("bottom" in own_sides, "top" in own_sides)),
+            )
+        )
+    for axis in (0, 1):
+        whole = [np.ptp(span[axis][1]) for span in spans if not any(span[axis][2])]
+        typical = float(np.median(whole or [max(np.ptp(span[axis][1]) for span in spans)]))
+        for j, span in enumerate(spans):
+            direction, (low, high), (cut_low, cut_high) = span[axis]
+            lacks = max(typical - (high - low), 0.0)
+            out[j] += 0.5 * lacks * (float(cut_low) - float(cut_high)) * direction
     return out
 
 
@@ -266,8 +308,31 @@ def register_jointly(
     """
     R, t = stack(list(T_target_lidar))
     if coarse:
-        t = centre_clouds(state.clouds, R, t)
+        t = centre_clouds(state.clouds, R, t, [c.cut for c in state.observation.clouds])
     state.seed(R, t, COARSE_SIGMA_M if coarse else FINE_SIGMA_M)
+    run = _alternated(state, R, t, max_iterations)
+    if coarse:
+        run = _from_other_starts(state, run, max_iterations)
+    quadratic = state.expect(run.R, run.t)
+    joint = quadratic.joint()
+    return state.result(
+        run.R, run.t, quadratic.blocks, joint, run.iterations, run.converged, run.last_step
+    )
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Where an alternation of E-step and M-step ended: see `Registration`."""
+
+    R: Array
+    t: Array
+    iterations: int
+    converged: bool
+    last_step: tuple[float, float]
+
+
+def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: int) -> _Run:
+    """E-step and M-step in turn, from a seeded mixture until the poses stay."""
     converged, step = False, (np.inf, np.inf)
     iteration = 0
     while iteration < max_iterations and not converged:
@@ -288,6 +353,26 @@ def register_jointly(
         )
         fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
         converged = state.finest and fine
-    quadratic = state.expect(R, t)
-    joint = quadratic.joint()
-    return state.result(R, t, quadratic.blocks, joint, iteration, converged, step)
+    return _Run(R, t, iteration, converged, step)
+
+
+def _from_other_starts(state: JointRegistration, run: _Run, max_iterations: int) -> _Run:
+    """The same run, or one in which clouds that show less of the target have better places."""
+    found = suspicious(state.clouds, run.R, run.t)
+    if not len(found.clouds):
+        return run
+    mixture, floor, weights = state.mixture, state.floor, state.weights
+    state.weights = weights.copy()
+    state.weights[found.clouds] *= LEFT_OUT
+    state.seed(run.R, run.t, COARSE_SIGMA_M)
+    others = _alternated(state, run.R, run.t, max_iterations)
+    R, t, moved = best_starts(state.clouds, state.mixture, others.R, others.t, found)
+    state.weights = weights
+    if not moved.any():
+        state.restore(mixture, floor)
+        return run
+    R_all, t_all = others.R.copy(), others.t.copy()
+    R_all[found.clouds], t_all[found.clouds] = R, t
+    state.seed(R_all, t_all, FINE_SIGMA_M)
+    again = _alternated(state, R_all, t_all, max_iterations)
+    return replace(again, iterations=run.iterations + others.iterations + again.iterations)

@@ -230,7 +230,7 @@ def _weight_rows(solution: Solution) -> list[dict[str, Any]]:
                         "lidar": name,
                         "scans": int(mine.sum()),
                         "points": f"{min(points)} / {int(np.median(points))} / {max(points)}",
-                        "cut": sum(c.cut for c in clouds if c.lidar == name),
+                        "cut": sum(bool(c.cut) for c in clouds if c.lidar == name),
                         "down": int((w < 0.5).sum()),
                         "dropped": int((w < 0.01).sum()),
                         "inliers": f"{np.median(registration.inlier_ratio[mine]):.0%}",

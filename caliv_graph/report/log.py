@@ -64,7 +64,7 @@ def log_documents(
                 "lidar": name,
                 "scans": int(mine.sum()),
                 "points": sum(len(c.points_lidar) for c in clouds if c.lidar == name),
-                "cut": sum(c.cut for c in clouds if c.lidar == name),
+                "cut": sum(bool(c.cut) for c in clouds if c.lidar == name),
                 "median_inlier_ratio": rounded(np.median(registration.inlier_ratio[mine])),
                 "weights": [rounded(w) for w in weights[mine]],
                 "stamps_ns": [c.stamp_ns for c in clouds if c.lidar == name],

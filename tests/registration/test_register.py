@@ -222,12 +222,6 @@ def test_half_of_the_target_is_hidden_from_some() -> None:
     assert rms(e)[1] < 3e-3
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="clouds without the lower third of the chair are centred 0.2 m too low, and slide down "
-    "the backrest no further than to the nearest fit: 50 mm and 120 mm off, and said to have "
-    "converged with 98 percent inliers",
-)
 def test_the_lower_third_of_the_target_is_hidden_from_some() -> None:
     scene = chair()
     clouds = clouds_of(scene)

@@ -305,11 +305,10 @@ def _observation(
         elif not tally.scans:
             warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
         else:
-            reasons = ", ".join(f"{n} {why}" for why, n in tally.rejected.most_common(3))
             warnings.append(
                 f"{label}: lidar '{name}' sees it in {tally.kept} scans, needs "
                 f"{config.extraction.min_scans} (extraction.min_scans). Of {tally.scans} scans: "
-                f"{reasons}. Widen target.min/max or run 'caliv-graph inspect'"
+                f"{tally.reasons()}. Widen target.min/max or run 'caliv-graph inspect'"
             )
     if not kept:
         warnings = [_why_none(label, config, extractor.tallies)]
@@ -321,7 +320,6 @@ def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
     """Why no LiDAR saw the target, in one line."""
     parts = []
     for name, tally in tallies.items():
-        reasons = ", ".join(f"{n} {why}" for why, n in tally.rejected.most_common(3))
         near = (
             f"nearest return {tally.nearest_m:.2f} m from the region"
             if 0.0 < tally.nearest_m < math.inf
@@ -329,7 +327,7 @@ def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
         )
         parts.append(
             f"lidar '{name}' in {tally.kept} of {tally.scans} scans, needs "
-            f"{config.extraction.min_scans} ({near}; {reasons or 'nothing rejected'})"
+            f"{config.extraction.min_scans} ({near}; {tally.reasons() or 'nothing rejected'})"
         )
     return (
         f"{region}: no LiDAR sees the target: {'; '.join(parts)}. Move or widen target.min/max, "

@@ -16,10 +16,15 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
 from caliv_graph.products import Array, IntArray, LidarScan, TargetCloud
-from caliv_graph.targets.cloud.field_of_view import azimuth_edges, is_cut
+from caliv_graph.targets.cloud.beams import (
+    Linking,
+    beam_spacing,
+    elevations,
+)
+from caliv_graph.targets.cloud.field_of_view import MOST_OF_A_SCAN, SeenEdges
 from caliv_graph.targets.cloud.track import CandidateSet
 from caliv_graph.targets.ground.fit import fit_ground, height_above
-from caliv_graph.targets.search.objects import LINK_M, connected
+from caliv_graph.targets.search.objects import connected
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -50,15 +55,43 @@ MOST_CANDIDATES = 4
 """Objects of one scan that are kept until the static one is known."""
 
 
+RINGS = 3.0
+"""The ground is looked for so many distances between its rings around the region: no ring may be in
+it, and a single row on a target is as level as a ring. Below the lowest channel there is none."""
+
+LIDAR_HEIGHT_M = 1.5
+"""Height of a LiDAR over the ground, by which the distance between the rings is estimated: low on a
+roof, so that it is rather overestimated."""
+
+NEAR_RINGS_M = 0.5
+FARTHEST_RING_M = 6.0
+"""Where the rings are nearer than the first, the ground in the region is enough; beyond the second
+it may be another ground."""
+
+
 @dataclass
 class Tally:
-    """Counts of the scans of one LiDAR, and how near its returns came to the region."""
+    """Counts of the scans of one LiDAR, and how near its returns came to the region.
+
+    `cut` of the `kept` ones are cut off by the edge of the field of view.
+    """
 
     scans: int = 0
     kept: int = 0
+    cut: int = 0
     nearest_m: float = math.inf
     most_points: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
+
+    def reasons(self) -> str:
+        """Why scans were rejected, the three most common reasons; and how many kept ones are cut.
+
+        Empty if there is nothing to say.
+        """
+        lines = [f"{n} {why}" for why, n in self.rejected.most_common(3)]
+        if self.cut:
+            lines.append(f"{self.cut} cut off by the edge of the field of view")
+        return ", ".join(lines)
 
 
 @dataclass(frozen=True)
@@ -70,7 +103,8 @@ class Candidate:
         centre_lidar: (3,) metres, middle of its extent.
         R_region_lidar: (3, 3) at the guess.
         t_region_lidar: (3,) metres, at the guess.
-        cut: whether the edge of the field of view may cut it off.
+        measured_lidar: (n, 3) metres, its points without motion compensation.
+        row_rad: spacing of the rows of beams about it.
         top_m: height of its highest point above the ground; inf without ground in the region.
     """
 
@@ -78,8 +112,9 @@ class Candidate:
     centre_lidar: Array
     R_region_lidar: Array
     t_region_lidar: Array
-    cut: bool
-    top_m: float = math.inf
+    measured_lidar: Array
+    row_rad: float
+    top_m: float
 
     @property
     def points_region(self) -> Array:
@@ -95,19 +130,46 @@ def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
     return GUESS_SIGMAS * (max(sigma.xyz_m()) + max(sigma.rpy_rad()) * range_m)
 
 
-def _filtered(points: Array, extraction: ExtractionConfig) -> IntArray:
-    """Indices of the points that survive the voxel and the statistical outlier filter."""
+def _filtered(points: Array, places: Array, extraction: ExtractionConfig) -> IntArray:
+    """Indices of the points that survive the voxel and the statistical outlier filter.
+
+    The outlier filter compares their `places` (`beams.Linking`): a row of beams is not lonely
+    because the next one is far.
+    """
     keep = np.arange(len(points))
     if extraction.voxel > 0.0:
         cells = np.floor(points / extraction.voxel).astype(np.int64)
         keep = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     k = extraction.outlier_neighbours
     if k and len(keep) > k + 1:
-        distances, _ = cKDTree(points[keep]).query(points[keep], k + 1)
+        distances, _ = cKDTree(places[keep]).query(places[keep], k + 1)
         distance = np.asarray(distances)[:, 1:].mean(axis=1)
         limit = distance.mean() + extraction.outlier_ratio * distance.std()
         keep = keep[distance <= limit]
     return keep
+
+
+def _extent_m(points: Array) -> float:
+    """Largest horizontal extent of points (n, 3), z up."""
+    return float(np.ptp(points[:, :2], axis=0).max())
+
+
+def _groups(points: Array, linking: Linking) -> list[IntArray]:
+    """Indices of the points (n, 3) of each object; see `RegionExtractor._objects`."""
+    out = []
+    for member in _connected(linking.pairs(), len(points)):
+        if linking.row_m and _extent_m(points[member]) > MAX_EXTENT_M:
+            near = cKDTree(points[member]).query_pairs(linking.link_m, output_type="ndarray")
+            out += [member[part] for part in _connected(near, len(member))]
+        else:
+            out.append(member)
+    return out
+
+
+def _connected(pairs: IntArray, count: int) -> list[IntArray]:
+    """Indices of the points of each connected component, given linked pairs (p, 2)."""
+    labels = connected(pairs, count)
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 class RegionExtractor:
@@ -134,24 +196,18 @@ class RegionExtractor:
         self._R_map_region, self._t_map_region = R, t
         self._guess = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
         self.tallies: dict[str, Tally] = {name: Tally() for name in config.lidars}
+        self._edges: dict[str, SeenEdges] = {name: SeenEdges() for name in config.lidars}
 
     def fresh(self) -> RegionExtractor:
-        """The same extractor with empty tallies."""
-        return RegionExtractor(self._region, self._config, self.trajectory)
+        """The same extractor with empty tallies; it knows the fields of view."""
+        out = RegionExtractor(self._region, self._config, self.trajectory)
+        out._edges = self._edges
+        return out
 
     @property
     def centre_map(self) -> Array:
         """(3,) metres, middle of the region in the map."""
         return np.asarray(self._R_map_region @ self.centre + self._t_map_region)
-
-    def accept(self, candidate: Candidate) -> TargetCloud | None:
-        """The cloud of a candidate, unless the edge of the field of view cuts it off."""
-        tally = self.tallies[candidate.cloud.lidar]
-        if candidate.cut:
-            tally.rejected["cut off by the edge of the field of view"] += 1
-            return None
-        tally.kept += 1
-        return candidate.cloud
 
     def candidates(self, scan: LidarScan, drive: int) -> list[Candidate]:
         """The objects in a scan that may be the target, at most `MOST_CANDIDATES`, best first."""
@@ -168,7 +224,13 @@ class RegionExtractor:
         if len(near) < extraction.min_points:
             tally.rejected["outside the region"] += 1
             return []
-        plane = fit_ground(points, extraction.ground_distance)
+        scan_elevations = elevations(scan.points_lidar)
+        spacing = beam_spacing(scan.points_lidar[near], scan_elevations)
+        around = points
+        rings_m = min(RINGS * spacing.row * range_m**2 / LIDAR_HEIGHT_M, FARTHEST_RING_M)
+        if rings_m > NEAR_RINGS_M:
+            around, _ = self._near_region(scan.points_lidar, R, t, margin + rings_m, tally)
+        plane = fit_ground(around, extraction.ground_distance)
         if plane is None:
             # No ground inside the region: all points are candidates.
             height = np.full(len(near), extraction.ground_distance * 2.0)
@@ -176,14 +238,16 @@ class RegionExtractor:
             height = height_above(plane, points)
         above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
         points, near, height = points[above], near[above], height[above]
-        objects = self._objects(points, range_m)
+        linking = Linking.of(scan.points_lidar[near], spacing, range_m)
+        objects = self._objects(points, linking)
         if not objects:
             tally.rejected["nothing above the ground that is 0.2 to 2 m wide"] += 1
             return []
-        edges = azimuth_edges(scan.points_lidar)
+        if len(objects[0]) <= MOST_OF_A_SCAN * len(scan.points_lidar):
+            self._edges[scan.lidar].add(scan.points_lidar, scan_elevations)
         out = []
         for chosen in objects:
-            kept = near[chosen][_filtered(points[chosen], extraction)]
+            kept = near[chosen][_filtered(points[chosen], linking.places[chosen], extraction)]
             tally.most_points = max(tally.most_points, len(kept))
             if len(kept) < extraction.min_points:
                 continue
@@ -193,9 +257,9 @@ class RegionExtractor:
             low, high = np.percentile(target, [2, 98], axis=0)
             swept = None if times is None else compact
             cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
-            cut = is_cut(target, edges, len(scan.points_lidar))
+            centre, measured = 0.5 * (low + high), compact.points_lidar
             top_m = math.inf if plane is None else float(height[chosen].max())
-            out.append(Candidate(cloud, 0.5 * (low + high), R, t, cut, top_m=top_m))
+            out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m))
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
         return out
@@ -238,18 +302,17 @@ class RegionExtractor:
         inside = distance <= margin
         return points[inside], near[inside]
 
-    def _objects(self, points: Array, range_m: float) -> list[IntArray]:
-        """Indices of the objects of the right size, the best inside the region first."""
+    def _objects(self, points: Array, linking: Linking) -> list[IntArray]:
+        """Indices of the objects of the right size, the best inside the region first.
+
+        Points (n, 3), region frame, are of one object if they are linked. What is too wide that way
+        is taken apart by plain distance: a sparse LiDAR's target that stands near something else.
+        """
         if len(points) < 3:
             return []
-        # Beams diverge: gaps within one object at 20 m separate two objects at 5 m.
-        link_m = max(LINK_M, 0.02 * range_m)
-        pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
-        labels = connected(pairs, len(points))
         scored = []
-        for label in np.unique(labels):
-            member = np.flatnonzero(labels == label)
-            extent = np.ptp(points[member, :2], axis=0).max()
+        for member in _groups(points, linking):
+            extent = _extent_m(points[member])
             if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
                 continue
             centre = points[member].mean(axis=0)
@@ -261,6 +324,7 @@ class RegionExtractor:
     def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
         """The clouds of the static object among the candidates of a LiDAR's scans, best first.
 
+        They are marked where the edge of the field of view may cut them off.
         With a wrong guess even a static object moves in the map; but one error of the extrinsic,
         small by its sigma, must explain that motion (`track`).
         """
@@ -272,27 +336,39 @@ class RegionExtractor:
         return self.clouds([flat[n] for n in best.tolist()], len(scans), lidar)
 
     def clouds(self, chosen: Sequence[Candidate], scans: int, lidar: str) -> list[TargetCloud]:
-        """The clouds of the candidates of one object, at most one per scan, of so many scans."""
+        """The clouds of one object's candidates, of `candidate_set`, at most one per scan."""
+        tally = self.tallies[lidar]
         lost = scans - len(chosen)
         if lost:
-            self.tallies[lidar].rejected["something else stood there"] += lost
-        clouds = [self.accept(candidate) for candidate in chosen]
-        return [cloud for cloud in clouds if cloud is not None]
+            tally.rejected["something else stood there"] += lost
+        tally.kept += len(chosen)
+        tally.cut += sum(bool(candidate.cloud.cut) for candidate in chosen)
+        return [candidate.cloud for candidate in chosen]
 
     def candidate_set(
         self, scans: Sequence[Sequence[Candidate]], lidar: str
     ) -> tuple[list[Candidate], CandidateSet]:
-        """The candidates of a LiDAR's scans, none of them empty, in one list; and as a set."""
+        """The candidates of a LiDAR's scans, none of them empty, in one list; and as a set.
+
+        They are marked where the edge of the field of view may cut them off.
+        """
         sigma = self._config.lidars[lidar].sigma
         prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
         if self._config.lidars[lidar].fixed:
             prior = np.full(6, 1e-3)
-        flat = [c for candidates in scans for c in candidates]
+        # The edges as all scans of which candidates were asked for show them.
+        edges = self._edges[lidar]
+        flat = [
+            replace(c, cloud=replace(c.cloud, cut=edges.cuts(c.measured_lidar, c.row_rad)))
+            for candidates in scans
+            for c in candidates
+        ]
         index = np.repeat(np.arange(len(scans)), [len(candidates) for candidates in scans])
         centres = np.array([c.centre_lidar for c in flat])
         R = np.array([c.R_region_lidar for c in flat])
         t = np.array([c.t_region_lidar for c in flat])
-        return flat, CandidateSet(centres, R, t, index, prior)
+        is_cut = np.array([bool(c.cloud.cut) for c in flat])
+        return flat, CandidateSet(centres, R, t, index, prior, is_cut)
 
     def outside_m(self, places: Array) -> Array:
         """(n,) metres, distance of places (n, 3), region frame, from the region."""

@@ -1,17 +1,21 @@
-"""The static object among the candidates of a LiDAR's scans."""
+"""The static objects among the candidates of a LiDAR's scans."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from caliv_graph.geometry.se3 import skew
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 
 SEEDS = 24
 """Candidates from which a track is begun."""
 
 STANDS_STILL_M = 0.35
 """Final gate of a track: the middle of a target's visible points moves by this as one passes it."""
+
+CUT_OFF_M = 0.3
+"""The same of a target that is cut off, in addition: by half of what is missing, which is up to a
+half of a target 1.2 m wide or high."""
 
 GATE_STEPS = (1.0, 0.5, 0.2, 0.05, 0.0)
 """Factors on the possible error of the guess in the gate, while the error is estimated."""
@@ -29,23 +33,30 @@ class CandidateSet:
         moves: (n, 3, 6) derivative of the place by a right perturbation of the extrinsic.
         reach_m: (n,) displacement that the guess may cause there.
         prior: (6,) sigmas of the guess, rad and m.
+        stands_m: (n,) final gate of each candidate.
     """
 
     def __init__(
-        self, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array
+        self, centres_lidar: Array, R: Array, t: Array, scan: IntArray, prior: Array, cut: BoolArray
     ) -> None:
-        """Middles (n, 3), metres, at R (n, 3, 3) and t (n, 3) of T_region_lidar, the guess."""
+        """Middles (n, 3), metres, at R (n, 3, 3) and t (n, 3) of T_region_lidar, the guess.
+
+        `cut` (n,) candidates are cut off by the edge of the field of view.
+        """
         self.scan = scan
         self.places = np.einsum("nij,nj->ni", R, centres_lidar) + t
         self.moves = np.concatenate([-R @ skew(centres_lidar), R], axis=2)
         self.reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
         self.prior = prior
-        self._poses = centres_lidar, R, t
+        self.stands_m = STANDS_STILL_M + np.where(cut, CUT_OFF_M, 0.0)
+        self._given = centres_lidar, R, t, cut
 
     def subset(self, index: IntArray) -> CandidateSet:
         """The candidates at these indices."""
-        centres_lidar, R, t = (part[index] for part in self._poses)
-        return CandidateSet(centres_lidar, R, t, self.scan[index], self.prior)
+        centres_lidar, R, t, cut = self._given
+        return CandidateSet(
+            centres_lidar[index], R[index], t[index], self.scan[index], self.prior, cut[index]
+        )
 
     def tracks(self, fewest: int) -> list[IntArray]:
         """Indices of the candidates of each static object with at least `fewest` scans.
@@ -73,7 +84,7 @@ class CandidateSet:
     def track(self, seed: int) -> IntArray:
         """Indices of the candidates of the same object as candidate `seed`, one per scan."""
         place, error = self.places[seed], np.zeros(6)
-        gates = STANDS_STILL_M + np.outer(GATE_STEPS, self.reach_m + self.reach_m[seed])
+        gates = self.stands_m + np.outer(GATE_STEPS, self.reach_m + self.reach_m[seed])
         members = np.array([seed])
         for gate_m in gates:
             off = np.linalg.norm(self.places + self.moves @ error - place, axis=1)

@@ -40,6 +40,9 @@ SCATTER_PER_EXTENT = 0.15
 its extent, since its visible side changes. Measured: at most 0.20 m for a chair 0.9 m wide with a
 guess 10 degrees off; 0.3 to 0.4 m for somebody who strolls about or waits."""
 
+WELL_SEEN_POINTS = 50
+"""Width and height are judged by views with at least so many points, if there are enough."""
+
 FULL_POINTS = 300
 """Number of points above which a view is not better."""
 
@@ -92,7 +95,8 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
         baseline = float(np.ptp(history.t_map_vehicle[scans][:, :2], axis=0).max())
         presence = len(scans) / (len(scans) + len(missed))
         good = members[history.points[members] >= config.extraction.min_points]
-        judged = good if len(good) >= MIN_VIEWS else members
+        well = good[history.points[good] >= WELL_SEEN_POINTS]
+        judged = next((m for m in (well, good) if len(m) >= MIN_VIEWS), members)
         # Range noise makes the extent larger.
         noise_m = 2.0 * config.noise.lidar_range_m
         extent = max(float(np.quantile(history.extent_m[judged], 0.8)) - noise_m, 0.01)

@@ -1,0 +1,297 @@
+"""Other starts for clouds that show less of the target than the rest.
+
+The pre-alignment puts the middles of all clouds together. A cloud without its lower third is then
+off by a sixth of the target's height, and may end in the nearest fit instead of the right one. Such
+a cloud is tried at several places on the shape of the others; the best explanation wins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.products import Array, BoolArray, IntArray, Mixture
+from caliv_graph.registration.clouds import CloudStack
+from caliv_graph.registration.mixture import expect
+from caliv_graph.registration.moments import cell_moments
+from caliv_graph.registration.quadratic import shape_quadratic
+from caliv_graph.targets.cloud.beams import elevations, typical_gap
+
+LESS_HIGH_M = 0.08
+"""A cloud whose height is less than the median of all by more than this is suspicious."""
+
+ROWS = 1.2
+"""The same in row spacings, where those are wider: how many rows meet a target is chance."""
+
+LESS_WIDE = 0.3
+"""A cloud narrower than the median by more than this part of it is suspicious: the width of a chair
+differs by less from side to side."""
+
+MOST_SUSPICIOUS = 0.5
+"""Where a larger part of the clouds is suspicious, the rest is no shape to compare with."""
+
+START_STEP_M = 0.1
+"""Distance between starts: a cloud is drawn in from half of it, one sigma of the first width."""
+
+START_SIGMA_M = 0.05
+"""Width of the components at a start. It falls by `NARROWER` per iteration, down to their own."""
+
+NARROWER = 0.85
+ITERATIONS = 16
+"""Iterations from each start: annealed to 4 mm, which tells the places apart."""
+
+COMPARED_SIGMA_M = 0.01
+"""Places are compared with components at least so wide: none of the fits has ended to the
+millimetre."""
+
+OUTLIER_DENSITY = 0.2
+"""Density of outliers, per cubic metre and inlier: a tenth of outliers in half a cubic metre."""
+
+MISSING_NATS = 4.0
+"""Cost of a return that the shape calls for and that is not there: about that of an outlier."""
+
+FACING = 0.3
+"""Cosine between beam and surface above which a return is called for."""
+
+BEHIND_M = 0.1
+"""A return this much nearer than the surface occludes it, this much farther contradicts it."""
+
+BEAMS_APART = 2.0
+"""A surface has a return if there is one within so many spacings of the cloud's own points."""
+
+SAME_PLACE_M = 0.03
+"""A start that ends nearer to the present place of the cloud than this is no other one."""
+
+LEAST_WEIGHT = 1e-3
+"""Components with less than this part of the mean weight were seeded on clouds that are left out:
+each of them would explain its own cloud where that is now."""
+
+STEP_RIDGE = 1e-3
+"""Levenberg-Marquardt damping of the steps of a single cloud, relative to its information."""
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Which clouds show less of the target than the rest.
+
+    Attributes:
+        clouds: (S,) their indices.
+        up_m: (S,) height that they lack, metres, at least 0.
+        across_m: (S,) width that they lack, at right angles to the view, metres, at least 0.
+        across: (S, 3) unit vectors of that direction, target frame.
+    """
+
+    clouds: IntArray
+    up_m: Array
+    across_m: Array
+    across: Array
+
+
+def suspicious(clouds: CloudStack, R: Array, t: Array) -> Suspicion:
+    """The clouds that are lower or narrower than the median at `T_target_lidar` (R, t).
+
+    None if they are the majority.
+    """
+    points = clouds.moved(R, t)
+    beams = clouds.rotated(R, clouds.beams)
+    ends = np.append(clouds.starts, len(points))
+    count = clouds.count
+    high, wide, rows = np.empty(count), np.empty(count), np.empty(count)
+    across = np.empty((count, 3))
+    for j in range(count):
+        own = slice(ends[j], ends[j + 1])
+        view = beams[own].mean(axis=0)
+        across[j] = np.array([-view[1], view[0], 0.0]) / max(float(np.hypot(*view[:2])), 1e-9)
+        high[j] = float(np.ptp(np.percentile(points[own, 2], [2, 98])))
+        wide[j] = float(np.ptp(np.percentile(points[own] @ across[j], [2, 98])))
+        range_m = float(np.linalg.norm(clouds.centres[j]))
+        rows[j] = typical_gap(elevations(clouds.points[own])) * range_m
+    up_m = np.median(high) - high
+    across_m = np.median(wide) - wide
+    low = up_m > np.maximum(LESS_HIGH_M, ROWS * rows)
+    narrow = across_m > LESS_WIDE * np.median(wide)
+    found = np.flatnonzero(low | narrow)
+    if len(found) > MOST_SUSPICIOUS * count:
+        found = found[:0]
+    return Suspicion(
+        found,
+        np.where(low, up_m, 0.0)[found],
+        np.where(narrow, across_m, 0.0)[found],
+        across[found],
+    )
+
+
+def best_starts(
+    clouds: CloudStack, mixture: Mixture, R: Array, t: Array, found: Suspicion
+) -> tuple[Array, Array, BoolArray]:
+    """Where the suspicious clouds fit the shape of the others best.
+
+    Args:
+        clouds: all clouds.
+        mixture: the shape that the others show.
+        R: (J, 3, 3) rotations of `T_target_lidar`.
+        t: (J, 3) translations of it, metres.
+        found: the suspicious clouds, S of them.
+
+    Returns:
+        R (S, 3, 3) and t (S, 3) of them, and (S,) whether that is another place than before.
+    """
+    part = _only(clouds, found.clouds)
+    mixture = _shown_by_others(mixture)
+    R_now, t_now = R[found.clouds], t[found.clouds]
+    best_R, best_t, best = R_now, t_now, np.full(part.count, -np.inf)
+    for shift in _shifts(found):
+        R_end, t_end = _fitted(part, mixture, R_now, t_now + shift)
+        compared = _widened(mixture, COMPARED_SIGMA_M)
+        score = _log_likelihood(part, compared, R_end, t_end)
+        score -= MISSING_NATS * _missing(part, mixture, R_end, t_end)
+        better = score > best
+        best_R = np.where(better[:, None, None], R_end, best_R)
+        best_t = np.where(better[:, None], t_end, best_t)
+        best = np.maximum(best, score)
+    middle = part.centres
+    moved = np.einsum("sab,sb->sa", best_R - R_now, middle) + best_t - t_now
+    return best_R, best_t, np.linalg.norm(moved, axis=1) > SAME_PLACE_M
+
+
+def _shifts(found: Suspicion) -> list[Array]:
+    """(S, 3) displacements of the clouds, metres, target frame; the first is none."""
+    up = _steps(found.up_m)
+    across = _steps(found.across_m)
+    shifts = [
+        (0.5 * u * found.up_m)[:, None] * np.array([0.0, 0.0, 1.0])
+        + (0.5 * a * found.across_m)[:, None] * found.across
+        for u in up
+        for a in across
+    ]
+    return sorted(shifts, key=lambda shift: float(np.abs(shift).max(initial=0.0)))
+
+
+def _steps(lacks_m: Array) -> Array:
+    """From -1 to 1 with 0: from one end of what clouds lack (S,) to the other, in small steps."""
+    half = int(np.ceil(0.5 * lacks_m.max(initial=0.0) / START_STEP_M))
+    return np.linspace(-1.0, 1.0, 2 * half + 1) if half else np.zeros(1)
+
+
+def _only(clouds: CloudStack, which: IntArray) -> CloudStack:
+    """The clouds at these indices, ascending."""
+    kept = np.isin(clouds.cloud, which)
+    sizes = clouds.sizes[which]
+    return CloudStack(
+        points=clouds.points[kept],
+        cloud=np.repeat(np.arange(len(which)), sizes),
+        starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+        beams=clouds.beams[kept],
+        normals=clouds.normals[kept],
+        flatness=clouds.flatness[kept],
+        whole=tuple(clouds.whole[j] for j in which.tolist()),
+        sigma_range_m=clouds.sigma_range_m,
+    )
+
+
+def _shown_by_others(mixture: Mixture) -> Mixture:
+    """The components that stand for points of the other clouds, not for those left out."""
+    kept = mixture.weights > LEAST_WEIGHT / len(mixture.weights)
+    weights = mixture.weights[kept]
+    return Mixture(
+        means_target=mixture.means_target[kept],
+        normals_target=mixture.normals_target[kept],
+        var_normal=mixture.var_normal[kept],
+        var_tangent=mixture.var_tangent[kept],
+        weights=weights / weights.sum(),
+    )
+
+
+def _widened(mixture: Mixture, sigma_m: float) -> Mixture:
+    return replace(
+        mixture,
+        var_normal=np.maximum(mixture.var_normal, sigma_m**2),
+        var_tangent=np.maximum(mixture.var_tangent, sigma_m**2),
+    )
+
+
+def _fitted(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> tuple[Array, Array]:
+    """The poses of the clouds, each for itself, on a shape that stays."""
+    # Here, as `register` uses this module.
+    from caliv_graph.registration.register import MAX_STEP, left_step
+
+    ones = np.ones(clouds.count)
+    for i in range(ITERATIONS):
+        shape = _widened(mixture, START_SIGMA_M * NARROWER**i)
+        who = expect(clouds, R, t, shape, OUTLIER_DENSITY, ones)
+        cells = cell_moments(clouds, who, len(shape.weights))
+        quadratic = shape_quadratic(clouds, R, t, shape, cells, who)
+        H = quadratic.blocks
+        size = np.trace(H, axis1=1, axis2=2) / 6.0
+        H = H + (STEP_RIDGE * size + 1e-9)[:, None, None] * np.eye(6)
+        d = -np.linalg.solve(H, quadratic.gradient[..., None])[..., 0]
+        largest = np.abs(d).max(axis=1, keepdims=True)
+        d = d * np.minimum(1.0, MAX_STEP / np.maximum(largest, 1e-12))
+        R, t = left_step(R, t, d)
+    return R, t
+
+
+def _log_likelihood(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> Array:
+    """(S,) sums over each cloud's points of the log of inliers and outliers over outliers."""
+    who = expect(clouds, R, t, mixture, OUTLIER_DENSITY, np.ones(clouds.count))
+    outlier = np.maximum(1.0 - who.alpha.sum(axis=1), 1e-15)
+    return -clouds.sum_per_cloud(np.log(outlier))
+
+
+def _missing(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> Array:
+    """(S,) how many returns the shape calls for where a cloud has none.
+
+    A component that faces the LiDAR, that lies where the cloud has beams on all sides, and that
+    nothing occludes, has to have returned some. What lies outside the cloud's directions may be
+    hidden, or outside the field of view.
+    """
+    out = np.zeros(clouds.count)
+    ends = np.append(clouds.starts, len(clouds.points))
+    for j in range(clouds.count):
+        points = clouds.points[ends[j] : ends[j + 1]]
+        means = (mixture.means_target - t[j]) @ R[j]
+        normals = mixture.normals_target @ R[j]
+        range_m = np.linalg.norm(means, axis=1)
+        facing = -np.einsum("ka,ka->k", normals, means) / range_m > FACING
+        own, shape = _directions(points), _directions(means)
+        spacing = _spacing(own)
+        apart = np.abs(shape[:, None] - own[None]) / spacing
+        near = apart.max(axis=2) <= BEAMS_APART
+        depth = np.linalg.norm(points, axis=1)[None] - range_m[:, None]
+        occluded = (near & (depth < -BEHIND_M)).any(axis=1)
+        returned = (near & (np.abs(depth) <= BEHIND_M)).any(axis=1)
+        called = facing & ~occluded & _within(shape, own, spacing)
+        expected = float(mixture.weights[called].sum())
+        if expected > 0.0:
+            lacking = float(mixture.weights[called & ~returned].sum())
+            out[j] = len(points) * lacking / expected
+    return out
+
+
+def _directions(points: Array) -> Array:
+    """(n, 2) azimuth and elevation of points (n, 3), radians; a target is never behind the jump."""
+    middle = points.mean(axis=0)
+    turn = np.arctan2(middle[1], middle[0])
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) - turn
+    azimuth = (azimuth + np.pi) % (2.0 * np.pi) - np.pi + turn
+    return np.column_stack([azimuth, elevations(points)])
+
+
+def _spacing(directions: Array) -> Array:
+    """(2,) typical distance of directions (n, 2) along either angle, if they were on a grid."""
+    span = np.maximum(np.ptp(directions, axis=0), 1e-4)
+    row = max(typical_gap(directions[:, 1]), 1e-4)
+    column = span[0] * span[1] / (row * max(len(directions), 1))
+    return np.array([max(column, 1e-4), row])
+
+
+def _within(shape: Array, own: Array, spacing: Array) -> BoolArray:
+    """(K,) which directions of a shape have directions (n, 2) of a cloud on all four sides."""
+    inside = np.ones(len(shape), dtype=bool)
+    for axis in (0, 1):
+        off = shape[:, None, axis] - own[None, :, axis]
+        level = np.abs(shape[:, None, 1 - axis] - own[None, :, 1 - axis])
+        level = level <= BEAMS_APART * spacing[1 - axis]
+        inside &= (level & (off >= 0.0)).any(axis=1) & (level & (off <= 0.0)).any(axis=1)
+    return np.asarray(inside)

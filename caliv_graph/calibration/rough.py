@@ -84,9 +84,7 @@ def rough_solve(
     registrations = []
     with progress.stage("registering the clouds", len(observations)) as advance:
         for m, observation in enumerate(observations):
-            state = JointRegistration(
-                observation, config, rough=True, views=problem.views_of(m)
-            )
+            state = JointRegistration(observation, config, rough=True, views=problem.views_of(m))
             registrations.append(register_jointly(state, prealigned(problem, m), iterations))
             advance()
     registration_s = time.perf_counter() - begun
@@ -129,7 +127,7 @@ def roughly_used(
         cloud_lidar=problem.cloud_lidar[kept],
         cloud_pose=problem.cloud_pose[kept],
         cloud_placement=problem.cloud_placement[kept],
-        weights_of_views=problem.view_weights()[kept],
+        views=None if problem.views is None else problem.views[kept],
     ), out
 
 

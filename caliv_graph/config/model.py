@@ -154,7 +154,7 @@ class TopicsConfig(Section):
 
 
 class TargetRegion(Section):
-    """An axis-aligned box in which the target, and nothing else above the ground, stands."""
+    """An axis-aligned box in which the target stands. Every object that stands in it is one."""
 
     min: Triple = Field(description="metres, lower corner")
     max: Triple = Field(description="metres, upper corner")

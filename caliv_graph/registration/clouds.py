@@ -221,8 +221,9 @@ def merged_normals(stack: CloudStack, R: Array, t: Array) -> CloudStack:
     """The same clouds, with normals and flatness from the aligned clouds of each LiDAR, merged.
 
     One cloud has one or two columns of points on the leg of a chair; a dozen clouds show its faces.
-    Clouds of different LiDARs are not merged: their alignment is what is estimated. `T_target_lidar`
-    (rotations (J, 3, 3), translations (J, 3), metres) are right to a few millimetres at the target.
+    Clouds of different LiDARs are not merged: their alignment is what is estimated.
+    `T_target_lidar` (rotations (J, 3, 3), translations (J, 3), metres) are right to a few
+    millimetres at the target.
     """
     lidar = stack.lidar
     points = stack.moved(R, t)

@@ -50,9 +50,7 @@ class HeightNoise:
     def variance(self, cosine: Array, lidar: IntArray) -> Array:
         """(n, k) variance of heights at cosines of incidence (n, k), of points of LiDARs (n,)."""
         roughness = np.maximum(self.roughness_m2, self.floor_m**2)
-        return np.asarray(
-            cosine**2 * self.range_m2[lidar][:, None] + roughness[lidar][:, None]
-        )
+        return np.asarray(cosine**2 * self.range_m2[lidar][:, None] + roughness[lidar][:, None])
 
     def shared_part(self, heights: HeightSums) -> Array:
         """(L,) part of a height's variance that scans from one place share.

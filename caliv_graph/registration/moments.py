@@ -21,8 +21,8 @@ PART_CLOUDS = 8
 """Clouds whose points are summed together: their sums stay in the processor's cache."""
 
 PRIOR_COUNT = 1e-8
-"""Weight, per square metre, that keeps a component without points defined. More would add up over all
-components to information on the place of the target, which no cloud has."""
+"""Weight, per square metre, that keeps a surfel without points defined. More would add up over all
+surfels to information on the place of the target, which no cloud has."""
 
 MOMENTS = slice(0, 10)
 """Columns of `cell_moments`: sums of `alpha h h^T`, upper triangle, h of the points."""

@@ -146,6 +146,7 @@ _JWY = (_JWY + np.swapaxes(_JWY, 0, 1))[ROW, COLUMN]
 _GRADIENTS = (HALF_DIAGONAL[:, None, None] * _JWY).reshape(60, 6)
 """`J^T W y` of the ten moments times the six entries of W."""
 
+
 def shape_quadratic(
     stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, who: Responsibilities
 ) -> ShapeQuadratic:

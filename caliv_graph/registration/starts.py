@@ -37,7 +37,7 @@ START_STEP_M = 0.1
 """Distance between starts: a cloud is drawn in from half of it, one sigma of the first width."""
 
 START_SIGMA_M = 0.05
-"""Roughness and width of the surfels at a start. It falls by `NARROWER` per iteration, down to their own."""
+"""Roughness and width of the surfels at a start. It falls by `NARROWER` per iteration."""
 
 NARROWER = 0.85
 ITERATIONS = 16

@@ -13,8 +13,9 @@ from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
 from caliv_graph.products import IntArray, Recording, TargetCloud, TargetObservation
+from caliv_graph.targets.cloud.constellation import match_objects, one_object, static_objects
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
-from caliv_graph.targets.cloud.region import Candidate, RegionExtractor, Tally
+from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor, Tally
 from caliv_graph.targets.cloud.scans import scans_to_decode, thinned
 from caliv_graph.targets.cloud.views import clouds_per_lidar
 from caliv_graph.targets.search import find_target
@@ -38,8 +39,9 @@ def extract_targets(
     scan.
 
     Returns:
-        One observation per drive and region, clouds in order of LiDAR and stamp; one per place for
-        a target that was moved while the vehicle stood.
+        One observation per drive and region, clouds in order of LiDAR and stamp; one per object
+        where several stand in a region, and one per place for a target that was moved while the
+        vehicle stood.
 
     Raises:
         TargetError: no LiDAR sees a target, or none was found.
@@ -119,8 +121,7 @@ def _placements(
     centres = {name: _centres(found) for name, found in flat.items()}
     moved = periods(centres, extractor.trajectory, config.extraction.min_scans)
     if not moved:
-        clouds = [c for name, scans in seen.items() for c in extractor.choose(scans, name)]
-        return [_observation(label, extractor, clouds, config, hints)]
+        return _objects(label, extractor, seen, config, hints)
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -143,6 +144,109 @@ def _placements(
     warnings = [*hints, *_warnings_of_moves(label, extractor, out, len(moved), config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
+
+
+def _objects(
+    label: str,
+    extractor: RegionExtractor,
+    seen: Mapping[str, Sequence[Sequence[Candidate]]],
+    config: Config,
+    hints: Sequence[str],
+) -> list[TargetObservation]:
+    """One observation of each object in the region that stands still."""
+    fewest = config.extraction.min_scans
+    found = [static_objects(extractor, scans, name, fewest) for name, scans in seen.items()]
+    lidars = {objects.lidar: objects for objects in found if objects is not None}
+    if one_object(tuple(lidars.values())):
+        clouds = []
+        for name, scans in seen.items():
+            if name in lidars:
+                clouds += extractor.clouds(lidars[name].candidates[0], lidars[name].scans, name)
+            else:
+                clouds += extractor.choose(scans, name)
+        return [_observation(label, extractor, clouds, config, hints)]
+    matched = match_objects(tuple(lidars.values()))
+    outside_m = extractor.outside_m(np.array([shared.place for shared in matched.objects]))
+    # What stands beside the region is not meant; the guesses place all objects wrong together.
+    limit_m = max(OUTSIDE_M, float(outside_m.min()))
+    meant = [o for o, m in zip(matched.objects, outside_m.tolist(), strict=True) if m <= limit_m]
+    out = []
+    for number, shared in enumerate(meant, start=1):
+        own = extractor if len(meant) == 1 else extractor.fresh()
+        clouds = []
+        for name in seen:
+            if name in shared.seen:
+                objects = lidars[name]
+                clouds += own.clouds(objects.candidates[shared.seen[name]], objects.scans, name)
+        if len(meant) == 1:
+            return [_observation(label, own, clouds, config, hints)]
+        name = f"{label}, object {number} of {len(meant)}"
+        observation = _observation(name, own, clouds, config, ())
+        if observation.clouds:
+            out.append(replace(observation, centre_map=extractor.in_map(shared.place)))
+    if not out:
+        return [_observation(label, extractor, [], config, hints)]
+    warnings = [*hints, *_warnings_of_objects(label, extractor, out, matched.ambiguous, config)]
+    out = [replace(o, warnings=()) for o in out]
+    return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
+
+
+def _warnings_of_objects(
+    label: str,
+    extractor: RegionExtractor,
+    observations: Sequence[TargetObservation],
+    ambiguous: Sequence[tuple[str, str]],
+    config: Config,
+) -> Iterator[str]:
+    """Warnings about a region with several objects."""
+    phrases, groups = _who_sees(observations, config)
+    yield (
+        f"{label}: {len(observations)} objects stand in the region, each solved for by itself: "
+        f"{', '.join(phrases)}"
+    )
+    for one, other in ambiguous:
+        yield (
+            f"{label}: which object of lidar '{one}' is which of lidar '{other}' is ambiguous: "
+            "their initial guesses are too uncertain for how far apart the objects stand. The two "
+            "share none of them, so that these do not determine S2S while the vehicle stands. "
+            f"Give better guesses (initial and sigma of '{one}' and '{other}'), or leave one "
+            "object in the region"
+        )
+    yield from _warnings_of_blind(label, extractor, groups, "sees none of them", config)
+
+
+def _who_sees(
+    observations: Sequence[TargetObservation], config: Config
+) -> tuple[list[str], dict[tuple[str, ...], int]]:
+    """How many placements each group of LiDARs sees, in words and as counts."""
+    groups: dict[tuple[str, ...], int] = {}
+    for o in observations:
+        lidars = tuple(n for n in config.lidars if any(c.lidar == n for c in o.clouds))
+        groups[lidars] = groups.get(lidars, 0) + 1
+    phrases = [
+        f"{count} seen by {' and '.join(repr(n) for n in lidars)}"
+        + (" alone" if len(lidars) == 1 else "")
+        for lidars, count in groups.items()
+    ]
+    return phrases, groups
+
+
+def _warnings_of_blind(
+    label: str,
+    extractor: RegionExtractor,
+    groups: Mapping[tuple[str, ...], int],
+    what: str,
+    config: Config,
+) -> Iterator[str]:
+    """A warning for each LiDAR that is in none of the groups."""
+    seeing = {name for lidars in groups for name in lidars}
+    for name in config.lidars:
+        if name not in seeing and extractor.tallies[name].scans:
+            yield (
+                f"{label}: lidar '{name}' {what} in "
+                f"{config.extraction.min_scans} scans (extraction.min_scans) of its "
+                f"{extractor.tallies[name].scans}"
+            )
 
 
 def _centres(found: Sequence[Candidate]) -> CandidateCentres:
@@ -168,15 +272,7 @@ def _warnings_of_moves(
     config: Config,
 ) -> Iterator[str]:
     """Warnings about a target that was moved."""
-    groups: dict[tuple[str, ...], int] = {}
-    for o in observations:
-        lidars = tuple(n for n in config.lidars if any(c.lidar == n for c in o.clouds))
-        groups[lidars] = groups.get(lidars, 0) + 1
-    phrases = [
-        f"{count} seen by {' and '.join(repr(n) for n in lidars)}"
-        + (" alone" if len(lidars) == 1 else "")
-        for lidars, count in groups.items()
-    ]
+    phrases, groups = _who_sees(observations, config)
     line = (
         f"{label}: it was moved while the vehicle stood: {places} places, each solved for by "
         f"itself: {', '.join(phrases)}"
@@ -185,13 +281,7 @@ def _warnings_of_moves(
     if len(seeing) > 1 and all(len(lidars) == 1 for lidars in groups):
         line += ". No placement is shared, so S2S is unobservable: put it where two LiDARs see it"
     yield line
-    for name in config.lidars:
-        if name not in seeing and extractor.tallies[name].scans:
-            yield (
-                f"{label}: lidar '{name}' sees it at no place in "
-                f"{config.extraction.min_scans} scans (extraction.min_scans) of its "
-                f"{extractor.tallies[name].scans}"
-            )
+    yield from _warnings_of_blind(label, extractor, groups, "sees it at no place", config)
 
 
 def _observation(

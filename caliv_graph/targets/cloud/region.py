@@ -47,6 +47,10 @@ views are smaller, tilt errors of the ground and noise make them larger."""
 OUTSIDE_M = 0.2
 """Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
 
+RIM_M = 0.1
+"""Width of the rim of the widened region, half its margin at most: beams of common LiDARs are 2 to
+10 cm apart at 10 m, and what is cut off there has points in it."""
+
 MOST_CANDIDATES = 4
 """Objects of one scan that are kept until the static one is known."""
 
@@ -101,6 +105,7 @@ class Candidate:
         t_region_lidar: (3,) metres, at the guess.
         measured_lidar: (n, 3) metres, its points without motion compensation.
         row_rad: spacing of the rows of beams about it.
+        top_m: height of its highest point above the ground; inf without ground in the region.
     """
 
     cloud: TargetCloud
@@ -109,6 +114,12 @@ class Candidate:
     t_region_lidar: Array
     measured_lidar: Array
     row_rad: float
+    top_m: float
+
+    @property
+    def points_region(self) -> Array:
+        """(N, 3) metres, region frame, at the guess."""
+        return self.cloud.points_lidar @ self.R_region_lidar.T + self.t_region_lidar
 
 
 def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
@@ -226,7 +237,7 @@ class RegionExtractor:
         else:
             height = height_above(plane, points)
         above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
-        points, near = points[above], near[above]
+        points, near, height = points[above], near[above], height[above]
         linking = Linking.of(scan.points_lidar[near], spacing, range_m)
         objects = self._objects(points, linking)
         if not objects:
@@ -246,9 +257,9 @@ class RegionExtractor:
             low, high = np.percentile(target, [2, 98], axis=0)
             swept = None if times is None else compact
             cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
-            out.append(
-                Candidate(cloud, 0.5 * (low + high), R, t, compact.points_lidar, spacing.row)
-            )
+            centre, measured = 0.5 * (low + high), compact.points_lidar
+            top_m = math.inf if plane is None else float(height[chosen].max())
+            out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m))
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
         return out
@@ -320,24 +331,57 @@ class RegionExtractor:
         scans = [candidates for candidates in found if candidates]
         if not scans:
             return []
+        flat, candidate_set = self.candidate_set(scans, lidar)
+        best = candidate_set.longest_track()
+        return self.clouds([flat[n] for n in best.tolist()], len(scans), lidar)
+
+    def clouds(self, chosen: Sequence[Candidate], scans: int, lidar: str) -> list[TargetCloud]:
+        """The clouds of one object's candidates, of `candidate_set`, at most one per scan."""
+        tally = self.tallies[lidar]
+        lost = scans - len(chosen)
+        if lost:
+            tally.rejected["something else stood there"] += lost
+        tally.kept += len(chosen)
+        tally.cut += sum(bool(candidate.cloud.cut) for candidate in chosen)
+        return [candidate.cloud for candidate in chosen]
+
+    def candidate_set(
+        self, scans: Sequence[Sequence[Candidate]], lidar: str
+    ) -> tuple[list[Candidate], CandidateSet]:
+        """The candidates of a LiDAR's scans, none of them empty, in one list; and as a set.
+
+        They are marked where the edge of the field of view may cut them off.
+        """
         sigma = self._config.lidars[lidar].sigma
         prior = np.array([max(sigma.rpy_rad())] * 3 + [max(sigma.xyz_m())] * 3)
         if self._config.lidars[lidar].fixed:
             prior = np.full(6, 1e-3)
-        flat = [c for candidates in scans for c in candidates]
+        # The edges as all scans of which candidates were asked for show them.
+        edges = self._edges[lidar]
+        flat = [
+            replace(c, cloud=replace(c.cloud, cut=edges.cuts(c.measured_lidar, c.row_rad)))
+            for candidates in scans
+            for c in candidates
+        ]
         index = np.repeat(np.arange(len(scans)), [len(candidates) for candidates in scans])
         centres = np.array([c.centre_lidar for c in flat])
         R = np.array([c.R_region_lidar for c in flat])
         t = np.array([c.t_region_lidar for c in flat])
-        # The edges as all scans of which candidates were asked for show them.
-        edges = self._edges[lidar]
-        cuts = [edges.cuts(c.measured_lidar, c.row_rad) for c in flat]
-        is_cut = np.array([bool(cut) for cut in cuts])
-        best = CandidateSet(centres, R, t, index, prior, is_cut).longest_track()
-        tally = self.tallies[lidar]
-        lost = len(scans) - len(best)
-        if lost:
-            tally.rejected["something else stood there"] += lost
-        tally.kept += len(best)
-        tally.cut += int(is_cut[best].sum())
-        return [replace(flat[n].cloud, cut=cuts[n]) for n in best.tolist()]
+        is_cut = np.array([bool(c.cloud.cut) for c in flat])
+        return flat, CandidateSet(centres, R, t, index, prior, is_cut)
+
+    def outside_m(self, places: Array) -> Array:
+        """(n,) metres, distance of places (n, 3), region frame, from the region."""
+        off = np.maximum(np.maximum(self._low - places, places - self._high), 0.0)
+        return np.asarray(np.linalg.norm(off, axis=1))
+
+    def reaches_rim(self, candidate: Candidate) -> bool:
+        """Whether a candidate may go on where the points near the region end."""
+        range_m = float(np.linalg.norm(self.centre - candidate.t_region_lidar))
+        margin = widened_margin_m(self._config, candidate.cloud.lidar, range_m)
+        rim_m = min(RIM_M, 0.5 * margin)
+        return float(self.outside_m(candidate.points_region).max()) > margin - rim_m
+
+    def in_map(self, place: Array) -> Array:
+        """(3,) metres, a place (3,) of the region frame in the map."""
+        return np.asarray(self._R_map_region @ place + self._t_map_region)

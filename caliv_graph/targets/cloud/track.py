@@ -1,4 +1,4 @@
-"""The static object among the candidates of a LiDAR's scans."""
+"""The static objects among the candidates of a LiDAR's scans."""
 
 from __future__ import annotations
 
@@ -49,6 +49,29 @@ class CandidateSet:
         self.reach_m = 2.0 * (prior[3] + prior[0] * np.linalg.norm(centres_lidar, axis=1))
         self.prior = prior
         self.stands_m = STANDS_STILL_M + np.where(cut, CUT_OFF_M, 0.0)
+        self._given = centres_lidar, R, t, cut
+
+    def subset(self, index: IntArray) -> CandidateSet:
+        """The candidates at these indices."""
+        centres_lidar, R, t, cut = self._given
+        return CandidateSet(
+            centres_lidar[index], R[index], t[index], self.scan[index], self.prior, cut[index]
+        )
+
+    def tracks(self, fewest: int) -> list[IntArray]:
+        """Indices of the candidates of each static object with at least `fewest` scans.
+
+        The object of `longest_track` comes first, then that of the longest among the others.
+        """
+        out: list[IntArray] = []
+        free = np.arange(len(self.scan), dtype=np.int64)
+        while len(free) >= max(fewest, 1):
+            found = free[self.subset(free).longest_track()]
+            if len(found) < fewest:
+                break
+            out.append(found)
+            free = np.setdiff1d(free, found)
+        return out
 
     def longest_track(self) -> IntArray:
         """Indices of the candidates of the object that is static in most scans, one per scan."""

@@ -13,7 +13,7 @@ beams hit the same spots of it. Beams of common LiDARs are 2 to 10 cm apart at 1
 
 TYPICAL_SHARED = 0.25
 """Part of the variance of a height that scans of one view share, where it has not been estimated:
-3 to 4.5 mm of what the shape does not show beside 5.5 to 10 mm of noise (measured on two OS1-128)."""
+3 to 4.5 mm of what the shape does not show beside 5.5 to 10 mm of noise, on two OS1-128."""
 
 TOTAL_PER_LIDARS = 2.5
 """Clouds of one target that are used at most, as a multiple of `extraction.max_scans`: with more
@@ -37,7 +37,7 @@ def views(centres_lidar: Array) -> Array:
 
 
 def weights_of_views(count: Array, shared: Array | float = TYPICAL_SHARED) -> Array:
-    """(n,) weight, 0 to 1, of clouds whose view `count` (n,) have, a part of whose errors is shared.
+    """(n,) weight, 0 to 1, of clouds whose view `count` (n,) have; a part of their errors is shared.
 
     The variance of a mean of c errors with the correlation `shared` is that of
     c / (1 + (c - 1) shared) independent ones (Kish's design effect).

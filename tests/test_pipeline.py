@@ -51,7 +51,7 @@ HEIGHT = "height of all LiDARs together"
 
 QUIET_SEEDS = (1, 2, 3)
 
-NOISY_SEEDS = tuple(range(1, 11))
+NOISY_SEEDS = tuple(range(1, 7))
 
 
 def run_on(drive: ChairDrive) -> CalibrationRun:
@@ -302,7 +302,7 @@ def test_noise_of_the_poses_never_makes_an_arc_look_determined(noisy: list[Tried
 def test_errors_of_sensor_to_sensor_are_such_as_the_covariance_says(noisy: list[Tried]) -> None:
     nees = np.array([tried.nees() for tried in noisy])
 
-    # 6 on average for a perfect covariance, 6 +- 3.3 (3 sigma) for ten draws. A mean of 1 is a
+    # 6 on average for a perfect covariance, 6 +- 4.2 (3 sigma) for six draws. A mean of 1 is a
     # sigma that is 2.4 times too large, one of 12 a sigma that is 1.4 times too small.
     assert 1.0 < nees.mean() < 12.0, np.round(nees, 1).tolist()
     assert nees.max() < 30.0, np.round(nees, 1).tolist()
@@ -323,7 +323,9 @@ def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
 
 def test_a_change_of_curvature_determines_x_and_yaw(tmp_path: Path) -> None:
     tried = try_out(
-        simulated(paper_scenario(S_CURVE, chair_xy_m=S_CHAIR_XY_M), 1, tmp_path / "drive")
+        simulated(
+            paper_scenario(S_CURVE, chair_xy_m=S_CHAIR_XY_M, rate_hz=2.5), 1, tmp_path / "drive"
+        )
     )
 
     assert tried.texts() == [HEIGHT]
@@ -427,15 +429,15 @@ def test_names_do_not_matter(plain: Tried) -> None:
     strict=True,
     reason="expectation-maximisation ends at another of several near optima: 0.4 sigma apart",
 )
-def test_the_map_does_not_matter(quiet: list[Tried]) -> None:
+def test_the_map_does_not_matter(plain: Tried) -> None:
     # What is left is rounding, and at worst a point that it moves from one component to the next.
     # A hundredth of a sigma is 15 um and 5 urad here.
     T_new_map = gtsam.Pose3(gtsam.Rot3.Yaw(0.7), np.array([30.0, -70.0, 0.0]))
 
-    other = try_out(quiet[0].drive.moved(T_new_map))
+    other = try_out(plain.drive.moved(T_new_map))
 
-    assert apart(quiet[0], other) < 0.01
-    assert widened(quiet[0], other) < 0.01
+    assert apart(plain, other) < 0.01
+    assert widened(plain, other) < 0.01
 
 
 def test_the_order_of_the_lidars_does_not_matter(plain: Tried) -> None:
@@ -466,9 +468,9 @@ def test_the_reference_does_not_matter(plain: Tried) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["huber", "tls", "trimmed"])
-def test_displaced_clouds_lose_their_say(quiet: list[Tried], kernel: RobustKernel) -> None:
+def test_displaced_clouds_lose_their_say(plain: Tried, kernel: RobustKernel) -> None:
     # A tenth of the clouds that see the chair, each 0.3 m off to some side.
-    clean = quiet[0]
+    clean = plain
     rng = np.random.default_rng(3)
     seen = sorted((c.lidar, c.stamp_ns) for o in clean.run.observations for c in o.clouds)
     bad = {
@@ -490,7 +492,7 @@ def test_displaced_clouds_lose_their_say(quiet: list[Tried], kernel: RobustKerne
     clouds = [c for o in tried.run.observations for c in o.clouds]
     weights = np.concatenate(tried.run.solution.cloud_weights)
     is_bad = np.array([(c.lidar, c.stamp_ns) in bad for c in clouds])
-    assert is_bad.sum() == len(bad) == 7
+    assert is_bad.sum() == len(bad) == 3
     assert weights[is_bad].max() < 0.5, np.round(weights[is_bad], 2).tolist()
     assert np.median(weights[~is_bad]) > 0.9
     # What is left determines what it did, at most three times less well.

@@ -42,13 +42,15 @@ class Drive:
 
 
 def swept_and_noisy() -> Scenario:
-    """`noisy` with the sweeps of `distorted`."""
+    """`noisy` with the sweeps of `distorted`, and every second of its clouds."""
     noisy = load_scenario(SCENARIOS / "noisy.yaml")
     distorted = load_scenario(SCENARIOS / "distorted.yaml")
-    lidars = {
-        name: lidar.model_copy(update={"sweep": distorted.lidars[name].sweep})
-        for name, lidar in noisy.lidars.items()
-    }
+    lidars = {}
+    for name, lidar in noisy.lidars.items():
+        sweep = distorted.lidars[name].sweep
+        assert sweep is not None
+        sweep = sweep.model_copy(update={"duration_s": 0.1})
+        lidars[name] = lidar.model_copy(update={"sweep": sweep, "rate_hz": 5.0})
     return noisy.model_copy(update={"lidars": lidars})
 
 

@@ -12,7 +12,13 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import Config, GroundConfig, LidarConfig, PoseConfig
+from caliv_graph.config.model import (
+    Config,
+    GroundConfig,
+    LidarConfig,
+    PoseConfig,
+    RegistrationConfig,
+)
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
 from caliv_graph.readers import open_recording
@@ -45,6 +51,9 @@ S_CURVE = SCurveDrive(duration_s=17.0, radius_m=RADIUS_M)
 FIGURE_EIGHT = FigureEightDrive(radius_m=RADIUS_M)
 STRAIGHT = StraightDrive(duration_s=17.0)
 STANDSTILL = StandstillDrive(duration_s=17.0)
+
+QUICK = RegistrationConfig(components=200, max_points=160)
+"""A coarse registration in half the time, for what does not depend on how fine it is."""
 
 RAMP_HEIGHT_M = 1.6
 RAMP_LENGTH_M = 12.0

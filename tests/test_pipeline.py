@@ -51,7 +51,7 @@ HEIGHT = "height of all LiDARs together"
 
 QUIET_SEEDS = (1, 2, 3)
 
-NOISY_SEEDS = tuple(range(1, 11))
+NOISY_SEEDS = tuple(range(1, 7))
 
 
 def run_on(drive: ChairDrive) -> CalibrationRun:
@@ -114,16 +114,17 @@ def rounded(errors: Array) -> str:
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[Tried]:
-    """The paper's arc; 10 mm of range noise, and poses without any."""
+    """The paper's arc at 2.5 Hz; 10 mm of range noise, and poses without any."""
+    scenario = paper_scenario(rate_hz=2.5)
     return [
-        try_out(simulated(paper_scenario(), seed, tmp_path_factory.mktemp("quiet") / "drive"))
+        try_out(simulated(scenario, seed, tmp_path_factory.mktemp("quiet") / "drive"))
         for seed in QUIET_SEEDS
     ]
 
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> list[Tried]:
-    """The same at half the rate; the poses have white errors of 5 mm and 1 mrad."""
+    """The same, but the poses have white errors of 5 mm and 1 mrad."""
     scenario = paper_scenario(rate_hz=2.5, position_sigma_m=5 * MM, rotation_sigma_rad=1 * MRAD)
     return [
         try_out(simulated(scenario, seed, tmp_path_factory.mktemp("noisy") / "drive"))
@@ -131,9 +132,8 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> list[Tried]:
     ]
 
 
-def test_a_trusted_mounting_is_determined_and_so_is_the_other_by_it(tmp_path: Path) -> None:
-    scenario = paper_scenario(rate_hz=2.5)
-    drive = simulated(scenario, 1, tmp_path / "drive")
+def test_a_trusted_mounting_is_determined_and_so_is_the_other_by_it(quiet: list[Tried]) -> None:
+    drive = quiet[0].drive
     truth = drive.truth["rear"]
     initial = PoseConfig(
         xyz=tuple(truth.translation().tolist()),
@@ -165,8 +165,8 @@ def test_a_drum_is_named_and_turns_about_it_are_forgotten(tmp_path: Path) -> Non
     assert np.abs(tried.s2s()[3:]).max() < 10.0 * MM
 
 
-def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(tmp_path: Path) -> None:
-    drive = simulated(paper_scenario(rate_hz=2.5), 1, tmp_path / "drive")
+def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(quiet: list[Tried]) -> None:
+    drive = quiet[0].drive
     rng = np.random.default_rng(3)
     lidars = {}
     for name, lidar in drive.config.lidars.items():
@@ -179,7 +179,7 @@ def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(tmp_path:
         sigma = PoseSigmaConfig(xyz=0.29, rpy_deg=5.8)
         lidars[name] = lidar.model_copy(update={"initial": initial, "sigma": sigma})
     far = replace(drive, config=drive.config.model_copy(update={"lidars": lidars}))
-    near, tried = try_out(drive).s2s(), try_out(far)
+    near, tried = quiet[0].s2s(), try_out(far)
     assert np.abs(tried.s2s() - near)[:3].max() < 0.5 * MRAD
     assert np.abs(tried.s2s() - near)[3:].max() < 3.0 * MM
     assert not tried.run.calibration.contradictions
@@ -297,7 +297,7 @@ def test_noise_of_the_poses_never_makes_an_arc_look_determined(noisy: list[Tried
 def test_errors_of_sensor_to_sensor_are_such_as_the_covariance_says(noisy: list[Tried]) -> None:
     nees = np.array([tried.nees() for tried in noisy])
 
-    # 6 on average for a perfect covariance, 6 +- 3.3 (3 sigma) for ten draws. A mean of 1 is a
+    # 6 on average for a perfect covariance, 6 +- 4.2 (3 sigma) for six draws. A mean of 1 is a
     # sigma that is 2.4 times too large, one of 12 a sigma that is 1.4 times too small.
     assert 1.0 < nees.mean() < 12.0, np.round(nees, 1).tolist()
     assert nees.max() < 30.0, np.round(nees, 1).tolist()
@@ -317,9 +317,8 @@ def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
 
 
 def test_a_change_of_curvature_determines_x_and_yaw(tmp_path: Path) -> None:
-    tried = try_out(
-        simulated(paper_scenario(S_CURVE, chair_xy_m=S_CHAIR_XY_M), 1, tmp_path / "drive")
-    )
+    scenario = paper_scenario(S_CURVE, rate_hz=2.5, chair_xy_m=S_CHAIR_XY_M)
+    tried = try_out(simulated(scenario, 1, tmp_path / "drive"))
 
     assert tried.texts() == [HEIGHT]
     for name in tried.poses:
@@ -485,7 +484,7 @@ def test_displaced_clouds_lose_their_say(quiet: list[Tried], kernel: RobustKerne
     clouds = [c for o in tried.run.observations for c in o.clouds]
     weights = np.concatenate(tried.run.solution.cloud_weights)
     is_bad = np.array([(c.lidar, c.stamp_ns) in bad for c in clouds])
-    assert is_bad.sum() == len(bad) == 7
+    assert is_bad.sum() == len(bad) == 3
     assert weights[is_bad].max() < 0.5, np.round(weights[is_bad], 2).tolist()
     assert np.median(weights[~is_bad]) > 0.9
     # What is left determines what it did, at most three times less well.

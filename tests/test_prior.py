@@ -21,6 +21,7 @@ from tests.drives_with_chair import (
     ARC,
     ARC_LEFT,
     CHAIR_XYZ_M,
+    QUICK,
     ChairDrive,
     paper_scenario,
     simulated,
@@ -68,7 +69,7 @@ def arcs(tmp_path_factory: pytest.TempPathFactory) -> TwoArcs:
         pose_drift_position_m=1e-3,
         pose_drift_rotation_deg=math.degrees(1e-4),
     )
-    right = right.asked(target=both_sides, noise=noise)
+    right = right.asked(target=both_sides, noise=noise, registration=QUICK)
     left = replace(left, config=right.config)
     return TwoArcs(
         right,

@@ -13,7 +13,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from multiprocessing import resource_tracker
@@ -41,6 +41,10 @@ _LOGGERS = (
     *("distributed.worker.memory", "tornado", "tornado.application", "bokeh"),
 )
 
+_ENDED = ("closed", "failed")
+"""States of a Dask nanny that does not restart its worker: one of them follows when the worker dies
+before its nanny knows that it has started."""
+
 _RETRY_S = 0.5
 
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?P<host>[\w.-]+|\[[0-9a-fA-F:.]+\]):(?P<port>\d{1,5})")
@@ -52,23 +56,40 @@ _MEMORY = re.compile(r"\(pid=(\d+)\) exceeded (\d+)% memory")
 class Workers:
     """A connection to the workers of a batch.
 
-    The scheduler is asked for the number of workers if it may change (`count` None).
-
     Attributes:
         client: the Dask client.
         deaths: per process of the local cluster that died, the reason.
+
+    Args:
+        client: see above.
+        most: the largest number of jobs at a time; None: as many as there are workers.
+        deaths: see above.
+        replace_lost: starts the workers of the local cluster that Dask does not start again; None:
+            the workers are not ours.
     """
 
     def __init__(
-        self, client: Any, count: int | None, most: int | None, deaths: dict[int, str]
+        self,
+        client: Any,
+        most: int | None,
+        deaths: dict[int, str],
+        replace_lost: Callable[[], None] | None = None,
     ) -> None:
         self.client = client
         self.deaths = deaths
-        self._count, self._most = count, most
+        self._most = most
+        self._replace_lost = replace_lost
 
     def count(self) -> int:
-        """The number of jobs that can run at a time."""
-        count = len(self.client.nthreads()) if self._count is None else self._count
+        """The number of jobs that can run at a time; 0 while no worker is there.
+
+        Of a local cluster, this includes the workers that are still starting.
+        """
+        count = len(self.client.nthreads())
+        if self._replace_lost is not None:
+            self._replace_lost()
+            if count and self._most is not None:
+                return self._most
         return count if self._most is None else min(count, self._most)
 
     @property
@@ -115,7 +136,7 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
                 f"--scheduler {address}: has no workers. Start some with 'dask worker {address}' "
                 "in the environment of caliv-graph"
             ) from None
-        yield Workers(client, None, most, deaths)
+        yield Workers(client, most, deaths)
 
 
 @contextmanager
@@ -133,6 +154,8 @@ def start(count: int, scratch: Path) -> Iterator[Workers]:
     before = set(multiprocessing.active_children())
     settings = {
         "distributed.scheduler.worker-ttl": None,  # native code may block a worker for long
+        # Dask ends a worker for good that has not restarted by then, as on a busy machine.
+        "distributed.deploy.lost-worker-timeout": f"{_START_S:g}s",
         "distributed.comm.timeouts.tcp": "120s",
         # A job has nothing to spill, and a paused worker would never continue.
         "distributed.worker.memory.target": False,
@@ -172,7 +195,17 @@ def start(count: int, scratch: Path) -> Iterator[Workers]:
                 f"batch: no worker started within {_START_S:g} s: {str(e) or repr(e)}. Try fewer "
                 "--workers"
             ) from None
-        yield Workers(client, count, count, deaths)
+
+        async def forget_closed() -> None:
+            closed = [n for n, nanny in cluster.workers.items() if nanny.status.name in _ENDED]
+            for name in closed:
+                del cluster.workers[name]
+
+        def replace_lost() -> None:
+            cluster.sync(forget_closed)
+            cluster.scale(count)  # starts what is missing
+
+        yield Workers(client, count, deaths, replace_lost)
 
 
 def default_workers() -> int:

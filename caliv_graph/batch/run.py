@@ -188,7 +188,7 @@ class _Batch:
                 advance(finished, f"{finished} were done or failed before")
             while queue or flying:
                 now = time.monotonic()
-                if workers.connected and now - counted_s > _COUNT_S:
+                if workers.connected and now - counted_s > (_COUNT_S if count else _POLL_S):
                     count, counted_s = _asked(workers.count), now
                 if workers.connected and count:
                     alive_s = now

@@ -20,7 +20,7 @@ from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.uncertainty.consistency import difference, p_value
-from tests.drives_with_chair import FIGURE_EIGHT, ChairDrive, paper_scenario, simulated
+from tests.drives_with_chair import FIGURE_EIGHT, QUICK, ChairDrive, paper_scenario, simulated
 
 
 @cache
@@ -30,7 +30,7 @@ def eight() -> ChairDrive:
         scenario = paper_scenario(
             FIGURE_EIGHT, rate_hz=2.0, position_sigma_m=2e-3, rotation_sigma_rad=2e-4
         )
-        return simulated(scenario, 1, Path(folder))
+        return simulated(scenario, 1, Path(folder)).asked(registration=QUICK)
 
 
 def run_on(drive: ChairDrive) -> CalibrationRun:

@@ -1,0 +1,44 @@
+"""The order of the tests where several processes share them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+LONGEST = (
+    "tests/test_pipeline.py",
+    "tests/cli/test_batch.py",
+    "tests/test_raw_sensors.py",
+    "tests/targets/search/test_find.py",
+    "tests/robustness/test_outputs.py",
+    "tests/workflows/test_survey.py",
+    "tests/cli/test_main.py",
+    "tests/scripts/test_fuzz.py",
+    "tests/robustness/test_spoiled_drives.py",
+    "tests/calibration/test_staged.py",
+    "tests/report/test_html.py",
+    "tests/calibration/test_several_drives.py",
+    "tests/simulation/test_recording.py",
+    "tests/test_prior.py",
+    "tests/test_memory.py",
+    "tests/scripts/test_demo.py",
+    "tests/test_moved_target.py",
+    "tests/calibration/test_score_tests.py",
+    "tests/validation/test_validate.py",
+    "tests/registration/test_register.py",
+    "tests/cli/test_validate.py",
+    "tests/trajectory/test_smooth.py",
+    "tests/scripts/test_paper.py",
+    "tests/scripts/test_check_reproducible.py",
+)
+"""Files that take more than 10 s, the longest first: what begins last should be short, or one
+process works alone at the end."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist
+        places = {ROOT / name: place for place, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: places.get(item.path, len(places)))

@@ -225,7 +225,9 @@ def expect(
     return Responsibilities(
         component=near,
         weight=weights,
-        counts=np.bincount(near.ravel(), alpha.ravel(), len(mixture.weights)),
+        counts=np.asarray(
+            np.bincount(near.ravel(), alpha.ravel(), len(mixture.weights)), np.float64
+        ),
         explained=explained,
         inlier_ratio=stack.sum_per_cloud(explained) / stack.sizes,
         levers=stack.sum_per_cloud(levers),

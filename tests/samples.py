@@ -112,7 +112,6 @@ def make_solution(placements: int = 1) -> Solution:
     mixture = Mixture(
         means_target=np.array([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.25]]),
         normals_target=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-        var_normal=np.full(2, 1e-4),
         var_tangent=np.full(2, 1e-3),
         weights=np.full(2, 0.45),
     )
@@ -123,6 +122,7 @@ def make_solution(placements: int = 1) -> Solution:
             T_target_lidar=(gtsam.Pose3(),),
             information=np.eye(6)[None],
             information_joint=np.eye(6),
+            view_weights=np.ones(1),
             mixture=mixture,
             inlier_ratio=np.ones(1),
             iterations=7,

@@ -59,9 +59,11 @@ class ShapeQuadratic:
         blocks: (J, 6, 6) information of each cloud given the shape.
         gradient: (J, 6) g.
         across: (K, 6 J) root of the loss to the places of the surfels.
-        moments: (J, K, 10) sums of weight h h^T, h = (1, m), target frame.
-        coupling: (K, 10, 3, 6) linear map from the moments of a cloud and surfel to the coupling
+        moments: (J, K, 11) sums of weight h h^T, h = (1, m), target frame; last the part of the
+            prior of each normal that turns with the cloud.
+        coupling: (K, 11, 3, 6) linear map from the moments of a cloud and surfel to the coupling
             of its orientation and the cloud.
+        prior_turns: (J, J) information of the priors on turns of the clouds, per axis.
         orientation_information: (K, 3, 3) of each surfel, the prior of its normal included.
         turns: (K, 3) rotation of each surfel that it asks for at these poses.
         normal_information: (K,) of the prior of each normal.
@@ -72,6 +74,7 @@ class ShapeQuadratic:
     across: Array
     moments: Array
     coupling: Array
+    prior_turns: Array
     orientation_information: Array
     turns: Array
     normal_information: Array
@@ -86,7 +89,7 @@ class ShapeQuadratic:
         lost: list[Callable[[], Array]] = [lambda: self.across]
         if not given_orientations:
             root = np.linalg.inv(np.linalg.cholesky(self.orientation_information))
-            whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 10, 18)
+            whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 11, 18)
             lost += [
                 partial(self._lost_to_orientations, whitened, own)
                 for own in parts(len(self.across), ORIENTATION_PARTS)
@@ -107,6 +110,8 @@ class ShapeQuadratic:
         H4 = H.reshape(count, 6, count, 6)
         j = np.arange(count)
         H4[j, :, j, :] += self.blocks
+        for axis in range(3):
+            H4[:, axis, :, axis] += self.prior_turns
         return np.asarray(H)
 
     def _lost_to_orientations(self, whitened: Array, surfels: slice) -> Array:
@@ -180,14 +185,20 @@ def shape_quadratic(
     both = scatter_about(total, means) @ W
     torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + who.component_levers
     C = _orientation_information(scatter_about(on_surface, surface_means), W)
-    towards, reliability = _normal_prior(cells, R, mass, mixture)
-    known = reliability / NORMAL_SIGMA_RAD**2
+    towards, reliability, parts_of_normal = _normal_prior(cells, R, mass, mixture)
+    known, seen = reliability / NORMAL_SIGMA_RAD**2, 1.0 / SEEN_SIGMA_RAD**2
     torque += known[:, None] * towards
-    prior = known + 1.0 / SEEN_SIGMA_RAD**2
-    C += prior[:, None, None] * np.eye(3)
+    C += (known + seen)[:, None, None] * np.eye(3)
     turns = np.linalg.solve(C, torque[..., None])[..., 0]
+    # The normals of the points and the beams turn with their clouds: so do the priors.
+    parts_of_weight = points[..., 0] / mass
+    by_normals = known * parts_of_normal
+    gradient[:, :3] += by_normals @ towards
+    with_priors = np.concatenate(
+        [moments, (by_normals + seen * parts_of_weight)[..., None]], axis=2
+    )
     lost = np.einsum("kqae,ka->kqe", coupling, turns)
-    gradient -= moments.reshape(count, 10 * K) @ lost.reshape(10 * K, 6)
+    gradient -= with_priors.reshape(count, 11 * K) @ lost.reshape(11 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
     across = np.empty((K, count, 6))
     root = n / np.sqrt(mass)[:, None]
@@ -199,35 +210,44 @@ def shape_quadratic(
         ),
         gradient=np.asarray(gradient),
         across=across.reshape(K, 6 * count),
-        moments=moments,
+        moments=with_priors,
         coupling=coupling,
+        prior_turns=by_normals @ parts_of_normal.T + seen * parts_of_weight @ parts_of_weight.T,
         orientation_information=C,
         turns=np.asarray(turns),
-        normal_information=prior,
+        normal_information=known + seen,
     )
 
 
-def _normal_prior(cells: Array, R: Array, mass: Array, mixture: Mixture) -> tuple[Array, Array]:
-    """(K, 3) rotation of each normal to the mean of its points' normals; (K,) their reliability.
+def _normal_prior(
+    cells: Array, R: Array, mass: Array, mixture: Mixture
+) -> tuple[Array, Array, Array]:
+    """The mean normal of each surfel's points, as a prior of its own.
 
-    That is 0 to 1: the mean flatness, less where the normals differ.
+    (K, 3) rotation of the normal to it; (K,) its reliability, 0 to 1: the mean flatness, less where
+    the normals differ; (J, K) part that each cloud has in it, which adds up to one.
     """
-    summed = np.matmul(cells[..., NORMALS], np.swapaxes(R, 1, 2)).sum(axis=0)
+    by_cloud = np.matmul(cells[..., NORMALS], np.swapaxes(R, 1, 2))
+    summed = by_cloud.sum(axis=0)
     size = np.linalg.norm(summed, axis=1)
     mean = summed / np.maximum(size, 1e-300)[:, None]
     axis = cross(mixture.normals_target, mean)
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ka,ka->k", mixture.normals_target, mean))
-    return axis * (angle / np.maximum(sine, 1e-300))[:, None], size / mass
+    towards = axis * (angle / np.maximum(sine, 1e-300))[:, None]
+    part = np.einsum("jka,ka->jk", by_cloud, mean) / np.maximum(size, 1e-300)
+    return towards, size / mass, part
 
 
 def _coupling(W: Array, means: Array) -> Array:
-    """(K, 10, 3, 6) `ShapeQuadratic.coupling`, components about `means`."""
+    """(K, 11, 3, 6) `ShapeQuadratic.coupling`, components about `means`."""
     K = len(means)
-    P = (W[:, *np.triu_indices(3)] @ _ROTATION_ROWS).reshape(K, 10, 3, 6)
+    P = np.zeros((K, 11, 3, 6))
+    P[:, :10] = (W[:, *np.triu_indices(3)] @ _ROTATION_ROWS).reshape(K, 10, 3, 6)
     # Rotations are about the mean, not about the origin: first moments, which come first.
     about = (-skew(means) @ W).reshape(-1, 3) @ JACOBIAN.transpose(1, 0, 2).reshape(3, 24)
     P[:, :4] += about.reshape(K, 3, 4, 6).transpose(0, 2, 1, 3)
+    P[:, 10, :, :3] = np.eye(3)
     return np.asarray(P)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from caliv_graph.calibration.rough import roughly_used
@@ -22,7 +24,7 @@ def observation(front: list[frozenset[Side]], rear: list[frozenset[Side]]) -> Ta
 
 
 def test_cut_clouds_wait_where_there_are_enough_whole_ones() -> None:
-    problem = make_case(count=6).problem
+    problem = replace(make_case(count=6).problem, views=np.arange(1.0, 13.0))
     seen = observation([WHOLE, CUT, WHOLE, WHOLE, CUT, WHOLE], [CUT, CUT, CUT, WHOLE, CUT, WHOLE])
 
     fewer, (used,) = roughly_used(problem, [seen], fewest=4)
@@ -33,7 +35,9 @@ def test_cut_clouds_wait_where_there_are_enough_whole_ones() -> None:
     assert [c.stamp_ns for c in used.clouds if c.lidar == "rear"] == list(range(6))
     assert fewer.cloud_pose.tolist() == [*front, *range(6)]
     assert fewer.cloud_lidar.tolist() == [0] * 4 + [1] * 6
-    assert len(fewer.view_weights()) == fewer.clouds == 10
+    # Each keeps its own number of scans of one view.
+    assert fewer.clouds == 10
+    assert fewer.views_of(0).tolist() == [1.0, 3.0, 4.0, 6.0, *range(7, 13)]
     # The graph predicts the poses of the others.
     assert fewer.poses == problem.poses
 

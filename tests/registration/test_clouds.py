@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array
 from caliv_graph.registration.clouds import (
     CloudStack,
     merged_normals,
@@ -239,13 +240,9 @@ def leg_face(
 AHEAD = np.array([1.0, 0.0, 0.0])
 
 
-def one_lidar(stack: CloudStack) -> IntArray:
-    return np.zeros(stack.count, dtype=np.int64)
-
-
 def test_aligned_clouds_show_the_face_of_a_leg() -> None:
     stack, R, t = leg_face(azimuth_deg=30.0, sigma_m=0.002)
-    merged = merged_normals(stack, R, t, one_lidar(stack))
+    merged = merged_normals(stack, R, t)
     assert np.median(merged.flatness) > 0.8
     assert np.median(angle_deg(merged.rotated(R, merged.normals), AHEAD)) < 5.0
     np.testing.assert_allclose(np.linalg.norm(merged.normals, axis=1), 1.0)
@@ -258,14 +255,14 @@ def test_aligned_clouds_show_the_face_of_a_leg() -> None:
 def test_aligned_clouds_trust_normals_that_a_single_cloud_cannot_see() -> None:
     # A cloud has 30 points on the leg, 3 cm apart, with 1 cm of noise.
     stack, R, t = leg_face(azimuth_deg=-6.0)
-    merged = merged_normals(stack, R, t, one_lidar(stack))
+    merged = merged_normals(stack, R, t)
     assert np.median(stack.flatness) < 0.45
     assert np.median(merged.flatness) > 0.55
 
 
 def test_noise_along_the_beams_does_not_turn_normals_to_the_sensor() -> None:
     stack, R, t = leg_face(azimuth_deg=49.0)
-    merged = merged_normals(stack, R, t, one_lidar(stack))
+    merged = merged_normals(stack, R, t)
     inner = (np.abs(stack.moved(R, t)[:, 1]) < 0.012) & (merged.flatness > 0.5)
     assert inner.sum() > 100
     mean = merged.rotated(R, merged.normals)[inner].mean(axis=0)
@@ -275,22 +272,22 @@ def test_noise_along_the_beams_does_not_turn_normals_to_the_sensor() -> None:
 def test_clouds_of_another_lidar_are_not_merged() -> None:
     # Every other cloud is of another LiDAR, which is off by 4 cm.
     stack, R, t = leg_face()
-    lidar = np.arange(stack.count) % 2
+    two = replace(stack, lidar=np.arange(stack.count) % 2)
     off = t.copy()
     off[1::2] += [0.04, 0.0, 0.0]
-    aligned = merged_normals(stack, R, t, lidar)
-    moved = merged_normals(stack, R, off, lidar)
-    first = lidar[stack.cloud] == 0
+    aligned = merged_normals(two, R, t)
+    moved = merged_normals(two, R, off)
+    first = two.lidar[stack.cloud] == 0
     np.testing.assert_allclose(moved.normals[first], aligned.normals[first], atol=1e-12)
     np.testing.assert_allclose(moved.flatness[first], aligned.flatness[first], atol=1e-12)
     # Merged, those of the other change them.
-    together = merged_normals(stack, R, off, one_lidar(stack))
+    together = merged_normals(stack, R, off)
     assert np.median(angle_deg(together.normals[first], aligned.normals[first])) > 1.0
 
 
 def test_points_that_are_alone_have_no_normal_among_aligned_clouds() -> None:
     stack, R, t = leg_face(clouds=2)
-    merged = merged_normals(stack, R, t, one_lidar(stack))
+    merged = merged_normals(stack, R, t)
     points = stack.moved(R, t)
     near = np.linalg.norm(points[:, None] - points[None], axis=2) < 0.03
     alone = near.sum(axis=1) < 6

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from caliv_graph.targets.cloud.views import SCANS_OF_A_VIEW, evenly_spread, view_weights
+from caliv_graph.targets.cloud.views import (
+    TYPICAL_SHARED,
+    evenly_spread,
+    view_weights,
+    views,
+    weights_of_views,
+)
 
 
 def test_scans_of_a_moving_vehicle_count_fully() -> None:
@@ -15,23 +23,44 @@ def test_scans_of_a_moving_vehicle_count_fully() -> None:
     assert view_weights(np.zeros((0, 3))).tolist() == []
 
 
+def test_weights_are_those_of_equally_correlated_errors() -> None:
+    # Kish: the mean of c errors is worth c / (1 + (c - 1) shared). Of two with a quarter shared
+    # 2 / 1.25 = 1.6, of 80 80 / 20.75 = 3.86.
+    counts = np.array([1.0, 2.0, 80.0])
+    assert weights_of_views(counts, 0.25) == pytest.approx([1.0, 0.8, 1.0 / 20.75])
+    # Nothing shared: all are worth themselves. All shared: together they are worth one.
+    assert weights_of_views(counts, 0.0) == pytest.approx([1.0, 1.0, 1.0])
+    assert weights_of_views(counts, 1.0) == pytest.approx([1.0, 0.5, 1.0 / 80.0])
+    # Of each cloud its own.
+    assert weights_of_views(np.full(2, 5.0), np.array([0.0, 0.5])) == pytest.approx([1.0, 1 / 3])
+
+
+def test_weight_is_the_variance_of_a_simulated_mean() -> None:
+    rng = np.random.default_rng(2)
+    same, own = rng.normal(size=(20000, 1)), rng.normal(size=(20000, 6))
+    means = (math.sqrt(0.3) * same + math.sqrt(0.7) * own).mean(axis=1)
+    worth = float(weights_of_views(np.full(6, 6.0), 0.3).sum())
+    assert worth == pytest.approx(1.0 / float(means.var()), rel=0.05)
+
+
 @pytest.mark.parametrize("count", [10, 80, 300])
 def test_scans_from_one_place_are_worth_a_few_together(count: int) -> None:
+    worth = count / (1.0 + (count - 1.0) * TYPICAL_SHARED)
+    assert worth < 1.0 / TYPICAL_SHARED
     weights = view_weights(np.tile([3.0, 1.0, -1.0], (count, 1)))
-    assert weights == pytest.approx(np.full(count, SCANS_OF_A_VIEW / count))
+    assert weights == pytest.approx(np.full(count, worth / count))
     # Millimetres of noise in the poses make no new view.
     shaky = np.random.default_rng(1).normal(scale=0.002, size=(count, 3))
-    assert view_weights(shaky).sum() == pytest.approx(SCANS_OF_A_VIEW, rel=0.02)
+    assert view_weights(shaky).sum() == pytest.approx(worth, rel=0.02)
 
 
-def test_few_scans_of_a_place_are_all_worth_themselves() -> None:
-    assert view_weights(np.zeros((3, 3))).tolist() == [1.0] * 3
-
-
-def test_slow_scans_count_by_how_far_they_are_apart() -> None:
+def test_views_are_counted_by_how_far_scans_are_apart() -> None:
     # A Gaussian of 5 cm over scans every 2.5 cm sums to sqrt(2 pi) 5 / 2.5 = 5.013.
     path = np.column_stack([0.025 * np.arange(100), np.zeros(100), np.zeros(100)])
-    assert view_weights(path)[50] == pytest.approx(SCANS_OF_A_VIEW / 5.013, rel=1e-3)
+    assert views(path)[50] == pytest.approx(5.013, rel=1e-3)
+    assert view_weights(path)[50] == pytest.approx(1.0 / (1.0 + 4.013 * TYPICAL_SHARED), rel=1e-3)
+    # An end has half as many about it.
+    assert views(path)[0] == pytest.approx(0.5 * (5.013 + 1.0), rel=1e-3)
 
 
 def test_of_equal_scans_evenly_many_are_taken() -> None:

@@ -70,9 +70,12 @@ class HeightNoise:
             before: configured noise, a prior of `PRIOR_POINTS`.
         """
         points = heights.points.sum()
-        # Heights over planes that were fitted to them are too small.
-        inflation = points / max(points - parameters, 0.2 * points)
-        prior = PRIOR_POINTS / np.maximum(heights.points, 1.0)
+        # Heights over planes that were fitted to them are too small; what a point gives to the
+        # planes is in proportion to its weight.
+        taken_up = parameters * heights.squares.sum() / max(points, 1e-12)
+        inflation = points / max(points - taken_up, 0.2 * points)
+        # Kish's number of points: that of as many of equal weight.
+        prior = PRIOR_POINTS / np.maximum(heights.kish(), 1.0)
         range_m2, roughness_m2 = self.range_m2.copy(), self.roughness_m2.copy()
         for a in np.flatnonzero(heights.points > 0.0).tolist():
             A = heights.normal[a]
@@ -94,13 +97,15 @@ class HeightSums:
     """Sums over heights that their noise is fitted to, for L LiDARs.
 
     Attributes:
-        points: (L,) points that are target.
+        points: (L,) points that are target, each with the weight of its cloud.
+        squares: (L,) the same with squared weights.
         cosine2: (L,) sum of the squared cosines of incidence.
         normal: (L, 2, 2) normal matrix of squared heights by (f^2, 1), each of weight 1/variance^2.
         right: (L, 2) its right-hand side, m^2.
     """
 
     points: Array
+    squares: Array
     cosine2: Array
     normal: Array
     right: Array
@@ -108,9 +113,8 @@ class HeightSums:
     @classmethod
     def none(cls, lidars: int) -> HeightSums:
         """Zero."""
-        return cls(
-            np.zeros(lidars), np.zeros(lidars), np.zeros((lidars, 2, 2)), np.zeros((lidars, 2))
-        )
+        none = np.zeros(lidars)
+        return cls(none, none, none, np.zeros((lidars, 2, 2)), np.zeros((lidars, 2)))
 
     @classmethod
     def of(
@@ -119,10 +123,17 @@ class HeightSums:
         height: Array,
         cosine: Array,
         variance: Array,
+        cloud_weight: Array,
         lidar: IntArray,
         lidars: int,
     ) -> HeightSums:
-        """Of responsibilities, heights, cosines and variances (n, k) of points of LiDARs (n,)."""
+        """Of responsibilities, heights, cosines and variances (n, k) of points of LiDARs (n,).
+
+        A cloud that is somewhere else says nothing of the noise: `cloud_weight` (n,) is that of the
+        point's cloud.
+        """
+        squares = alpha * cloud_weight[:, None] ** 2
+        alpha = alpha * cloud_weight[:, None]
         weight, f2 = alpha / variance**2, cosine**2
 
         def summed(values: Array) -> Array:
@@ -134,17 +145,22 @@ class HeightSums:
         normal[:, 1, 1] = summed(weight)
         square = weight * height**2
         right = np.column_stack([summed(square * f2), summed(square)])
-        return cls(summed(alpha), summed(alpha * f2), normal, right)
+        return cls(summed(alpha), summed(squares), summed(alpha * f2), normal, right)
 
     @classmethod
     def total(cls, pieces: Sequence[HeightSums]) -> HeightSums:
         """The sum of several."""
         return cls(
             np.sum([p.points for p in pieces], axis=0),
+            np.sum([p.squares for p in pieces], axis=0),
             np.sum([p.cosine2 for p in pieces], axis=0),
             np.sum([p.normal for p in pieces], axis=0),
             np.sum([p.right for p in pieces], axis=0),
         )
+
+    def kish(self) -> Array:
+        """(L,) how many points of equal weight these are worth."""
+        return np.asarray(self.points**2 / np.maximum(self.squares, 1e-300))
 
     def mean_cosine2(self) -> Array:
         """(L,) mean squared cosine of incidence."""

@@ -210,7 +210,9 @@ def expect(
         slides[part] = np.einsum("nk,nk->n", density, slide) / np.maximum(inliers, 1e-300)
         density /= inliers[:, None] + outlier_density
         near[part], alpha[part] = found, density
-        sums[i] = HeightSums.of(density, height, cosine, variance, lidar, stack.lidars)
+        sums[i] = HeightSums.of(
+            density, height, cosine, variance, cloud_weights[cloud], lidar, stack.lidars
+        )
         weights[part] = density / variance * cloud_weights[cloud][:, None]
         force = weights[part] * height * slide
         summed = [np.einsum("nk,nk->n", force, n[found]) for n in surfels.normals]

@@ -58,6 +58,7 @@ class ShapeQuadratic:
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
         gradient: (J, 6) g.
+        gradient_given_shape: (J, 6) the same where the shape is held: that of `blocks`.
         across: (K, 6 J) root of the loss to the places of the surfels.
         moments: (J, K, 11) sums of weight h h^T, h = (1, m), target frame; last the part of the
             prior of each normal that turns with the cloud.
@@ -71,6 +72,7 @@ class ShapeQuadratic:
 
     blocks: Array
     gradient: Array
+    gradient_given_shape: Array
     across: Array
     moments: Array
     coupling: Array
@@ -175,15 +177,20 @@ def shape_quadratic(
     W = n[:, :, None] * n[:, None, :]
     halves = W[:, *np.triu_indices(3)]
     by_cloud = np.swapaxes(points, 1, 2)
-    pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, means)
-    gradient = (by_cloud @ halves).reshape(count, 60) @ _GRADIENTS
-    gradient -= np.einsum("jac,ace->je", pull, JACOBIAN)
-    gradient[:, :3] += who.levers
+    pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, mixture.means_target)
+    given_shape = (by_cloud @ halves).reshape(count, 60) @ _GRADIENTS
+    given_shape -= np.einsum("jac,ace->je", pull, JACOBIAN)
+    given_shape[:, :3] += who.levers
     on_surface = moments.sum(axis=0)
     surface_means = mass_and_means(on_surface, mixture)[1]
     coupling = _coupling(W, surface_means)
+    # Each surfel moves to its points, and turns into their plane.
+    move = np.einsum("ka,ka->k", n, means - mixture.means_target)[:, None] * n
+    taken = np.swapaxes(moments, 1, 2)[:, :4] @ move
+    gradient = given_shape - np.einsum("jac,ace->je", taken, JACOBIAN)
     both = scatter_about(total, means) @ W
     torque = both[:, [1, 2, 0], [2, 0, 1]] - both[:, [2, 0, 1], [1, 2, 0]] + who.component_levers
+    torque -= mass[:, None] * cross(surface_means - means, move)
     C = _orientation_information(scatter_about(on_surface, surface_means), W)
     towards, reliability, parts_of_normal = _normal_prior(cells, R, mass, mixture)
     known, seen = reliability / NORMAL_SIGMA_RAD**2, 1.0 / SEEN_SIGMA_RAD**2
@@ -209,6 +216,7 @@ def shape_quadratic(
             count, 6, 6
         ),
         gradient=np.asarray(gradient),
+        gradient_given_shape=np.asarray(given_shape),
         across=across.reshape(K, 6 * count),
         moments=with_priors,
         coupling=coupling,

@@ -238,7 +238,7 @@ def _fitted(
         H = quadratic.blocks
         size = np.trace(H, axis1=1, axis2=2) / 6.0
         H = H + (STEP_RIDGE * size + 1e-9)[:, None, None] * np.eye(6)
-        d = -np.linalg.solve(H, quadratic.gradient[..., None])[..., 0]
+        d = -np.linalg.solve(H, quadratic.gradient_given_shape[..., None])[..., 0]
         largest = np.abs(d).max(axis=1, keepdims=True)
         d = d * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-12))
         R, t = move(R, t, d)

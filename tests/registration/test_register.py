@@ -325,7 +325,8 @@ def against_a_known_shape(sigma_m: float) -> tuple[Array, Array]:
         R, t = matrices(scene.T_target_lidar)
         for _ in range(10):
             quadratic, _ = quadratic_at(clouds, R, t, teacher.mixture, teacher.noise, np.ones(6))
-            d = -np.linalg.solve(quadratic.blocks, quadratic.gradient[..., None])[..., 0]
+            g = quadratic.gradient_given_shape
+            d = -np.linalg.solve(quadratic.blocks, g[..., None])[..., 0]
             R, t = left_step(R, t, np.asarray(d, dtype=np.float64))
         e.append(
             [
@@ -426,9 +427,11 @@ def test_a_left_step_is_a_motion_of_the_target_frame() -> None:
 
 def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
     """Clouds that are each drawn to a minimum, and nothing that couples them."""
+    gradient = -np.einsum("jab,jb->ja", information, minima)
     return ShapeQuadratic(
         blocks=information,
-        gradient=-np.einsum("jab,jb->ja", information, minima),
+        gradient=gradient,
+        gradient_given_shape=gradient,
         across=np.zeros((1, 6 * len(minima))),
         moments=np.zeros((len(minima), 1, 11)),
         coupling=np.zeros((1, 11, 3, 6)),

@@ -14,10 +14,12 @@ from dataclasses import astuple, dataclass
 import gtsam
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
+from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.robust import own_blocks
 from caliv_graph.config.model import NoiseConfig
 from caliv_graph.conventions import key_pose_error, key_vehicle
 from caliv_graph.products import Array, BoolArray, IntArray, PoseNoise
@@ -31,7 +33,7 @@ TYPICAL = PoseNoise(
 )
 """Median of the prior: the filter of a good GNSS/INS."""
 
-TYPICAL_SCALE = 1.5
+TYPICAL_SCALE = 1.0
 """Median of the prior of the scale on the registration's sigmas."""
 
 LOG_SPREAD = math.log(10.0)
@@ -41,6 +43,9 @@ FLOORS = np.array([2e-5, 2e-4, 1e-5, 1e-4, 0.5])
 """Smallest values: rotation rad, position m (white, Gauss-Markov), scale."""
 
 CEILINGS = np.array([0.05, 1.0, 0.1, 2.0, 10.0])
+
+KNOWN_PART = 1e-9
+"""Eigenvalues of the joint information below this part of the largest are those of the gauge."""
 
 GROSS = 30.0
 """A cloud whose squared residual is this many times the median is left out of the noise fit."""
@@ -148,6 +153,65 @@ def fit_pose_noise(
     return noise, float(value[4])
 
 
+def fit_scale(
+    problem: Problem,
+    lines: CloudLinearisation,
+    clouds: tuple[Array, Array],
+    values: gtsam.Values,
+    noise: PoseNoise,
+) -> float:
+    """Scale of the registration's sigmas by the joint quadratic of shape and graph.
+
+    The gradient of the clouds at the poses as given is `g = n + H (B e + A d)`: n of covariance
+    s^2 H, of the clouds; e the errors of the poses; d those of extrinsics, targets and offsets,
+    which are integrated out. The shape is eliminated in H: what it takes up of the clouds' noise
+    does not make s too small.
+
+    Args:
+        problem: the clouds and poses.
+        lines: at `values`.
+        clouds: (6 J, 6 J) and (6 J,) their joint quadratic at `values`, scale 1.
+        values: the solution.
+        noise: of given poses.
+    """
+    every = np.arange(problem.clouds)
+    given = with_given_poses(problem, values)
+    there = linearise_clouds(problem, given).predicted
+    H, gradient = clouds
+    r, A, B, _ = _stacked(
+        problem, lines, there, np.tile(np.eye(6), (len(every), 1, 1)), values, every
+    )
+    # From the solved to the given poses: the gradient follows.
+    y = gradient - H @ r
+    K = _pose_covariance(problem, values, every, B, noise)
+    chosen = _spread(problem, np.trace(own_blocks(H), axis1=1, axis2=2) > 0.0)
+    rows = (6 * chosen[:, None] + np.arange(6)).ravel()
+    across = H[rows]
+    spread = across @ K @ across.T
+    own, axes = scipy.linalg.eigh(H[np.ix_(rows, rows)])
+    known = own > KNOWN_PART * own[-1]
+    white = axes[:, known] / np.sqrt(own[known])
+    variance, turned = scipy.linalg.eigh(white.T @ spread @ white)
+    white = white @ turned
+    z, design = white.T @ y[rows], white.T @ (across @ A)
+    ridge = _ridge(problem, A.shape[1])
+
+    def cost(logarithm: float) -> float:
+        weight = 1.0 / (np.exp(2.0 * logarithm) + np.maximum(variance, 0.0))
+        N = design.T @ (weight[:, None] * design) + ridge
+        L = scipy.linalg.cholesky(N, lower=True)
+        pull = scipy.linalg.solve_triangular(L, design.T @ (weight * z), lower=True)
+        surprise = ((logarithm - math.log(TYPICAL_SCALE)) / LOG_SPREAD) ** 2
+        return float(
+            np.log(np.diag(L)).sum()
+            + 0.5 * (z @ (weight * z) - pull @ pull - np.log(weight).sum() + surprise)
+        )
+
+    bounds = (math.log(FLOORS[-1]), math.log(CEILINGS[-1]))
+    found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
+    return math.exp(float(found.x))
+
+
 @dataclass(frozen=True)
 class _RestrictedLikelihood:
     """The restricted likelihood of the noise levels of m clouds, with its prior.
@@ -183,33 +247,12 @@ class _RestrictedLikelihood:
         chosen = _spread(problem, sound)
         lines = linearise_clouds(problem, values)
         r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
-        times = problem.times_s()[problem.cloud_pose[chosen]]
-        drives = problem.drives()[problem.cloud_pose[chosen]]
-        apart = np.abs(times[:, None] - times[None])
-        together = drives[:, None] == drives[None]
-        same = ((apart < 1e-9) & together).astype(np.float64)
-        slow = np.where(together, np.exp(-apart / first.drift_time_s), 0.0)
-        joint = _motion_covariance(problem, values, chosen, together=True)
-        known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
-        known += _stated_effect(problem, B, chosen, same)
-        # Rotation and position parts of what a pose error does to the clouds' residuals.
-        unstated = ~problem.stated()[problem.cloud_pose[chosen]]
-        B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
-        effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
-        spread = [e @ e.T for e in effect]
-        same = same * np.outer(unstated, unstated)
-        ones = np.ones((6, 6))
+        known, parts = _pose_parts(problem, values, chosen, B, first)
         return cls(
             residuals=r,
             design=A,
-            known=known.reshape(6 * len(chosen), 6 * len(chosen)),
-            parts=(
-                spread[0] * np.kron(same, ones),
-                spread[1] * np.kron(same, ones),
-                spread[0] * np.kron(slow, ones),
-                spread[1] * np.kron(slow, ones),
-                scipy.linalg.block_diag(*R),
-            ),
+            known=known,
+            parts=(*parts, scipy.linalg.block_diag(*R)),
             ridge=_ridge(problem, A.shape[1]),
             prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
         )
@@ -232,6 +275,49 @@ class _RestrictedLikelihood:
         return float(
             np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)
         )
+
+
+def _pose_parts(
+    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
+) -> tuple[Array, tuple[Array, ...]]:
+    """What pose errors do to the residuals of m clouds: (6m, 6m) covariances.
+
+    That of smoothed poses and stated white errors; and what the variances of white rotation and
+    position, Gauss-Markov rotation and position multiply. B (m, 6, 6) are the effects of pose
+    errors, `noise` has the time of the Gauss-Markov part.
+    """
+    times = problem.times_s()[problem.cloud_pose[chosen]]
+    drives = problem.drives()[problem.cloud_pose[chosen]]
+    apart = np.abs(times[:, None] - times[None])
+    together = drives[:, None] == drives[None]
+    same = ((apart < 1e-9) & together).astype(np.float64)
+    slow = np.where(together, np.exp(-apart / noise.drift_time_s), 0.0)
+    joint = _motion_covariance(problem, values, chosen, together=True)
+    known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
+    known += _stated_effect(problem, B, chosen, same)
+    # Rotation and position parts of what a pose error does to the clouds' residuals.
+    unstated = ~problem.stated()[problem.cloud_pose[chosen]]
+    B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
+    effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
+    spread = [e @ e.T for e in effect]
+    same = same * np.outer(unstated, unstated)
+    ones = np.ones((6, 6))
+    return known.reshape(6 * len(chosen), 6 * len(chosen)), (
+        spread[0] * np.kron(same, ones),
+        spread[1] * np.kron(same, ones),
+        spread[0] * np.kron(slow, ones),
+        spread[1] * np.kron(slow, ones),
+    )
+
+
+def _pose_covariance(
+    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
+) -> Array:
+    """(6m, 6m) covariance of the residuals of m clouds by pose errors; see `_pose_parts`."""
+    known, parts = _pose_parts(problem, values, chosen, B, noise)
+    for sigma, part in zip(astuple(noise)[:4], parts, strict=True):
+        known = known + sigma**2 * part
+    return np.asarray(known)
 
 
 def _spread(problem: Problem, sound: BoolArray) -> IntArray:

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
-from caliv_graph.calibration.noise import squares_without_own_pose
+from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
@@ -56,6 +57,13 @@ LAST_REFINEMENTS = 4
 DECIDED_AFTER = 9
 """Iteration from which the number of undetermined directions is fixed, so that a direction at the
 threshold does not make the estimate jump for ever."""
+
+SCALED_EVERY = 3
+"""Iterations at the noise level from one estimate of the registration's scale to the next."""
+
+JACKKNIFE_AFTER = 3
+"""Iterations at the noise level after which the scale is estimated by a jackknife, once: it costs
+as much as the loop."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
 STEP_SIGMAS = 0.1
@@ -100,7 +108,8 @@ def refined(
 class _Loop:
     """What the iterations carry along; `base` is the graph without clouds and guesses.
 
-    `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed.
+    `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed;
+    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it.
     """
 
     state: SolveState
@@ -108,6 +117,8 @@ class _Loop:
     base: CalibrationGraph
     prior: Array
     undetermined: int | None = None
+    fine: int = 0
+    jackknife: float = 1.0
 
     def linearised(self) -> tuple[_Shapes, Reduced]:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
@@ -120,11 +131,32 @@ class _Loop:
         state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
+    def left_out(self, reduced: Reduced) -> float:
+        """Scale of the registration by a jackknife, at a linearisation."""
+        problem, values = self.state.problem, self.state.values
+        extrinsics = [problem.extrinsic(values, name) for name in problem.lidars]
+        return jackknife_scale(problem, extrinsics, self.states, reduced.lines)
+
+    def scaled(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
+        """Estimates the scale of the registration at a linearisation, and applies it to that."""
+        state = self.state
+        clouds, lines = shapes.joint(1.0), reduced.lines
+        contradicted = fit_scale(state.problem, lines, clouds, state.values, state.noise)
+        state.scale = max(contradicted, self.jackknife)
+        clouds = shapes.joint(state.scale)
+        return reduce_to_extrinsics(state.problem, state.values, self.base, clouds, lines)
+
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
         state = self.state
         shapes, reduced = self.linearised()
         begun = time.perf_counter()
+        if all(shape.finest for shape in self.states):
+            if self.fine == JACKKNIFE_AFTER:
+                self.jackknife = self.left_out(reduced)
+            if self.fine % SCALED_EVERY == 0:
+                reduced = self.scaled(shapes, reduced)
+            self.fine += 1
         step, lost = self._step(reduced, number)
         squared = self._squares(shapes, reduced.lines)
         state.values = reduced.move(step)
@@ -176,7 +208,7 @@ class _Loop:
         """Whether the loop may end after an iteration."""
         small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
         return bool(
-            number > SHAPES_BEGUN_AGAIN
+            self.fine > JACKKNIFE_AFTER
             and all(s.finest for s in self.states)
             and (small or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
@@ -282,6 +314,7 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     state, problem = loop.state, loop.state.problem
     shapes, reduced = loop.linearised()
     begun = time.perf_counter()
+    reduced = loop.scaled(shapes, reduced)
     if state.config.solve.mode == "auto":
         split = spectrum(reduced.D, loop.prior, loop.undetermined)
         cov = covariance_with_prior_in_null_space(loop.prior, split)

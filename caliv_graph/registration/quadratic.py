@@ -116,6 +116,21 @@ class ShapeQuadratic:
             H4[:, axis, :, axis] += self.prior_turns
         return np.asarray(H)
 
+    def along(self, J: Array) -> Array:
+        """(m, m) information on what moves the clouds' poses by J (J, 6, m): `J^T H J`.
+
+        Without H itself: its cost grows with the square of the clouds.
+        """
+        H = np.einsum("jam,jab,jbn->mn", J, self.blocks, J, optimize=True)
+        for axis in range(3):
+            H += J[:, axis].T @ self.prior_turns @ J[:, axis]
+        across = self.across @ J.reshape(-1, J.shape[2])
+        H -= across.T @ across
+        moved = np.tensordot(self.moments, J, axes=(0, 0))
+        P = np.einsum("kqae,kqem->kam", self.coupling, moved, optimize=True)
+        H -= np.einsum("kam,kan->mn", P, np.linalg.solve(self.orientation_information, P))
+        return np.asarray(0.5 * (H + H.T))
+
     def _lost_to_orientations(self, whitened: Array, surfels: slice) -> Array:
         """(3 k, 6 J) root of what is lost to the orientations of k surfels."""
         moments = self.moments[:, surfels].transpose(1, 0, 2)

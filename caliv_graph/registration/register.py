@@ -38,10 +38,10 @@ FINE_SIGMA_M = 0.02
 ROUGH_POINTS = 400
 """Points of a cloud at most in the coarse pass."""
 
-ANNEALING = 0.8
+ANNEALING = 0.75
 """Factor on the floor of the roughness, per iteration."""
 
-FLOOR_PER_RANGE_SIGMA = 0.2
+FLOOR_PER_RANGE_SIGMA = 0.3
 """Final floor of the roughness, over the sigma of the noise along the beam: from then on the
 roughness is what the heights say."""
 
@@ -171,7 +171,7 @@ class JointRegistration:
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
-        noise = replace(self.noise, floor_m=self._floor)
+        noise = replace(self.noise, floor_m=0.0 if self.finest else self._floor)
         density = self._gamma / (self._depth_m * (self._gamma + 1.0))
         weights = self.weights * self.view_weights
         who = expect(self.clouds, R, t, self.mixture, noise, density, weights)

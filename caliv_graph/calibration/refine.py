@@ -97,7 +97,7 @@ def refined(
     converged = False
     while len(course) < most and not converged:
         course.append(loop.iterate(len(course) + 1))
-        converged = loop.has_converged(course[-1], len(course))
+        converged = loop.has_converged(course[-1])
         advance()
     return replace(
         _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
@@ -204,7 +204,7 @@ class _Loop:
         _hand_weights(state, self.states)
         return change
 
-    def has_converged(self, last: Iteration, number: int) -> bool:
+    def has_converged(self, last: Iteration) -> bool:
         """Whether the loop may end after an iteration."""
         small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
         return bool(

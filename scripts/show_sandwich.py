@@ -8,7 +8,7 @@ left is the estimating equation of the registration (`registration.quadratic`), 
 extrinsics of two LiDARs. Each run draws the noise of the ranges and the start of the iteration. In
 `noise` that is all. In `sampling` the path is also displaced and turned by a little, so that the
 beams meet other spots of the chair. In `still` moreover half of the clouds of each LiDAR are from
-one place, and have the weights of `targets.cloud.views`.
+one place, and have the weights of `targets.cloud.views` for what they share.
 
 Columns, 1 sigma per axis: `scatter` of the estimates over the runs and their `mean` error; `A^-1`
 as claimed; `scaled`, the same times the scale that the residuals of the clouds ask for;
@@ -26,7 +26,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gtsam
@@ -47,30 +47,36 @@ from caliv_graph.geometry.se3 import (
 )
 from caliv_graph.products import Array, IntArray, Mixture, TargetCloud, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
+from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import (
     REACH_SIGMAS,
     STEEP,
     expect,
-    information_weights,
     maximise_shape,
     seed_mixture,
 )
 from caliv_graph.registration.moments import (
     JACOBIAN,
     MOMENTS,
+    NORMALS,
+    SURFACE_MOMENTS,
     Responsibilities,
     cell_moments,
     mass_and_means,
     to_target,
 )
-from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
+from caliv_graph.registration.quadratic import (
+    NORMAL_SIGMA_RAD,
+    ShapeQuadratic,
+    shape_quadratic,
+)
 from caliv_graph.registration.register import ANNEALING, FINE_SIGMA_M, FLOOR_PER_RANGE_SIGMA
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.scenario.world import make_world
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
-from caliv_graph.targets.cloud.views import view_weights
+from caliv_graph.targets.cloud.views import TYPICAL_SHARED, views, weights_of_views
 from scripts._command import exit_code_of, positive
 
 TARGET = "chair"
@@ -103,7 +109,7 @@ class Clouds:
         lidar: (J,) index of the LiDAR of each.
         order: (J,) number of the scan of each.
         T_target_vehicle: of each, exact.
-        weights: (J,) of repeated views.
+        views: (J,) how many clouds have the view of each.
         sigma_range_m: noise along the beam.
     """
 
@@ -111,7 +117,7 @@ class Clouds:
     lidar: IntArray
     order: IntArray
     T_target_vehicle: tuple[gtsam.Pose3, ...]
-    weights: Array
+    views: Array
     sigma_range_m: float
 
 
@@ -173,7 +179,7 @@ class Scene:
             shift = np.append(rng.uniform(-SHIFT_M, SHIFT_M, 2), 0.0)
             turn = gtsam.Pose3(gtsam.Rot3.Yaw(rng.uniform(-TURN_RAD, TURN_RAD)), shift)
             displaced = about.compose(turn).compose(about.inverse())
-        observed, lidars, order, poses, weights = [], [], [], [], []
+        observed, lidars, order, poses, alike = [], [], [], [], []
         for a, name in enumerate(self.names):
             lidar, scans = self._lidar(name, rng), self.scans[a]
             if case == "still":
@@ -188,7 +194,7 @@ class Scene:
                 order.append(i)
                 poses.append(gtsam.Pose3(gtsam.Rot3(), -self.centre).compose(X))
                 places.append(X.compose(self.truth[a]).transformTo(self.centre))
-            weights.append(view_weights(np.array(places)))
+            alike.append(views(np.array(places)))
         sigma_m = next(iter(self.scenario.lidars.values())).range_sigma_m
         observation = TargetObservation(0, TARGET, self.centre, tuple(observed))
         return Clouds(
@@ -196,7 +202,7 @@ class Scene:
             np.array(lidars),
             np.array(order),
             tuple(poses),
-            np.concatenate(weights),
+            np.concatenate(alike),
             sigma_m,
         )
 
@@ -209,6 +215,7 @@ class Equation:
         quadratic: of the clouds' poses.
         cells: `cell_moments`.
         who: responsibilities.
+        noise: of the heights, in this E-step.
         J: (J, 6, 6 n) left perturbations of the clouds' poses by the extrinsics, vehicle axes.
         R: (J, 3, 3) of T_target_lidar.
         t: (J, 3) of it.
@@ -217,6 +224,7 @@ class Equation:
     quadratic: ShapeQuadratic
     cells: Array
     who: Responsibilities
+    noise: HeightNoise
     J: Array
     R: Array
     t: Array
@@ -238,7 +246,7 @@ class Equation:
         Args:
             weights: (J,) of the clouds, which one by itself does not have.
         """
-        blocks, gradient = self.quadratic.blocks, self.quadratic.gradient
+        blocks, gradient = self.quadratic.blocks, self.quadratic.gradient_given_shape
         pulls = np.linalg.solve(blocks, gradient[..., None])[..., 0]
         squares = np.sum(pulls * gradient, axis=1) / weights
         return float(np.sqrt(squares.sum() / (gradient.size - self.J.shape[2])))
@@ -253,8 +261,17 @@ class Estimator:
         self._floor_end = FLOOR_PER_RANGE_SIGMA * clouds.sigma_range_m
         self._floor = FINE_SIGMA_M
         self._stack = clouds.stack
-        self._volume = 1.0
+        self._depth_m = 1.0
+        self._noise = self._configured = HeightNoise.configured(
+            self._stack.lidars, clouds.sigma_range_m, self._floor
+        )
+        self._shared = np.full(self._stack.lidars, TYPICAL_SHARED)
         self._prior = np.diag(np.tile(PoseSigmaConfig().sigmas() ** -2.0, len(truth)))
+
+    @property
+    def weights(self) -> Array:
+        """(J,) of the clouds, for what they share with others of the same view."""
+        return weights_of_views(self.clouds.views, self._shared[self._stack.lidar])
 
     @property
     def prior(self) -> Array:
@@ -276,29 +293,34 @@ class Estimator:
     def begin(self, T: Sequence[gtsam.Pose3]) -> Mixture:
         """A new shape, with normals of the clouds as they lie now."""
         R, t, _ = self.poses(T)
-        self._stack = merged_normals(self._stack, R, t, self.clouds.lidar)
+        self._stack = merged_normals(self._stack, R, t)
         points = self._stack.moved(R, t)
         low, high = np.percentile(points, [1, 99], axis=0)
-        self._volume = float(np.prod(np.maximum(high - low, 0.05)))
+        self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
         self._floor = FINE_SIGMA_M
-        return seed_mixture(self._stack, R, t, self._components, FINE_SIGMA_M)
+        distinct = float((self._stack.sizes / self.clouds.views).sum())
+        return seed_mixture(self._stack, R, t, self._components, FINE_SIGMA_M, distinct)
 
     def at(self, T: Sequence[gtsam.Pose3], mixture: Mixture) -> Equation:
-        """E-step."""
+        """E-step; at the end of annealing the noise of the heights as well."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
         R, t, J = self.poses(T)
-        density = GAMMA / (self._volume * (GAMMA + 1.0))
-        who = expect(self._stack, R, t, mixture, density, self.clouds.weights)
+        density = GAMMA / (self._depth_m * (GAMMA + 1.0))
+        noise = replace(self._noise, floor_m=self._floor)
+        who = expect(self._stack, R, t, mixture, noise, density, self.weights)
         cells = cell_moments(self._stack, who, len(mixture.weights))
         quadratic = shape_quadratic(self._stack, R, t, mixture, cells, who)
-        return Equation(quadratic, cells, who, J, R, t)
+        if self._floor <= self._floor_end:
+            taken_up = quadratic.shape_parameters()
+            self._noise = noise.fitted(who.heights, taken_up, self._configured)
+            self._shared = self._noise.shared_part(who.heights)
+        return Equation(quadratic, cells, who, noise, J, R, t)
 
     def shape(self, T: Sequence[gtsam.Pose3], mixture: Mixture, equation: Equation) -> Mixture:
         """M-step of the shape."""
         R, t, _ = self.poses(T)
-        q = equation.quadratic
-        C, torque = q.orientation_information, q.torque
-        return maximise_shape(self._stack, R, t, mixture, self._floor, equation.cells, C, torque)
+        sums = equation.cells, equation.who.counts, equation.quadratic.turns
+        return maximise_shape(self._stack, R, t, mixture, self._floor, *sums)
 
     def solve(self, T: list[gtsam.Pose3]) -> tuple[list[gtsam.Pose3], Mixture, Equation]:
         """Iterates from T."""
@@ -319,7 +341,7 @@ class Estimator:
         return np.concatenate([vehicle_axes_difference(a, b) for a, b in pairs])
 
     def scores(self, mixture: Mixture, equation: Equation) -> Array:
-        """(J, 6 n) what each cloud adds to the score, mean and normal of the components free.
+        """(J, 6 n) what each cloud adds to the score, place and normal of the surfels free.
 
         Raises:
             RegistrationError: they do not add up to it.
@@ -334,22 +356,28 @@ class Estimator:
         height = np.einsum("nkc,nkc->nk", n, y - mixture.means_target[k])
         facing = -np.einsum("nkc,nkc->nk", n, np.broadcast_to(beam, n.shape))
         slide = height * np.maximum(facing, 0.0) / np.maximum(facing, STEEP) ** 2
-        reach_m = REACH_SIGMAS * clouds.sigma_range_m
-        slide = np.clip(slide, -reach_m, reach_m)
-        a, b = information_weights(mixture)
-        moments = np.matmul(equation.cells[..., MOMENTS], to_target(clouds, equation.R, equation.t))
-        mass, means = mass_and_means(moments.sum(axis=0), mixture)
-        r = who.alpha[..., None] * (y - means[k])
-        across = a[k] * np.einsum("nkc,nkc->nk", n, r)
-        force = across[..., None] * n + b[k][..., None] * r
-        lever = (who.alpha * a[k] * height * slide)[..., None] * np.cross(
-            np.broadcast_to(beam, n.shape), n
-        )
-        torque = np.cross(y - means[k], force) + lever
-        own = np.concatenate([np.cross(y, force) + lever, force], axis=2)
-        out = np.einsum("jab,ja->jb", J, clouds.sum_per_cloud(own.sum(axis=1)))
-        # What the clouds together move the mean and the normal of each component by.
-        of_means = np.einsum("jkc,cae,jeb->kab", q.moments[..., :4], JACOBIAN, J, optimize=True)
+        reach_m = REACH_SIGMAS * equation.noise.largest_m()
+        place = y + np.clip(slide, -reach_m, reach_m)[..., None] * beam
+        carry = to_target(clouds, equation.R, equation.t)
+        on_surface = np.matmul(equation.cells[..., SURFACE_MOMENTS], carry).sum(axis=0)
+        mass, middle = mass_and_means(on_surface, mixture)
+        force = (who.weight * height)[..., None] * n
+        own = np.concatenate([np.cross(place, force), force], axis=2)
+        by_pose = clouds.sum_per_cloud(own.sum(axis=1))
+        # The priors of the normals turn with the clouds that have a part in them.
+        normals = np.matmul(equation.cells[..., NORMALS], np.swapaxes(equation.R, 1, 2))
+        size = np.maximum(np.linalg.norm(normals.sum(axis=0), axis=1), 1e-300)
+        mean = normals.sum(axis=0) / size[:, None]
+        part = np.einsum("jka,ka->jk", normals, mean) / size
+        axis = np.cross(mixture.normals_target, mean)
+        sine = np.linalg.norm(axis, axis=1)
+        angle = np.arctan2(sine, np.einsum("ka,ka->k", mixture.normals_target, mean))
+        known = size / mass / NORMAL_SIGMA_RAD**2
+        of_prior = part[..., None] * (known * angle / np.maximum(sine, 1e-300))[:, None] * axis
+        by_pose[:, :3] += of_prior.sum(axis=1)
+        out = np.einsum("jab,ja->jb", J, by_pose)
+        # What the clouds together move the place and the normal of each surfel by.
+        of_places = np.einsum("jkc,cae,jeb->kab", q.moments[..., :4], JACOBIAN, J, optimize=True)
         of_turns = np.einsum("jkq,kqae,jeb->kab", q.moments, q.coupling, J, optimize=True)
         cell = (cloud * K + k).ravel()
 
@@ -358,22 +386,21 @@ class Estimator:
             return np.stack(columns, axis=1, dtype=np.float64).reshape(-1, K, 3)
 
         pulls = per_cell(np.moveaxis(force, 2, 0)) / mass[:, None]
-        turns = per_cell(np.moveaxis(torque, 2, 0))
+        turns = per_cell(np.moveaxis(np.cross(place - middle[k], force), 2, 0)) + of_prior
         turns = np.asarray(
             np.linalg.solve(q.orientation_information, turns[..., None])[..., 0], np.float64
         )
-        out -= np.einsum("jka,kab->jb", pulls, of_means)
+        out -= np.einsum("jka,kab->jb", pulls, of_places)
         out -= np.einsum("jka,kab->jb", turns, of_turns)
         scatter = np.sqrt(np.sum(out**2, axis=0))
         if (np.abs(out.sum(axis=0) - equation.score) > 1e-6 * scatter).any():
             raise RegistrationError("the clouds' scores do not add up to the gradient")
         return np.asarray(out)
 
-    def variance_ratios(self, mixture: Mixture, equation: Equation) -> tuple[float, float]:
-        """Variance of the force of a cloud on a component over what A claims, across and along.
+    def variance_ratio(self, mixture: Mixture, equation: Equation) -> float:
+        """Variance of the force of a cloud on a surfel over what A claims.
 
-        One if heights are independent with the component's variance, and if as many points along
-        the surface as `ALONG_SURFACE` says are worth one.
+        One if heights are independent with the variance that they are taken to have.
         """
         clouds, who, K = self._stack, equation.who, len(mixture.weights)
         k = who.component
@@ -382,20 +409,16 @@ class Estimator:
         mass, means = mass_and_means(moments.sum(axis=0), mixture)
         r = clouds.moved(equation.R, equation.t)[:, None] - means[k]
         height = np.einsum("nkc,nkc->nk", n, r)
-        a, b = information_weights(mixture)
         cell = (clouds.cloud[:, None] * K + k).ravel()
 
         def summed(values: Array) -> Array:
-            columns = np.bincount(cell, (who.alpha * values).ravel(), len(moments) * K)
+            columns = np.bincount(cell, (who.weight * values).ravel(), len(moments) * K)
             return np.asarray(columns.reshape(-1, K), np.float64)
 
         own = summed(np.ones(k.shape))
-        # The mean of the component is free: a cloud that has it to itself exerts no force.
+        # The place of the surfel is free: a cloud that has it to itself exerts no force.
         left = own * (1.0 - own / mass)
-        aside = [summed(part) for part in np.moveaxis(r - height[..., None] * n, 2, 0)]
-        across = float(np.sum(((a + b) * summed(height)) ** 2) / np.sum((a + b) * left))
-        along = float(sum(np.sum((b * part) ** 2) for part in aside) / np.sum(2.0 * b * left))
-        return across, along
+        return float(np.sum(summed(height) ** 2) / np.sum(left))
 
     def profile_sensitivity(
         self, T: Sequence[gtsam.Pose3], mixture: Mixture, steps: Array
@@ -456,7 +479,8 @@ class Run:
     sandwich: Array
     grouped: Array
     profile: Array | None
-    ratios: tuple[float, float]
+    ratio: float
+    noise: HeightNoise
 
 
 def run(scene: Scene, case: str, seed: int, options: argparse.Namespace) -> Run:
@@ -483,11 +507,12 @@ def run(scene: Scene, case: str, seed: int, options: argparse.Namespace) -> Run:
     return Run(
         estimator.error(T),
         claimed,
-        equation.scale(clouds.weights),
+        equation.scale(estimator.weights),
         sandwiched(claimed, scores),
         sandwiched(claimed, groups),
         profile,
-        estimator.variance_ratios(mixture, equation),
+        estimator.variance_ratio(mixture, equation),
+        equation.noise,
     )
 
 
@@ -518,8 +543,11 @@ def table(case: str, runs: Sequence[Run], names: Sequence[str], rows: Array) -> 
     for name in ("A^-1", "scaled", "sandwich", "groups", "profile"):
         ratio = np.exp(np.mean(np.log(scatter / columns[name])))
         yield f"scatter over {name}: {ratio:.2f} (geometric mean of the axes)"
-    across, along = np.mean([r.ratios for r in runs], axis=0)
-    yield f"variance of a cloud's force on a component: {across:.2f} of A across, {along:.3f} along"
+    ratio = np.mean([r.ratio for r in runs])
+    yield f"variance of a cloud's force on a surfel: {ratio:.2f} of A"
+    for part in ("range", "roughness"):
+        sigma_mm = 1e3 * np.mean([np.sqrt(getattr(r.noise, f"{part}_m2")) for r in runs], axis=0)
+        yield f"{part} sigma of each LiDAR, mm: " + " ".join(f"{s:.2f}" for s in sigma_mm)
 
 
 def main() -> int:

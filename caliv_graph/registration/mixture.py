@@ -277,7 +277,7 @@ def maximise_shape(
         means_target=centres,
         normals_target=normals,
         var_tangent=np.maximum(aside2 / (2.0 * mass), floor),
-        weights=counts / counts.sum(),
+        weights=counts / max(float(counts.sum()), 1e-300),
     )
 
 

@@ -1,25 +1,38 @@
-"""The mixture by hand: responsibilities, components, and its quadratic by numerical derivatives."""
+"""The surfels by hand: E-step, M-step, and the quadratic against numerical derivatives."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
 
 import gtsam
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
+from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
+from caliv_graph.registration.heights import HeightNoise, HeightSums
 from caliv_graph.registration.mixture import (
-    ALONG_SURFACE,
+    BESIDE,
+    LEAST_EXTENT_M,
     MAX_TURN_RAD,
+    STEEP,
     expect,
     maximise_shape,
     seed_mixture,
 )
 from caliv_graph.registration.moments import Responsibilities, cell_moments
-from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
+from caliv_graph.registration.quadratic import (
+    NORMAL_SIGMA_RAD,
+    SEEN_SIGMA_RAD,
+    ShapeQuadratic,
+    shape_quadratic,
+)
 from caliv_graph.registration.register import left_step
 from tests.registration.scenes import (
     looking_at_target,
@@ -48,6 +61,7 @@ def stack_of(
         points=points,
         cloud=cloud.astype(np.int64),
         starts=np.array(starts, dtype=np.int64),
+        lidar=np.zeros(len(starts), dtype=np.int64),
         beams=-normals if beams is None else beams,
         normals=normals,
         flatness=np.ones(count) if flatness is None else flatness,
@@ -56,19 +70,17 @@ def stack_of(
     )
 
 
-def component(
-    mean: tuple[float, float, float],
-    normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
+def surfel(
+    mean: tuple[float, ...],
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0),
     *,
-    sigma_normal: float = 0.1,
-    sigma_tangent: float = 0.1,
+    width_m: float = 0.1,
     weight: float = 1.0,
 ) -> Mixture:
     return Mixture(
         means_target=np.array([mean]),
         normals_target=np.array([normal]),
-        var_normal=np.array([sigma_normal**2]),
-        var_tangent=np.array([sigma_tangent**2]),
+        var_tangent=np.array([width_m**2]),
         weights=np.array([weight]),
     )
 
@@ -77,23 +89,40 @@ def together(*mixtures: Mixture) -> Mixture:
     return Mixture(
         *(
             np.concatenate([getattr(m, name) for m in mixtures])
-            for name in (
-                "means_target",
-                "normals_target",
-                "var_normal",
-                "var_tangent",
-                "weights",
-            )
+            for name in ("means_target", "normals_target", "var_tangent", "weights")
         )
     )
 
 
+def noise_of(range_m: float = 0.01, roughness_m: float = 0.0, floor_m: float = 0.0) -> HeightNoise:
+    """Of one LiDAR."""
+    return HeightNoise(np.array([range_m**2]), np.array([roughness_m**2]), floor_m)
+
+
 UP = np.array([[0.0, 0.0, 1.0]])
 
+SURE = 2.0 * 4.0 / -math.expm1(-8.0)
+"""Density of a reliable normal that agrees, over that of any: von Mises-Fisher of 4."""
 
-def held(component: IntArray, alpha: Array, clouds: int = 1) -> Responsibilities:
-    nothing = np.zeros((clouds, 3)), np.zeros((int(component.max()) + 1, 3))
-    return Responsibilities(component, alpha, np.ones(clouds), *nothing, np.zeros(len(alpha)))
+THERE = 1.0 / (1.0 + BESIDE)
+"""Presence of a surfel that a beam meets in its middle, alone."""
+
+
+def held(component: IntArray, weight: Array, clouds: int = 1) -> Responsibilities:
+    """Points that belong to surfels with these weights, whatever their places are."""
+    surfels = int(component.max()) + 1
+    counts = np.bincount(component.ravel(), weight.ravel(), surfels).astype(np.float64)
+    return Responsibilities(
+        component=component,
+        weight=weight,
+        counts=counts,
+        explained=np.ones(len(weight)),
+        inlier_ratio=np.ones(clouds),
+        levers=np.zeros((clouds, 3)),
+        component_levers=np.zeros((surfels, 3)),
+        slides_m=np.zeros(len(weight)),
+        heights=HeightSums.none(1),
+    )
 
 
 def quadratic_of(
@@ -108,69 +137,101 @@ def maximised(
 ) -> Mixture:
     cells = cell_moments(stack, who, len(mixture.weights))
     quadratic = shape_quadratic(stack, R, t, mixture, cells, who)
-    expected = cells, quadratic.orientation_information, quadratic.torque
-    return maximise_shape(stack, R, t, mixture, floor_m, *expected)
+    return maximise_shape(stack, R, t, mixture, floor_m, cells, who.counts, quadratic.turns)
 
 
 # ------------------------------------------------------------------ E-step
 
 
-def test_responsibility_of_one_component_by_hand() -> None:
-    # 0.1 m along x from the mean, sigma 0.1 m: N = (2 pi)^-3/2 0.1^-3 e^-1/2 = 38.51 per m^3.
-    stack = stack_of(np.array([[0.1, 0.0, 0.0]]), UP)
-    density = 38.51
-    who = expect(stack, *IDENTITY, component((0.0, 0.0, 0.0)), density, np.ones(1))
-    assert who.component.tolist() == [[0]]
-    assert who.alpha == pytest.approx(np.array([[0.5]]), abs=1e-4)
-    assert who.inlier_ratio == pytest.approx([0.5], abs=1e-4)
-    # Half the prior: 19.25 against 38.51.
-    who = expect(stack, *IDENTITY, component((0.0, 0.0, 0.0), weight=0.5), density, np.ones(1))
-    assert who.alpha == pytest.approx(np.array([[1.0 / 3.0]]), abs=1e-4)
+def explained(
+    points: Array,
+    mixture: Mixture,
+    noise: HeightNoise,
+    density: float,
+    *,
+    normals: Array | None = None,
+    beams: Array | None = None,
+    flatness: Array | None = None,
+) -> Array:
+    """(N,) responsibility of the mixture for points with normals up, or as given."""
+    normals = UP.repeat(len(points), axis=0) if normals is None else normals
+    stack = stack_of(points, normals, beams=beams, flatness=flatness)
+    return expect(stack, *IDENTITY, mixture, noise, density, np.ones(1)).explained
 
 
-def test_normal_and_tangent_have_their_own_variance() -> None:
-    # 20 mm off: 1 sigma along the normal (z), 0.2 sigmas across it. Both densities are
-    # (2 pi)^-3/2 / (0.02 0.1^2) = 317.5 times e^-0.5 and e^-0.02.
-    flat = component((0.0, 0.0, 0.0), sigma_normal=0.02, sigma_tangent=0.1)
-    stack = stack_of(np.array([[0.0, 0.0, 0.02], [0.02, 0.0, 0.0]]), UP.repeat(2, axis=0))
-    density = 100.0
-    who = expect(stack, *IDENTITY, flat, density, np.ones(1))
-    expected = [317.47 * math.exp(-0.5), 317.47 * math.exp(-0.02)]
-    assert who.alpha[:, 0] == pytest.approx([n / (n + density) for n in expected], rel=1e-4)
+def test_responsibility_of_one_surfel_by_hand() -> None:
+    # 10 mm above it, 1 sigma, straight from above: N = (2 pi)^-1/2 / 0.01 e^-1/2 = 24.20 per metre,
+    # times what a normal that agrees adds.
+    density = 24.197 * SURE
+    alone = surfel((0.0, 0.0, 0.0))
+    points = np.array([[0.0, 0.0, 0.01]])
+    assert explained(points, alone, noise_of(), density) == pytest.approx([0.5], abs=1e-4)
+    # Three times as many outliers.
+    assert explained(points, alone, noise_of(), 3.0 * density) == pytest.approx([0.25], abs=1e-4)
+    # Where the beam meets the plane, two widths beside the middle, it returns nearly as likely: no
+    # other surface is there. At five widths e^-12.5 = 3.7e-6 is less than "no surface here".
+    beside = np.array([[0.2, 0.0, 0.01], [0.5, 0.0, 0.01]])
+    a, b = math.exp(-2.0), math.exp(-12.5)
+    expected = [n / (n + BESIDE) / (n / (n + BESIDE) + 1.0) for n in (a, b)]
+    assert explained(beside, alone, noise_of(), density) == pytest.approx(expected, rel=1e-3)
+    assert expected[0] > 0.499
+    assert expected[1] < 0.04
 
 
-def test_a_point_belongs_where_its_beam_meets_the_surface() -> None:
-    # 60 degrees from the normal, 30 mm too far: 15 mm below the surface and 26 mm along it. The
-    # beam met the surface at the mean: only the height counts.
+def test_variance_of_a_height_is_of_the_range_and_of_the_surface() -> None:
+    # 60 degrees: f^2 sigma^2 + rho^2 = (5 mm)^2 + (12 mm)^2 = (13 mm)^2; the density of the range
+    # is f times that of the height.
     beam = np.array([[math.sin(math.radians(60.0)), 0.0, -0.5]])
-    flat = component((0.0, 0.0, 0.0), sigma_normal=0.02, sigma_tangent=0.05)
-    density = 100.0
-    who = expect(stack_of(0.03 * beam, UP, beams=beam), *IDENTITY, flat, density, np.ones(1))
-    expected = math.exp(-0.5 * (0.015 / 0.02) ** 2) / ((2 * math.pi) ** 1.5 * 0.02 * 0.05**2)
-    assert who.alpha[0, 0] == pytest.approx(expected / (expected + density), rel=1e-6)
-    # What the noise along the beam does not explain stands where it is.
-    still = stack_of(0.03 * beam, UP, beams=beam, sigma_range_m=1e-9)
-    apart = expect(still, *IDENTITY, flat, density, np.ones(1))
-    farther = expected * math.exp(-0.5 * (0.03 * math.sin(math.radians(60.0)) / 0.05) ** 2)
-    assert apart.alpha[0, 0] == pytest.approx(farther / (farther + density), rel=1e-6)
-    # A beam along the surface meets it nowhere: the point counts where it is.
-    flush = np.array([[1.0, 0.0, 0.0]])
-    near = expect(stack_of(0.03 * flush, UP, beams=flush), *IDENTITY, flat, density, np.ones(1))
-    aside = 0.5 / ((2 * math.pi) ** 1.5 * 0.02 * 0.05**2) * math.exp(-0.5 * (0.03 / 0.05) ** 2)
-    assert near.alpha[0, 0] == pytest.approx(aside / (aside + density), rel=1e-6)
+    noise = noise_of(0.01, 0.012)
+    points = np.array([[0.0, 0.0, 0.013]])
+    found = explained(points, surfel((0, 0, 0), width_m=1.0), noise, 1.0, beams=beam)
+    # The beam meets the plane 22.5 mm beside the middle of a surfel of a metre.
+    density = 0.5 * math.exp(-0.5) / (math.sqrt(2.0 * math.pi) * 0.013) * SURE
+    assert found == pytest.approx([density / (density + 1.0)], rel=2e-4)
+    # While annealing the floor stands for the roughness: (5 mm)^2 + (12 mm)^2 again.
+    coarse = explained(
+        points, surfel((0, 0, 0), width_m=1.0), noise_of(0.01, 0.001, 0.012), 1.0, beams=beam
+    )
+    assert coarse == pytest.approx(found, rel=1e-12)
+
+
+def test_a_beam_returns_from_where_it_meets_the_surface() -> None:
+    # 60 degrees from the normal, 20 mm too far: 10 mm below the surface, 17 mm beside the middle.
+    # The beam met the surface in the middle: of two surfels that lie beside each other it is that.
+    beam = np.array([[math.sin(math.radians(60.0)), 0.0, -0.5]])
+    pair = together(surfel((0, 0, 0), width_m=0.01), surfel((0.0346, 0.0, 0.0), width_m=0.01))
+    stack = stack_of(0.02 * beam, UP, beams=beam)
+    who = expect(stack, *IDENTITY, pair, noise_of(), 1e-9, np.ones(1))
+    weight = dict(zip(who.component[0].tolist(), who.weight[0].tolist(), strict=True))
+    # 0 and 34.6 mm, 10 mm wide: e^-5.99.
+    assert weight[1] / weight[0] == pytest.approx(math.exp(-0.5 * 3.46**2), rel=1e-3)
+    assert who.slides_m == pytest.approx([-0.02], rel=1e-9)
+    # A noise of 1 mm does not explain 20: the point counts 3 mm along its beam from where it is.
+    still = expect(stack, *IDENTITY, pair, noise_of(0.001), 1e-300, np.ones(1))
+    assert still.slides_m == pytest.approx([-0.003])
 
 
 def test_a_beam_nearly_along_the_surface_is_hardly_followed() -> None:
     # 1.7 degrees off it, 10 mm below: the beam meets the surface 0.33 m away, and a normal that is
-    # off by a degree would make 0.2 m of it. Followed are 0.01 x 0.03 / 0.1^2 = 30 mm; a beam that
-    # flat sees the surface for 0.8.
+    # off by a degree would make 0.2 m of it. Followed are 0.01 x 0.03 / 0.1^2 = 30 mm.
     beam = np.array([[math.sqrt(1.0 - 0.03**2), 0.0, -0.03]])
-    flat = component((0.0, 0.0, 0.0), sigma_normal=0.02, sigma_tangent=0.05)
-    stack = stack_of(np.array([[0.0, 0.0, -0.01]]), UP, beams=beam, sigma_range_m=0.05)
-    who = expect(stack, *IDENTITY, flat, 100.0, np.ones(1))
-    squares = (0.01 / 0.02) ** 2 + (0.03 * beam[0, 0] / 0.05) ** 2
-    expected = 0.8 * math.exp(-0.5 * squares) / ((2 * math.pi) ** 1.5 * 0.02 * 0.05**2)
-    assert who.alpha[0, 0] == pytest.approx(expected / (expected + 100.0), rel=1e-6)
+    flat = surfel((0.0, 0.0, 0.0), width_m=0.05)
+    points = np.array([[0.0, 0.0, -0.01]])
+    stack = stack_of(points, UP, beams=beam)
+    noise = noise_of(0.05, 0.02)
+    who = expect(stack, *IDENTITY, flat, noise, 100.0, np.ones(1))
+    assert who.slides_m == pytest.approx([-0.03])
+    # A beam that flat sees the surface for 0.8; the noise across it is that of f = 0.1.
+    there = 0.8 * math.exp(-0.5 * (0.03 * beam[0, 0] / 0.05) ** 2)
+    variance = (STEEP * 0.05) ** 2 + 0.02**2
+    expected = there / (there + BESIDE) * STEEP / math.sqrt(2.0 * math.pi * variance)
+    expected *= math.exp(-0.5 * 0.01**2 / variance) * SURE
+    assert who.explained == pytest.approx([expected / (expected + 100.0)], rel=1e-6)
+    # From behind, or along it, it is not followed at all.
+    for f in (0.0, 0.04):
+        beam = np.array([[math.sqrt(1.0 - f**2), 0.0, f]])
+        who = expect(stack_of(points, UP, beams=beam), *IDENTITY, flat, noise, 1.0, np.ones(1))
+        assert who.slides_m == pytest.approx([0.0])
 
 
 def test_levers_are_those_of_the_residual_along_the_beam() -> None:
@@ -178,16 +239,19 @@ def test_levers_are_those_of_the_residual_along_the_beam() -> None:
     # its derivative by a rotation is that of the distance across the surface, plus the levers.
     n, y, b = np.array([0.6, 0.0, 0.8]), np.array([0.3, -0.2, 0.5]), np.array([0.48, 0.6, -0.64])
     mu = y - 0.01 * n
-    flat = component((mu[0], mu[1], mu[2]), (0.6, 0.0, 0.8), sigma_normal=0.02, sigma_tangent=0.1)
     many = [np.tile(v, (10, 1)) for v in (y, n, b)]
-    stack = stack_of(many[0], many[1], beams=many[2], sigma_range_m=0.05)
-    who = expect(stack, *IDENTITY, flat, 1e-9, np.ones(1))
-    a = 1.0 / 0.02**2 - ALONG_SURFACE / 0.1**2
+    stack = stack_of(many[0], many[1], beams=many[2])
+    noise = noise_of(0.02, 0.01)
+    who = expect(
+        stack, *IDENTITY, surfel(tuple(mu.tolist()), (0.6, 0.0, 0.8)), noise, 1e-9, np.ones(1)
+    )
+    variance = (float(n @ b) * 0.02) ** 2 + 0.01**2
 
     def costs(d: Array) -> Array:
         R = gtsam.Rot3.Expmap(d).matrix()
-        across = n @ (R @ y - mu)
-        return 0.5 * a * np.array([(n @ b) ** 2 * (across / (n @ R @ b)) ** 2, across**2])
+        across = float(n @ (R @ y - mu))
+        along = float(n @ b) * across / float(n @ (R @ b))
+        return np.asarray(0.5 / variance * np.array([along**2, across**2]))
 
     step = 1e-5
     slopes = np.array([costs(d) - costs(-d) for d in step * np.eye(3)]) / (2.0 * step)
@@ -197,13 +261,18 @@ def test_levers_are_those_of_the_residual_along_the_beam() -> None:
 
 
 def test_a_turn_of_all_clouds_changes_nothing() -> None:
-    # Of pulls, the levers' too: the components that clouds share are turned with them.
+    # Of pulls, the levers' too: the surfels that clouds share are turned with them, and the normals
+    # of the points, which the surfels' are drawn to, as well. Not at convergence only.
     stack, R, t, quadratic = skins()
-    who = expect(stack, R, t, seed_mixture(stack, R, t, 150, 0.01), 0.05, np.ones(6))
+    who = expect(
+        stack, R, t, seed_mixture(stack, R, t, 150, 0.01), noise_of(0.005), 0.05, np.ones(6)
+    )
     assert np.abs(who.levers).max() > 1.0
     assert who.levers.sum(axis=0) == pytest.approx(who.component_levers.sum(axis=0))
-    scale = np.abs(quadratic.gradient).max()
-    assert np.abs(quadratic.gradient.sum(axis=0)).max() < 1e-3 * scale
+    rough = quadratic_of(stack, R, t, seed_mixture(stack, R, t, 150, 0.01), who)
+    for found in (quadratic, rough):
+        scale = np.abs(found.gradient).max()
+        assert np.abs(found.gradient.sum(axis=0)).max() < 1e-6 * scale
 
 
 def half_turned(seed: int, levers: float) -> float:
@@ -233,15 +302,10 @@ def half_turned(seed: int, levers: float) -> float:
         starts=(0, count),
     )
     R, t = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
-    shape = together(
-        *[
-            component(tuple(p), tuple(normal), sigma_normal=0.01, sigma_tangent=0.012)
-            for p in points[0][:300]
-        ]
-    )
+    shape = together(*[surfel(tuple(p), tuple(normal), width_m=0.012) for p in points[0][:300]])
 
     def expected() -> Responsibilities:
-        who = expect(stack, R, t, shape, 1e-3, np.ones(2))
+        who = expect(stack, R, t, shape, noise_of(0.01), 1e-3, np.ones(2))
         missing = levers * who.levers, levers * who.component_levers
         return replace(who, levers=missing[0], component_levers=missing[1])
 
@@ -273,11 +337,11 @@ def slanted(rng: np.random.Generator, noise_m: float, normal: Array) -> CloudSta
 
 def test_levers_do_not_grow_with_the_noise() -> None:
     # Noise of 10 mm moves the points by 8.7 mm along the surface, beside the 23 mm they spread.
-    flat = component((0.0, 0.0, 0.0), sigma_normal=0.01, sigma_tangent=0.03)
+    flat = surfel((0.0, 0.0, 0.0), width_m=0.03)
     found = []
     for noise_m in (1e-6, 0.01):
         stack = slanted(np.random.default_rng(3), noise_m, UP[0])
-        who = expect(stack, *IDENTITY, flat, 1e-9, np.ones(1))
+        who = expect(stack, *IDENTITY, flat, noise_of(0.02), 1e-9, np.ones(1))
         found.append((stack, who, quadratic_of(stack, *IDENTITY, flat, who)))
     (_, _, still), (stack, who, noisy) = found
     for axis in (0, 1):
@@ -287,106 +351,157 @@ def test_levers_do_not_grow_with_the_noise() -> None:
     at_points = replace(who, slides_m=np.zeros(len(stack.points)))
     longer = quadratic_of(stack, *IDENTITY, flat, at_points)
     assert longer.orientation_information[0, 1, 1] > 1.1 * still.orientation_information[0, 1, 1]
-    # Nor does the component become wider.
+    # Nor does the surfel become wider.
     after = maximised(stack, *IDENTITY, flat, who, 0.001)
     assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.08 / math.sqrt(12.0), rel=0.02)
 
 
-def test_a_component_turns_into_the_plane_of_its_points() -> None:
+def test_a_surfel_turns_into_the_plane_of_its_points() -> None:
     # The normals of the points are 0.1 rad off; the points themselves tell to
     # 5 mm / (23 mm sqrt(4000)) = 3 mrad.
     wrong = np.array([math.sin(0.1), 0.0, math.cos(0.1)])
     stack = slanted(np.random.default_rng(4), 0.01, wrong)
-    mixture = component((0, 0, 0), tuple(wrong), sigma_normal=0.01, sigma_tangent=0.03)
+    mixture = surfel((0, 0, 0), tuple(wrong), width_m=0.03)
     for _ in range(8):
-        who = expect(stack, *IDENTITY, mixture, 1e-9, np.ones(1))
+        who = expect(stack, *IDENTITY, mixture, noise_of(), 1e-9, np.ones(1))
         mixture = maximised(stack, *IDENTITY, mixture, who, 0.001)
     assert mixture.normals_target[0] == pytest.approx(UP[0], abs=0.012)
-    assert math.sqrt(mixture.var_normal[0]) == pytest.approx(0.005, rel=0.05)
+    # The noise is that along the beam: 10 mm, of which a half is across the surface.
+    fitted = noise_of().fitted(who.heights, 3.0, noise_of())
+    assert math.sqrt(fitted.range_m2[0]) == pytest.approx(0.01, rel=0.05)
 
 
-def test_a_component_turns_no_further_at_once_than_where_it_is_nearly_linear() -> None:
-    # The points' normals agree with the component's, and the points stand 0.6 rad off them.
-    wrong = np.array([math.sin(0.6), 0.0, math.cos(0.6)])
+def test_a_surfel_turns_no_further_at_once_than_where_it_is_nearly_linear() -> None:
+    # The points' normals agree with the surfel's, and the points stand 0.6 rad off them.
+    wrong = np.array([-math.sin(0.6), 0.0, math.cos(0.6)])
     stack = slanted(np.random.default_rng(4), 0.001, wrong)
-    mixture = component((0, 0, 0), tuple(wrong), sigma_normal=0.02, sigma_tangent=0.03)
-    who = expect(stack, *IDENTITY, mixture, 1e-9, np.ones(1))
+    mixture = surfel((0, 0, 0), tuple(wrong), width_m=0.03)
+    who = expect(stack, *IDENTITY, mixture, noise_of(0.02), 1e-9, np.ones(1))
     after = maximised(stack, *IDENTITY, mixture, who, 0.001)
     turned = math.acos(float(after.normals_target[0] @ wrong))
     assert turned == pytest.approx(MAX_TURN_RAD, abs=1e-6)
 
 
 def test_points_on_a_line_leave_the_turn_about_it_to_their_normals() -> None:
+    # To 0.2 rad by normals that can be trusted, to 1 rad by where the beams come from: of 0.3 rad
+    # a 26th remains after the first turn.
     rng = np.random.default_rng(6)
     points = np.column_stack([np.zeros(200), rng.uniform(-0.05, 0.05, 200), np.zeros(200)])
-    leaning = np.array([math.sin(0.3), 0.0, math.cos(0.3)])
+    leaning = np.array([math.sin(0.15), 0.0, math.cos(0.15)])
     stack = stack_of(points, np.tile(leaning, (200, 1)), beams=np.tile(-UP, (200, 1)))
-    flat = component((0.0, 0.0, 0.0), sigma_normal=0.01, sigma_tangent=0.03)
-    who = expect(stack, *IDENTITY, flat, 1e-9, np.ones(1))
-    after = maximised(stack, *IDENTITY, flat, who, 0.001)
-    assert after.normals_target[0] == pytest.approx(leaning, abs=1e-3)
+    mixture = surfel((0.0, 0.0, 0.0), width_m=0.03)
+    remains = 0.15
+    for _ in range(3):
+        who = expect(stack, *IDENTITY, mixture, noise_of(), 1e-9, np.ones(1))
+        mixture = maximised(stack, *IDENTITY, mixture, who, 0.001)
+        remains /= 1.0 + SEEN_SIGMA_RAD**-2 / NORMAL_SIGMA_RAD**-2
+        remains *= SEEN_SIGMA_RAD**-2 / NORMAL_SIGMA_RAD**-2
+        off = math.acos(min(float(mixture.normals_target[0] @ leaning), 1.0))
+        assert off == pytest.approx(remains, abs=1e-6)
 
 
-def test_two_components_share_a_point_between_them() -> None:
-    pair = together(component((-0.1, 0.0, 0.0), weight=0.5), component((0.1, 0.0, 0.0), weight=0.5))
+def test_two_surfels_share_a_beam_between_them() -> None:
+    pair = together(surfel((-0.1, 0.0, 0.0)), surfel((0.1, 0.0, 0.0)))
     stack = stack_of(np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), UP.repeat(2, axis=0))
-    who = expect(stack, *IDENTITY, pair, 1e-9, np.ones(1))
-    alpha = {
-        (n, k): a for n in range(2) for k, a in zip(who.component[n], who.alpha[n], strict=True)
+    who = expect(stack, *IDENTITY, pair, noise_of(), 1e-9, np.ones(1))
+    weight = {
+        (n, k): w for n in range(2) for k, w in zip(who.component[n], who.weight[n], strict=True)
     }
-    assert alpha[0, 0] == pytest.approx(0.5)
-    assert alpha[0, 1] == pytest.approx(0.5)
+    # Half of it each, over the variance.
+    assert weight[0, 0] == pytest.approx(0.5 / 0.01**2)
+    assert weight[0, 1] == pytest.approx(0.5 / 0.01**2)
     # 0.05 and 0.15 m: the ratio is e^(0.125 - 1.125) = e^-1.
-    assert alpha[1, 0] / alpha[1, 1] == pytest.approx(math.exp(-1.0))
-    assert who.alpha.sum(axis=1) == pytest.approx([1.0, 1.0])
+    assert weight[1, 0] / weight[1, 1] == pytest.approx(math.exp(-1.0))
+    assert who.explained == pytest.approx([1.0, 1.0])
+    assert who.counts.sum() == pytest.approx(2.0)
+
+
+def test_more_surfels_are_no_more_surface() -> None:
+    # What a beam meets there is one surface, however many surfels stand for it.
+    points = np.array([[0.03, 0.0, 0.01]])
+    one = surfel((0.0, 0.0, 0.0))
+    many = together(*[one] * 6)
+    alone = explained(points, one, noise_of(), 30.0)
+    assert explained(points, many, noise_of(), 30.0) == pytest.approx(alone, rel=1e-3)
 
 
 def test_points_are_looked_at_under_the_pose_of_their_cloud() -> None:
-    # A point 5 m ahead of a LiDAR that stands 5 m from the component, and looks at it.
+    # A point 5 m ahead of a LiDAR that stands 5 m from the surfel, and looks at it.
     T = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi / 2), np.array([0.3, -5.0, 0.0]))
     R, t = matrices([T])
     ahead = np.array([[1.0, 0.0, 0.0]])
     stack = stack_of(5.0 * ahead, -ahead)
-    shape = component((0.3, 0.0, 0.0), (0.0, -1.0, 0.0), sigma_normal=0.01, sigma_tangent=0.01)
-    assert expect(stack, R, t, shape, 1.0, np.ones(1)).alpha[0, 0] > 0.99
-    assert expect(stack, *IDENTITY, shape, 1.0, np.ones(1)).alpha[0, 0] < 1e-9
+    shape = surfel((0.3, 0.0, 0.0), (0.0, -1.0, 0.0), width_m=0.01)
+    assert expect(stack, R, t, shape, noise_of(), 1.0, np.ones(1)).explained[0] > 0.99
+    assert expect(stack, *IDENTITY, shape, noise_of(), 1.0, np.ones(1)).explained[0] < 1e-9
+
+
+MANY = 1e6
+"""Density of outliers beside which responsibilities are the densities of the surfels over it."""
 
 
 def test_normals_that_disagree_cost_their_exponent() -> None:
-    # Same place, seen from the front: normals 0, 60 and 90 degrees from the component's.
+    # Same place, seen from the front: normals 0, 60 and 90 degrees from the surfel's.
     angles = np.radians([0.0, 60.0, 90.0])
     normals = np.column_stack([np.sin(angles), np.zeros(3), np.cos(angles)])
-    stack = stack_of(np.zeros((3, 3)), normals, beams=-UP.repeat(3, axis=0))
-    density = 1e6  # so that alpha is the density of the component over it
-    alpha = expect(stack, *IDENTITY, component((0, 0, 0)), density, np.ones(1)).alpha[:, 0]
+    beams = -UP.repeat(3, axis=0)
+    flat, where = surfel((0.0, 0.0, 0.0)), np.zeros((3, 3))
+    alpha = explained(where, flat, noise_of(), MANY, normals=normals, beams=beams)
     # 60 degrees a factor of e^2, 90 degrees e^4.
     assert alpha[1] / alpha[0] == pytest.approx(math.exp(-2.0), rel=1e-3)
     assert alpha[2] / alpha[0] == pytest.approx(math.exp(-4.0), rel=1e-3)
-    # A normal that cannot be trusted costs nothing.
-    blind = replace(stack, flatness=np.zeros(3))
-    alpha = expect(blind, *IDENTITY, component((0, 0, 0)), density, np.ones(1)).alpha[:, 0]
-    assert alpha == pytest.approx(np.full(3, alpha[0]))
+    # A normal that cannot be trusted costs nothing, and adds nothing.
+    none = np.zeros(3)
+    blind = explained(where, flat, noise_of(), MANY, normals=normals, beams=beams, flatness=none)
+    assert blind == pytest.approx(np.full(3, alpha[0] / SURE), rel=1e-3)
 
 
-def test_a_component_is_not_seen_from_behind() -> None:
-    # Beams at 0, 45, 135 and 180 degrees from the component's back; nothing known of normals.
+def test_densities_of_normals_add_up_to_one() -> None:
+    # Over the sphere, in units of the uniform one: reliable normals gain nothing on the average.
+    cosine = np.linspace(-1.0, 1.0, 2001)
+    normals = np.column_stack([np.sqrt(1.0 - cosine**2), np.zeros(2001), cosine])
+    beams, where = -UP.repeat(2001, axis=0), np.zeros((2001, 3))
+    for flat in (0.2, 1.0):
+        flatness = np.full(2001, flat)
+        sure = explained(
+            where,
+            surfel((0, 0, 0)),
+            noise_of(),
+            MANY,
+            normals=normals,
+            beams=beams,
+            flatness=flatness,
+        )
+        never = explained(
+            np.zeros((1, 3)), surfel((0, 0, 0)), noise_of(), MANY, flatness=np.zeros(1)
+        )
+        assert np.trapezoid(sure, cosine) / 2.0 == pytest.approx(never[0], rel=1e-3)
+
+
+def test_a_surfel_is_not_seen_from_behind() -> None:
+    # Beams at 0, 45, 135 and 180 degrees from the surfel's back; nothing known of normals.
     angles = np.radians([0.0, 45.0, 135.0, 180.0])
     beams = -np.column_stack([np.sin(angles), np.zeros(4), np.cos(angles)])
-    stack = stack_of(np.zeros((4, 3)), -beams, beams=beams, flatness=np.zeros(4))
-    alpha = expect(stack, *IDENTITY, component((0, 0, 0)), 1e6, np.ones(1)).alpha[:, 0]
-    assert alpha[1] == pytest.approx(alpha[0])
-    assert alpha[2] < 2e-3 * alpha[0]
-    assert alpha[3] < 2e-3 * alpha[0]
+    found = explained(
+        np.zeros((4, 3)), surfel((0, 0, 0)), noise_of(), MANY, beams=beams, flatness=np.zeros(4)
+    )
+    # On the surface itself the density of the range is the same from everywhere.
+    assert found[1] == pytest.approx(found[0])
+    assert found[2:].tolist() == [0.0, 0.0]
 
 
-def test_weights_of_clouds_scale_responsibilities_and_leave_the_ratio_alone() -> None:
+def test_weights_of_clouds_scale_weights_and_leave_the_ratio_alone() -> None:
     points = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
     stack = stack_of(points, UP.repeat(4, axis=0), starts=(0, 1))
     R, t = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
-    full = expect(stack, R, t, component((0, 0, 0)), 1.0, np.ones(2))
-    weighted = expect(stack, R, t, component((0, 0, 0)), 1.0, np.array([1.0, 0.25]))
-    assert weighted.alpha[0] == pytest.approx(full.alpha[0])
-    assert weighted.alpha[1:] == pytest.approx(0.25 * full.alpha[1:])
+    flat = surfel((0, 0, 0))
+    full = expect(stack, R, t, flat, noise_of(), 1.0, np.ones(2))
+    weighted = expect(stack, R, t, flat, noise_of(), 1.0, np.array([1.0, 0.25]))
+    assert weighted.weight[0] == pytest.approx(full.weight[0])
+    assert weighted.weight[1:] == pytest.approx(0.25 * full.weight[1:])
+    # The noise is that of the clouds that count.
+    assert full.heights.points == pytest.approx([3.0], abs=0.02)
+    assert weighted.heights.points == pytest.approx([1.5], abs=0.02)
     # Of the second cloud's three points one is 5 m away.
     assert full.inlier_ratio[1] == pytest.approx(2.0 / 3.0, abs=0.02)
     assert weighted.inlier_ratio == pytest.approx(full.inlier_ratio)
@@ -395,179 +510,293 @@ def test_weights_of_clouds_scale_responsibilities_and_leave_the_ratio_alone() ->
 # ------------------------------------------------------------------ the quadratic
 
 
-Case = tuple[CloudStack, Array, Array, Mixture, Responsibilities]
+@dataclass(frozen=True)
+class Case:
+    """Clouds of tiles that are far apart: each point belongs to one of them, for certain."""
+
+    stack: CloudStack
+    R: Array
+    t: Array
+    mixture: Mixture
+    who: Responsibilities
+    tile: IntArray
+    noise: HeightNoise
+
+    def quadratic(self) -> ShapeQuadratic:
+        return quadratic_of(self.stack, self.R, self.t, self.mixture, self.who)
 
 
-def random_case(seed: int = 0) -> Case:
-    """Anything at all: the quadratic is exact whatever the responsibilities are."""
-    clouds, points, components = 3, 60, 8
+TILES = 6
+CLOUDS = 3
+
+
+@cache
+def tiles_case(seed: int = 0, at_optimum: bool = True) -> Case:
+    """Three clouds of six tiles, 8 mm of noise along the beams, poses and normals a little wrong.
+
+    Nothing is beyond three of the 12 mm that are assumed: there slides end.
+    With `at_optimum` places and normals of the surfels are those that the clouds ask for.
+    """
     rng = np.random.default_rng(seed)
-    poses = [
-        looking_at_target(float(azimuth), float(rng.uniform(4.0, 12.0)))
-        for azimuth in rng.uniform(0.0, 360.0, clouds)
-    ]
-    target = rng.normal(size=(clouds, points, 3)) * [0.3, 0.3, 0.5]
-    lidar = np.concatenate([p.transformTo(part.T).T for p, part in zip(poses, target, strict=True)])
+    poses = [looking_at_target(azimuth, 6.0 + azimuth / 30.0) for azimuth in (0.0, 35.0, 70.0)]
+    centres = 2.0 * np.array([[x, y, z] for x in (0, 1) for y in (0, 1, 2) for z in (0,)], float)
+    centres += rng.uniform(-0.2, 0.2, centres.shape)
+    # To the middle of the LiDARs, and up to 40 degrees away from there.
+    middle = np.mean([T.translation() for T in poses], axis=0)
+    normals = middle - centres
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, (TILES, 3))).apply(normals)
+    points, beams, own, tile = [], [], [], []
+    for T in poses:
+        for k in range(TILES):
+            count = int(rng.integers(20, 60))
+            across = tangent_axes(normals[k])
+            on = centres[k] + rng.uniform(-0.1, 0.1, (count, 2)) @ across
+            seen = seen_from(T, on, 0.008, rng)
+            points.append(seen)
+            beams.append(seen / np.linalg.norm(seen, axis=1)[:, None])
+            leaning = Rotation.from_rotvec(rng.normal(scale=0.1, size=3)).apply(normals[k])
+            own.append(np.tile(T.rotation().unrotate(leaning), (count, 1)))
+            tile.append(np.full(count, k))
+    per_cloud = [sum(len(p) for p in points[TILES * j : TILES * (j + 1)]) for j in range(CLOUDS)]
+    starts = np.concatenate([[0], np.cumsum(per_cloud)[:-1]])
     stack = stack_of(
-        lidar,
-        directions(rng, len(lidar)),
-        beams=lidar / np.linalg.norm(lidar, axis=1, keepdims=True),
-        starts=tuple(points * j for j in range(clouds)),
+        np.vstack(points),
+        np.vstack(own),
+        beams=np.vstack(beams),
+        flatness=rng.uniform(0.2, 1.0, sum(per_cloud)),
+        starts=tuple(int(s) for s in starts),
     )
-    mixture = Mixture(
-        means_target=rng.normal(size=(components, 3)),
-        normals_target=directions(rng, components),
-        var_normal=rng.uniform(0.01, 0.03, components) ** 2,
-        var_tangent=rng.uniform(0.03, 0.1, components) ** 2,
-        weights=np.full(components, 1.0 / components),
-    )
-    component = np.array([rng.permutation(components)[:4] for _ in lidar])
-    # Many points' worth each, so that what keeps abandoned components defined does not matter.
-    alpha = rng.uniform(1.0, 30.0, component.shape)
-    return stack, *matrices(poses), mixture, held(component, alpha, clouds)
-
-
-def directions(rng: np.random.Generator, count: int) -> Array:
-    v = rng.normal(size=(count, 3))
-    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
-
-
-def weight_matrices(case: Case) -> Array:
-    """(N, 4, 3, 3) weight of each pair, across its component and a part of it along."""
-    _, _, _, mixture, who = case
-    out = np.empty((*who.component.shape, 3, 3))
-    for n, (ks, alphas) in enumerate(zip(who.component, who.alpha, strict=True)):
-        for i, (k, a) in enumerate(zip(ks, alphas, strict=True)):
-            normal = np.outer(mixture.normals_target[k], mixture.normals_target[k])
-            out[n, i] = a * normal / mixture.var_normal[k]
-            out[n, i] += a * ALONG_SURFACE * (np.eye(3) - normal) / mixture.var_tangent[k]
-    return out
-
-
-def offsets(case: Case, d: Array) -> Array:
-    """(N, 4, 3) of each pair of point and component: the point from the component's mean."""
-    stack, R, t, mixture, who = case
-    R, t = left_step(R, t, d.reshape(-1, 6))
-    y = np.array([R[j] @ p + t[j] for p, j in zip(stack.points, stack.cloud, strict=True)])
-    mu = np.zeros((len(mixture.weights), 3))
-    for k in range(len(mu)):
-        n, i = np.nonzero(who.component == k)
-        mu[k] = np.average(y[n], axis=0, weights=who.alpha[n, i])
-    return np.asarray(y[:, None] - mu[who.component])
-
-
-def whitened(case: Case, d: Array) -> Array:
-    """Residuals whose halved square is the negative log-likelihood, components at their best."""
-    who, W = case[4], weight_matrices(case)
-    r, lever = offsets(case, d), offsets(case, np.zeros(18))
-    G = np.cross(np.eye(3), lever[..., None, :])  # rows e_i x lever: turns about the mean
-    for k in range(len(case[3].weights)):
-        n, i = np.nonzero(who.component == k)
-        C = np.einsum("nap,npq,nbq->ab", G[n, i], W[n, i], G[n, i])
-        turn = np.linalg.solve(C, np.einsum("nap,npq,nq->a", G[n, i], W[n, i], r[n, i]))
-        r[n, i] -= np.einsum("a,nap->np", turn, G[n, i])
-    return np.asarray(np.einsum("nkji,nkj->nki", np.linalg.cholesky(W), r)).ravel()
-
-
-def test_gradient_is_that_of_the_negative_log_likelihood() -> None:
-    case = random_case()
-    quadratic = quadratic_of(*case)
-    step = 1e-5
-    numerical = np.array(
-        [
-            0.25 * (np.sum(whitened(case, d) ** 2) - np.sum(whitened(case, -d) ** 2)) / step
-            for d in step * np.eye(18)
+    d = rng.normal(size=(CLOUDS, 6)) * np.repeat([1e-3, 3e-3], 3)
+    R, t = left_step(*matrices(poses), d)
+    mixture = together(
+        *[
+            surfel(tuple(c), tuple(n), width_m=0.06)
+            for c, n in zip(centres.tolist(), normals.tolist(), strict=True)
         ]
     )
-    scale = np.abs(numerical).max()
-    assert quadratic.gradient.shape == (3, 6)
-    assert quadratic.gradient.ravel() / scale == pytest.approx(numerical / scale, abs=2e-4)
+    noise = noise_of(0.012, 0.004)
+    # Weights that differ, as those of clouds with one view do.
+    weights = np.array([1.0, 0.5, 0.8])
+    for _ in range(60 if at_optimum else 1):
+        who = expect(stack, R, t, mixture, noise, 1e-12, weights)
+        if at_optimum:
+            mixture = maximised(stack, R, t, mixture, who, 0.01)
+    if at_optimum:
+        who = expect(stack, R, t, mixture, noise, 1e-12, weights)
+    return Case(stack, R, t, mixture, who, np.concatenate(tile), noise)
 
 
-@pytest.mark.parametrize("thick", [False, True])
-def test_joint_is_the_square_of_the_numerical_jacobian(thick: bool) -> None:
-    case = random_case(1)
-    if thick:
-        # Half of the components are so much thicker than wide that they hold along, not across.
-        stack, R, t, mixture, who = case
-        var_tangent = mixture.var_tangent.copy()
-        var_tangent[::2] = 0.03 * mixture.var_normal[::2]
-        case = stack, R, t, replace(mixture, var_tangent=var_tangent), who
-        assert (quadratic_of(*case).sign < 0.0).sum() == 4
-    step = 1e-5
-    J = np.array(
-        [(whitened(case, d) - whitened(case, -d)) / (2.0 * step) for d in step * np.eye(18)]
-    ).T
-    expected = J.T @ J
+def residuals(case: Case, d: Array, shape: Array) -> Array:
+    """Whitened: their halved square is the cost of the ranges, and of the normals' priors.
+
+    Written down from the model alone: the distance s along each beam from the point to the plane of
+    its surfel, of variance V / f^2, with responsibility and V those of the E-step.
+
+    Args:
+        case: the clouds and the surfels.
+        d: (18,) left perturbations of the poses.
+        shape: (K, 3) offset of each plane along its normal, and turns about two axes in it.
+    """
+    poses = d.reshape(CLOUDS, 6)
+    R, t = left_step(case.R, case.t, poses)
+    stack, mixture, k = case.stack, case.mixture, case.tile
+    before = mixture.normals_target
+    axes = np.array([tangent_axes(n) for n in before])
+    turns = np.einsum("ka,kab->kb", shape[:, 1:], axes)
+    normals = Rotation.from_rotvec(turns).apply(before)
+    places = mixture.means_target + shape[:, :1] * before
+    y, b = stack.moved(R, t), stack.rotated(R, stack.beams)
+    n = normals[k]
+    s = np.einsum("na,na->n", n, y - places[k]) / -np.einsum("na,na->n", n, b)
+    f0 = -np.einsum("na,na->n", before[k], stack.rotated(case.R, stack.beams))
+    V = case.noise.variance(f0[:, None], np.zeros(len(f0), np.int64))[:, 0]
+    weight = np.array([1.0, 0.5, 0.8])[stack.cloud]
+    of_ranges = np.sqrt(weight * f0**2 / V) * s
+    # The mean normal of the points, which turn with their clouds, and the beams, which do as well.
+    flat = (weight / V * stack.flatness)[:, None]
+    seen, seen_before = (flat * stack.rotated(Q, stack.normals) for Q in (R, case.R))
+    of_normals = []
+    for i in range(TILES):
+        own = k == i
+        mass = (weight / V)[own].sum()
+        known = np.linalg.norm(seen_before[own].sum(axis=0)) / mass / NORMAL_SIGMA_RAD**2
+        mean = seen[own].sum(axis=0)
+        mean /= np.linalg.norm(mean)
+        of_normals.append(math.sqrt(known) * np.cross(normals[i], mean))
+        part = np.bincount(stack.cloud[own], (weight / V)[own], CLOUDS) / mass
+        turned = np.cross(turns[i] - part @ poses[:, :3], before[i])
+        of_normals.append(turned / SEEN_SIGMA_RAD)
+    return np.concatenate([of_ranges, *of_normals])
+
+
+def jacobians(case: Case) -> tuple[Array, Array, Array]:
+    """Residuals, and their derivatives by poses (., 18) and by the shape (., 3 K)."""
+    step = 1e-6
+    zero, still = np.zeros(3 * CLOUDS * 2), np.zeros((TILES, 3))
+
+    def slopes(of: Callable[[Array], Array], count: int) -> Array:
+        return np.array([(of(e) - of(-e)) / (2.0 * step) for e in step * np.eye(count)]).T
+
+    by_pose = slopes(lambda d: residuals(case, d, still), 6 * CLOUDS)
+    by_shape = slopes(lambda e: residuals(case, zero, e.reshape(TILES, 3)), 3 * TILES)
+    return residuals(case, zero, still), by_pose, by_shape
+
+
+def test_the_shape_that_is_found_is_the_best_for_the_ranges() -> None:
+    r, _, by_shape = jacobians(tiles_case())
+    curvature = np.sqrt(np.diag(by_shape.T @ by_shape))
+    # In sigmas of each place and each normal.
+    assert np.abs(by_shape.T @ r / curvature).max() < 2e-3
+    # Before, they are not.
+    r, _, by_shape = jacobians(tiles_case(0, False))
+    assert np.abs(by_shape.T @ r / np.sqrt(np.diag(by_shape.T @ by_shape))).max() > 1.0
+
+
+def test_gradient_is_that_of_the_likelihood_of_the_ranges() -> None:
+    # The shape at its best for every displaced pose, by a general minimiser.
+    case = tiles_case()
+
+    def cost(d: Array) -> float:
+        def of_shape(shape: Array) -> float:
+            return 0.5 * float(np.sum(residuals(case, d, shape.reshape(TILES, 3) * scale) ** 2))
+
+        scale = np.array([1e-3, 1e-2, 1e-2])
+        best = minimize(of_shape, np.zeros(3 * TILES), method="BFGS", options={"gtol": 1e-6})
+        return float(best.fun)
+
+    step = 1e-4
+    found = case.quadratic().gradient.ravel()
+    scale = np.sqrt(np.diag(case.quadratic().joint()))
+    # A turn and shifts of each cloud: all 18 take long.
+    for i in (0, 2, 4, 7, 9, 11, 13, 15, 17):
+        d = step * np.eye(18)[i]
+        numerical = (cost(d) - cost(-d)) / (2.0 * step)
+        assert found[i] / scale[i] == pytest.approx(numerical / scale[i], abs=5e-3)
+    assert np.abs(found / scale).max() > 2.0
+
+
+def test_gradient_given_the_shape_is_that_of_the_ranges_alone() -> None:
+    # At any shape, also one that is not the best.
+    for at_optimum in (False, True):
+        case = tiles_case(1, at_optimum)
+        r, by_pose, _ = jacobians(case)
+        of_ranges = slice(0, len(case.tile))
+        expected = (by_pose[of_ranges].T @ r[of_ranges]).reshape(CLOUDS, 6)
+        found = case.quadratic().gradient_given_shape
+        assert found == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("at_optimum", [False, True])
+def test_gradient_has_the_shape_eliminated_wherever_the_shape_is(at_optimum: bool) -> None:
+    # Gauss-Newton: what the shape takes up of the residuals is projected out.
+    case = tiles_case(5, at_optimum)
+    r, by_pose, by_shape = jacobians(case)
+    taken = np.linalg.lstsq(by_shape, r, rcond=None)[0]
+    expected = by_pose.T @ (r - by_shape @ taken)
+    scale = np.sqrt(np.diag(by_pose.T @ by_pose))
+    found = case.quadratic().gradient.ravel()
+    assert found / scale == pytest.approx(expected / scale, abs=5e-4)
+    assert np.abs(expected / scale).max() > 1.0
+
+
+def test_joint_is_the_information_of_the_ranges_with_the_shape_eliminated() -> None:
+    case = tiles_case(4)
+    _, by_pose, by_shape = jacobians(case)
+    left = by_pose - by_shape @ np.linalg.lstsq(by_shape, by_pose, rcond=None)[0]
+    expected = left.T @ left
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert quadratic_of(*case).joint() / scale == pytest.approx(expected / scale, abs=1e-3)
+    assert case.quadratic().joint() / scale == pytest.approx(expected / scale, abs=2e-5)
+    # Given the orientations: offsets alone are estimated.
+    offsets = by_shape[:, ::3]
+    left = by_pose - offsets @ np.linalg.lstsq(offsets, by_pose, rcond=None)[0]
+    given = case.quadratic().joint(given_orientations=True)
+    assert given / scale == pytest.approx(left.T @ left / scale, abs=2e-5)
 
 
 def test_blocks_are_the_information_given_the_shape() -> None:
-    # GMMCalib: the sum of alpha J^T W J, J = [-skew(y), I]; -skew(y) by the cross product.
-    case = random_case(2)
-    stack, R, t, _, _ = case
-    W = weight_matrices(case).sum(axis=1)
-    expected = np.zeros((3, 6, 6))
-    for n, j in enumerate(stack.cloud):
-        y = R[j] @ stack.points[n] + t[j]
-        J = np.hstack([np.cross(np.eye(3), y).T, np.eye(3)])
-        expected[j] += J.T @ W[n] @ J
-    blocks = quadratic_of(*case).blocks
-    assert blocks == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+    case = tiles_case(4)
+    _, by_pose, _ = jacobians(case)
+    of_ranges = by_pose[: len(case.tile)]
+    expected = of_ranges.T @ of_ranges
+    blocks = case.quadratic().blocks
+    for j in range(CLOUDS):
+        own = slice(6 * j, 6 * j + 6)
+        largest = np.abs(expected[own, own]).max()
+        assert blocks[j] == pytest.approx(expected[own, own], rel=1e-6, abs=1e-6 * largest)
 
 
-def test_isotropic_components_have_the_paper_s_information() -> None:
-    # Where a component is no surface, W = alpha / s^2: that of a shift is the count over s^2.
-    stack, R, t, mixture, who = random_case(3)
-    even = replace(
-        mixture,
-        var_normal=np.full(8, 0.02**2),
-        var_tangent=np.full(8, ALONG_SURFACE * 0.02**2),
+def test_nothing_holds_a_cloud_along_one_plane() -> None:
+    # A floor tells three of six: a shift along it and the turn about its normal are free.
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (3000, 2)), np.zeros(3000)])
+    stack = stack_of(points, UP.repeat(3000, axis=0), flatness=np.zeros(3000))
+    floor = together(*[surfel(tuple(p), width_m=0.05) for p in points[:200].tolist()])
+    who = expect(stack, *IDENTITY, floor, noise_of(), 1e-9, np.ones(1))
+    blocks = quadratic_of(stack, *IDENTITY, floor, who).blocks[0]
+    assert np.diag(blocks)[[2, 3, 4]] == pytest.approx(np.zeros(3), abs=1e-6)
+    # Heights of 10 mm: a shift upwards is known to 10 mm over the root of 3000.
+    assert blocks[5, 5] == pytest.approx(3000.0 / 0.01**2, rel=1e-3)
+
+
+def test_shape_parameters_are_those_that_the_ranges_determine() -> None:
+    # Offset and two turns of each tile, none of the turn about its own normal: of a tile of 60 mm
+    # with 100 points and 12 mm of noise the prior of 0.2 rad has hardly a part.
+    known = tiles_case().quadratic().shape_parameters()
+    assert 3.0 * TILES - 0.5 < known <= 3.0 * TILES
+    # Points on a line determine two; the turn about it is that of the priors.
+    line = np.column_stack([np.zeros(200), np.linspace(-0.2, 0.2, 200), np.zeros(200)])
+    stack = stack_of(line, UP.repeat(200, axis=0))
+    flat = surfel((0.0, 0.0, 0.0), width_m=0.1)
+    who = expect(stack, *IDENTITY, flat, noise_of(), 1e-12, np.ones(1))
+    assert quadratic_of(stack, *IDENTITY, flat, who).shape_parameters() == pytest.approx(
+        2, abs=0.01
     )
-    blocks = quadratic_of(stack, R, t, even, who).blocks
-    mass = stack.sum_per_cloud(who.alpha.sum(axis=1))
-    for j in range(3):
-        assert blocks[j, 3:, 3:] == pytest.approx(np.eye(3) * mass[j] / 0.02**2, abs=1e-6)
 
 
 def common(quadratic: ShapeQuadratic) -> Array:
     """(6,) information on a common motion of all clouds, over what the blocks claim of it."""
-    together = np.tile(np.eye(6), (len(quadratic.blocks), 1))
+    motion = np.tile(np.eye(6), (len(quadratic.blocks), 1))
     claimed = np.diag(quadratic.blocks.sum(axis=0))
-    return np.asarray(np.diag(together.T @ quadratic.joint() @ together) / claimed)
+    return np.asarray(np.diag(motion.T @ quadratic.joint() @ motion) / claimed)
 
 
-def test_joint_is_positive_semidefinite_with_a_common_shift_in_its_null_space() -> None:
-    quadratic = quadratic_of(*random_case(4))
+@pytest.mark.parametrize("at_optimum", [False, True])
+def test_a_common_motion_is_a_gauge_freedom(at_optimum: bool) -> None:
+    quadratic = tiles_case(4, at_optimum).quadratic()
     H = quadratic.joint()
     np.testing.assert_allclose(H, H.T, rtol=0.0, atol=1e-12 * np.abs(H).max())
     eigenvalues = np.linalg.eigvalsh(H)
     assert eigenvalues[0] > -1e-9 * eigenvalues[-1]
-    assert common(quadratic)[3:] == pytest.approx(np.zeros(3), abs=1e-4)
-    pull = quadratic.gradient.sum(axis=0)[3:]
-    assert np.abs(pull).max() < 1e-3 * np.abs(quadratic.gradient[:, 3:]).max()
+    assert common(quadratic) == pytest.approx(np.zeros(6), abs=1e-9)
+    pull = np.abs(quadratic.gradient.sum(axis=0))
+    assert (pull < 1e-7 * np.abs(quadratic.gradient).max(axis=0)).all()
     # Of the 18 directions it is all that is lost: one shape ties three clouds together.
-    assert eigenvalues[6] > 1e-4 * eigenvalues[-1]
+    assert eigenvalues[6] > 1e-6 * eigenvalues[-1]
 
 
 def test_joint_never_claims_more_than_the_blocks() -> None:
-    quadratic = quadratic_of(*random_case(5))
+    quadratic = tiles_case(5).quadratic()
     taken = np.zeros((18, 18))
     for j in range(3):
         taken[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] = quadratic.blocks[j]
     less = np.linalg.eigvalsh(taken - quadratic.joint())
-    assert less[0] > -1e-9 * less[-1]
+    # But for the priors of six normals: 0.2 rad each.
+    assert less[0] > -TILES / NORMAL_SIGMA_RAD**2
+    assert less[0] > -1e-6 * less[-1]
     assert less[-1] > 0.0
 
 
 def test_quadratic_grows_with_the_weight_of_a_cloud() -> None:
-    stack, R, t, mixture, who = random_case(6)
-    half = replace(who, alpha=who.alpha * np.array([1.0, 0.5, 1.0])[stack.cloud][:, None])
-    full_blocks = quadratic_of(stack, R, t, mixture, who).blocks
-    half_blocks = quadratic_of(stack, R, t, mixture, half).blocks
-    assert half_blocks[1] == pytest.approx(0.5 * full_blocks[1])
-    assert half_blocks[[0, 2]] == pytest.approx(full_blocks[[0, 2]])
+    case = tiles_case(6)
+    stack, R, t, mixture, noise = case.stack, case.R, case.t, case.mixture, case.noise
+    weights = np.array([1.0, 1.0, 1.0]), np.array([1.0, 0.5, 1.0])
+    full, half = (
+        quadratic_of(stack, R, t, mixture, expect(stack, R, t, mixture, noise, 1e-12, w)).blocks
+        for w in weights
+    )
+    assert half[1] == pytest.approx(0.5 * full[1])
+    assert half[[0, 2]] == pytest.approx(full[[0, 2]])
 
 
 def skins(thickness_m: float = 0.025) -> tuple[CloudStack, Array, Array, ShapeQuadratic]:
@@ -587,7 +816,7 @@ def skins(thickness_m: float = 0.025) -> tuple[CloudStack, Array, Array, ShapeQu
     R, t = matrices(poses)
     mixture = seed_mixture(stack, R, t, 150, 0.01)
     for _ in range(6):
-        who = expect(stack, R, t, mixture, 0.05, np.ones(6))
+        who = expect(stack, R, t, mixture, noise_of(0.005), 0.05, np.ones(6))
         mixture = maximised(stack, R, t, mixture, who, 0.005)
     return stack, R, t, quadratic_of(stack, R, t, mixture, who)
 
@@ -596,7 +825,7 @@ RELATIVE = np.kron(np.array([0.5, -0.5] * 3)[:, None], np.eye(6))
 """(36, 6) clouds of the front against clouds of the back."""
 
 
-def test_disjoint_skins_are_explained_by_their_own_components() -> None:
+def test_disjoint_skins_are_explained_by_their_own_surfels() -> None:
     stack, _, _, quadratic = skins()
     # What ties clouds is the coupling: none between a front and a back cloud.
     H = quadratic.joint().reshape(6, 6, 6, 6)
@@ -606,9 +835,9 @@ def test_disjoint_skins_are_explained_by_their_own_components() -> None:
     assert stack.count == 6
 
 
-def test_a_common_turn_is_in_the_null_space() -> None:
+def test_a_common_motion_of_skins_is_in_the_null_space() -> None:
     _, _, _, quadratic = skins()
-    assert common(quadratic)[:3] == pytest.approx(np.zeros(3), abs=1e-3)
+    assert common(quadratic) == pytest.approx(np.zeros(6), abs=1e-9)
 
 
 def test_clouds_of_disjoint_skins_have_no_information_on_each_other() -> None:
@@ -627,18 +856,21 @@ def test_clouds_of_disjoint_skins_have_less_relative_information_than_the_blocks
     assert (joint / claimed).max() < 0.05
 
 
-# ------------------------------------------------------------------ components
+# ------------------------------------------------------------------ surfels
 
 
-def test_means_are_weighted_means() -> None:
+def test_planes_go_through_the_weighted_means_of_their_points() -> None:
+    # Straight from above: the beams meet the plane at the points' places along it.
     points = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [2.0, 0.0, 0.0]])
     who = held(
         np.array([[0, 1], [1, 0], [0, 2]]),
         np.array([[300.0, 100.0], [100.0, 100.0], [400.0, 0.0]]),
     )
-    places = [component((0.1 * k, 0.0, 0.0), sigma_tangent=0.3) for k in range(3)]
-    after = maximised(
-        stack_of(points, UP.repeat(3, axis=0)), *IDENTITY, together(*places), who, 0.01
+    places = [surfel((0.1 * k, 0.0, 0.0), width_m=0.3) for k in range(3)]
+    stack = stack_of(points, UP.repeat(3, axis=0), flatness=np.zeros(3))
+    cells = cell_moments(stack, who, 3)
+    after = maximise_shape(
+        stack, *IDENTITY, together(*places), 0.01, cells, who.counts, np.zeros((3, 3))
     )
     # (300 x 0 + 100 x (1, 2, 3) + 400 x (2, 0, 0)) / 800.
     assert after.means_target[0] == pytest.approx([900 / 800, 200 / 800, 300 / 800], rel=1e-4)
@@ -646,8 +878,8 @@ def test_means_are_weighted_means() -> None:
     assert after.weights == pytest.approx([0.8, 0.2, 0.0], abs=1e-4)
 
 
-def test_components_learn_the_surface_and_its_noise() -> None:
-    # One component on a plane tilted by 30 degrees, 4 mm of noise, 0.2 m wide.
+def test_surfels_learn_the_surface() -> None:
+    # One surfel on a plane tilted by 30 degrees, 4 mm of noise, 0.2 m wide.
     rng = np.random.default_rng(8)
     tilt = math.radians(30.0)
     normal = np.array([math.sin(tilt), 0.0, math.cos(tilt)])
@@ -656,60 +888,67 @@ def test_components_learn_the_surface_and_its_noise() -> None:
     points = u * along + v * np.array([0, 1.0, 0]) + 0.004 * rng.normal(size=(4000, 1)) * normal
     points += np.array([1.0, 2.0, 3.0])
     stack = stack_of(points, np.tile(normal, (4000, 1)))
-    who = held(np.zeros((4000, 1), np.int64), np.ones((4000, 1)))
-    before = component((0.9, 2.0, 3.0), (0.0, 0.0, 1.0))
-
-    after = maximised(stack, *IDENTITY, before, who, 0.001)
-
-    assert after.means_target[0] == pytest.approx([1.0, 2.0, 3.0], abs=5e-3)
+    mixture = surfel((0.9, 2.0, 3.0), (0.0, 0.0, 1.0), width_m=0.2)
+    for _ in range(12):
+        who = expect(stack, *IDENTITY, mixture, noise_of(0.02), 1e-9, np.ones(1))
+        mixture = maximised(stack, *IDENTITY, mixture, who, 0.001)
+    assert mixture.means_target[0] == pytest.approx([1.0, 2.0, 3.0], abs=5e-3)
     # The points' own plane: 4 mm over 58 mm and the root of 4000 are 1.1 mrad.
-    assert after.normals_target[0] == pytest.approx(normal, abs=4e-3)
-    assert math.sqrt(after.var_normal[0]) == pytest.approx(0.004, rel=0.05)
+    assert mixture.normals_target[0] == pytest.approx(normal, abs=4e-3)
     # Uniform over 0.2 m: 0.2 / sqrt(12).
-    assert math.sqrt(after.var_tangent[0]) == pytest.approx(0.0577, rel=0.05)
-    floored = maximised(stack, *IDENTITY, before, who, 0.01)
-    assert math.sqrt(floored.var_normal[0]) == pytest.approx(0.01)
-    assert floored.var_tangent == pytest.approx(after.var_tangent)
+    assert math.sqrt(mixture.var_tangent[0]) == pytest.approx(0.0577, rel=0.05)
+    floored = maximised(stack, *IDENTITY, mixture, who, 0.1)
+    assert math.sqrt(floored.var_tangent[0]) == pytest.approx(0.1)
 
 
-def test_normals_of_components_are_those_that_can_be_trusted() -> None:
-    # Of 20 points 4 have a normal, upwards; what the others say, sideways, is noise.
+def test_a_point_on_its_own_has_the_least_width() -> None:
+    stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
+    who = expect(stack, *IDENTITY, surfel((0.3, 0.3, 0.3)), noise_of(), 1e-9, np.ones(1))
+    after = maximised(stack, *IDENTITY, surfel((0.3, 0.3, 0.3)), who, 0.0)
+    assert math.sqrt(after.var_tangent[0]) == pytest.approx(LEAST_EXTENT_M)
+
+
+def test_normals_of_surfels_are_drawn_to_those_that_can_be_trusted() -> None:
+    # Of 20 points 4 have a normal, leaning 0.1 rad; what the others say, sideways, is noise.
+    leaning = np.array([math.sin(0.1), 0.0, math.cos(0.1)])
     normals = np.tile([1.0, 0.0, 0.0], (20, 1))
-    normals[:4] = UP
+    normals[:4] = leaning
     flatness = np.where(np.arange(20) < 4, 1.0, 0.0)
-    stack = stack_of(np.zeros((20, 3)), normals, flatness=flatness)
+    beams = np.tile(-UP, (20, 1))
+    stack = stack_of(np.zeros((20, 3)), normals, beams=beams, flatness=flatness)
     who = held(np.zeros((20, 1), np.int64), np.ones((20, 1)))
-    after = maximised(stack, *IDENTITY, component((0, 0, 0)), who, 0.01)
-    assert after.normals_target[0] == pytest.approx([0.0, 0.0, 1.0], abs=1e-3)
+    flat = surfel((0.0, 0.0, 0.0))
+    quadratic = quadratic_of(stack, *IDENTITY, flat, who)
+    # A fifth of 1 / 0.2^2 against 1 / 1 rad^2.
+    known = 0.2 / NORMAL_SIGMA_RAD**2
+    assert quadratic.normal_information == pytest.approx([known + SEEN_SIGMA_RAD**-2])
+    turn = 0.1 * known / (known + SEEN_SIGMA_RAD**-2)
+    assert quadratic.turns[0] == pytest.approx([0.0, turn, 0.0], abs=1e-9)
 
 
-def test_weights_of_components_are_their_part_of_the_points() -> None:
+def test_weights_of_surfels_are_their_part_of_the_points() -> None:
     rng = np.random.default_rng(9)
     stack = stack_of(rng.normal(size=(40, 3)), UP.repeat(40, axis=0))
     who = held(np.tile([0, 1], (40, 1)), np.tile([0.6, 0.2], (40, 1)))
-    pair = together(component((0, 0, 0)), component((1, 0, 0)))
+    pair = together(surfel((0, 0, 0)), surfel((1, 0, 0)))
     after = maximised(stack, *IDENTITY, pair, who, 0.01)
     assert after.weights == pytest.approx([0.75, 0.25], abs=1e-4)
 
 
-def test_an_abandoned_component_stays_defined() -> None:
+def test_an_abandoned_surfel_stays_where_it_was() -> None:
     stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
-    who = held(np.zeros((20, 1), np.int64), np.ones((20, 1)))
-    pair = together(component((0.3, 0.3, 0.3)), component((1, 0, 0), (0.0, 1.0, 0.0)))
+    who = replace(
+        held(np.zeros((20, 1), np.int64), np.ones((20, 1))),
+        counts=np.array([20.0, 0.0]),
+        component_levers=np.zeros((2, 3)),
+    )
+    pair = together(surfel((0.3, 0.3, 0.3)), surfel((1, 0, 0), (0.0, 1.0, 0.0)))
     after = maximised(stack, *IDENTITY, pair, who, 0.01)
-    for values in (after.means_target, after.var_normal, after.var_tangent, after.weights):
+    for values in (after.means_target, after.var_tangent, after.weights):
         assert np.isfinite(values).all()
+    assert after.means_target[1] == pytest.approx([1.0, 0.0, 0.0])
     assert after.normals_target[1] == pytest.approx([0.0, 1.0, 0.0])
     assert after.weights[1] < 1e-4
-    assert (after.var_normal >= 0.01**2 - 1e-12).all()
-
-
-def test_an_abandoned_component_stays_where_it_was() -> None:
-    stack = stack_of(np.full((20, 3), 0.3), UP.repeat(20, axis=0))
-    who = held(np.zeros((20, 1), np.int64), np.ones((20, 1)))
-    pair = together(component((0.3, 0.3, 0.3)), component((1, 0, 0), (0.0, 1.0, 0.0)))
-    after = maximised(stack, *IDENTITY, pair, who, 0.01)
-    assert after.means_target[1] == pytest.approx([1.0, 0.0, 0.0])
 
 
 def seed_case() -> tuple[CloudStack, Array, Array]:
@@ -733,7 +972,7 @@ def seed_case() -> tuple[CloudStack, Array, Array]:
     return stack_clouds(observe(clouds), 2000, 0.001), *matrices(poses)
 
 
-def test_every_cloud_seeds_as_many_components() -> None:
+def test_every_cloud_seeds_as_many_surfels() -> None:
     stack, R, t = seed_case()
     mixture = seed_mixture(stack, R, t, 90, 0.03)
     points = stack.moved(R, t)
@@ -744,7 +983,6 @@ def test_every_cloud_seeds_as_many_components() -> None:
     # Normals and widths of the seeds.
     expected = stack.rotated(R, stack.normals)[drawn]
     np.testing.assert_array_equal(mixture.normals_target, expected)
-    assert mixture.var_normal == pytest.approx(np.full(90, 0.03**2))
     assert mixture.var_tangent == pytest.approx(np.full(90, 0.03**2))
     assert mixture.weights.sum() == pytest.approx(1.0)
 
@@ -759,7 +997,7 @@ def test_seeds_are_the_same_points_wherever_the_clouds_are() -> None:
     assert [row[tuple(m)] for m in here.tolist()] == [moved_row[tuple(m)] for m in there.tolist()]
 
 
-def test_no_more_components_than_points_can_tell() -> None:
+def test_no_more_surfels_than_points_can_tell() -> None:
     stack, R, t = seed_case()
     mixture = seed_mixture(stack, R, t, 5000, 0.03)
     # Ten points of each: 900 + 150 + 90 in all.

@@ -262,9 +262,7 @@ def test_without_normals_the_skins_are_pulled_together() -> None:
     state = JointRegistration(scene.observation, config_of(components=200, lidar_range_m=0.003))
     R, _ = matrices(scene.T_target_lidar)
     ahead = np.swapaxes(R, 1, 2)[state.clouds.cloud][:, :, 0]
-    state.clouds = replace(
-        state.clouds, normals=ahead, beams=-ahead, flatness=np.ones(len(ahead))
-    )
+    state.clouds = replace(state.clouds, normals=ahead, beams=-ahead, flatness=np.ones(len(ahead)))
     guess = guesses(scene.T_target_lidar, 1, 1.0, 0.3)
     registration = register_jointly(state, guess, 100)
     e = errors(registration.T_target_lidar, scene.T_target_lidar)
@@ -334,7 +332,9 @@ def against_a_known_shape(sigma_m: float) -> tuple[Array, Array]:
                 for est, true in zip(unstack(R, t), scene.T_target_lidar, strict=True)
             ]
         )
-        information.append(quadratic_at(clouds, R, t, teacher.mixture, teacher.noise, np.ones(6))[0].blocks)
+        information.append(
+            quadratic_at(clouds, R, t, teacher.mixture, teacher.noise, np.ones(6))[0].blocks
+        )
     return np.array(e), np.array(information)
 
 

@@ -37,7 +37,7 @@ def views(centres_lidar: Array) -> Array:
 
 
 def weights_of_views(count: Array, shared: Array | float = TYPICAL_SHARED) -> Array:
-    """(n,) weight, 0 to 1, of clouds whose view `count` (n,) have: a part of their errors is common.
+    """(n,) weight, 0 to 1, of clouds whose view `count` (n,) have: errors are shared in part.
 
     The variance of a mean of c errors with the correlation `shared` is that of
     c / (1 + (c - 1) shared) independent ones (Kish's design effect).

@@ -222,6 +222,7 @@ def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normal
         if normals:
             shape.refine_normals(R, t)
         shape.seed(R, t, FINE_SIGMA_M)
+        shape.held_along = 0.0
     _hand_weights(state, states)
 
 

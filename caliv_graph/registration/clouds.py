@@ -28,6 +28,11 @@ MERGED_RADIUS_M = 0.03
 """Neighbourhood in aligned clouds: as wide as the leg of a chair, with enough points for a plane at
 10 mm of noise."""
 
+MERGED_WIDEST_M = 0.08
+MERGED_FEWEST = 12
+"""Where the merged clouds are sparse, the neighbourhood is as wide as so many points ask for, but
+no wider than this: a wrong normal is worse than one that is blurred at the edges."""
+
 WINDOW_RAD = math.radians(10.0)
 WINDOW_POINTS = 9000
 """Clouds are merged with those of the same LiDAR from about the same side, nearest direction first,
@@ -243,7 +248,13 @@ def merged_normals(stack: CloudStack, R: Array, t: Array) -> CloudStack:
         around = np.concatenate([whole[i] for i in near])
         own = slice(stack.starts[j], ends[j])
         normals[own], flatness[own] = _normals_across(
-            points[own], around, beams[own], MERGED_NEIGHBOURS, MERGED_RADIUS_M, stack.sigma_range_m
+            points[own],
+            around,
+            beams[own],
+            MERGED_NEIGHBOURS,
+            MERGED_RADIUS_M,
+            stack.sigma_range_m,
+            MERGED_WIDEST_M,
         )
 
     share_out(of_cloud, range(stack.count))
@@ -266,6 +277,7 @@ def _normals_across(
     neighbours: int,
     radius_m: float,
     sigma_range_m: float,
+    widest_m: float = 0.0,
 ) -> tuple[Array, Array]:
     """(n, 3) unit normals and (n,) flatness at points (n, 3) of the surface `around` (N, 3).
 
@@ -280,13 +292,15 @@ def _normals_across(
     there, here = around @ plane, points @ plane
     # Few queries: the time to build the tree matters.
     tree = cKDTree(there, compact_nodes=False, balanced_tree=False)
-    distance, near = tree.query(here, k, distance_upper_bound=radius_m)
+    distance, near = tree.query(here, k, distance_upper_bound=max(radius_m, widest_m))
     distance, near = np.reshape(distance, (-1, k)), np.reshape(near, (-1, k))
-    inside = np.isfinite(distance)
+    enough = distance[:, min(MERGED_FEWEST, k) - 1 :][:, :1]
+    radius = np.clip(enough, radius_m, max(radius_m, widest_m))
+    inside = distance <= radius
     near = np.where(inside, near, 0)
     # The neighbourhood ends at two standard deviations of the kernel: a point that enters or leaves
     # changes nothing abruptly.
-    width_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius_m)
+    width_m = 0.5 * np.where(inside[:, -1:], distance[:, -1:], radius)
     width_m = np.maximum(width_m, 1e-6)
     kernel = np.where(inside, np.exp(-0.5 * (np.where(inside, distance, 0.0) / width_m) ** 2), 0.0)
     depth = (around @ along)[near] - (points @ along)[:, None]

@@ -100,9 +100,16 @@ def seed_mixture(
     return Mixture(
         means_target=points[chosen].copy(),
         normals_target=normals[chosen].copy(),
-        var_tangent=np.full(count, max(sigma_m, LEAST_EXTENT_M) ** 2),
+        var_tangent=np.maximum(_half_apart(points[chosen]), max(sigma_m, LEAST_EXTENT_M)) ** 2,
         weights=np.full(count, 1.0 / count),
     )
+
+
+def _half_apart(places: Array) -> Array:
+    """(K,) half the distance of each of (K, 3) places to its third neighbour: they tile a face."""
+    if len(places) < 4:
+        return np.zeros(len(places))
+    return np.asarray(0.5 * np.asarray(cKDTree(places).query(places, 4)[0])[:, 3])
 
 
 class _Surfels:
@@ -170,6 +177,7 @@ def expect(
     noise: HeightNoise,
     outlier_density: float,
     cloud_weights: Array,
+    held_along: float = 0.0,
 ) -> Responsibilities:
     """E-step: which surfel each beam returned from, and the weights of the points' heights.
 
@@ -181,11 +189,13 @@ def expect(
         noise: of the heights of points over the surface.
         outlier_density: of outliers along a beam, per metre.
         cloud_weights: (J,) weight of each cloud: robust weight times view weight.
+        held_along: weight of what holds points along the surface, per square metre.
     """
     surfels = _Surfels(mixture)
     count, k = len(stack.points), surfels.neighbours
     near = np.empty((count, k), dtype=np.int64)
     alpha, weights, forces = np.empty((count, k)), np.empty((count, k)), np.empty((count, k))
+    along = np.empty((count, k))
     directions, levers, slides = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     pieces = parts(count, count // PART_POINTS + 1)
     sums = [HeightSums.none(stack.lidars)] * len(pieces)
@@ -214,6 +224,7 @@ def expect(
             density, height, cosine, variance, cloud_weights[cloud], lidar, stack.lidars
         )
         weights[part] = density / variance * cloud_weights[cloud][:, None]
+        along[part] = density * (held_along * cloud_weights[cloud])[:, None]
         force = weights[part] * height * slide
         summed = [np.einsum("nk,nk->n", force, n[found]) for n in surfels.normals]
         levers[part] = cross(beams, np.column_stack(summed))
@@ -227,6 +238,7 @@ def expect(
     return Responsibilities(
         component=near,
         weight=weights,
+        weight_along=along,
         counts=np.asarray(
             np.bincount(near.ravel(), alpha.ravel(), len(mixture.weights)), np.float64
         ),

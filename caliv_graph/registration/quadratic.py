@@ -18,11 +18,13 @@ from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.moments import (
+    ALONG_MOMENTS,
     COLUMN,
     HALF_DIAGONAL,
     JACOBIAN,
     MOMENTS,
     NORMALS,
+    PRIOR_COUNT,
     ROW,
     SURFACE_MOMENTS,
     Responsibilities,
@@ -39,6 +41,10 @@ number of cores: so are the bits of the sums."""
 NORMAL_SIGMA_RAD = 0.2
 """Prior of a surfel's normal about the mean normal of its points, 1 sigma, where these are reliable
 and agree. Normals are blurred near edges, and their noise is that of the same points."""
+
+ALONG_PART = 1e-6
+"""Surfels with less than this part of the largest weight along the surface have none to
+lose."""
 
 SEEN_SIGMA_RAD = 1.0
 """The same where they are not: a surfel faces the beams that it was seen by."""
@@ -59,10 +65,12 @@ class ShapeQuadratic:
         blocks: (J, 6, 6) information of each cloud given the shape.
         gradient: (J, 6) g.
         gradient_given_shape: (J, 6) the same where the shape is held: that of `blocks`.
-        across: (K, 6 J) root of the loss to the places of the surfels.
-        moments: (J, K, 11) sums of weight h h^T, h = (1, m), target frame; last the part of the
-            prior of each normal that turns with the cloud.
-        coupling: (K, 11, 3, 6) linear map from the moments of a cloud and surfel to the coupling
+        across: (K', 6 J) roots of the loss to the places of the surfels: across the surface of all,
+            along it where points are held there.
+        moments: (J, K, 21) sums of weight h h^T, h = (1, m), target frame; then the part of the
+            prior of each normal that turns with the cloud; then the sums with the weights along
+            the surface.
+        coupling: (K, 21, 3, 6) linear map from the moments of a cloud and surfel to the coupling
             of its orientation and the cloud.
         prior_turns: (J, J) information of the priors on turns of the clouds, per axis.
         orientation_information: (K, 3, 3) of each surfel, the prior of its normal included.
@@ -91,10 +99,10 @@ class ShapeQuadratic:
         lost: list[Callable[[], Array]] = [lambda: self.across]
         if not given_orientations:
             root = np.linalg.inv(np.linalg.cholesky(self.orientation_information))
-            whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 11, 18)
+            whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 21, 18)
             lost += [
                 partial(self._lost_to_orientations, whitened, own)
-                for own in parts(len(self.across), ORIENTATION_PARTS)
+                for own in parts(len(self.coupling), ORIENTATION_PARTS)
             ]
         squares = [np.empty(0)] * len(lost)
 
@@ -211,35 +219,80 @@ def shape_quadratic(
     known, seen = reliability / NORMAL_SIGMA_RAD**2, 1.0 / SEEN_SIGMA_RAD**2
     torque += known[:, None] * towards
     C += (known + seen)[:, None, None] * np.eye(3)
+    held, E, along_means = _held_along(cells, carry, mixture, W)
+    along_mass = held[..., 0].sum(axis=0) + PRIOR_COUNT
+    along_halves = E[:, *np.triu_indices(3)]
+    along_by_cloud = np.swapaxes(held, 1, 2)
+    gradient += (along_by_cloud @ along_halves).reshape(count, 60) @ _GRADIENTS
+    pull = along_by_cloud[:, :4] @ np.einsum("kab,kb->ka", E, along_means)
+    gradient -= np.einsum("jac,ace->je", pull, JACOBIAN)
+    C += _orientation_information(scatter_about(held.sum(axis=0), along_means), E)
+    coupling = np.concatenate([coupling, _coupling(E, along_means)[:, :10]], axis=1)
     turns = np.linalg.solve(C, torque[..., None])[..., 0]
     # The normals of the points and the beams turn with their clouds: so do the priors.
     parts_of_weight = points[..., 0] / mass
     by_normals = known * parts_of_normal
     gradient[:, :3] += by_normals @ towards
-    with_priors = np.concatenate(
-        [moments, (by_normals + seen * parts_of_weight)[..., None]], axis=2
+    turning = np.concatenate(
+        [moments, (by_normals + seen * parts_of_weight)[..., None], held], axis=2
     )
     lost = np.einsum("kqae,ka->kqe", coupling, turns)
-    gradient -= with_priors.reshape(count, 11 * K) @ lost.reshape(11 * K, 6)
+    gradient -= turning.reshape(count, 21 * K) @ lost.reshape(21 * K, 6)
     sums = moments[..., :4].transpose(1, 0, 2)
     across = np.empty((K, count, 6))
     root = n / np.sqrt(mass)[:, None]
     across[..., :3] = cross(sums[..., 1:], root[:, None])
     across[..., 3:] = sums[..., :1] * root[:, None]
+    aside = _lost_along(held, mixture, along_mass)
+    blocks = (np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS
+    blocks += (along_by_cloud @ along_halves).reshape(count, 60) @ _BLOCKS
     return ShapeQuadratic(
-        blocks=((np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS).reshape(
-            count, 6, 6
-        ),
+        blocks=blocks.reshape(count, 6, 6),
         gradient=np.asarray(gradient),
         gradient_given_shape=np.asarray(given_shape),
-        across=across.reshape(K, 6 * count),
-        moments=with_priors,
+        across=np.concatenate([across.reshape(K, 6 * count), aside]),
+        moments=turning,
         coupling=coupling,
         prior_turns=by_normals @ parts_of_normal.T + seen * parts_of_weight @ parts_of_weight.T,
         orientation_information=C,
         turns=np.asarray(turns),
         normal_information=known + seen,
     )
+
+
+def _held_along(
+    cells: Array, carry: Array, mixture: Mixture, W: Array
+) -> tuple[Array, Array, Array]:
+    """(J, K, 10) moments with the weights along the surface, (K, 3, 3) projections on it, means.
+
+    Residuals along the surface are those of points of one surfel against the mean of all of them.
+    """
+    held = np.matmul(cells[..., ALONG_MOMENTS], carry)
+    means = mass_and_means(held.sum(axis=0), mixture)[1]
+    return held, np.eye(3) - W, means
+
+
+def _lost_along(held: Array, mixture: Mixture, mass: Array) -> Array:
+    """(K', 6 J) roots of the loss to the places along the surface, where points are held."""
+    count = len(held)
+    taking = np.flatnonzero(mass > ALONG_PART * mass.max())
+    sums = held[:, taking, :4].transpose(1, 0, 2)
+    rows = []
+    for axis in np.moveaxis(tangents(mixture.normals_target[taking]), 1, 0):
+        root = axis / np.sqrt(mass[taking])[:, None]
+        own = np.empty((len(taking), count, 6))
+        own[..., :3] = cross(sums[..., 1:], root[:, None])
+        own[..., 3:] = sums[..., :1] * root[:, None]
+        rows.append(own.reshape(len(taking), 6 * count))
+    return np.concatenate(rows)
+
+
+def tangents(normals: Array) -> Array:
+    """(K, 2, 3) two orthogonal directions along each surface, of (K, 3) normals."""
+    steep = np.abs(normals[:, 2:]) > 0.9
+    first = cross(normals, np.where(steep, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return np.stack([first, cross(normals, first)], axis=1)
 
 
 def _normal_prior(

@@ -45,6 +45,11 @@ FLOOR_PER_RANGE_SIGMA = 0.3
 """Final floor of the roughness, over the sigma of the noise along the beam: from then on the
 roughness is what the heights say."""
 
+HELD_ALONG_M = 0.05
+"""1 sigma that a point is held with along the surface at the others of its surfel, where no graph
+holds the clouds: one of a flat side would slide along it to where noise fits best. It is a bias,
+towards where the beams of all clouds fell; the joint loop does without."""
+
 DAMPING = 1e-3
 """Levenberg-Marquardt damping, relative to the block of each cloud. Clouds that share no component
 (two LiDARs that saw different skins) keep the relative pose of the pre-alignment."""
@@ -84,6 +89,7 @@ class JointRegistration:
         observation: the clouds as they were extracted.
         clouds: the same, thinned and stacked.
         tolerance: (rad, m) of `register_jointly`.
+        held_along: what holds points along surfaces, per square metre; 0 where a graph does.
         weights: (J,) robust weight of each cloud, set from outside.
         noise: of the heights of the points of each LiDAR, estimated at the end of annealing.
         inlier_ratio: (J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step.
@@ -137,6 +143,7 @@ class JointRegistration:
         # Until the noise is known, as much is taken to be shared as is typical.
         self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)
         self.weights: Array = np.ones(self.clouds.count)
+        self.held_along = HELD_ALONG_M**-2.0
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
@@ -165,7 +172,7 @@ class JointRegistration:
         low, high = np.percentile(points, [1, 99], axis=0)
         self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
         self._floor = max(sigma_m, self._floor_end)
-        distinct = float((self.clouds.sizes / self._views).sum())
+        distinct = float((self.clouds.sizes * self.view_weights).sum())
         self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor, distinct)
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
@@ -174,7 +181,7 @@ class JointRegistration:
         noise = replace(self.noise, floor_m=0.0 if self.finest else self._floor)
         density = self._gamma / (self._depth_m * (self._gamma + 1.0))
         weights = self.weights * self.view_weights
-        who = expect(self.clouds, R, t, self.mixture, noise, density, weights)
+        who = expect(self.clouds, R, t, self.mixture, noise, density, weights, self.held_along)
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)

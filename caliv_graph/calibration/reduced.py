@@ -58,6 +58,10 @@ class Reduced:
                 out[name] = (value, float(np.sqrt(variance)))
         return out
 
+    def in_tangents(self, information: Array) -> Array:
+        """(6n, 6n) information of the extrinsics, vehicle axes, in tangents of the graph's."""
+        return np.asarray(self._to_axes.T @ information @ self._to_axes, np.float64)
+
     def step_with(self, prior: Array, offset: Array) -> Array:
         """The step (6n,) that data and guesses together call for.
 
@@ -77,8 +81,7 @@ class Reduced:
         H, gradient = self.clouds
         guesses = np.zeros_like(self.system.H)
         of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
-        prior = self._to_axes.T @ problem.guess_information() @ self._to_axes
-        guesses[of_extrinsics, of_extrinsics] = prior
+        guesses[of_extrinsics, of_extrinsics] = self.in_tangents(problem.guess_information())
         return LinearisedGraph(
             information=self.system.H,
             gradient=self.system.b,

@@ -19,6 +19,12 @@ from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.range_bias import (
+    TYPICAL_BIAS_M,
+    bias_directions,
+    fit_bias_sigma,
+    without_bias,
+)
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
@@ -61,9 +67,9 @@ threshold does not make the estimate jump for ever."""
 SCALED_EVERY = 3
 """Iterations at the noise level from one estimate of the registration's scale to the next."""
 
-JACKKNIFE_AFTER = 3
-"""Iterations at the noise level after which the scale is estimated by a jackknife, once: it costs
-as much as the loop."""
+BIAS_AFTER = 4
+"""Iterations at the noise level after which the sigma of the biases is estimated, once: with the
+biases free the shapes fit each other, and contradict nothing any more."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
 STEP_SIGMAS = 0.1
@@ -109,7 +115,8 @@ class _Loop:
     """What the iterations carry along; `base` is the graph without clouds and guesses.
 
     `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed;
-    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it.
+    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it;
+    `bias_m`: sigma of the biases of the ranges.
     """
 
     state: SolveState
@@ -119,15 +126,15 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
     jackknife: float = 1.0
+    bias_m: float = TYPICAL_BIAS_M
 
     def linearised(self) -> tuple[_Shapes, Reduced]:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
         state = self.state
         lines = linearise_clouds(state.problem, state.values)
         shapes = _expect(self.states, lines, state.turns)
-        clouds = shapes.joint(state.scale)
         begun = time.perf_counter()
-        reduced = reduce_to_extrinsics(state.problem, state.values, self.base, clouds, lines)
+        reduced = self._without_bias(shapes, lines)
         state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
@@ -143,8 +150,23 @@ class _Loop:
         clouds, lines = shapes.joint(1.0), reduced.lines
         contradicted = fit_scale(state.problem, lines, clouds, state.values, state.noise)
         state.scale = max(contradicted, self.jackknife)
-        clouds = shapes.joint(state.scale)
-        return reduce_to_extrinsics(state.problem, state.values, self.base, clouds, lines)
+        return self._without_bias(shapes, lines)
+
+    def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
+        """Estimates the sigma of the biases at a linearisation, and applies it to that."""
+        reduced = self._reduced(shapes.joint(self.state.scale), lines)
+        directions = bias_directions(self.states, shapes.poses)
+        self.bias_m = fit_bias_sigma(reduced, directions, reduced.in_tangents(self.prior))
+        return self._without_bias(shapes, lines)
+
+    def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
+        return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
+
+    def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
+        """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
+        directions = bias_directions(self.states, shapes.poses)
+        clouds = without_bias(*shapes.joint(self.state.scale), directions, self.bias_m)
+        return self._reduced(clouds, lines)
 
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
@@ -152,11 +174,11 @@ class _Loop:
         shapes, reduced = self.linearised()
         begun = time.perf_counter()
         if all(shape.finest for shape in self.states):
-            if self.fine == JACKKNIFE_AFTER:
-                self.jackknife = self.left_out(reduced)
             if self.fine % SCALED_EVERY == 0:
                 reduced = self.scaled(shapes, reduced)
             self.fine += 1
+            if self.fine == BIAS_AFTER:
+                reduced = self.with_bias(shapes, reduced.lines)
         step, lost = self._step(reduced, number)
         squared = self._squares(shapes, reduced.lines)
         state.values = reduced.move(step)
@@ -208,7 +230,7 @@ class _Loop:
         """Whether the loop may end after an iteration."""
         small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
         return bool(
-            self.fine > JACKKNIFE_AFTER
+            self.fine > BIAS_AFTER
             and all(s.finest for s in self.states)
             and (small or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
@@ -315,6 +337,7 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     state, problem = loop.state, loop.state.problem
     shapes, reduced = loop.linearised()
     begun = time.perf_counter()
+    loop.jackknife = loop.left_out(reduced)
     reduced = loop.scaled(shapes, reduced)
     if state.config.solve.mode == "auto":
         split = spectrum(reduced.D, loop.prior, loop.undetermined)

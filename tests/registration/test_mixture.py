@@ -18,7 +18,7 @@ from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.heights import HeightNoise, HeightSums
 from caliv_graph.registration.mixture import (
-    SEE_THROUGH,
+    BESIDE,
     LEAST_EXTENT_M,
     MAX_TURN_RAD,
     STEEP,
@@ -104,7 +104,7 @@ UP = np.array([[0.0, 0.0, 1.0]])
 SURE = 2.0 * 4.0 / -math.expm1(-8.0)
 """Density of a reliable normal that agrees, over that of any: von Mises-Fisher of 4."""
 
-THERE = 1.0 / (1.0 + SEE_THROUGH)
+THERE = 1.0 / (1.0 + BESIDE)
 """Presence of a surfel that a beam meets in its middle, alone."""
 
 
@@ -119,6 +119,7 @@ def held(component: IntArray, weight: Array, clouds: int = 1) -> Responsibilitie
         explained=np.ones(len(weight)),
         inlier_ratio=np.ones(clouds),
         levers=np.zeros((clouds, 3)),
+        weight_along=np.zeros_like(weight),
         component_levers=np.zeros((surfels, 3)),
         slides_m=np.zeros(len(weight)),
         heights=HeightSums.none(1),
@@ -172,7 +173,7 @@ def test_responsibility_of_one_surfel_by_hand() -> None:
     # other surface is there. At five widths e^-12.5 = 3.7e-6 is less than "no surface here".
     beside = np.array([[0.2, 0.0, 0.01], [0.5, 0.0, 0.01]])
     a, b = math.exp(-2.0), math.exp(-12.5)
-    expected = [n / (n + SEE_THROUGH) / (n / (n + SEE_THROUGH) + 1.0) for n in (a, b)]
+    expected = [n / (n + BESIDE) / (n / (n + BESIDE) + 1.0) for n in (a, b)]
     assert explained(beside, alone, noise_of(), density) == pytest.approx(expected, rel=1e-3)
     assert expected[0] > 0.499
     assert expected[1] < 0.04
@@ -224,7 +225,7 @@ def test_a_beam_nearly_along_the_surface_is_hardly_followed() -> None:
     # A beam that flat sees the surface for 0.8; the noise across it is that of f = 0.1.
     there = 0.8 * math.exp(-0.5 * (0.03 * beam[0, 0] / 0.05) ** 2)
     variance = (STEEP * 0.05) ** 2 + 0.02**2
-    expected = there / (there + SEE_THROUGH) * STEEP / math.sqrt(2.0 * math.pi * variance)
+    expected = there / (there + BESIDE) * STEEP / math.sqrt(2.0 * math.pi * variance)
     expected *= math.exp(-0.5 * 0.01**2 / variance) * SURE
     assert who.explained == pytest.approx([expected / (expected + 100.0)], rel=1e-6)
     # From behind, or along it, it is not followed at all.

@@ -411,6 +411,8 @@ class Solution:
         residuals: whitened pose-factor residuals, (J, 6) per placement.
         pose_noise: error model of the given poses that was used; None: no poses were given.
         registration_scale: factor on the sigmas of the registration, estimated from the data.
+        range_bias_m: 1 sigma of a bias of the ranges of each LiDAR on each target, estimated; 0:
+            none was looked for.
         information_data: (6n, 6n) of the data alone, no prior on the extrinsics.
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
@@ -454,6 +456,7 @@ class Solution:
     time_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     gradient_data: Array | None = None
+    range_bias_m: float = 0.0
     course: tuple[Iteration, ...] = ()
 
 

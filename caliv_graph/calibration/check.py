@@ -68,6 +68,7 @@ def check(
             counts=cloud_counts(solution, trajectories),
             registration_scale=solution.registration_scale,
             registration_sigma=registration_sigma(solution),
+            range_bias_m=solution.range_bias_m,
             assumed=assumptions(solution, drives),
             headings=[
                 consistency.Heading(

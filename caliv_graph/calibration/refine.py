@@ -97,6 +97,7 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
+    state.range_bias_m = TYPICAL_BIAS_M
     loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
     _begin_shapes(state, states, normals=False)
     course: list[Iteration] = []
@@ -115,8 +116,7 @@ class _Loop:
     """What the iterations carry along; `base` is the graph without clouds and guesses.
 
     `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed;
-    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it;
-    `bias_m`: sigma of the biases of the ranges.
+    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it.
     """
 
     state: SolveState
@@ -126,7 +126,6 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
     jackknife: float = 1.0
-    bias_m: float = TYPICAL_BIAS_M
 
     def linearised(self) -> tuple[_Shapes, Reduced]:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
@@ -156,7 +155,9 @@ class _Loop:
         """Estimates the sigma of the biases at a linearisation, and applies it to that."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
         directions = bias_directions(self.states, shapes.poses)
-        self.bias_m = fit_bias_sigma(reduced, directions, reduced.in_tangents(self.prior))
+        self.state.range_bias_m = fit_bias_sigma(
+            reduced, directions, reduced.in_tangents(self.prior)
+        )
         return self._without_bias(shapes, lines)
 
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
@@ -165,7 +166,7 @@ class _Loop:
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
         directions = bias_directions(self.states, shapes.poses)
-        clouds = without_bias(*shapes.joint(self.state.scale), directions, self.bias_m)
+        clouds = without_bias(*shapes.joint(self.state.scale), directions, self.state.range_bias_m)
         return self._reduced(clouds, lines)
 
     def iterate(self, number: int) -> Iteration:

@@ -79,6 +79,8 @@ class SolveState:
     turns: tuple[Symmetry | None, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
+    range_bias_m: float = 0.0
+    """1 sigma of the biases of the ranges; 0: none is looked for."""
 
 
 def solve_registered(

@@ -44,6 +44,10 @@ SCALE_LIMIT = 5.0
 channel's calibration error: with about 25 points of a channel on a chair 8 m away, sigmas are
 sqrt(25) times as large. No known LiDAR effect exceeds this."""
 
+RANGE_BIAS_LIMIT_M = 0.005
+"""1 sigma of the biases of ranges that a calibration may have: data sheets of LiDARs state a
+repeatability of 3 to 10 mm, and what is left of it on one material is less."""
+
 OUTLIERS = 0.1
 """Fraction of a LiDAR's clouds that may be outliers: the paper's k = 10 percent."""
 
@@ -167,6 +171,7 @@ class CheckInputs:
         counts: of outliers.
         registration_scale: sigmas of the registrations over what their points' scatter gives.
         registration_sigma: rad and m, of the median cloud, scaled.
+        range_bias_m: 1 sigma of the biases of the ranges, metres.
         assumed: quantities that the config assumes.
         headings: of the drives that have one.
         speed_m_s: median over the clouds.
@@ -177,6 +182,7 @@ class CheckInputs:
     counts: Sequence[CloudCount] = ()
     registration_scale: float = 1.0
     registration_sigma: tuple[float, float] = (0.0, 0.0)
+    range_bias_m: float = 0.0
     assumed: Sequence[Assumed] = ()
     headings: Sequence[Heading] = ()
     speed_m_s: float = 0.0
@@ -226,8 +232,27 @@ class CoarseRegistrations:
     likely: CloudCount | ScoreTest | None
 
 
+@dataclass(frozen=True)
+class RangesDisagree:
+    """Ranges of LiDARs on several targets that no mounting brings together.
+
+    Attributes:
+        sigma_m: of the biases of each LiDAR on each target, metres.
+        lidars: that take part.
+    """
+
+    sigma_m: float
+    lidars: tuple[str, ...]
+
+
 Contradiction = (
-    GuessContradiction | CloudCount | CoarseRegistrations | ScoreTest | Assumed | Heading
+    GuessContradiction
+    | CloudCount
+    | CoarseRegistrations
+    | RangesDisagree
+    | ScoreTest
+    | Assumed
+    | Heading
 )
 """One finding; `wording.contradictions` makes a sentence of it."""
 
@@ -238,6 +263,7 @@ def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
         *against_guesses(inputs.lidars, inputs.speed_m_s),
         *(count for count in inputs.counts if too_many_outliers(count)),
         *coarse_registrations(inputs),
+        *disagreeing_ranges(inputs),
         *(test for test in inputs.score_tests if p_value(test) < CONTRADICTION_P),
         *(each for each in inputs.assumed if assumption_contradicted(each)),
         *(heading for heading in inputs.headings if heading_contradicted(heading)),
@@ -322,6 +348,13 @@ def coarse_registrations(inputs: CheckInputs) -> tuple[CoarseRegistrations, ...]
             likely,
         ),
     )
+
+
+def disagreeing_ranges(inputs: CheckInputs) -> tuple[RangesDisagree, ...]:
+    """Whether the ranges on the targets contradict each other by more than LiDARs are off."""
+    if inputs.range_bias_m < RANGE_BIAS_LIMIT_M:
+        return ()
+    return (RangesDisagree(inputs.range_bias_m, tuple(inputs.lidars)),)
 
 
 def p_value(test: ScoreTest) -> float:

@@ -11,6 +11,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.uncertainty.consistency import (
     FAR_M,
     OUTLIERS,
+    RANGE_BIAS_LIMIT_M,
     SCALE_LIMIT,
     Assumed,
     CloudCount,
@@ -18,6 +19,7 @@ from caliv_graph.uncertainty.consistency import (
     Contradiction,
     GuessContradiction,
     Heading,
+    RangesDisagree,
     ScoreTest,
     difference,
     lateness,
@@ -41,6 +43,8 @@ def contradiction_sentence(found: Contradiction) -> str:
             )
         case CoarseRegistrations():
             return _coarse(found)
+        case RangesDisagree():
+            return _ranges(found)
         case ScoreTest():
             return f"{_score_test(found)}. {_SCORE_TEST_REMEDIES[found.kind]}"
         case Assumed():
@@ -136,6 +140,17 @@ def _coarse(found: CoarseRegistrations) -> str:
         f"{1e3 * shift:.0f} mm, {found.scale:.0f} times what the scatter of their points gives "
         f"(limit {SCALE_LIMIT:.0f}).{likely} Check the stamps of every LiDAR, and that no mount "
         "and no target moved"
+    )
+
+
+def _ranges(found: RangesDisagree) -> str:
+    names = " and ".join(f"'{name}'" for name in found.lidars)
+    return (
+        f"the ranges of the lidars {names} on the targets contradict each other: no mounting brings "
+        f"them together unless each range on each target is off by {1e3 * found.sigma_m:.0f} mm "
+        f"(1 sigma; limit {1e3 * RANGE_BIAS_LIMIT_M:.0f} mm). Check the range calibration of the "
+        "LiDARs and that no target moved; use matt targets of one material, and see each from "
+        "several sides"
     )
 
 

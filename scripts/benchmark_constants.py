@@ -3,7 +3,7 @@
 Needs the environment that scripts/demo makes:
 
     .venv/bin/python scripts/benchmark_constants.py
-    .venv/bin/python scripts/benchmark_constants.py --only mixture.ALONG_SURFACE --seeds 5
+    .venv/bin/python scripts/benchmark_constants.py --only mixture.BESIDE --seeds 5
     .venv/bin/python scripts/benchmark_constants.py --summary
 
 Each drive is simulated and calibrated with every constant as it is, then with one constant at a

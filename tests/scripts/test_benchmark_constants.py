@@ -133,7 +133,7 @@ def test_a_constant_changes_a_drive(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     monkeypatch.setattr(drives, "_recording", lambda *_: recording)
 
     own = drives.performed("given", 1, tmp_path, SMALL, early=False)
-    with patched("caliv_graph.registration.mixture", "ALONG_SURFACE", 0.5):
+    with patched("caliv_graph.registration.quadratic", "NORMAL_SIGMA_RAD", 0.8):
         other = drives.performed("given", 1, tmp_path, SMALL, early=False)
 
     found = benchmark.effect([own], [other])

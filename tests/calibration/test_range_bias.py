@@ -144,7 +144,7 @@ def biased(bias_m: float, seed: int, *, placements: int = 6) -> tuple[Reduced, A
     case = make_case(count=10, drives=placements, seed=seed)
     rng = np.random.default_rng(100 + seed)
     directions = directions_of(case)
-    drawn = bias_m * rng.normal(size=directions.shape[1])
+    drawn = bias_m * rng.normal(size=(directions.shape[1],))
     moved = directions @ drawn
     for j, information in enumerate(case.information):
         root = np.linalg.cholesky(information)

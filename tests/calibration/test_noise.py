@@ -8,9 +8,11 @@ from collections.abc import Iterator
 import gtsam
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.graph import with_given_poses
+from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.noise import (
     CEILINGS,
     FLOORS,
@@ -18,6 +20,7 @@ from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
     first_pose_noise,
     fit_pose_noise,
+    fit_scale,
 )
 from caliv_graph.config.model import NoiseConfig
 from caliv_graph.products import PoseNoise
@@ -97,6 +100,44 @@ SEEDS = range(2)
 def test_scale_of_the_registration_is_found(scale: float, seed: int) -> None:
     _, found = fitted(BOTH, seed, scale=scale)
     assert found == pytest.approx(scale, rel=0.15)
+
+
+def scale_of_quadratic(scale: float, seed: int) -> float:
+    """Of clouds whose errors are `scale` times those of their quadratic, the poses' noise known."""
+    case = make_case(count=24, seed=seed)
+    problem = with_poses(case, given_poses(case, BOTH, seed))
+    lines = linearise_clouds(problem, case.truth)
+    errors = [
+        gtsam.Pose3.Logmap(T.compose(Z.inverse()))
+        for T, Z in zip(lines.predicted, noisy(case, seed + 10, scale), strict=True)
+    ]
+    H = np.asarray(block_diag(*case.information))
+    return fit_scale(problem, lines, (H, H @ np.concatenate(errors)), case.truth, BOTH)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_scale_of_a_joint_quadratic_is_found(seed: int) -> None:
+    once, twice = (scale_of_quadratic(scale, seed) for scale in (1.0, 2.0))
+    assert once == pytest.approx(1.0, rel=0.3)
+    assert twice / once == pytest.approx(2.0, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_scale_does_not_depend_on_where_the_poses_were_solved_to(seed: int) -> None:
+    # The solved poses follow their clouds; the errors are counted from the given ones.
+    case = make_case(count=24, seed=seed)
+    problem = with_poses(case, given_poses(case, BOTH, seed))
+    H = np.asarray(block_diag(*case.information))
+    measured, scales = noisy(case, seed + 10), []
+    for values in (case.truth, with_given_poses(problem, case.truth)):
+        lines = linearise_clouds(problem, values)
+        errors = [
+            gtsam.Pose3.Logmap(T.compose(Z.inverse()))
+            for T, Z in zip(lines.predicted, measured, strict=True)
+        ]
+        clouds = (H, H @ np.concatenate(errors))
+        scales.append(fit_scale(problem, lines, clouds, values, BOTH))
+    assert scales[1] == pytest.approx(scales[0], rel=0.05)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

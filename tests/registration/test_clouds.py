@@ -10,6 +10,8 @@ import pytest
 
 from caliv_graph.products import Array
 from caliv_graph.registration.clouds import (
+    MERGED_RADIUS_M,
+    MERGED_WIDEST_M,
     CloudStack,
     merged_normals,
     sampling_order,
@@ -286,14 +288,29 @@ def test_clouds_of_another_lidar_are_not_merged() -> None:
 
 
 def test_points_that_are_alone_have_no_normal_among_aligned_clouds() -> None:
-    stack, R, t = leg_face(clouds=2)
+    # A wall of a metre, 200 points per square metre: four within 8 cm of a point. Distances that
+    # count are those across the beams, up to 3 % shorter.
+    stack, R, t = leg_face(clouds=4, width_m=1.0, sigma_m=0.002)
     merged = merged_normals(stack, R, t)
     points = stack.moved(R, t)
-    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 0.03
-    alone = near.sum(axis=1) < 6
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    alone = (apart < 1.05 * MERGED_WIDEST_M).sum(axis=1) < 6
     assert 10 < alone.sum() < len(points)
     np.testing.assert_array_equal(merged.flatness[alone], 0.0)
     np.testing.assert_allclose(merged.normals[alone], -stack.beams[alone], atol=1e-12)
+
+
+def test_where_aligned_clouds_are_sparse_neighbourhoods_are_wider() -> None:
+    # 60 points on 60 cm of a leg: five within 3 cm of a point, the 12 of a normal within 7 cm.
+    stack, R, t = leg_face(clouds=2, sigma_m=0.002, azimuth_deg=30.0)
+    points = stack.moved(R, t)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    sparse = (apart < MERGED_RADIUS_M).sum(axis=1) < 6
+    assert sparse.sum() > 10
+    merged = merged_normals(stack, R, t)
+    assert np.median(merged.flatness[sparse]) > 0.5
+    turned = merged.rotated(R, merged.normals)[sparse]
+    assert np.median(angle_deg(turned, AHEAD)) < 10.0
 
 
 # ------------------------------------------------------------------ the scenes of these tests

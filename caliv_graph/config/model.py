@@ -298,7 +298,7 @@ class RegistrationConfig(Section):
     """The mixture that all clouds of a target are registered to."""
 
     components: Annotated[int, Field(ge=20)] = Field(
-        1000, description="Gaussian components of the target at most; one per 10 points if fewer"
+        1000, description="surfels of the target at most; one per 10 points if fewer"
     )
     outlier_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
         0.05, description="assumed ratio of outliers to inliers (gamma)"

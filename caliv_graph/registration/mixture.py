@@ -269,7 +269,7 @@ def maximise_shape(
         t: (J, 3) translations of it.
         mixture: the surfels of the E-step.
         sigma_floor_m: smallest width; annealed from coarse to that of the thinnest parts.
-        cells: (J, K, 23) `cell_moments` of its responsibilities.
+        cells: (J, K, 33) `cell_moments` of its responsibilities.
         counts: (K,) points of each surfel.
         turns: (K, 3) rotation of each normal, of the quadratic of the E-step.
     """

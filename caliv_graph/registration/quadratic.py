@@ -187,7 +187,7 @@ def shape_quadratic(
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of it.
         mixture: the surfels of the E-step.
-        cells: (J, K, 23) `cell_moments` of the responsibilities.
+        cells: (J, K, 33) `cell_moments` of the responsibilities.
         who: the responsibilities; their lever corrections enter.
     """
     count, K = stack.count, len(mixture.weights)

@@ -148,8 +148,8 @@ def _ranges(found: RangesDisagree) -> str:
     return (
         f"the ranges of the lidars {names} on the targets contradict each other: no mounting "
         "brings them together unless each range on each target is off by "
-        f"{1e3 * found.sigma_m:.0f} mm (1 sigma; limit {1e3 * RANGE_BIAS_LIMIT_M:.0f} mm). Check the range calibration of the "
-        "LiDARs and that no target moved; use matt targets of one material, and see each from "
+        f"{1e3 * found.sigma_m:.0f} mm (1 sigma; limit {1e3 * RANGE_BIAS_LIMIT_M:.0f} mm). "
+        "Check the range calibration of the LiDARs and that no target moved; use matt targets of one material, and see each from "
         "several sides"
     )
 

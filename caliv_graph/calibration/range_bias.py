@@ -28,6 +28,10 @@ ranges and materials; two OS1-128 differ by 4.4 mm each on three boxes of one ma
 LOG_SPREAD = math.log(2.5)
 """1 sigma of its logarithm: 4.4 mm are 1.6 sigmas."""
 
+EVIDENCE = 8.0
+"""Logarithm of the ratio of likelihoods above which the sigma is not `TYPICAL_BIAS_M`: what a few
+clouds on one target seem to say of biases is chance, and takes what they say of the mountings."""
+
 LEAST_BIAS_M, LARGEST_BIAS_M = 1e-4, 0.05
 """Bounds of the sigma."""
 
@@ -63,6 +67,8 @@ def without_bias(
 def fit_bias_sigma(reduced: Reduced, directions: Array, prior: Array) -> float:
     """The sigma of the biases, metres, by restricted maximum likelihood with its prior.
 
+    `TYPICAL_BIAS_M` if the data do not contradict that (`EVIDENCE`).
+
     Extrinsics, poses, targets and shape are integrated out: a bias that a mounting can make up for
     says nothing.
 
@@ -94,4 +100,6 @@ def fit_bias_sigma(reduced: Reduced, directions: Array, prior: Array) -> float:
 
     bounds = (math.log(LEAST_BIAS_M), math.log(LARGEST_BIAS_M))
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
+    if cost(math.log(TYPICAL_BIAS_M)) - cost(float(found.x)) < EVIDENCE:
+        return TYPICAL_BIAS_M
     return math.exp(float(found.x))

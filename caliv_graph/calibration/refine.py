@@ -240,13 +240,13 @@ class _Loop:
 
 def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
     """A new mixture, and if asked for new normals, at the graph's poses: EM ends near its start."""
+    _hand_weights(state, states)
     lines = linearise_clouds(state.problem, state.values)
     for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
         if normals:
             shape.refine_normals(R, t)
         shape.seed(R, t, FINE_SIGMA_M)
         shape.held_along = 0.0
-    _hand_weights(state, states)
 
 
 def _expect(

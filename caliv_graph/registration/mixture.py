@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.common.cores import parts, share_out
-from caliv_graph.products import Array, IntArray, Mixture
+from caliv_graph.products import Array, BoolArray, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, sampling_order
 from caliv_graph.registration.heights import HeightNoise, HeightSums
 from caliv_graph.registration.moments import (
@@ -73,21 +73,24 @@ def seed_mixture(
     components: int,
     sigma_m: float,
     distinct: float | None = None,
+    trusted: BoolArray | None = None,
 ) -> Mixture:
     """The initial mixture of width `sigma_m`: components on points with reliable normals.
 
     Every cloud contributes the same number of points: a near cloud with many does not take all
     components. The draw does not depend on the poses `T_target_lidar`, rotations R (J, 3, 3) and
     translations t (J, 3). There are fewer `components` if few points are `distinct`
-    (`POINTS_PER_COMPONENT`): those of scans of one view count as one. None: all are.
+    (`POINTS_PER_COMPONENT`): those of scans of one view count as one. None: all are. Clouds (J,)
+    that are not `trusted` get no surfels: a cloud in the wrong place would explain itself.
     """
     distinct = len(stack.points) if distinct is None else distinct
     points = stack.moved(R, t)
     normals = stack.rotated(R, stack.normals)
     components = max(min(components, int(distinct) // POINTS_PER_COMPONENT), 1)
-    usable = np.flatnonzero(stack.flatness > 0.5)
+    allowed = np.ones(len(points), bool) if trusted is None else trusted[stack.cloud]
+    usable = np.flatnonzero(allowed & (stack.flatness > 0.5))
     if len(usable) < 2 * components:
-        usable = np.arange(len(points))
+        usable = np.flatnonzero(allowed)
     order = usable[np.argsort(sampling_order(stack.points[usable]))]
     # The rank of each point in its own cloud: all first ones, then all second ones, ...
     cloud = stack.cloud[order]

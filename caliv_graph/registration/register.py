@@ -45,6 +45,9 @@ FLOOR_PER_RANGE_SIGMA = 0.3
 """Final floor of the roughness, over the sigma of the noise along the beam: from then on the
 roughness is what the heights say."""
 
+TRUSTED_WEIGHT = 0.5
+"""Robust weight below which a cloud gets no surfels of its own."""
+
 HELD_ALONG_M = 0.05
 """1 sigma that a point is held with along the surface at the others of its surfel, where no graph
 holds the clouds: one of a flat side would slide along it to where noise fits best. It is a bias,
@@ -173,7 +176,16 @@ class JointRegistration:
         self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
         self._floor = max(sigma_m, self._floor_end)
         distinct = float((self.clouds.sizes * self.view_weights).sum())
-        self._mixture = seed_mixture(self.clouds, R, t, self._components, self._floor, distinct)
+        trusted = self.weights > TRUSTED_WEIGHT
+        self._mixture = seed_mixture(
+            self.clouds,
+            R,
+            t,
+            self._components,
+            self._floor,
+            distinct,
+            trusted if trusted.sum() >= 2 else None,
+        )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""

@@ -145,12 +145,12 @@ def _coarse(found: CoarseRegistrations) -> str:
 
 def _ranges(found: RangesDisagree) -> str:
     names = " and ".join(f"'{name}'" for name in found.lidars)
+    sigma, limit = 1e3 * found.sigma_m, 1e3 * RANGE_BIAS_LIMIT_M
     return (
         f"the ranges of the lidars {names} on the targets contradict each other: no mounting "
-        "brings them together unless each range on each target is off by "
-        f"{1e3 * found.sigma_m:.0f} mm (1 sigma; limit {1e3 * RANGE_BIAS_LIMIT_M:.0f} mm). "
-        "Check the range calibration of the LiDARs and that no target moved; use matt targets of one material, and see each from "
-        "several sides"
+        f"brings them together unless each range on each target is off by {sigma:.0f} mm "
+        f"(1 sigma; limit {limit:.0f} mm). Check the range calibration of the LiDARs and that no "
+        "target moved; use matt targets of one material, and see each from several sides"
     )
 
 

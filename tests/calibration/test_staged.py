@@ -189,7 +189,8 @@ def test_clouds_of_several_targets_are_judged_together() -> None:
     for m in range(2):
         mine = np.flatnonzero(case.problem.cloud_placement == m)
         part = replace(case, information=case.information[mine])
-        registrations.append(registered(part, tuple(measured[j] for j in mine)))
+        one = registered(part, tuple(measured[j] for j in mine))
+        registrations.append(replace(one, view_weights=np.ones(len(mine))))
     order = np.argsort(case.problem.cloud_placement, kind="stable")
     problem = replace(
         case.problem,

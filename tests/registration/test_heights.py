@@ -225,9 +225,9 @@ def test_the_shared_part_is_the_roughness_over_all_by_hand() -> None:
     sums = sums_of(np.zeros(4), cosine, np.ones(4), lidar)
     assert sums.mean_cosine2() == pytest.approx([1.0, 0.25])
     assert noise.shared_part(sums) == pytest.approx([9.0 / 109.0, 16.0 / 116.0])
-    # While the floor is above the roughness it counts as shared.
-    coarse = noise_of([0.01, 0.02], [0.003, 0.004], 0.01)
-    assert coarse.shared_part(sums) == pytest.approx([0.5, 0.5])
+    # At least 3 mm are shared, whatever the surfels show; the floor of annealing is not.
+    smooth = noise_of([0.01, 0.02], [0.001, 0.004], 0.01)
+    assert smooth.shared_part(sums) == pytest.approx([9.0 / 109.0, 16.0 / 116.0])
 
 
 def test_sums_by_hand_and_in_parts() -> None:

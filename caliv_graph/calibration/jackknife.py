@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, stack
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.registration.register import JointRegistration
 
 GROUPS = 4
@@ -32,9 +32,6 @@ spots."""
 ROUNDS = 5
 """Rounds of expectation-maximisation without a part: what is missing of the way to its end is a
 tenth on sparse clouds."""
-
-LEFT_OUT = 1e-9
-"""Weight of the clouds that are left out."""
 
 LEAST_LIDAR_CLOUDS = 3 * GROUPS * TOGETHER
 """Clouds of every LiDAR for a jackknife: with fewer the parts are too large."""
@@ -58,32 +55,24 @@ def jackknife_scale(
         states: the registration of each placement at the solution; they stay as they are.
         lines: predicted poses of the clouds there.
     """
-    distinct = np.array(
-        [
-            np.sum(1.0 / _views(problem)[problem.cloud_lidar == a])
-            for a in range(len(problem.lidars))
-        ]
+    distinct = np.bincount(
+        problem.cloud_lidar, 1.0 / problem.all_views(), minlength=len(problem.lidars)
     )
     if (distinct[distinct > 0.0] < LEAST_LIDAR_CLOUDS).any():
         return 1.0
-    # T_target_vehicle of every cloud.
-    before = [
-        Z.compose(extrinsics[a].inverse())
-        for Z, a in zip(lines.predicted, problem.cloud_lidar.tolist(), strict=True)
-    ]
+    prior = problem.guess_information()
     group = _groups(problem)
-    ends = [_without(problem, extrinsics, before, states, group == g) for g in range(GROUPS)]
-    ends_mean = np.mean(ends, axis=0)
-    scatter = np.array(ends) - ends_mean
-    H, _ = _system(problem, extrinsics, before, [copy(state) for state in states])
-    known = np.linalg.solve(H + problem.guess_information(), H)
+    every = _placements(problem, extrinsics, states, lines, group >= 0)
+    H, _ = _system(every, extrinsics)
+    ends = [
+        _end(_placements(problem, extrinsics, states, lines, group != g), extrinsics, prior)
+        for g in range(GROUPS)
+    ]
+    scatter = np.array(ends) - np.mean(ends, axis=0)
+    known = np.linalg.solve(H + prior, H)
     claimed = float(np.trace(known @ known))
     found = (GROUPS - 1) / GROUPS * float(np.einsum("ga,ab,gb->", scatter, H, scatter))
     return max(math.sqrt(found / max(claimed, 1e-12)), 1.0) if claimed > 1.0 else 1.0
-
-
-def _views(problem: Problem) -> Array:
-    return np.ones(problem.clouds) if problem.views is None else problem.views
 
 
 def _groups(problem: Problem) -> IntArray:
@@ -97,71 +86,83 @@ def _groups(problem: Problem) -> IntArray:
     return out
 
 
-def _without(
+@dataclass(frozen=True)
+class _Placement:
+    """Clouds of a placement, and where the vehicle was.
+
+    Attributes:
+        state: their registration, a copy.
+        lidar: (J,) index of the LiDAR of each.
+        T_target_vehicle: J poses.
+    """
+
+    state: JointRegistration
+    lidar: IntArray
+    T_target_vehicle: tuple[gtsam.Pose3, ...]
+
+    def poses(self, extrinsics: Sequence[gtsam.Pose3]) -> tuple[Array, Array, Array]:
+        """Poses of the clouds (J, 3, 3) and (J, 3), and (J, 6, 6 n) their derivatives.
+
+        Left perturbations by those of the extrinsics in vehicle axes.
+        """
+        axes = [right_to_vehicle_axes(T).T for T in extrinsics]
+        J = np.zeros((len(self.lidar), 6, 6 * len(extrinsics)))
+        predicted = []
+        for j, (a, T) in enumerate(zip(self.lidar.tolist(), self.T_target_vehicle, strict=True)):
+            Z = T.compose(extrinsics[a])
+            predicted.append(Z)
+            J[j, :, 6 * a : 6 * a + 6] = Z.AdjointMap() @ axes[a]
+        return (*stack(predicted), J)
+
+
+def _placements(
     problem: Problem,
     extrinsics: Sequence[gtsam.Pose3],
-    before: Sequence[gtsam.Pose3],
     states: Sequence[JointRegistration],
-    left_out: Array,
+    lines: CloudLinearisation,
+    kept: BoolArray,
+) -> list[_Placement]:
+    """Every placement with those of its clouds that are kept (J,); none without clouds."""
+    out = []
+    for own, state in zip(problem.clouds_of_placements(), states, strict=True):
+        which = np.flatnonzero(kept[own])
+        if len(which):
+            lidar = problem.cloud_lidar[own][which]
+            T_target_vehicle = tuple(
+                lines.predicted[own.start + j].compose(extrinsics[a].inverse())
+                for j, a in zip(which.tolist(), lidar.tolist(), strict=True)
+            )
+            out.append(_Placement(state.only(which), lidar, T_target_vehicle))
+    return out
+
+
+def _end(
+    placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3], prior: Array
 ) -> Array:
-    """(6 n,) where the extrinsics go without some of the clouds (J,), vehicle axes."""
-    trial = [copy(state) for state in states]
-    start = 0
-    for state in trial:
-        own = left_out[start : start + state.clouds.count]
-        start += state.clouds.count
-        state.weights = np.where(own, LEFT_OUT, state.weights)
-    moved, total = list(extrinsics), np.zeros(6 * len(extrinsics))
-    prior = problem.guess_information()
+    """(6 n,) where expectation-maximisation takes the extrinsics, vehicle axes."""
+    moved, total = list(extrinsics), np.zeros(len(prior))
     for _ in range(ROUNDS):
-        H, gradient = _system(problem, moved, before, trial)
+        H, gradient = _system(placements, moved)
         step = -np.asarray(np.linalg.solve(H + prior, gradient), np.float64)
         moved = [
             retract_vehicle_axes(T, d) for T, d in zip(moved, step.reshape(-1, 6), strict=True)
         ]
         total += step
-        for state, (R, t, _) in zip(trial, _poses(problem, moved, before, trial), strict=True):
-            state.maximise(R, t)
-    return np.asarray(total)
+        for placement in placements:
+            R, t, _ = placement.poses(moved)
+            placement.state.maximise(R, t)
+    return total
 
 
 def _system(
-    problem: Problem,
-    extrinsics: Sequence[gtsam.Pose3],
-    before: Sequence[gtsam.Pose3],
-    states: Sequence[JointRegistration],
+    placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3]
 ) -> tuple[Array, Array]:
     """E-step: (6 n, 6 n) information and (6 n,) gradient over the extrinsics, vehicle axes."""
     H = np.zeros((6 * len(extrinsics), 6 * len(extrinsics)))
     gradient = np.zeros(len(H))
-    for state, (R, t, J) in zip(states, _poses(problem, extrinsics, before, states), strict=True):
-        quadratic = state.expect(R, t)
+    for placement in placements:
+        R, t, J = placement.poses(extrinsics)
+        quadratic = placement.state.expect(R, t)
         H += quadratic.along(J)
         gradient += np.einsum("jab,ja->b", J, quadratic.gradient)
     return H, gradient
-
-
-def _poses(
-    problem: Problem,
-    extrinsics: Sequence[gtsam.Pose3],
-    before: Sequence[gtsam.Pose3],
-    states: Sequence[JointRegistration],
-) -> list[tuple[Array, Array, Array]]:
-    """Per placement the poses of its clouds (J, 3, 3), (J, 3), and (J, 6, 6 n) their derivatives.
-
-    Left perturbations by those of the extrinsics in vehicle axes.
-    """
-    axes = [right_to_vehicle_axes(T).T for T in extrinsics]
-    out, start = [], 0
-    for state in states:
-        count = state.clouds.count
-        J = np.zeros((count, 6, 6 * len(extrinsics)))
-        predicted = []
-        for j in range(count):
-            a = int(problem.cloud_lidar[start + j])
-            Z = before[start + j].compose(extrinsics[a])
-            predicted.append(Z)
-            J[j, :, 6 * a : 6 * a + 6] = Z.AdjointMap() @ axes[a]
-        start += count
-        out.append((*stack(predicted), J))
-    return out

@@ -84,14 +84,15 @@ def sound_clouds(
     """
     lines = linearise_clouds(problem, values)
     every = np.arange(problem.clouds)
-    r, _, B, R = _stacked(problem, lines, measured, information, values, every)
+    r, _, B = _stacked(problem, lines, measured, values, every)
     rotation = noise.white_rotation_rad**2 + noise.drift_rotation_rad**2
     position = noise.white_position_m**2 + noise.drift_position_m**2
     spread = np.tile([rotation] * 3 + [position] * 3, (problem.clouds, 1))
     stated = problem.stated()[problem.cloud_pose]
     spread[stated] = [noise.drift_rotation_rad**2] * 3 + [noise.drift_position_m**2] * 3
     given = problem.given()[problem.cloud_pose]
-    V = R + np.einsum("jax,jx,jbx->jab", B * given[:, None, None], spread, B)
+    V = np.linalg.inv(information)
+    V += np.einsum("jax,jx,jbx->jab", B * given[:, None, None], spread, B)
     V += _stated_effect(problem, B, every)
     V += np.einsum("jax,jxy,jby->jab", B, _motion_covariance(problem, values, every), B)
     r = r.reshape(-1, 6)
@@ -178,9 +179,7 @@ def fit_scale(
     given = with_given_poses(problem, values)
     there = linearise_clouds(problem, given).predicted
     H, gradient = clouds
-    r, A, B, _ = _stacked(
-        problem, lines, there, np.tile(np.eye(6), (len(every), 1, 1)), values, every
-    )
+    r, A, B = _stacked(problem, lines, there, values, every)
     # From the solved to the given poses: the gradient follows.
     y = gradient - H @ r
     K = _pose_covariance(problem, values, every, B, noise)
@@ -246,13 +245,13 @@ class _RestrictedLikelihood:
         """Linearised at `values`; arguments as in `fit_pose_noise`."""
         chosen = _spread(problem, sound)
         lines = linearise_clouds(problem, values)
-        r, A, B, R = _stacked(problem, lines, measured, information, values, chosen)
+        r, A, B = _stacked(problem, lines, measured, values, chosen)
         known, parts = _pose_parts(problem, values, chosen, B, first)
         return cls(
             residuals=r,
             design=A,
             known=known,
-            parts=(*parts, scipy.linalg.block_diag(*R)),
+            parts=(*parts, scipy.linalg.block_diag(*np.linalg.inv(information[chosen]))),
             ridge=_ridge(problem, A.shape[1]),
             prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
         )
@@ -425,13 +424,12 @@ def _stacked(
     problem: Problem,
     lines: CloudLinearisation,
     measured: Sequence[gtsam.Pose3],
-    information: Array,
     values: gtsam.Values,
     chosen: IntArray,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Residuals (6m,) of the chosen clouds, and what they depend on.
 
-    (6m, p) by extrinsics, targets and offsets; (m, 6, 6) by pose errors; (m, 6, 6) covariances.
+    (6m, p) by extrinsics, targets and offsets; (m, 6, 6) by pose errors.
     """
     keys = (*problem.extrinsic_keys(), *problem.target_keys())
     columns = {key: 6 * i for i, key in enumerate(keys)}
@@ -445,7 +443,7 @@ def _stacked(
         for key, jacobian in zip(lines.keys[j], lines.jacobians[j], strict=True):
             if key in columns:
                 A[block, columns[key] : columns[key] + jacobian.shape[1]] = jacobian
-    return r, A, B, np.asarray(np.linalg.inv(information[chosen]), dtype=np.float64)
+    return r, A, B
 
 
 def _ridge(problem: Problem, size: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -85,10 +86,18 @@ class Problem:
         """Number of clouds."""
         return len(self.cloud_lidar)
 
+    def clouds_of_placements(self) -> list[slice]:
+        """Where the clouds of each placement are among all clouds."""
+        ends = np.searchsorted(self.cloud_placement, np.arange(self.placements + 1)).tolist()
+        return [slice(first, last) for first, last in itertools.pairwise(ends)]
+
+    def all_views(self) -> Array:
+        """(J,) `views`, also where all differ."""
+        return np.ones(self.clouds) if self.views is None else self.views
+
     def views_of(self, placement: int) -> Array:
         """How many clouds have the view of each of the clouds of a placement."""
-        own = self.cloud_placement == placement
-        return np.ones(own.sum()) if self.views is None else self.views[own]
+        return self.all_views()[self.clouds_of_placements()[placement]]
 
     def extrinsic_keys_of(self, lidar: str) -> tuple[int, ...]:
         """Keys whose product is T_vehicle_lidar: E, and S_a unless it is the reference."""

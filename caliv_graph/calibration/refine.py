@@ -19,6 +19,7 @@ from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import (
     TYPICAL_BIAS_M,
     bias_directions,
@@ -131,7 +132,7 @@ class _Loop:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
         state = self.state
         lines = linearise_clouds(state.problem, state.values)
-        shapes = _expect(self.states, lines, state.turns)
+        shapes = _expect(self.states, per_placement(state.problem, lines), state.turns)
         begun = time.perf_counter()
         reduced = self._without_bias(shapes, lines)
         state.graph_seconds += time.perf_counter() - begun
@@ -154,9 +155,8 @@ class _Loop:
     def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """Estimates the sigma of the biases at a linearisation, and applies it to that."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
-        directions = bias_directions(self.states, shapes.poses)
         self.state.range_bias_m = fit_bias_sigma(
-            reduced, directions, reduced.in_tangents(self.prior)
+            reduced, shapes.biases, reduced.in_tangents(self.prior)
         )
         return self._without_bias(shapes, lines)
 
@@ -165,8 +165,8 @@ class _Loop:
 
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
-        directions = bias_directions(self.states, shapes.poses)
-        clouds = without_bias(*shapes.joint(self.state.scale), directions, self.state.range_bias_m)
+        clouds = shapes.joint(self.state.scale)
+        clouds = without_bias(*clouds, shapes.biases, self.state.range_bias_m)
         return self._reduced(clouds, lines)
 
     def iterate(self, number: int) -> Iteration:
@@ -185,7 +185,7 @@ class _Loop:
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
         new = linearise_clouds(state.problem, state.values)
-        for shape, (R, t) in zip(self.states, per_placement(self.states, new), strict=True):
+        for shape, (R, t) in zip(self.states, per_placement(state.problem, new), strict=True):
             shape.maximise(R, t)
         change = self._weigh(squared)
         if number == SHAPES_BEGUN_AGAIN:
@@ -242,7 +242,7 @@ def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normal
     """A new mixture, and if asked for new normals, at the graph's poses: EM ends near its start."""
     _hand_weights(state, states)
     lines = linearise_clouds(state.problem, state.values)
-    for shape, (R, t) in zip(states, per_placement(states, lines), strict=True):
+    for shape, (R, t) in zip(states, per_placement(state.problem, lines), strict=True):
         if normals:
             shape.refine_normals(R, t)
         shape.seed(R, t, FINE_SIGMA_M)
@@ -251,45 +251,40 @@ def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normal
 
 def _expect(
     states: Sequence[JointRegistration],
-    lines: CloudLinearisation,
+    poses: list[tuple[Array, Array]],
     turns: Sequence[Symmetry | None],
 ) -> _Shapes:
-    """E-step of every placement at the poses that the graph predicts."""
-    poses = per_placement(states, lines)
+    """E-step of every placement at the poses that the graph predicts, those of `per_placement`."""
     quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
     fitted = [
         None if turn is None else refit(turn, state.mixture)
         for turn, state in zip(turns, states, strict=True)
     ]
-    return _Shapes(poses, quadratics, fitted)
+    return _Shapes(poses, quadratics, fitted, bias_directions(states, poses))
 
 
-def per_placement(
-    states: Sequence[JointRegistration], lines: CloudLinearisation
-) -> list[tuple[Array, Array]]:
+def per_placement(problem: Problem, lines: CloudLinearisation) -> list[tuple[Array, Array]]:
     """The predicted poses of the clouds, per placement (J, 3, 3) and (J, 3), target frame."""
-    out, start = [], 0
-    for state in states:
-        out.append(stack(lines.predicted[start : start + state.clouds.count]))
-        start += state.clouds.count
-    return out
+    return [stack(lines.predicted[own]) for own in problem.clouds_of_placements()]
 
 
 def _hand_weights(state: SolveState, states: Sequence[JointRegistration]) -> None:
     """Gives every placement the robust weights of its clouds."""
-    start = 0
-    for shape in states:
-        shape.weights = state.weights.values[start : start + shape.clouds.count]
-        start += shape.clouds.count
+    for own, shape in zip(state.problem.clouds_of_placements(), states, strict=True):
+        shape.weights = state.weights.values[own]
 
 
 @dataclass
 class _Shapes:
-    """The clouds' quadratic over all placements at one set of poses."""
+    """The clouds' quadratic over all placements at one set of poses.
+
+    `biases` (6 J, B): `bias_directions` there.
+    """
 
     poses: list[tuple[Array, Array]]
     quadratics: list[ShapeQuadratic]
     turns: list[Symmetry | None]
+    biases: Array
 
     def joint(self, scale: float) -> tuple[Array, Array]:
         """(6 J, 6 J) and (6 J,) of all placements."""
@@ -349,10 +344,11 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     # The robust weights of the clouds are kept apart from their information.
     weighted = shapes.single[0]
     last_step = (last.turn_rad, last.shift_m)
-    registrations, start = [], 0
-    for shape, (R, t), (H, _) in zip(loop.states, shapes.poses, shapes.joints, strict=True):
-        part = slice(start, start + shape.clouds.count)
-        start = part.stop
+    registrations = []
+    placements = problem.clouds_of_placements()
+    for part, shape, (R, t), (H, _) in zip(
+        placements, loop.states, shapes.poses, shapes.joints, strict=True
+    ):
         R, t = left_step(R, t, pull[part])
         blocks = information[part] * state.scale**2
         joint = H + block_diag(*(blocks - weighted[part]))

@@ -230,10 +230,9 @@ def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
     """(6 J, 6 J) joint information of all registered poses, with robust weights."""
     turns = state.turns or [None] * len(registrations)
-    out, start = [], 0
-    for r, turn in zip(registrations, turns, strict=True):
-        part = slice(start, start + len(r.information))
-        start = part.stop
+    out = []
+    placements = state.problem.clouds_of_placements()
+    for part, r, turn in zip(placements, registrations, turns, strict=True):
         H = r.information_joint
         if turn is not None:
             H = marginalise_symmetry(H, np.zeros(len(H)), turn)[0]

@@ -5,7 +5,6 @@ Frames, tangent order and *vehicle axes* are defined in `caliv_graph.conventions
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -16,18 +15,27 @@ from scipy.linalg import block_diag
 from caliv_graph.products import Array
 
 
-def tangent_axes(direction: Array) -> Array:
-    """Two unit vectors (2, 3) perpendicular to a unit vector (3,) and to each other.
+def tangent_axes(directions: Array) -> Array:
+    """Two unit vectors perpendicular to each unit vector and to each other.
 
     With the direction as third axis they form a right-handed frame.
+
+    Args:
+        directions: (..., 3).
+
+    Returns:
+        (..., 2, 3).
     """
-    x, y, z = direction.tolist()
+    x, y, z = np.moveaxis(directions, -1, 0)
+    none = np.zeros_like(x)
+    across = np.stack([[none, -z, y], [z, none, -x], [-y, x, none]])
     # The first is also perpendicular to the coordinate axis farthest from the direction.
-    least = min(range(3), key=lambda axis: abs(direction[axis]))
-    u = [(0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)][least]
-    length = math.hypot(*u)
-    a, b, c = (part / length for part in u)
-    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a]])
+    least = np.argmin(np.abs(directions), axis=-1)
+    first = np.where(least == 0, across[0], np.where(least == 1, across[1], across[2]))
+    first /= np.sqrt(first[0] ** 2 + first[1] ** 2 + first[2] ** 2)
+    a, b, c = first
+    second = np.stack([y * c - z * b, z * a - x * c, x * b - y * a])
+    return np.asarray(np.moveaxis(np.stack([first, second]), (0, 1), (-2, -1)))
 
 
 def skew(vectors: Array) -> Array:

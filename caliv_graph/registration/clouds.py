@@ -88,6 +88,22 @@ class CloudStack:
     whole: tuple[Array, ...]
     sigma_range_m: float
 
+    def only(self, which: IntArray) -> CloudStack:
+        """The clouds at these indices, ascending."""
+        kept = np.isin(self.cloud, which)
+        sizes = self.sizes[which]
+        return CloudStack(
+            points=self.points[kept],
+            cloud=np.repeat(np.arange(len(which)), sizes),
+            starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+            lidar=self.lidar[which],
+            beams=self.beams[kept],
+            normals=self.normals[kept],
+            flatness=self.flatness[kept],
+            whole=tuple(self.whole[j] for j in which.tolist()),
+            sigma_range_m=self.sigma_range_m,
+        )
+
     @property
     def count(self) -> int:
         """Number of clouds."""

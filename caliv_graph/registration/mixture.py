@@ -192,16 +192,17 @@ def expect(
         noise: of the heights of points over the surface.
         outlier_density: of outliers along a beam, per metre.
         cloud_weights: (J,) weight of each cloud: robust weight times view weight.
-        held_along: weight of what holds points along the surface, per square metre.
+        held_along: weight of what holds points along the surface, per square metre; 0: nothing.
     """
     surfels = _Surfels(mixture)
     count, k = len(stack.points), surfels.neighbours
     near = np.empty((count, k), dtype=np.int64)
     alpha, weights, forces = np.empty((count, k)), np.empty((count, k)), np.empty((count, k))
-    along = np.empty((count, k))
+    along = np.empty((count, k)) if held_along > 0.0 else None
     directions, levers, slides = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     pieces = parts(count, count // PART_POINTS + 1)
-    sums = [HeightSums.none(stack.lidars)] * len(pieces)
+    lidars = len(noise.range_m2)
+    sums = [HeightSums.none(lidars)] * len(pieces)
 
     def of_part(i: int) -> None:
         part = pieces[i]
@@ -224,10 +225,11 @@ def expect(
         density /= inliers[:, None] + outlier_density
         near[part], alpha[part] = found, density
         sums[i] = HeightSums.of(
-            density, height, cosine, variance, cloud_weights[cloud], lidar, stack.lidars
+            density, height, cosine, variance, cloud_weights[cloud], lidar, lidars
         )
         weights[part] = density / variance * cloud_weights[cloud][:, None]
-        along[part] = density * (held_along * cloud_weights[cloud])[:, None]
+        if along is not None:
+            along[part] = density * (held_along * cloud_weights[cloud])[:, None]
         force = weights[part] * height * slide
         summed = [np.einsum("nk,nk->n", force, n[found]) for n in surfels.normals]
         levers[part] = cross(beams, np.column_stack(summed))
@@ -272,7 +274,7 @@ def maximise_shape(
         t: (J, 3) translations of it.
         mixture: the surfels of the E-step.
         sigma_floor_m: smallest width; annealed from coarse to that of the thinnest parts.
-        cells: (J, K, 33) `cell_moments` of its responsibilities.
+        cells: `cell_moments` of its responsibilities.
         counts: (K,) points of each surfel.
         turns: (K, 3) rotation of each normal, of the quadratic of the E-step.
     """

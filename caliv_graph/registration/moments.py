@@ -34,7 +34,7 @@ SURFACE_MOMENTS = slice(13, 23)
 """As `MOMENTS`, h of the places where the beams meet the surface."""
 
 ALONG_MOMENTS = slice(23, 33)
-"""As `SURFACE_MOMENTS`, with the weights along the surface."""
+"""As `SURFACE_MOMENTS`, with the weights along the surface; where points are held there."""
 
 # The upper triangle of h h^T, row by row, is what is stored: entry i is of (ROW[i], COLUMN[i]).
 
@@ -57,7 +57,7 @@ class Responsibilities:
         component: (N, k) indices of surfels.
         weight: (N, k) responsibilities over the variance of the height, times the weight of the
             point's cloud, per square metre.
-        weight_along: (N, k) the same along the surface, where points are held there.
+        weight_along: (N, k) the same along the surface; None where no points are held there.
         counts: (K,) points of each surfel.
         explained: (N,) probability that the point is target.
         inlier_ratio: (J,) its mean over each cloud.
@@ -70,7 +70,7 @@ class Responsibilities:
 
     component: IntArray
     weight: Array
-    weight_along: Array
+    weight_along: Array | None
     counts: Array
     explained: Array
     inlier_ratio: Array
@@ -81,15 +81,17 @@ class Responsibilities:
 
 
 def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:
-    """(J, K, 33) sums over the points of each cloud and component ("cell"), for K `components`.
+    """(J, K, m) sums over the points of each cloud and component ("cell"), for K `components`.
 
-    `MOMENTS`, `NORMALS`, `SURFACE_MOMENTS` and `ALONG_MOMENTS`, lidar axes, points less the centre
-    of their cloud.
+    `MOMENTS`, `NORMALS`, `SURFACE_MOMENTS` and, where points are held along the surface,
+    `ALONG_MOMENTS`: m = 23 or 33. Lidar axes, points less the centre of their cloud.
     """
     width = who.component.shape[1]
     ends = np.append(stack.starts, len(stack.points))
     features = stack.features
-    sums = np.empty((stack.count, components, 33))
+    along = who.weight_along
+    columns = SURFACE_MOMENTS.stop if along is None else ALONG_MOMENTS.stop
+    sums = np.empty((stack.count, components, columns))
 
     def of_clouds(first: int) -> None:
         last = min(first + PART_CLOUDS, stack.count)
@@ -105,11 +107,12 @@ def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> A
             shape=((last - first) * components, count),
         )
         on_surface = second_moments(stack.centred[own] + who.slides_m[own, None] * stack.beams[own])
-        part = sums[first:last].reshape(-1, 33)
-        part[:, :13] = np.asarray(belongs @ features[own])
-        part[:, 13:23] = np.asarray(belongs @ on_surface)
-        belongs.data = who.weight_along[own].ravel()
-        part[:, 23:] = np.asarray(belongs @ on_surface)
+        part = sums[first:last].reshape(-1, columns)
+        part[:, : NORMALS.stop] = np.asarray(belongs @ features[own])
+        part[:, SURFACE_MOMENTS] = np.asarray(belongs @ on_surface)
+        if along is not None:
+            belongs.data = along[own].ravel()
+            part[:, ALONG_MOMENTS] = np.asarray(belongs @ on_surface)
 
     share_out(of_clouds, range(0, stack.count, PART_CLOUDS))
     return sums

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from caliv_graph.common.cores import parts, share_out
-from caliv_graph.geometry.se3 import skew
+from caliv_graph.geometry.se3 import skew, tangent_axes
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.moments import (
@@ -24,7 +24,6 @@ from caliv_graph.registration.moments import (
     JACOBIAN,
     MOMENTS,
     NORMALS,
-    PRIOR_COUNT,
     ROW,
     SURFACE_MOMENTS,
     Responsibilities,
@@ -67,10 +66,10 @@ class ShapeQuadratic:
         gradient_given_shape: (J, 6) the same where the shape is held: that of `blocks`.
         across: (K', 6 J) roots of the loss to the places of the surfels: across the surface of all,
             along it where points are held there.
-        moments: (J, K, 21) sums of weight h h^T, h = (1, m), target frame; then the part of the
-            prior of each normal that turns with the cloud; then the sums with the weights along
-            the surface.
-        coupling: (K, 21, 3, 6) linear map from the moments of a cloud and surfel to the coupling
+        moments: (J, K, q) sums of weight h h^T, h = (1, m), target frame; then the part of the
+            prior of each normal that turns with the cloud, q = 11; then, where points are held
+            along the surface, the sums with the weights along it, q = 21.
+        coupling: (K, q, 3, 6) linear map from the moments of a cloud and surfel to the coupling
             of its orientation and the cloud.
         prior_turns: (J, J) information of the priors on turns of the clouds, per axis.
         orientation_information: (K, 3, 3) of each surfel, the prior of its normal included.
@@ -99,7 +98,7 @@ class ShapeQuadratic:
         lost: list[Callable[[], Array]] = [lambda: self.across]
         if not given_orientations:
             root = np.linalg.inv(np.linalg.cholesky(self.orientation_information))
-            whitened = np.matmul(root[:, None], self.coupling).reshape(-1, 21, 18)
+            whitened = np.matmul(root[:, None], self.coupling).reshape(*self.coupling.shape[:2], 18)
             lost += [
                 partial(self._lost_to_orientations, whitened, own)
                 for own in parts(len(self.coupling), ORIENTATION_PARTS)
@@ -187,26 +186,18 @@ def shape_quadratic(
         R: (J, 3, 3) rotations of current `T_target_lidar`.
         t: (J, 3) translations of it.
         mixture: the surfels of the E-step.
-        cells: (J, K, 33) `cell_moments` of the responsibilities.
+        cells: `cell_moments` of the responsibilities.
         who: the responsibilities; their lever corrections enter.
     """
-    count, K = stack.count, len(mixture.weights)
     carry = to_target(stack, R, t)
     points = np.matmul(cells[..., MOMENTS], carry)
     moments = np.matmul(cells[..., SURFACE_MOMENTS], carry)
-    total = points.sum(axis=0)
+    blocks, given_shape = _given_shape(points, moments, mixture, who)
+    total, on_surface = points.sum(axis=0), moments.sum(axis=0)
     mass, means = mass_and_means(total, mixture)
+    surface_means = mass_and_means(on_surface, mixture)[1]
     n = mixture.normals_target
     W = n[:, :, None] * n[:, None, :]
-    halves = W[:, *np.triu_indices(3)]
-    by_cloud = np.swapaxes(points, 1, 2)
-    pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, mixture.means_target)
-    given_shape = (by_cloud @ halves).reshape(count, 60) @ _GRADIENTS
-    given_shape -= np.einsum("jac,ace->je", pull, JACOBIAN)
-    given_shape[:, :3] += who.levers
-    on_surface = moments.sum(axis=0)
-    surface_means = mass_and_means(on_surface, mixture)[1]
-    coupling = _coupling(W, surface_means)
     # Each surfel moves to its points, and turns into their plane.
     move = np.einsum("ka,ka->k", n, means - mixture.means_target)[:, None] * n
     taken = np.swapaxes(moments, 1, 2)[:, :4] @ move
@@ -219,82 +210,126 @@ def shape_quadratic(
     known, seen = reliability / NORMAL_SIGMA_RAD**2, 1.0 / SEEN_SIGMA_RAD**2
     torque += known[:, None] * towards
     C += (known + seen)[:, None, None] * np.eye(3)
-    held, E, along_means = _held_along(cells, carry, mixture, W)
-    along_mass = held[..., 0].sum(axis=0) + PRIOR_COUNT
-    along_halves = E[:, *np.triu_indices(3)]
-    along_by_cloud = np.swapaxes(held, 1, 2)
-    gradient += (along_by_cloud @ along_halves).reshape(count, 60) @ _GRADIENTS
-    pull = along_by_cloud[:, :4] @ np.einsum("kab,kb->ka", E, along_means)
-    gradient -= np.einsum("jac,ace->je", pull, JACOBIAN)
-    C += _orientation_information(scatter_about(held.sum(axis=0), along_means), E)
-    coupling = np.concatenate([coupling, _coupling(E, along_means)[:, :10]], axis=1)
-    turns = np.linalg.solve(C, torque[..., None])[..., 0]
     # The normals of the points and the beams turn with their clouds: so do the priors.
     parts_of_weight = points[..., 0] / mass
     by_normals = known * parts_of_normal
+    turning = [moments, (by_normals + seen * parts_of_weight)[..., None]]
+    coupling = [_coupling(W, surface_means)]
+    across = [_lost_across(moments, mixture, mass)]
+    if who.weight_along is not None:
+        along = _Along.of(np.matmul(cells[..., ALONG_MOMENTS], carry), mixture, W)
+        along_blocks, along_gradient = along.quadratic()
+        blocks += along_blocks
+        gradient += along_gradient
+        C += along.orientation_information()
+        turning.append(along.moments)
+        coupling.append(_coupling(along.projection, along.means)[:, :10])
+        across.append(along.lost(n))
+    turns = np.linalg.solve(C, torque[..., None])[..., 0]
     gradient[:, :3] += by_normals @ towards
-    turning = np.concatenate(
-        [moments, (by_normals + seen * parts_of_weight)[..., None], held], axis=2
-    )
-    lost = np.einsum("kqae,ka->kqe", coupling, turns)
-    gradient -= turning.reshape(count, 21 * K) @ lost.reshape(21 * K, 6)
-    sums = moments[..., :4].transpose(1, 0, 2)
-    across = np.empty((K, count, 6))
-    root = n / np.sqrt(mass)[:, None]
-    across[..., :3] = cross(sums[..., 1:], root[:, None])
-    across[..., 3:] = sums[..., :1] * root[:, None]
-    aside = _lost_along(held, mixture, along_mass)
-    blocks = (np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS
-    blocks += (along_by_cloud @ along_halves).reshape(count, 60) @ _BLOCKS
-    return ShapeQuadratic(
-        blocks=blocks.reshape(count, 6, 6),
-        gradient=np.asarray(gradient),
-        gradient_given_shape=np.asarray(given_shape),
-        across=np.concatenate([across.reshape(K, 6 * count), aside]),
-        moments=turning,
-        coupling=coupling,
+    quadratic = ShapeQuadratic(
+        blocks=blocks,
+        gradient=gradient,
+        gradient_given_shape=given_shape,
+        across=np.concatenate(across),
+        moments=np.concatenate(turning, axis=2),
+        coupling=np.concatenate(coupling, axis=1),
         prior_turns=by_normals @ parts_of_normal.T + seen * parts_of_weight @ parts_of_weight.T,
         orientation_information=C,
         turns=np.asarray(turns),
         normal_information=known + seen,
     )
+    lost = np.einsum("kqae,ka->kqe", quadratic.coupling, turns).reshape(-1, 6)
+    gradient -= quadratic.moments.reshape(stack.count, len(lost)) @ lost
+    return quadratic
 
 
-def _held_along(
-    cells: Array, carry: Array, mixture: Mixture, W: Array
-) -> tuple[Array, Array, Array]:
-    """(J, K, 10) moments with the weights along the surface, (K, 3, 3) projections on it, means.
+def quadratic_given_shape(
+    stack: CloudStack, R: Array, t: Array, mixture: Mixture, cells: Array, who: Responsibilities
+) -> tuple[Array, Array]:
+    """(J, 6, 6) information and (J, 6) gradient of each cloud on a shape that is held.
 
-    Residuals along the surface are those of points of one surfel against the mean of all of them.
+    Those of `shape_quadratic` where no points are held along the surface, without the rest of it.
     """
-    held = np.matmul(cells[..., ALONG_MOMENTS], carry)
-    means = mass_and_means(held.sum(axis=0), mixture)[1]
-    return held, np.eye(3) - W, means
+    carry = to_target(stack, R, t)
+    points = np.matmul(cells[..., MOMENTS], carry)
+    return _given_shape(points, np.matmul(cells[..., SURFACE_MOMENTS], carry), mixture, who)
 
 
-def _lost_along(held: Array, mixture: Mixture, mass: Array) -> Array:
-    """(K', 6 J) roots of the loss to the places along the surface, where points are held."""
-    count = len(held)
-    own_mass = held[..., 0].sum(axis=0)
-    # None where a graph holds the clouds: rows of zeros would cost as much as the rest.
-    taking = np.flatnonzero(own_mass > ALONG_PART * own_mass.max())
-    sums = held[:, taking, :4].transpose(1, 0, 2)
-    rows = []
-    for axis in np.moveaxis(tangents(mixture.normals_target[taking]), 1, 0):
-        root = axis / np.sqrt(mass[taking])[:, None]
-        own = np.empty((len(taking), count, 6))
-        own[..., :3] = cross(sums[..., 1:], root[:, None])
-        own[..., 3:] = sums[..., :1] * root[:, None]
-        rows.append(own.reshape(len(taking), 6 * count))
-    return np.concatenate(rows)
+def _given_shape(
+    points: Array, moments: Array, mixture: Mixture, who: Responsibilities
+) -> tuple[Array, Array]:
+    """`quadratic_given_shape` of moments (J, K, 10) of points and of where their beams end."""
+    count = len(points)
+    n = mixture.normals_target
+    W = n[:, :, None] * n[:, None, :]
+    halves = W[:, *np.triu_indices(3)]
+    by_cloud = np.swapaxes(points, 1, 2)
+    pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", W, mixture.means_target)
+    gradient = (by_cloud @ halves).reshape(count, 60) @ _GRADIENTS
+    gradient -= np.einsum("jac,ace->je", pull, JACOBIAN)
+    gradient[:, :3] += who.levers
+    blocks = (np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS
+    return blocks.reshape(count, 6, 6), np.asarray(gradient)
 
 
-def tangents(normals: Array) -> Array:
-    """(K, 2, 3) two orthogonal directions along each surface, of (K, 3) normals."""
-    steep = np.abs(normals[:, 2:]) > 0.9
-    first = cross(normals, np.where(steep, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
-    first /= np.linalg.norm(first, axis=1)[:, None]
-    return np.stack([first, cross(normals, first)], axis=1)
+def _lost_across(moments: Array, mixture: Mixture, mass: Array) -> Array:
+    """(K, 6 J) roots of the loss to the places across the surface."""
+    root = mixture.normals_target / np.sqrt(mass)[:, None]
+    return _roots(moments[..., :4].transpose(1, 0, 2), root)
+
+
+def _roots(sums: Array, root: Array) -> Array:
+    """(K, 6 J) of sums (K, J, 4) over points and directions (K, 3) over the root of the weight."""
+    out = np.empty((*sums.shape[:2], 6))
+    out[..., :3] = cross(sums[..., 1:], root[:, None])
+    out[..., 3:] = sums[..., :1] * root[:, None]
+    return out.reshape(len(out), 6 * sums.shape[1])
+
+
+@dataclass(frozen=True)
+class _Along:
+    """What holds points along the surface, at the mean of all points of their surfel.
+
+    Attributes:
+        moments: (J, K, 10) with the weights along the surface.
+        projection: (K, 3, 3) on the surface.
+        mass: (K,) weight of each surfel's points.
+        means: (K, 3) their means.
+    """
+
+    moments: Array
+    projection: Array
+    mass: Array
+    means: Array
+
+    @classmethod
+    def of(cls, moments: Array, mixture: Mixture, W: Array) -> _Along:
+        """Of moments (J, K, 10) and projections (K, 3, 3) on the normals."""
+        return cls(moments, np.eye(3) - W, *mass_and_means(moments.sum(axis=0), mixture))
+
+    def quadratic(self) -> tuple[Array, Array]:
+        """(J, 6, 6) information and (J, 6) gradient of each cloud, the means held."""
+        count = len(self.moments)
+        halves = self.projection[:, *np.triu_indices(3)]
+        by_cloud = np.swapaxes(self.moments, 1, 2)
+        sums = (by_cloud @ halves).reshape(count, 60)
+        pull = by_cloud[:, :4] @ np.einsum("kab,kb->ka", self.projection, self.means)
+        gradient = sums @ _GRADIENTS - np.einsum("jac,ace->je", pull, JACOBIAN)
+        return (sums @ _BLOCKS).reshape(count, 6, 6), np.asarray(gradient)
+
+    def orientation_information(self) -> Array:
+        """(K, 3, 3) information on the orientations of the surfels."""
+        scatter = scatter_about(self.moments.sum(axis=0), self.means)
+        return _orientation_information(scatter, self.projection)
+
+    def lost(self, normals: Array) -> Array:
+        """(K', 6 J) roots of the loss to the places along the surface, where points are held."""
+        own_mass = self.moments[..., 0].sum(axis=0)
+        taking = np.flatnonzero(own_mass > ALONG_PART * own_mass.max())
+        sums = self.moments[:, taking, :4].transpose(1, 0, 2)
+        axes = tangent_axes(normals[taking]) / np.sqrt(self.mass[taking])[:, None, None]
+        return np.concatenate([_roots(sums, axes[:, side]) for side in (0, 1)])
 
 
 def _normal_prior(

@@ -20,7 +20,7 @@ import scipy.linalg
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
-from caliv_graph.products import Array, Mixture, Registration, Side, TargetObservation
+from caliv_graph.products import Array, IntArray, Mixture, Registration, Side, TargetObservation
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
@@ -168,6 +168,14 @@ class JointRegistration:
     def view_weights(self) -> Array:
         """(J,) weight of each cloud for what it shares with others of the same view."""
         return weights_of_views(self._views, self._shared[self.clouds.lidar])
+
+    def only(self, which: IntArray) -> JointRegistration:
+        """The same state with the clouds at these indices, ascending, alone; this one stays."""
+        part = copy(self)
+        part.clouds, part.weights = self.clouds.only(which), self.weights[which]
+        part._views, part.inlier_ratio = self._views[which], self.inlier_ratio[which]
+        part._expected = None
+        return part
 
     def seed(self, R: Array, t: Array, sigma_m: float) -> None:
         """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""

@@ -17,7 +17,7 @@ from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect
 from caliv_graph.registration.moments import cell_moments
-from caliv_graph.registration.quadratic import shape_quadratic
+from caliv_graph.registration.quadratic import quadratic_given_shape
 from caliv_graph.targets.cloud.beams import elevations, typical_gap
 
 LESS_HIGH_M = 0.08
@@ -154,7 +154,7 @@ def best_starts(
     Returns:
         R (S, 3, 3) and t (S, 3) of them, and (S,) whether that is another place than before.
     """
-    part = _only(clouds, found.clouds)
+    part = clouds.only(found.clouds)
     mixture = _shown_by_others(mixture)
     R_now, t_now = R[found.clouds], t[found.clouds]
     best_R, best_t, best = R_now, t_now, np.full(part.count, -np.inf)
@@ -190,23 +190,6 @@ def _steps(lacks_m: Array) -> Array:
     return np.linspace(-1.0, 1.0, 2 * half + 1) if half else np.zeros(1)
 
 
-def _only(clouds: CloudStack, which: IntArray) -> CloudStack:
-    """The clouds at these indices, ascending."""
-    kept = np.isin(clouds.cloud, which)
-    sizes = clouds.sizes[which]
-    return CloudStack(
-        points=clouds.points[kept],
-        cloud=np.repeat(np.arange(len(which)), sizes),
-        starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
-        lidar=clouds.lidar[which],
-        beams=clouds.beams[kept],
-        normals=clouds.normals[kept],
-        flatness=clouds.flatness[kept],
-        whole=tuple(clouds.whole[j] for j in which.tolist()),
-        sigma_range_m=clouds.sigma_range_m,
-    )
-
-
 def _shown_by_others(mixture: Mixture) -> Mixture:
     """The components that stand for points of the other clouds, not for those left out."""
     kept = mixture.weights > LEAST_WEIGHT / len(mixture.weights)
@@ -234,11 +217,10 @@ def _fitted(
         shape, wide = _widened(mixture, noise, START_SIGMA_M * NARROWER**i)
         who = expect(clouds, R, t, shape, wide, OUTLIER_DENSITY, ones)
         cells = cell_moments(clouds, who, len(shape.weights))
-        quadratic = shape_quadratic(clouds, R, t, shape, cells, who)
-        H = quadratic.blocks
+        H, gradient = quadratic_given_shape(clouds, R, t, shape, cells, who)
         size = np.trace(H, axis1=1, axis2=2) / 6.0
         H = H + (STEP_RIDGE * size + 1e-9)[:, None, None] * np.eye(6)
-        d = -np.linalg.solve(H, quadratic.gradient_given_shape[..., None])[..., 0]
+        d = -np.linalg.solve(H, gradient[..., None])[..., 0]
         largest = np.abs(d).max(axis=1, keepdims=True)
         d = d * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, 1e-12))
         R, t = move(R, t, d)

@@ -21,6 +21,7 @@ from caliv_graph.geometry.se3 import (
     rpy,
     skew,
     stack,
+    tangent_axes,
     unstack,
     vehicle_axes_difference,
 )
@@ -247,3 +248,15 @@ def test_unstack_mends_a_shear() -> None:
         np.testing.assert_allclose(M @ M.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(M) == pytest.approx(1.0)
         assert mended.equals(true, 1e-4)
+
+
+def test_axes_across_directions_form_right_handed_frames() -> None:
+    # By hand: of z the axis farthest is x; two rows of directions, as of any number.
+    assert tangent_axes(np.array([0.0, 0.0, 1.0])).tolist() == [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]
+    directions = np.random.default_rng(3).normal(size=(2, 50, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    frames = np.concatenate([tangent_axes(directions), directions[..., None, :]], axis=-2)
+    np.testing.assert_allclose(
+        frames @ np.swapaxes(frames, -1, -2), np.tile(np.eye(3), (2, 50, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(frames), np.ones((2, 50)), atol=1e-12)

@@ -195,7 +195,9 @@ def _robust(A: Array, y: Array, prior_sigma: Array) -> tuple[Array, Array]:
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
         normal = (A * root).T @ (A * root) / OVERLAP
-        found = np.linalg.lstsq(normal + prior, (A * weight[:, None]).T @ y / OVERLAP)[0]
+        found = np.asarray(
+            np.linalg.lstsq(normal + prior, (A * weight[:, None]).T @ y / OVERLAP)[0], np.float64
+        )
         left = y - A @ found
         scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
         weight = np.clip(1.0 - (left / (4.685 * scale)) ** 2, 0.0, None) ** 2

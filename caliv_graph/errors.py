@@ -22,7 +22,15 @@ class TrajectoryError(CalivError):
 
 
 class TargetError(CalivError):
-    """The target was not found in the clouds."""
+    """The target was not found in the clouds.
+
+    Attributes:
+        what: the message without the remedy, which is wrong where another cause is known.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        self.what = what
+        super().__init__(f"{what}. {remedy}" if remedy else what)
 
 
 class RegistrationError(CalivError):

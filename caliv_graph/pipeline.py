@@ -14,10 +14,22 @@ from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.errors import CalivError, TargetError, TrajectoryError
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
+from caliv_graph.physics import (
+    check_clouds,
+    contradicted,
+    heading_findings,
+    raise_fatal,
+    raw_findings,
+    smoothed_findings,
+    warnings_of,
+    with_cause,
+)
 from caliv_graph.products import (
     Calibration,
+    Finding,
     GroundObservation,
     MotionData,
     Recording,
@@ -38,12 +50,14 @@ class Prepared:
         trajectories: one per drive, with a node at every scan that sees a target.
         observations: the targets' clouds.
         grounds: the ground as the LiDARs saw it.
+        findings: values of the config that the raw data contradict.
         warnings: for the user, a line each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
     observations: tuple[TargetObservation, ...]
     grounds: tuple[GroundObservation, ...]
+    findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
 
 
@@ -64,9 +78,18 @@ def prepare(
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
-    with progress.stage("smoothing the trajectory", None):
-        rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-    observations = extract_targets(recordings, rough, config, progress)
+    check_clouds(recordings, config)
+    raw = raw_findings(motions, config)
+    raise_fatal(raw)
+    findings = causes = raw
+    try:
+        with progress.stage("smoothing the trajectory", None):
+            rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
+        findings += smoothed_findings(recordings, rough, motions, config, progress)
+        causes = (*findings, *heading_findings(rough, motions, config, raw))
+        observations = extract_targets(recordings, rough, config, progress)
+    except (TrajectoryError, TargetError) as error:
+        raise with_cause(error, causes) from error
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations)
@@ -76,8 +99,53 @@ def prepare(
     warnings += [w for t in trajectories for w in t.warnings]
     warnings += [w for o in observations for w in o.warnings]
     return Prepared(
-        tuple(trajectories), tuple(observations), tuple(grounds), (*warnings, *ground_warnings)
+        tuple(trajectories),
+        tuple(observations),
+        tuple(grounds),
+        findings,
+        (*warnings, *ground_warnings, *warnings_of(findings)),
     )
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a recorded drive shows with a config, as far as it can be seen.
+
+    Attributes:
+        observations: the targets' clouds; None if the search stopped.
+        findings: values of the config that the raw data contradict, the heading included.
+        problems: what stopped the search, a sentence each.
+    """
+
+    observations: tuple[TargetObservation, ...] | None
+    findings: tuple[Finding, ...]
+    problems: tuple[str, ...]
+
+
+def look(recording: Recording, config: Config, progress: Progress) -> Look:
+    """The checks of `prepare`, and the search for the target, of one drive; raises no CalivError.
+
+    Clouds that are read for the first time here may be damaged: that is a problem like the others.
+    """
+    findings: tuple[Finding, ...] = ()
+    problems: list[str] = []
+    try:
+        check_clouds([recording], config)
+    except CalivError as error:
+        problems.append(str(error))
+    try:
+        motions = {0: recording.motion()}
+        findings = raw = raw_findings(motions, config)
+        if any(found.severity == "fatal" for found in findings):
+            return Look(None, findings, tuple(problems))
+        trajectories = smooth_trajectories([recording], config, [[]], motions)
+        findings += smoothed_findings([recording], trajectories, motions, config, progress)
+        findings += heading_findings(trajectories, motions, config, raw)
+        observations = extract_targets([recording], trajectories, config, progress)
+    except CalivError as error:
+        problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
+        return Look(None, findings, tuple(problems))
+    return Look(observations, findings, tuple(problems))
 
 
 def _stamps_seen(drives: int, observations: Sequence[TargetObservation]) -> list[list[int]]:
@@ -127,6 +195,7 @@ def _calibrate(
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
+    calibration = contradicted(calibration, prepared.findings)
     calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)

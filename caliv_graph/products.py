@@ -292,6 +292,28 @@ class GroundObservation:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """A value that the user gave and that the raw data contradict, found without a solved graph.
+
+    Attributes:
+        input: its key in the config, such as `imu.T_vehicle_imu`.
+        value: what would fit, in the units of the config; empty: unknown.
+        sigma: of each of `value`.
+        sigmas: how significant the contradiction is.
+        severity: `fatal`: nothing can be computed from such data; `contradiction`: beyond 5 sigma;
+            `warning`: less.
+        sentence: for the user.
+    """
+
+    input: str
+    value: tuple[float, ...]
+    sigma: float
+    sigmas: float
+    severity: Literal["fatal", "contradiction", "warning"]
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Mixture:
     """The reconstructed target: surfels, small pieces of plane, in the target frame.
 

@@ -25,29 +25,41 @@ def inspect(
 ) -> None:
     """Show the content of a recording: topics, rates, gaps, clocks, point times, units, the drive.
 
-    With a config, also when each LiDAR sees the target.
+    With a config, also what the data say against it, and when each LiDAR sees the target.
 
     Example: caliv-graph inspect drive/ --config config.yaml
     """
+    from dataclasses import replace
+
     from caliv_graph.config.load import load_config
+    from caliv_graph.errors import RecordingError
     from caliv_graph.readers import open_recording
     from caliv_graph.readers.discover import open_all
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
     from caliv_graph.report.inspection_table import inspection_table
 
     settings = None if config is None else load_config(config)
-    recording = open_all(data) if settings is None else open_recording(settings, data)
+    warnings: list[str] = []
+    if settings is None:
+        recording = open_all(data)
+    else:
+        try:
+            recording = open_recording(settings, data)
+        except RecordingError as error:
+            # Its topics can still be shown, if it is a recording at all.
+            recording, settings = open_all(data), None
+            warnings.append(str(error))
     with streams.progress_on_stdout(as_json) as progress:
-        inspection = inspect_any(recording, progress)
-        warnings: list[str] = []
+        inspection = inspect_any(recording, progress, settings)
         if settings is not None:
-            from caliv_graph.targets import extract_targets
-            from caliv_graph.trajectory.select import smooth_trajectories
+            from caliv_graph.pipeline import look
 
-            trajectories = smooth_trajectories([recording], settings, [[]])
-            observations = extract_targets([recording], trajectories, settings, progress)
-            inspection = add_any_targets(inspection, observations)
-            warnings += [line for seen in observations for line in seen.warnings]
+            seen = look(recording, settings, progress)
+            if seen.observations is not None:
+                inspection = add_any_targets(inspection, seen.observations)
+                warnings += [line for found in seen.observations for line in found.warnings]
+            inspection = replace(inspection, findings=seen.findings, problems=seen.problems)
+            warnings += [*(found.sentence for found in seen.findings), *seen.problems]
         warnings = [*recording.warnings(), *warnings]
     if as_json:
         streams.show_json(inspection.document())

@@ -83,12 +83,14 @@ class ImuCheck:
         angular_rate_rad_s: 95th percentile of its norm, as if in rad/s.
         gravity_problem: a problem of the specific force; empty: none.
         rate_problem: a problem of the angular rate; empty: none.
+        up_imu: unit vector along the mean specific force, imu frame: upwards.
     """
 
     specific_force_m_s2: float
     angular_rate_rad_s: float
     gravity_problem: str
     rate_problem: str
+    up_imu: tuple[float, float, float]
 
 
 _Reason = tuple[str, Callable[[Array], Any]]
@@ -489,7 +491,9 @@ def check_imu(samples: ImuSamples) -> ImuCheck:
             f"a twentieth of the angular rates exceeds {rate:.3g} rad/s, too fast for a vehicle: "
             "it looks like degrees per second"
         )
-    return ImuCheck(force, rate, gravity_problem, rate_problem)
+    mean = samples.specific_force.mean(axis=0)
+    x, y, z = (mean / max(float(np.linalg.norm(mean)), 1e-9)).tolist()
+    return ImuCheck(force, rate, gravity_problem, rate_problem, (x, y, z))
 
 
 def right_perturbations(R_map_vehicle: Array, cov_ros: Array) -> Array:

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import Recording, TargetObservation
+from caliv_graph.products import Finding, Recording, TargetObservation
 from caliv_graph.readers.clock import Clock
+from caliv_graph.readers.motion import ImuCheck
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.report.inspection import (
     DriveSummary,
@@ -27,6 +29,7 @@ from caliv_graph.report.inspection import (
     summarise_points,
     summarise_targets,
 )
+from caliv_graph.wording.physics import gravity_problem
 
 _SAMPLED_CLOUDS = 20
 """Clouds per LiDAR that are decoded, spread over the drive: a bag can hold many thousands."""
@@ -110,11 +113,13 @@ class ImuSummary:
     Attributes:
         specific_force_m_s2: median of its norm.
         angular_rate_rad_s: 95th percentile of its norm.
+        up_imu: unit vector along the mean specific force, imu frame: upwards.
         problems: one sentence per problem.
     """
 
     specific_force_m_s2: float
     angular_rate_rad_s: float
+    up_imu: tuple[float, float, float]
     problems: tuple[str, ...]
 
 
@@ -125,6 +130,8 @@ class BagInspection:
     Attributes:
         gnss_fixes: number of messages with a fix, per GNSS topic that was read.
         drive: the motion according to given poses; None without poses.
+        findings: values of the config that the data contradict (`physics`).
+        problems: why the search for the target stopped, a sentence each.
     """
 
     data: str
@@ -136,21 +143,25 @@ class BagInspection:
     gnss_fixes: dict[str, int]
     drive: DriveSummary | None
     targets: tuple[TargetSummary, ...] | None = None
+    findings: tuple[Finding, ...] = ()
+    problems: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return asdict(self)
 
 
-def inspect_any(recording: Recording, progress: Progress) -> Inspection | BagInspection:
-    """The content of a recording of any format.
+def inspect_any(
+    recording: Recording, progress: Progress, config: Config | None = None
+) -> Inspection | BagInspection:
+    """The content of a recording of any format; `config` says how its IMU is mounted.
 
     Raises:
         RecordingError: the recording is damaged.
         TrajectoryError: a CaLiV folder has no vehicle poses.
     """
     if isinstance(recording, RosbagRecording):
-        return inspect_bag(recording, progress)
+        return inspect_bag(recording, progress, config)
     return inspect_recording(recording, progress)
 
 
@@ -176,7 +187,9 @@ def add_any_targets(
     return replace(inspection, targets=targets)
 
 
-def inspect_bag(recording: RosbagRecording, progress: Progress) -> BagInspection:
+def inspect_bag(
+    recording: RosbagRecording, progress: Progress, config: Config | None = None
+) -> BagInspection:
     """Reads a bag once, and some clouds of each LiDAR.
 
     Raises:
@@ -207,15 +220,29 @@ def inspect_bag(recording: RosbagRecording, progress: Progress) -> BagInspection
         topics=topics,
         lidars=lidars,
         imus={
-            topic: ImuSummary(
-                specific_force_m_s2=check.specific_force_m_s2,
-                angular_rate_rad_s=check.angular_rate_rad_s,
-                problems=tuple(p for p in (check.gravity_problem, check.rate_problem) if p),
-            )
+            topic: _summarise_imu(check, config if _is_used(config, topic) else None)
             for topic, check in recording.imu_checks().items()
         },
         gnss_fixes=dict(recording.gnss_fixes()),
         drive=_drive(recording),
+    )
+
+
+def _is_used(config: Config | None, topic: str) -> bool:
+    """Whether the config takes this IMU; without `topics.imu` it takes the only one there is."""
+    return config is not None and config.topics.imu in (None, topic)
+
+
+def _summarise_imu(check: ImuCheck, config: Config | None) -> ImuSummary:
+    """An IMU, its axes by the config that uses it; without one as if it stood upright."""
+    R = np.eye(3) if config is None else config.imu.T_vehicle_imu.pose().rotation().matrix()
+    # Without gravity in it, a force has no direction.
+    axes = "" if check.gravity_problem else gravity_problem(np.array(check.up_imu), R)
+    return ImuSummary(
+        specific_force_m_s2=check.specific_force_m_s2,
+        angular_rate_rad_s=check.angular_rate_rad_s,
+        up_imu=check.up_imu,
+        problems=tuple(p for p in (check.gravity_problem, axes, check.rate_problem) if p),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from caliv_graph.common.progress import Progress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import GivenPoses, Recording, TargetObservation
+from caliv_graph.products import Finding, GivenPoses, Recording, TargetObservation
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
 
 Run = tuple[int, int]
@@ -104,12 +104,19 @@ class TargetSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a recording; `targets` is None if no target was searched."""
+    """The content of a recording; `targets` is None if no target was searched.
+
+    Attributes:
+        findings: values of the config that the data contradict (`physics`).
+        problems: why the search for the target stopped, a sentence each.
+    """
 
     data: str
     lidars: dict[str, LidarSummary]
     drive: DriveSummary
     targets: tuple[TargetSummary, ...] | None = None
+    findings: tuple[Finding, ...] = ()
+    problems: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""

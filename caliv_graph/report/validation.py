@@ -23,6 +23,7 @@ from caliv_graph.validation.findings import (
     Validation,
 )
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
+from caliv_graph.validation.verdict import UNSEEN
 from caliv_graph.workflows.repeatability import Repeatability
 
 MOST_SHOWN = 12
@@ -30,11 +31,11 @@ MOST_SHOWN = 12
 
 
 def validation_table(found: Validation, repeated: Repeatability | None, p_value: float) -> Group:
-    """Distances between LiDARs, thicknesses, objects, repeatability, and the verdict.
+    """The verdict in a word, distances between LiDARs, thicknesses, objects, and sentences.
 
     `p_value` is the limit of the tests of repeatability; `repeated` None: not tested.
     """
-    parts: list[RenderableType] = []
+    parts: list[RenderableType] = [Text(first_line(found), style="bold")]
     for title, headings, rows in tables(found):
         table = new_table(*headings)
         for row in rows:
@@ -46,6 +47,11 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
     style = STATUS_STYLES[validation_status(found)]
     parts += [Text(sentence, style=style) for sentence in found.verdict.sentences]
     return Group(*parts)
+
+
+def first_line(found: Validation) -> str:
+    """The verdict in a word, and what it does not cover."""
+    return f"Verdict: {found.verdict.word}. {UNSEEN}."
 
 
 def validation_status(found: Validation) -> str:
@@ -176,7 +182,9 @@ def validation_document(
     document: dict[str, Any] = {
         "drive": found.drive,
         "structure": found.has_structure,
-        "verdict": {
+        "verdict": verdict.word,
+        "unseen": UNSEEN,
+        "test": {
             "text": " ".join(verdict.sentences),
             "better": verdict.better,
             "measure": verdict.measure if found.surfaces else None,
@@ -345,6 +353,7 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     return template.render(
         found=found,
         status=validation_status(found),
+        first_line=first_line(found),
         tables=tables(found),
         repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
         figures=figures,

@@ -107,7 +107,7 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         inertial=inertial,
         noise=imu_noise(motion.imu, config),
         positions=positions,
-        orientation=_has_orientation(motion.imu, inertial, name),
+        orientation=has_orientation(motion.imu, inertial, name),
         T_vehicle_imu=config.imu.T_vehicle_imu.pose(),
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
     )
@@ -135,7 +135,7 @@ def _positions(
     return None, gravity, [*lines, unused]
 
 
-def _has_orientation(imu: ImuSamples, inertial: Inertial, name: str) -> bool:
+def has_orientation(imu: ImuSamples, inertial: Inertial, name: str) -> bool:
     """Whether messages carry an orientation; its vertical must agree with the accelerometer's."""
     usable = usable_orientations(imu) & np.isfinite(imu.specific_force).all(axis=1)
     stamps = imu.stamps_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import gtsam
 
@@ -77,11 +78,18 @@ class PairResult:
     overlap: Mapping[str, float]
 
 
+Word = Literal["good", "contradicted", "worse", "unclear"]
+"""The verdict in one word. `contradicted`: better than the guess, but beyond its sigmas (exit code
+4); `worse`: worse than the guess beyond its sigmas (exit code 4); `unclear`: nothing was tested
+(exit code 3 without structure), or noise explains the rest poorly; else `good`."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Verdict of a validation.
 
     Attributes:
+        word: the verdict in one word.
         better: ratio of the measure before calibration to after it; None: nothing measured.
         measure: `distance` between LiDARs, or `thickness` where no two see the same surface.
         of_expected: ratio of the measure after calibration to its expected value.
@@ -92,6 +100,7 @@ class Verdict:
         sentences: the verdict in words.
     """
 
+    word: Word
     better: float | None
     measure: str
     of_expected: float | None

@@ -16,6 +16,7 @@ from caliv_graph.validation.findings import (
     SurfaceResult,
     ThingResult,
     Verdict,
+    Word,
 )
 from caliv_graph.validation.measure import (
     POLE_TRUE_M,
@@ -24,6 +25,16 @@ from caliv_graph.validation.measure import (
     offset_covariance,
     rms,
 )
+
+UNSEEN = (
+    "Errors that all LiDARs share with the trajectory are not seen here: S2V, by a wrong "
+    "imu.T_vehicle_imu, gnss.lever_arm or ground.vehicle_height"
+)
+"""What no validation by structure sees: trajectory and S2V are off by opposite motions, and every
+cloud lies where it should."""
+
+POOR = 0.01
+"""Probability below which noise explains the offsets poorly."""
 
 CONTRADICTION = 5.7e-7
 """Probability beyond 5 sigma. Below it the data contradict each other, which is exit code 4."""
@@ -75,7 +86,18 @@ def judge(
             for name, value in alone[0][AFTER].items()
         )
         sentences += (f"Thickness of {_kinds(surfaces)} by each LiDAR alone: {thick}.",)
-    return Verdict(better, measure, of_expected, chi2, dof, p_value, contradicts, sentences)
+    word = _word(better, p_value)
+    return Verdict(word, better, measure, of_expected, chi2, dof, p_value, contradicts, sentences)
+
+
+def _word(better: float | None, p_value: float | None) -> Word:
+    """The verdict in one word, of the gain over the guesses and the test of the offsets."""
+    worse = better is not None and better < 1.0
+    if p_value is None:
+        return "unclear"
+    if p_value < CONTRADICTION:
+        return "worse" if worse else "contradicted"
+    return "unclear" if worse or p_value < POOR else "good"
 
 
 def _tested(surfaces: Sequence[SurfaceResult]) -> list[tuple[SurfaceResult, Pair]]:
@@ -127,7 +149,7 @@ def _sentences(
     else:
         tested = f"chi2 {chi2:.1f} of {dof} dof, p {p_value:.2g}"
         word = "They do not explain it" if contradicts else "They explain it"
-        if not contradicts and p_value < 0.01:
+        if not contradicts and p_value < POOR:
             word = "They explain it poorly"
         out.append(f"{remains}. {word} ({tested}).")
     out.append(f"Extrinsics fitted to this structure alone would leave {best}.")

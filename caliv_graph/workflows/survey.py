@@ -62,7 +62,11 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     return replace(
         found,
         names=tuple(recording.name for recording in recordings),
-        warnings=(*prepared.warnings, *found.warnings),
+        warnings=(
+            *prepared.warnings,
+            *(f.sentence for f in prepared.findings if f.severity == "contradiction"),
+            *found.warnings,
+        ),
     )
 
 

@@ -67,8 +67,9 @@ def test_a_right_calibration(drive: Path, tmp_path: Path) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     document = json.loads(result.stdout)
     assert document == json.loads((out / "validation.json").read_text())
-    assert document["verdict"]["better"] > 30.0
-    assert document["verdict"]["contradicts"] is False
+    assert document["verdict"] == "good"
+    assert document["test"]["better"] > 30.0
+    assert document["test"]["contradicts"] is False
     assert document["repeatability"] is None
     (pair,) = document["pairs"]
     assert (pair["from"], pair["to"], pair["surfaces"]) == ("front", "rear", 3)
@@ -105,6 +106,10 @@ def test_a_wrong_calibration(drive: Path) -> None:
 
     assert result.exit_code == 4
     assert re.match(r"warning: .*wrong\.yaml: .* They do not explain it", result.stderr)
+    # Before the first table.
+    _, first = result.stdout.split("Distance between LiDARs")[0].split("Verdict: ")
+    assert first.startswith("contradicted. ")
+    assert "not seen here: S2V" in " ".join(first.split())
     assert "Distance between LiDARs" in result.stdout
     assert "front alone" in result.stdout
 
@@ -125,7 +130,8 @@ def test_nothing_to_validate_on(tmp_path: Path) -> None:
     assert result.exit_code == 3
     document = json.loads(result.stdout)
     assert document["structure"] is False
-    assert document["verdict"]["better"] is document["verdict"]["p_value"] is None
+    assert document["verdict"] == "unclear"
+    assert document["test"]["better"] is document["test"]["p_value"] is None
     assert document["thickness_m"]["merged"]["after"] is None
     assert result.stderr.startswith("warning: Nothing can be said: there is no wall")
     assert (tmp_path / "out" / "validation.html").exists()

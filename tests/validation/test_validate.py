@@ -128,6 +128,7 @@ def test_a_calibration_that_is_worse_than_the_guess_is_said_to_be() -> None:
 
     assert found.verdict.better is not None
     assert found.verdict.better < 0.1
+    assert found.verdict.word == "worse"
     assert "WORSE" in found.verdict.sentences[0]
 
 

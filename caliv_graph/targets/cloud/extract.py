@@ -21,6 +21,11 @@ from caliv_graph.targets.cloud.views import clouds_per_lidar
 from caliv_graph.targets.search import find_target
 from caliv_graph.trajectory.select import VehicleTrajectory
 
+REMEDY = (
+    "Move or widen target.min/max, check the initial guesses, or run 'caliv-graph inspect' with "
+    "the config"
+)
+
 SCANS_OF_A_PLACE = 10
 """Scans of each place of a target that is moved while the vehicle stands. All show the same spots
 of it: more would average the noise but not the sampling by the beams."""
@@ -72,7 +77,8 @@ def extract_targets(
                 for found in _placements(label, extractor, of_lidar, config, hints[drive]):
                     observations.append(replace(found, placement=len(observations)))
     if not any(o.clouds for o in observations):
-        raise TargetError(observations[0].warnings[-1])
+        why = observations[0].warnings[-1]
+        raise TargetError(why.removesuffix(f". {REMEDY}"), REMEDY)
     return tuple(observations)
 
 
@@ -329,7 +335,4 @@ def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
             f"lidar '{name}' in {tally.kept} of {tally.scans} scans, needs "
             f"{config.extraction.min_scans} ({near}; {tally.reasons() or 'nothing rejected'})"
         )
-    return (
-        f"{region}: no LiDAR sees the target: {'; '.join(parts)}. Move or widen target.min/max, "
-        "check the initial guesses, or run 'caliv-graph inspect' with the config"
-    )
+    return f"{region}: no LiDAR sees the target: {'; '.join(parts)}. {REMEDY}"

@@ -47,6 +47,9 @@ REGION_MARGIN_M = 0.3
 """Margin of the region about the object on each side."""
 
 
+REMEDY = "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
+
+
 @dataclass(frozen=True)
 class FoundTarget:
     """The target of one drive.
@@ -164,7 +167,7 @@ def _target_of_drive(
     usable = matched([track for track in tracks if not track.verdict])
     proposals = [c for c in usable if math.isfinite(c.height_m)]
     if not proposals:
-        raise TargetError(_why_none(name, histories, tracks, len(usable)))
+        raise TargetError(_why_none(name, histories, tracks, len(usable)), REMEDY)
     proposals.sort(key=Proposal.rank, reverse=True)
     best = proposals[0]
     return FoundTarget(
@@ -213,6 +216,5 @@ def _why_none(
     return (
         f"{name}: target: none found in {scans} scans: needs a static object on the ground, "
         f"0.3 to {MAX_EXTENT_M} m wide, at most 2 m high, seen well in several scans. Seen: "
-        f"{', '.join(found) or 'nothing above the ground'}{sight}. "
-        "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
+        f"{', '.join(found) or 'nothing above the ground'}{sight}"
     )

@@ -1,0 +1,134 @@
+"""Checks of the raw data against the config, before the target is searched for.
+
+`calibrate` and `inspect` make the same checks and say them in the same words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.errors import CalivError, RecordingError, TargetError, TrajectoryError
+from caliv_graph.products import Calibration, Finding, MotionData, Recording
+from caliv_graph.targets.cloud.copies import copies
+from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
+from caliv_graph.trajectory.heading import heading_disagreement
+from caliv_graph.trajectory.physics import motion_physics
+from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.tilt import vehicle_tilt
+from caliv_graph.wording.physics import (
+    copies_sentence,
+    guess_findings,
+    heading_finding,
+    motion_findings,
+    tilt_finding,
+)
+
+
+def check_clouds(recordings: Sequence[Recording], config: Config) -> None:
+    """Raises `RecordingError` if two LiDARs of a drive have the same clouds."""
+    for recording in recordings:
+        for found in copies(recording):
+            raise RecordingError(copies_sentence(recording.name, found, config))
+
+
+def raw_findings(motions: Mapping[int, MotionData], config: Config) -> tuple[Finding, ...]:
+    """What the raw sensors of each drive say against each other and against the config."""
+    out: list[Finding] = []
+    for motion in motions.values():
+        if takes_given_poses(motion, config):
+            continue
+        try:
+            found = motion_physics(motion, config)
+        except TrajectoryError:
+            continue  # unusable samples: smoothing says the same
+        if found is not None:
+            out += motion_findings(found, config)
+    return tuple(out)
+
+
+def raise_fatal(findings: Sequence[Finding]) -> None:
+    """Raises `TrajectoryError` with the most significant fatal finding, if there is one."""
+    fatal = [found for found in findings if found.severity == "fatal"]
+    if fatal:
+        raise TrajectoryError(_most_likely(fatal).sentence)
+
+
+def smoothed_findings(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+    progress: Progress,
+) -> tuple[Finding, ...]:
+    """What trajectory and ground say against the config, but for the heading.
+
+    Raises:
+        RecordingError: a cloud could not be read.
+    """
+    out: list[Finding] = []
+    for index, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
+        tilt = vehicle_tilt(trajectory, motions[index].name, config)
+        found = tilt_finding(tilt, config)
+        if found is not None:
+            out.append(found)
+        if config.ground.use:
+            grounds = lidar_grounds(recording, trajectory, config, progress)
+            out += guess_findings(recording.name, misfits(grounds, config), config)
+    return tuple(out)
+
+
+def heading_findings(
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+    raw: Sequence[Finding],
+) -> tuple[Finding, ...]:
+    """Headings that disagree with the course. `calibration.check` says them after the solve.
+
+    None with a finding of the raw sensors about `T_vehicle_imu`: then the trajectory is no
+    evidence.
+    """
+    if any(found.input == "imu.T_vehicle_imu" for found in raw):
+        return ()
+    out = []
+    for index, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, SmoothedTrajectory):
+            disagreement = heading_disagreement(trajectory, motions[index])
+            found = None if disagreement is None else heading_finding(disagreement, config)
+            if found is not None:
+                out.append(found)
+    return tuple(out)
+
+
+def _most_likely(findings: Sequence[Finding]) -> Finding:
+    return max(findings, key=lambda found: found.sigmas)
+
+
+def with_cause(error: CalivError, findings: Sequence[Finding]) -> CalivError:
+    """The same error with the most significant finding as its cause, instead of its remedy."""
+    if not findings:
+        return error
+    found = _most_likely(findings)
+    what = error.what if isinstance(error, TargetError) else str(error)
+    return type(error)(f"{what}. Most likely because of {found.input}: {found.sentence}")
+
+
+def contradicted(calibration: Calibration, findings: Sequence[Finding]) -> Calibration:
+    """The calibration, inconsistent if there are contradictions among the findings."""
+    sentences = tuple(f.sentence for f in findings if f.severity != "warning")
+    if not sentences:
+        return calibration
+    return replace(
+        calibration,
+        status="inconsistent",
+        contradictions=(*calibration.contradictions, *sentences),
+    )
+
+
+def warnings_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The sentences of those that are no contradictions."""
+    return tuple(f.sentence for f in findings if f.severity == "warning")

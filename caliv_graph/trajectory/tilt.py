@@ -1,0 +1,134 @@
+"""Vertical against the vehicle's z over a drive: roll and pitch of the vehicle frame.
+
+An error of roll and pitch of `imu.T_vehicle_imu` turns every LiDAR's S2V by the same angles. The
+slope of the ground is told apart by the climb of the path and by changes of heading (`README.md`,
+section 11).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import Array
+from caliv_graph.trajectory.noise import stated
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+STEP_NS = 200_000_000
+"""Of the samples."""
+
+MAX_SAMPLES = 3000
+
+CLIMB_WINDOW_NS = 500_000_000
+"""Half the time over which the climb of the path is measured: a metre at 2 m/s."""
+
+CORRELATED_S = 5.0
+"""Time over which the slope of the ground under a vehicle changes: so much driving counts as one
+sample of it."""
+
+SLOPE_SIGMA_RAD = math.radians(2.0)
+"""1 sigma of the mean slope of the ground, per axis, where nothing tells it: roads have a crossfall
+of 2.5 percent."""
+
+MIN_CLIMB_SIGMA_RAD = 1e-3
+MIN_SLOPE_SIGMA_RAD = 5e-3
+"""Minimum sigmas of one sample: of climb against pitch, as wheels and body give way, and of the
+local slope."""
+
+MIN_SPEED_M_S = 0.5
+"""Below, the direction of the path is noise."""
+
+BODY_SIGMA_RAD = math.radians(0.3)
+"""1 sigma of the body's roll and pitch on its springs at rest: a centimetre over 2 m by load."""
+
+
+@dataclass(frozen=True)
+class VehicleTilt:
+    """Roll and pitch of the vehicle's axes against the ground.
+
+    Attributes:
+        name: of the recording.
+        roll_pitch_rad: (2,) of the vehicle frame against the ground under it.
+        sigma_rad: (2,) of them, body and slope included.
+        given: whether the poses were given, not smoothed from the IMU.
+    """
+
+    name: str
+    roll_pitch_rad: Array
+    sigma_rad: Array
+    given: bool
+
+
+def body_sigma_rad(config: Config) -> float:
+    """How parallel to the ground the vehicle stands, 1 sigma: as the config says, or as usual."""
+    stated = config.ground.parallel_sigma_deg
+    return BODY_SIGMA_RAD if stated is None else math.radians(stated)
+
+
+def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> VehicleTilt:
+    """Roll and pitch of the vehicle's axes over a drive, least squares with priors."""
+    begin, end = trajectory.span_ns
+    count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
+    at = np.linspace(begin, end, count).astype(np.int64)
+    R, _ = trajectory.poses_at(at)
+    up = R[:, 2, :]  # e_z of the map in vehicle axes
+    heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    before, after = np.maximum(at - CLIMB_WINDOW_NS, begin), np.minimum(at + CLIMB_WINDOW_NS, end)
+    moved = trajectory.poses_at(after)[1] - trajectory.poses_at(before)[1]
+    seconds = (after - before) / NANOSECONDS_PER_SECOND
+    across = np.hypot(moved[:, 0], moved[:, 1])
+    driving = across > MIN_SPEED_M_S * seconds
+    climb = np.where(driving, moved[:, 2] / np.where(driving, across, 1.0), 0.0)
+    # Positive where the vehicle moves forward.
+    ahead = np.sign(moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading))
+    climb *= ahead
+    c, s = np.cos(heading), np.sin(heading)
+    zero, one = np.zeros(count), np.ones(count)
+    # Unknowns: mean of up along x and along y, slope of the ground along the map's x and y.
+    groups = [
+        (np.stack([one, zero, zero, zero], 1)[driving], (up[:, 0] - climb)[driving]),
+        (np.stack([zero, zero, c, s], 1)[driving], climb[driving]),
+        (np.stack([one, zero, c, s], 1)[~driving], up[~driving, 0]),
+        (np.stack([zero, one, -s, c], 1), up[:, 1]),
+    ]
+    least = (MIN_CLIMB_SIGMA_RAD, *[MIN_SLOPE_SIGMA_RAD] * 3)
+    sigmas = np.array(least)
+    prior = np.diag([0.0, 0.0, SLOPE_SIGMA_RAD**-2, SLOPE_SIGMA_RAD**-2])
+    # So many samples count as one: correlated over `CORRELATED_S`.
+    alike = max(CORRELATED_S * (count - 1) / max((end - begin) * 1e-9, 1e-9), 1.0)
+    found, information = np.zeros(4), prior
+    for _ in range(5):
+        weights = [1.0 / (sigma**2 * alike) for sigma in sigmas]
+        information = prior + sum(w * A.T @ A for w, (A, _) in zip(weights, groups, strict=True))
+        right = sum((w * A.T @ y for w, (A, y) in zip(weights, groups, strict=True)), np.zeros(4))
+        found = np.linalg.lstsq(information, right)[0]
+        spread = [
+            float(np.sqrt(((y - A @ found) ** 2).mean())) if len(y) else 0.0 for A, y in groups
+        ]
+        sigmas = np.maximum(spread, least)
+    cov = np.linalg.pinv(information)[:2, :2]
+    cov = cov + _attitude_cov(trajectory)
+    body = body_sigma_rad(config)
+    x, y = found[:2]
+    # Nose up: up leans along +x in vehicle axes, which is a negative pitch; left side up: +y, roll.
+    return VehicleTilt(
+        name=name,
+        roll_pitch_rad=np.array([y, -x]),
+        sigma_rad=np.sqrt(np.array([cov[1, 1], cov[0, 0]]) + body**2),
+        given=not isinstance(trajectory, SmoothedTrajectory),
+    )
+
+
+def _attitude_cov(trajectory: VehicleTrajectory) -> Array:
+    """(2, 2) of a pose's pitch and roll, taken as common to the drive; zero if unknown."""
+    cov = trajectory.trajectory.cov
+    known = None if cov is None else cov[stated(cov)]
+    if known is None or not len(known):
+        return np.zeros((2, 2))
+    median = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
+    return np.diag(median[[1, 0]])

@@ -1,0 +1,347 @@
+"""Sentences about raw data that contradict what the user gave: what, by how much, what to check."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Array, Finding
+from caliv_graph.targets.cloud.copies import Copy
+from caliv_graph.targets.ground.guesses import Misfit
+from caliv_graph.trajectory.alignment import level
+from caliv_graph.trajectory.heading import HeadingDisagreement
+from caliv_graph.trajectory.physics import Axes, Gravity, MotionPhysics, Ratio
+from caliv_graph.trajectory.tilt import VehicleTilt
+from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
+
+WARNING_SIGMAS = 3.0
+"""From here a disagreement is said."""
+
+MAX_GRAVITY_TILT_RAD = math.radians(20.0)
+"""Between gravity and the vehicle's z: more is a wrong axis. Slopes and accelerations of a drive
+are below."""
+
+MIN_TILT_RAD = math.radians(1.0)
+"""A smaller tilt of the vehicle's axes is not said: load and springs do as much."""
+
+MIN_YAW_RAD = math.radians(20.0)
+"""A smaller angle between axes and path is left to the heading of the smoothed trajectory, which
+knows it better: a wrong lever arm turns the path of an antenna by some degrees."""
+
+GROSS_RATIO = 0.2
+"""Part by which a rate may be off by scale and slip: more is another unit or axis."""
+
+SMALL_RATIO = 0.05
+"""A smaller one is not said: the scale error of a cheap gyroscope, or of a worn tyre."""
+
+MIN_DELAY_S = 0.1
+"""A smaller clock offset is left to the solve: parabolas over 2 s do not resolve it safely."""
+
+KNOWN_PART = 0.1
+"""A ratio this near to that of two units is taken for it."""
+
+GYRO_UNITS = {math.degrees(1.0): "degrees per second", -1.0: "the opposite sign"}
+SPEED_UNITS = {3.6: "km/h", 2.23694: "miles per hour", 1.94384: "knots"}
+"""Ratio of the measured to the true value -> what has that effect."""
+
+
+def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]:
+    """What the raw sensors of a drive say against each other and against `T_vehicle_imu`."""
+    axes = found.axes
+    if found.gravity.tilt_rad > MAX_GRAVITY_TILT_RAD:
+        # Nothing else can be judged about wrong axes, but units can.
+        return (_gravity(found, config), *_rates(found))
+    out = list(_rates(found))
+    if axes is not None:
+        out += _axes(found.name, axes, config)
+    return tuple(out)
+
+
+def gravity_problem(up_imu: Array, R_vehicle_imu: Array) -> str:
+    """What is wrong with an IMU whose gravity is not along the vehicle's +z; empty: nothing."""
+    gravity = Gravity(up_imu, R_vehicle_imu @ up_imu)
+    if gravity.tilt_rad <= MAX_GRAVITY_TILT_RAD:
+        return ""
+    roll, pitch = (f"{round(v) + 0.0:.0f}" for v in gravity.roll_pitch_deg)
+    return (
+        f"gravity is {_gravity_axis(up_imu)}, {math.degrees(gravity.tilt_rad):.0f} degrees from "
+        f"the vehicle's +z: imu.T_vehicle_imu rpy_deg about ({roll}, {pitch}, yaw) would fit"
+    )
+
+
+def _gravity_axis(up_imu: Array) -> str:
+    """The axis of the IMU that gravity is along, in words."""
+    i = int(np.abs(up_imu).argmax())
+    if abs(up_imu[i]) > math.cos(MAX_GRAVITY_TILT_RAD):
+        return f"along {'+' if up_imu[i] > 0.0 else '-'}{'xyz'[i]} of the IMU"
+    return f"along ({', '.join(f'{v:.2f}' for v in up_imu)}) of the IMU"
+
+
+def _rpy(values: Sequence[float], digits: int = 0) -> str:
+    """Roll, pitch, yaw in degrees as a config has them."""
+    # Rounded first, so that no minus sign stands before zero.
+    return f"({', '.join(f'{round(v, digits) + 0.0:.{digits}f}' for v in values)})"
+
+
+def _gravity(found: MotionPhysics, config: Config) -> Finding:
+    gravity: Gravity = found.gravity
+    given = config.imu.T_vehicle_imu
+    value: tuple[float, ...] = ()
+    sentence = gravity_problem(gravity.up_imu, given.pose().rotation().matrix())
+    axes = found.axes
+    if axes is not None and not axes.mirrored and axes.sigma_rad < MIN_YAW_RAD:
+        R = given.pose().rotation().matrix()
+        turned = gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ level(gravity.up_vehicle) @ R
+        value = _degrees(turned)
+        sentence += f"; with the accelerations of the path {_rpy(value)}"
+    sentence = f"{found.name}: {sentence}. Now it is {_rpy(given.rpy_deg)}"
+    sigma = MAX_GRAVITY_TILT_RAD / CONTRADICTION_SIGMAS
+    return Finding(
+        "imu.T_vehicle_imu",
+        value,
+        math.degrees(sigma),
+        gravity.tilt_rad / sigma,
+        "fatal",
+        sentence,
+    )
+
+
+def _degrees(R: Array) -> tuple[float, float, float]:
+    roll, pitch, yaw = np.degrees(gtsam.Rot3(R).rpy()).tolist()
+    return roll, pitch, yaw
+
+
+def _rates(found: MotionPhysics) -> Iterator[Finding]:
+    """Gyroscope and speed against what else measures them."""
+    by_course = [r for r in found.gyroscope if r.against == "course"]
+    by_orientation = [r for r in found.gyroscope if r.against == "orientation"]
+    sound = [r for r in by_course if abs(r.value - 1.0) <= GROSS_RATIO]
+    for ratio in by_course or by_orientation:
+        yield from _ratio(found.name, ratio, "topics.imu", GYRO_UNITS)
+    if sound:
+        for ratio in by_orientation:
+            if abs(ratio.value - 1.0) > GROSS_RATIO:
+                yield from _ratio(found.name, ratio, "topics.imu", {})
+    if found.speed is not None:
+        yield from _ratio(found.name, found.speed, "topics.twist", SPEED_UNITS)
+
+
+_RATIOS = {
+    "course": (
+        "the gyroscope turns {value} times as fast as the course over ground",
+        "Check the axes of the IMU and imu.T_vehicle_imu",
+    ),
+    "orientation": (
+        "the gyroscope turns {value} times as fast as the orientation of the same messages",
+        "One of the two is wrong: choose another topics.imu, or set its orientation_covariance[0] "
+        "to -1",
+    ),
+    "gnss": (
+        "the velocities are {value} times those of the GNSS",
+        "Check topics.twist and the scale of its wheel speed",
+    ),
+}
+
+
+def _ratio(name: str, ratio: Ratio, key: str, units: dict[float, str]) -> Iterator[Finding]:
+    off = abs(ratio.value - 1.0)
+    sigmas = off / ratio.sigma
+    if off < SMALL_RATIO or sigmas < CONTRADICTION_SIGMAS:
+        return
+    what, remedy = _RATIOS[ratio.against]
+    unit = next(
+        (text for of, text in units.items() if abs(ratio.value / of - 1.0) < KNOWN_PART), ""
+    )
+    if unit:
+        remedy = (
+            f"This is {unit}: convert them"
+            if "sign" not in unit
+            else ("They have the opposite sign: check the axes of the IMU")
+        )
+    gross: Literal["contradiction", "warning"] = "contradiction" if off > GROSS_RATIO else "warning"
+    value = f"{ratio.value:.3g} +- {ratio.sigma:.1g}"
+    yield Finding(
+        key,
+        (ratio.value,),
+        ratio.sigma,
+        sigmas,
+        "fatal" if unit else gross,
+        f"{name}: {what.format(value=value)}. {remedy}",
+    )
+
+
+def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:
+    """The accelerometer's horizontal axes against the path of the GNSS antenna."""
+    if axes.mirrored:
+        yield Finding(
+            "topics.imu",
+            (),
+            0.0,
+            axes.ratio[0] / axes.ratio[1],
+            "contradiction",
+            f"{name}: accelerometer and GNSS agree only if left and right are exchanged: the axes "
+            "of the IMU's messages are left-handed, or two of them are swapped",
+        )
+        return
+    sigmas = abs(axes.yaw_rad) / axes.sigma_rad
+    if abs(axes.yaw_rad) > MIN_YAW_RAD and sigmas > CONTRADICTION_SIGMAS:
+        R = config.imu.T_vehicle_imu.pose().rotation().matrix()
+        value = _degrees(gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ R)
+        yield Finding(
+            "imu.T_vehicle_imu",
+            value,
+            math.degrees(axes.sigma_rad),
+            sigmas,
+            "contradiction",
+            f"{name}: the IMU's axes are turned by {math.degrees(axes.yaw_rad):+.0f} +- "
+            f"{math.degrees(axes.sigma_rad):.0f} degrees of yaw against the accelerations of the "
+            f"path: imu.T_vehicle_imu rpy_deg about {_rpy(value)} would fit",
+        )
+    if axes.delay_s is not None:
+        delay_s, sigma_s = axes.delay_s
+        if abs(delay_s) > max(MIN_DELAY_S, CONTRADICTION_SIGMAS * sigma_s):
+            way = "late" if delay_s > 0.0 else "early"
+            yield Finding(
+                "topics.gnss",
+                (delay_s,),
+                sigma_s,
+                abs(delay_s) / sigma_s,
+                "contradiction",
+                f"{name}: the stamps of the GNSS are {abs(delay_s):.2f} +- {sigma_s:.2f} s {way} "
+                "against those of the IMU, by the accelerations of both: correct its clock",
+            )
+
+
+def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
+    """Vehicle axes that are not level over the drive; None if they are."""
+    off, sigma = np.abs(tilt.roll_pitch_rad), tilt.sigma_rad
+    said = (off > MIN_TILT_RAD) & (off > WARNING_SIGMAS * sigma)
+    if not said.any():
+        return None
+    i = int(np.argmax(np.where(said, off / sigma, 0.0)))
+    sigmas = float(off[i] / sigma[i])
+    parts = " and ".join(
+        f"{axis} {value:+.2f} +- {spread:.2f} degrees"
+        for axis, value, spread in zip(
+            ("roll", "pitch"), np.degrees(tilt.roll_pitch_rad), np.degrees(sigma), strict=True
+        )
+    )
+    key, remedy = "topics.pose", "check the frame of the poses"
+    value: tuple[float, ...] = ()
+    if not tilt.given:
+        roll, pitch = tilt.roll_pitch_rad
+        R = config.imu.T_vehicle_imu.pose().rotation().matrix()
+        value = _degrees(level(np.array([-pitch, roll, 1.0])) @ R)
+        key = "imu.T_vehicle_imu"
+        remedy = f"imu.T_vehicle_imu rpy_deg about {_rpy(value, 1)} would fit"
+    return Finding(
+        key,
+        value,
+        math.degrees(float(sigma[i])),
+        sigmas,
+        "contradiction" if sigmas > CONTRADICTION_SIGMAS else "warning",
+        f"{tilt.name}: the vehicle's axes are not level with the ground over the drive: {parts} "
+        f"({sigmas:.0f} sigma). Roll and pitch of every LiDAR to the vehicle are off by as much: "
+        f"{remedy}; if the vehicle frame is meant to lean, set ground.parallel_sigma_deg",
+    )
+
+
+def heading_finding(found: HeadingDisagreement, config: Config) -> Finding | None:
+    """A heading that disagrees with the course over ground, in the words of the check after it."""
+    if not found.warning:
+        return None
+    R = config.imu.T_vehicle_imu.pose().rotation().matrix()
+    return Finding(
+        "imu.T_vehicle_imu",
+        _degrees(gtsam.Rot3.Rz(found.yaw_rad).matrix() @ R),
+        math.degrees(found.sigma_rad),
+        abs(found.yaw_rad) / found.sigma_rad,
+        "warning",
+        found.warning,
+    )
+
+
+def guess_findings(name: str, found: Sequence[Misfit], config: Config) -> tuple[Finding, ...]:
+    """Guesses and vehicle height that do not fit the ground that the LiDARs see."""
+    out = []
+    for misfit in found:
+        contradicted = misfit.p_value < CONTRADICTION_P or misfit.sigmas > CONTRADICTION_SIGMAS
+        if misfit.sigmas < WARNING_SIGMAS and not contradicted:
+            continue
+        key, value, sigma, text = (
+            _height(misfit, config) if misfit.quantity == "height" else _level(misfit, config)
+        )
+        out.append(
+            Finding(
+                key,
+                value,
+                sigma,
+                misfit.sigmas,
+                "contradiction" if contradicted else "warning",
+                f"{name}: {text}",
+            )
+        )
+    return tuple(out)
+
+
+def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], float, str]:
+    """Key, value, sigma and sentence of a misfit of the heights above the ground."""
+    text = (
+        f"the ground that the LiDARs see, the z of their guesses and ground.vehicle_height do not "
+        f"fit together (chi2 {misfit.chi2:.1f} of {misfit.dof}): "
+    )
+    fits = f"would fit ({misfit.sigmas:.1f} sigma)"
+    if misfit.lidar:
+        key = f"lidars.{misfit.lidar}.initial.xyz"
+        value = config.lidars[misfit.lidar].initial.xyz[2] + misfit.value
+        text += f"lidar '{misfit.lidar}' alone is off, z {value:.2f} +- {misfit.sigma:.2f} m {fits}"
+    else:
+        key = "ground.vehicle_height"
+        value = (config.ground.vehicle_height or 0.0) + misfit.value
+        text += f"vehicle_height {value:.2f} +- {misfit.sigma:.2f} m {fits}"
+        if misfit.dof == 1:
+            text += f", or z of lidar '{next(iter(config.lidars))}' is wrong"
+    return key, (value,), misfit.sigma, text
+
+
+def _level(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], float, str]:
+    """Key, value, sigma and sentence of a misfit of roll or pitch."""
+    value, sigma = math.degrees(misfit.value), math.degrees(misfit.sigma)
+    off = f"{misfit.quantity} by {-value:+.1f} +- {sigma:.1f} degrees ({misfit.sigmas:.1f} sigma)"
+    if misfit.lidar:
+        key = f"lidars.{misfit.lidar}.initial.rpy_deg"
+        turn = gtsam.Rot3.Rx if misfit.quantity == "roll" else gtsam.Rot3.Ry
+        guess = config.lidars[misfit.lidar].initial.pose().rotation()
+        fits = _degrees(turn(misfit.value).compose(guess).matrix())
+        text = (
+            f"with its guess, the ground that lidar '{misfit.lidar}' sees is not level: {off}. "
+            f"rpy_deg about {_rpy(fits)} would be level. Check it: signs, degrees, T_vehicle_lidar "
+            "and not its inverse"
+        )
+        return key, fits, sigma, text
+    text = (
+        f"with their guesses, the ground that the LiDARs see is not level, all alike: {off}. "
+        "Check the vehicle frame that the guesses were measured in"
+    )
+    return "lidars", (), sigma, text
+
+
+def copies_sentence(name: str, found: Copy, config: Config) -> str:
+    """Two topics with the same clouds."""
+    first, second = found.lidars
+    topics = [config.lidars[lidar].topic for lidar in found.lidars]
+    how = "the same clouds"
+    if found.moved_m > 1e-3 or found.turned_rad > 1e-3:
+        how = (
+            f"the same clouds in two frames, {found.moved_m:.3f} m and "
+            f"{math.degrees(found.turned_rad):.2f} degrees apart"
+        )
+    return (
+        f"{name}: '{topics[0]}' (lidar '{first}') and '{topics[1]}' (lidar '{second}') hold {how}: "
+        "they are one LiDAR. Give the topic of the other LiDAR, or remove one of the two"
+    )

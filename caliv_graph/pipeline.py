@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
+from caliv_graph.calibration.choose import choose_static
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.common.progress import Progress
@@ -66,7 +67,7 @@ def prepare(
     """
     with progress.stage("smoothing the trajectory", None):
         rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-    observations = extract_targets(recordings, rough, config, progress)
+    observations = extract_targets(recordings, rough, config, progress, choose_static)
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,7 +15,7 @@ from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, IntArray, Recording
 from caliv_graph.targets.search.align import align
-from caliv_graph.targets.search.history import LidarHistory
+from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
     MAX_EXTENT_M,
@@ -43,6 +43,12 @@ STANDS_RAD = math.radians(2.0)
 STANDING_PERIODS = 4
 """While the vehicle stands, every fourth scan is read: other objects move."""
 
+MOST_TRIED = 4
+"""Candidates that are tried at most: each costs a registration of some of its clouds."""
+
+SAME_PLACE_M = 0.7
+"""Tracks whose places are nearer to each other than this are of one candidate: half of a target."""
+
 REGION_MARGIN_M = 0.3
 """Margin of the region about the object on each side."""
 
@@ -63,7 +69,9 @@ class FoundTarget:
         looked_at: per LiDAR, the number of scans that were read.
         aligned: per LiDAR, T_vehicle_lidar with corrected yaw and shift (`align`): better than the
             guess for associating objects, but no estimate.
-        others: other proposals, a phrase each.
+        doubtful: in the scans that were read it scatters, or is missing, more than a static object.
+        score: quality of the view.
+        others: the other candidates, the best first.
     """
 
     drive: int
@@ -74,7 +82,17 @@ class FoundTarget:
     scans: Mapping[str, int]
     looked_at: Mapping[str, int]
     aligned: Mapping[str, gtsam.Pose3]
-    others: tuple[str, ...]
+    doubtful: bool = False
+    score: float = 0.0
+    others: tuple[FoundTarget, ...] = ()
+
+    def __str__(self) -> str:
+        x, y, _ = self.centre_map
+        seen_by = ", ".join(name for name, scans in self.scans.items() if scans)
+        return (
+            f"({x:.1f}, {y:.1f}) {self.extent_m:.1f} m wide {self.height_m:.1f} m high seen by "
+            f"{seen_by}"
+        )
 
 
 def find_target(
@@ -158,25 +176,45 @@ def _read_history(
 def _target_of_drive(
     drive: int, name: str, histories: Sequence[LidarHistory], config: Config
 ) -> FoundTarget:
-    """The best proposal of a drive."""
+    """The best proposal of a drive, and the others."""
     alignments = {history.name: align(history, config) for history in histories}
     tracks = [t for h in histories for t in judged_tracks(h, alignments[h.name], config)]
-    usable = matched([track for track in tracks if not track.verdict])
-    proposals = [c for c in usable if math.isfinite(c.height_m)]
+    plain = matched([track for track in tracks if not track.verdict])
+    proposals = _ranked(plain)
+    for doubtful in _ranked(matched([track for track in tracks if track.doubtful])):
+        apart = [float(np.linalg.norm((doubtful.place - p.place)[:2])) for p in proposals]
+        if min(apart, default=math.inf) > SAME_PLACE_M:
+            proposals.append(doubtful)
     if not proposals:
-        raise TargetError(_why_none(name, histories, tracks, len(usable)))
-    proposals.sort(key=Proposal.rank, reverse=True)
-    best = proposals[0]
+        raise TargetError(_why_none(name, histories, tracks, len(plain)))
+    found = [_found(drive, p, histories, alignments) for p in proposals[:MOST_TRIED]]
+    return replace(found[0], others=tuple(found[1:]))
+
+
+def _ranked(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """Those whose height is known, the best first."""
+    known = [proposal for proposal in proposals if math.isfinite(proposal.height_m)]
+    return sorted(known, key=Proposal.rank, reverse=True)
+
+
+def _found(
+    drive: int,
+    proposal: Proposal,
+    histories: Sequence[LidarHistory],
+    alignments: Mapping[str, Alignment],
+) -> FoundTarget:
+    tracks = proposal.tracks
     return FoundTarget(
         drive=drive,
-        region=_region(best),
-        centre_map=best.place + np.array([0.0, 0.0, 0.5 * best.height_m]),
-        extent_m=best.extent_m,
-        height_m=best.height_m,
-        scans={h.name: best.tracks[h.name].good if h.name in best.tracks else 0 for h in histories},
+        region=_region(proposal),
+        centre_map=proposal.place + np.array([0.0, 0.0, 0.5 * proposal.height_m]),
+        extent_m=proposal.extent_m,
+        height_m=proposal.height_m,
+        scans={h.name: tracks[h.name].good if h.name in tracks else 0 for h in histories},
         looked_at={h.name: len(h.scans) for h in histories},
         aligned={h.name: h.aligned(alignments[h.name]) for h in histories},
-        others=tuple(str(proposal) for proposal in proposals[1:]),
+        doubtful=any(track.doubtful for track in tracks.values()),
+        score=proposal.rank()[1],
     )
 
 

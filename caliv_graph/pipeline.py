@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -28,6 +28,8 @@ from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
+from caliv_graph.targets.search import find_target
+from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 
 
@@ -40,12 +42,16 @@ class Prepared:
         observations: the targets' clouds.
         grounds: the ground as the LiDARs saw it.
         warnings: for the user, a line each.
+        config: the config, with the guesses that the search for the target had to replace.
+        misplaced: how these guesses contradict what the LiDARs see, a sentence each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
     observations: tuple[TargetObservation, ...]
     grounds: tuple[GroundObservation, ...]
     warnings: tuple[str, ...]
+    config: Config
+    misplaced: tuple[str, ...] = ()
 
 
 def prepare(
@@ -67,7 +73,9 @@ def prepare(
     """
     with progress.stage("smoothing the trajectory", None):
         rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-    observations = extract_targets(recordings, rough, config, progress, choose_static)
+    searched = find_target(recordings, rough, config, progress) if config.target is None else []
+    config, doubts = realigned(config, searched)
+    observations = extract_targets(recordings, rough, config, progress, choose_static, searched)
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations)
@@ -77,7 +85,12 @@ def prepare(
     warnings += [w for t in trajectories for w in t.warnings]
     warnings += [w for o in observations for w in o.warnings]
     return Prepared(
-        tuple(trajectories), tuple(observations), tuple(grounds), (*warnings, *ground_warnings)
+        tuple(trajectories),
+        tuple(observations),
+        tuple(grounds),
+        (*warnings, *ground_warnings),
+        config,
+        doubts,
     )
 
 
@@ -124,10 +137,13 @@ def _calibrate(
 
     prepared = prepare(recordings, guessed, motions, progress)
     solution = estimate(
-        prepared.observations, prepared.trajectories, guessed, progress, prepared.grounds
+        prepared.observations, prepared.trajectories, prepared.config, progress, prepared.grounds
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
+    if prepared.misplaced:
+        found = (*prepared.misplaced, *calibration.contradictions)
+        calibration = replace(calibration, status="inconsistent", contradictions=found)
     calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)

@@ -12,17 +12,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.config.model import Config
-from caliv_graph.errors import RegistrationError
-from caliv_graph.geometry.se3 import unstack
+from caliv_graph.errors import RegistrationError, TargetError
+from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
 from caliv_graph.products import Array, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.targets.cloud.extract import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
-from caliv_graph.targets.search.place import Place, Sightings, fit_place
+from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 CLOUDS = 16
@@ -39,6 +40,15 @@ AGREE_M = 0.05
 SAME_OBJECT_M = 0.4
 """Candidates whose clouds are at places nearer than this to each other are one object: the guesses
 leave half a metre between what the search proposes and what is extracted there."""
+
+MOVES_M = 0.15
+"""Scatter above which an object moves, unless late stamps or a wrong guess explain it."""
+
+EXPLAINS = 0.5
+"""Factor on the scatter below which late stamps or another guess explain it."""
+
+LATE_S = 0.02
+"""Smallest lateness that is named: at 2 m/s it is 4 cm, which poses explain too."""
 
 AGREE_RATIO = 3.0
 """Poses that are worse displace all candidates: one is static as well if it scatters by at most
@@ -66,6 +76,9 @@ def choose_static(
     """The candidate that is static and that most LiDARs see best; with reasons.
 
     One candidate without a doubt is not tried: there is nothing to choose.
+
+    Raises:
+        TargetError: all move.
     """
     if len(candidates) == 1 and not candidates[0].found.doubtful:
         return Choice(0)
@@ -80,13 +93,14 @@ def choose_static(
 
     apart = _different(candidates, found)
     best = max(apart, key=rank)
-    if not rank(best)[0]:
-        best = 0
+    cause = _cause(found[best], config)
     others = [i for i in apart if i != best]
     same = [i for i in others if rank(i)[0]]
     moving = [i for i in others if math.isfinite(scatter[i]) and i not in same]
-    reasons = []
     of = candidates[best].found
+    if of.doubtful and scatter[best] > MOVES_M and cause is None:
+        raise TargetError(_why_none_stands(candidates, scatter))
+    reasons = [] if cause is None else [cause]
     if same:
         listed = ", ".join(f"{candidates[i].found} (to {scatter[i]:.2f} m)" for i in same)
         reasons.append(
@@ -101,6 +115,60 @@ def choose_static(
             f"scatters by {scatter[best]:.2f} m"
         )
     return Choice(best, tuple(reasons))
+
+
+def _cause(of: Agreement, config: Config) -> str | None:
+    """What would bring the clouds of a candidate to one place; None if they are, or nothing does.
+
+    Late stamps shift an object along the course, by as much as the speed; a guess that is off
+    shifts it rigidly in the frame of the vehicle.
+    """
+    if of.sightings is None or of.scatter_m <= AGREE_M:
+        return None
+    names = [name for name in config.lidars if name in of.sightings.lidars]
+    guesses = _guesses(config)
+    enough = EXPLAINS * of.scatter_m
+    sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
+    tried = [fit_place(of.sightings, guesses, late=each) for each in sets]
+    late = min(tried, key=lambda place: place.scatter_m)
+    if late.scatter_m <= enough and max(map(abs, late.late_s.values())) > LATE_S:
+        by = " and ".join(f"those of '{name}' by {s:+.2f} s" for name, s in late.late_s.items())
+        return (
+            f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
+            f"{late.scatter_m:.2f} m if stamps are late: {by}. Check the clocks, or set "
+            "solve.time_offset"
+        )
+    for name in names:
+        T, sigmas = guesses[name]
+        far = fit_place(of.sightings, {**guesses, name: (T, np.maximum(sigmas, WIDE_SIGMAS))})
+        if far.scatter_m <= enough:
+            off = vehicle_axes_difference(far.T_vehicle_lidar[name], T)
+            degrees = math.degrees(float(np.linalg.norm(off[:3])))
+            return (
+                f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
+                f"{far.scatter_m:.2f} m if lidars.{name}.initial is off by about {degrees:.0f} "
+                f"degrees and {float(np.linalg.norm(off[3:])):.1f} m. Check it"
+            )
+    return None
+
+
+def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[float]) -> str:
+    listed = ", ".join(
+        f"{candidate.found} (its clouds scatter by {of:.2f} m)"
+        for candidate, of in zip(candidates, scatter, strict=True)
+        if math.isfinite(of)
+    )
+    return (
+        f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
+        "guess of one LiDAR explains it, so these objects move: let a target stand alone, or name "
+        "its box with target: {min: [x, y, z], max: [x, y, z]} in metres, frame map"
+    )
+
+
+def _guesses(config: Config) -> dict[str, tuple[gtsam.Pose3, Array]]:
+    """LiDAR -> its guess and the guess's sigmas."""
+    of = {name: configured_guess(config, name) for name in config.lidars}
+    return {name: (guess.T_vehicle_lidar, guess.sigmas) for name, guess in of.items()}
 
 
 def _different(candidates: Sequence[TriedCandidate], found: Sequence[Agreement]) -> list[int]:
@@ -144,12 +212,7 @@ def agreement(
     sightings = _sightings(replace(most, clouds=tuple(clouds)), trajectory, config)
     if sightings is None:
         return Agreement(math.inf)
-    guesses = {
-        name: (guess.T_vehicle_lidar, guess.sigmas)
-        for name in config.lidars
-        for guess in [configured_guess(config, name)]
-    }
-    place = fit_place(sightings, guesses)
+    place = fit_place(sightings, _guesses(config))
     return Agreement(place.scatter_m, place, sightings)
 
 

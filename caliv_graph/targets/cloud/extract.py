@@ -74,13 +74,14 @@ def extract_targets(
     config: Config,
     progress: Progress,
     choose: Choose = first_candidate,
+    searched: Sequence[FoundTarget] = (),
 ) -> tuple[TargetObservation, ...]:
     """Reads every scan once and keeps the points of the targets (paper III-D.2).
 
     Scans outside the span of their drive's trajectory are left out, LiDARs that saw the target in
     fewer than `extraction.min_scans` scans too, with a warning. `progress` advances with every
-    scan. Where no region is given, the search proposes objects, and `choose` decides by their
-    clouds.
+    scan. Where no region is given, the search proposes objects (`searched`, of each drive, if it
+    has been done), and `choose` decides by their clouds.
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; one per object
@@ -91,9 +92,8 @@ def extract_targets(
         TargetError: no LiDAR sees a target, or none was found.
         RecordingError: a cloud could not be read.
     """
-    searched = (
-        find_target(recordings, trajectories, config, progress) if config.target is None else []
-    )
+    if config.target is None and not searched:
+        searched = find_target(recordings, trajectories, config, progress)
     regions: list[tuple[TargetRegion, ...]] = (
         [tuple(f.region for f in (found, *found.others)) for found in searched]
         if config.target is None

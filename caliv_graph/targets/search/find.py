@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -14,7 +14,14 @@ from caliv_graph.common.progress import Advance, Progress
 from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, IntArray, Recording
-from caliv_graph.targets.search.align import align
+from caliv_graph.targets.search.align import (
+    FAR_PAIRS,
+    FAR_RATIO,
+    GUESS_SIGMAS,
+    align,
+    align_anywhere,
+    concentration,
+)
 from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
@@ -72,6 +79,8 @@ class FoundTarget:
         doubtful: in the scans that were read it scatters, or is missing, more than a static object.
         score: quality of the view.
         others: the other candidates, the best first.
+        misplaced: LiDARs whose objects stand still only with a guess that is farther off than its
+            sigma allows, and the correction; `aligned` has it.
     """
 
     drive: int
@@ -85,6 +94,7 @@ class FoundTarget:
     doubtful: bool = False
     score: float = 0.0
     others: tuple[FoundTarget, ...] = ()
+    misplaced: Mapping[str, Alignment] = field(default_factory=dict)
 
     def __str__(self) -> str:
         x, y, _ = self.centre_map
@@ -178,23 +188,51 @@ def _target_of_drive(
 ) -> FoundTarget:
     """The best proposal of a drive, and the others."""
     alignments = {history.name: align(history, config) for history in histories}
+    tracks, proposals = _proposals(histories, alignments, config)
+    misplaced = {h.name: a for h in histories if (a := _elsewhere(h, alignments[h.name], config))}
+    if misplaced:
+        tried = {**alignments, **misplaced}
+        other_tracks, others = _proposals(histories, tried, config)
+        if others and (not proposals or len(others[0].tracks) >= len(proposals[0].tracks)):
+            alignments, tracks, proposals = tried, other_tracks, others
+        else:
+            misplaced = {}
+    usable = [p for p in proposals if math.isfinite(p.height_m)]
+    if not usable:
+        raise TargetError(_why_none(name, histories, tracks, len(proposals)))
+    found = [_found(drive, p, histories, alignments) for p in usable[:MOST_TRIED]]
+    return replace(found[0], others=tuple(found[1:]), misplaced=misplaced)
+
+
+def _proposals(
+    histories: Sequence[LidarHistory], alignments: Mapping[str, Alignment], config: Config
+) -> tuple[list[Track], list[Proposal]]:
+    """All tracks, and the candidates: those without a doubt first."""
     tracks = [t for h in histories for t in judged_tracks(h, alignments[h.name], config)]
-    plain = matched([track for track in tracks if not track.verdict])
-    proposals = _ranked(plain)
+    proposals = _ranked(matched([track for track in tracks if not track.verdict]))
     for doubtful in _ranked(matched([track for track in tracks if track.doubtful])):
         apart = [float(np.linalg.norm((doubtful.place - p.place)[:2])) for p in proposals]
         if min(apart, default=math.inf) > SAME_PLACE_M:
             proposals.append(doubtful)
-    if not proposals:
-        raise TargetError(_why_none(name, histories, tracks, len(plain)))
-    found = [_found(drive, p, histories, alignments) for p in proposals[:MOST_TRIED]]
-    return replace(found[0], others=tuple(found[1:]))
+    return tracks, proposals
+
+
+def _elsewhere(history: LidarHistory, near: Alignment, config: Config) -> Alignment | None:
+    """A correction beyond the guess's sigma under which much more stands still; None if none."""
+    lidar = config.lidars[history.name]
+    if lidar.fixed:
+        return None
+    far = align_anywhere(history, config)
+    prior = np.array([lidar.sigma.rpy_rad()[2], *lidar.sigma.xyz_m()[:2]])
+    if (np.abs([far.yaw_rad, *far.shift_m]) <= GUESS_SIGMAS * prior).all():
+        return None
+    least = FAR_RATIO * max(concentration(history, near), 0) + FAR_PAIRS
+    return far if concentration(history, far) > least else None
 
 
 def _ranked(proposals: Sequence[Proposal]) -> list[Proposal]:
-    """Those whose height is known, the best first."""
-    known = [proposal for proposal in proposals if math.isfinite(proposal.height_m)]
-    return sorted(known, key=Proposal.rank, reverse=True)
+    """The best first; those whose top no LiDAR sees last."""
+    return sorted(proposals, key=lambda p: (math.isfinite(p.height_m), p.rank()), reverse=True)
 
 
 def _found(

@@ -383,9 +383,10 @@ class TestNothingFound:
             assert part in message
 
     @pytest.mark.parametrize("key", ["stroller", "waiting"])
-    def test_somebody_slow_is_no_target(self, key: str) -> None:
-        with pytest.raises(TargetError, match="moving"):
-            recorded(key, 1).find()
+    def test_somebody_slow_is_a_target_with_a_doubt_at_most(self, key: str) -> None:
+        found = recorded(key, 1).find()
+        assert found.doubtful
+        assert all(other.doubtful for other in found.others)
 
     def test_a_drive_without_anything_to_see(self) -> None:
         drive = recorded("street")

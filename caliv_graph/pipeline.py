@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
+from caliv_graph.calibration.choose import choose_static
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.common.progress import Progress
@@ -39,6 +40,8 @@ from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
+from caliv_graph.targets.search import find_target
+from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 
 
@@ -52,6 +55,8 @@ class Prepared:
         grounds: the ground as the LiDARs saw it.
         findings: values of the config that the raw data contradict.
         warnings: for the user, a line each.
+        config: the config, with the guesses that the search for the target had to replace.
+        misplaced: how these guesses contradict what the LiDARs see, a sentence each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -59,6 +64,8 @@ class Prepared:
     grounds: tuple[GroundObservation, ...]
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
+    config: Config
+    misplaced: tuple[str, ...] = ()
 
 
 def prepare(
@@ -87,7 +94,7 @@ def prepare(
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         causes = (*findings, *heading_findings(rough, motions, config, raw))
-        observations = extract_targets(recordings, rough, config, progress)
+        config, doubts, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         raise with_cause(error, causes) from error
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
@@ -104,7 +111,29 @@ def prepare(
         tuple(grounds),
         findings,
         (*warnings, *ground_warnings, *warnings_of(findings)),
+        config,
+        doubts,
     )
+
+
+def _targets(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+) -> tuple[Config, tuple[str, ...], tuple[TargetObservation, ...]]:
+    """The config with the guesses that the search had to replace; sentences; the targets' clouds.
+
+    The sentences say how these guesses contradict what the LiDARs see.
+    """
+    searched = (
+        find_target(recordings, trajectories, config, progress) if config.target is None else []
+    )
+    config, doubts = realigned(config, searched)
+    observations = extract_targets(
+        recordings, trajectories, config, progress, choose_static, searched
+    )
+    return config, doubts, observations
 
 
 @dataclass(frozen=True)
@@ -141,7 +170,8 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
-        observations = extract_targets([recording], trajectories, config, progress)
+        _, doubts, observations = _targets([recording], trajectories, config, progress)
+        problems += doubts
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         return Look(None, findings, tuple(problems))
@@ -191,11 +221,14 @@ def _calibrate(
 
     prepared = prepare(recordings, guessed, motions, progress)
     solution = estimate(
-        prepared.observations, prepared.trajectories, guessed, progress, prepared.grounds
+        prepared.observations, prepared.trajectories, prepared.config, progress, prepared.grounds
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
     calibration = contradicted(calibration, prepared.findings)
+    if prepared.misplaced:
+        found = (*prepared.misplaced, *calibration.contradictions)
+        calibration = replace(calibration, status="inconsistent", contradictions=found)
     calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)

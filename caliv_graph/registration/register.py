@@ -328,6 +328,7 @@ def register_jointly(
     T_target_lidar: Sequence[gtsam.Pose3],
     max_iterations: int,
     coarse: bool = True,
+    other_starts: bool = True,
 ) -> Registration:
     """Registers all clouds of a placement to one reconstructed target (paper III-D.2).
 
@@ -340,6 +341,7 @@ def register_jointly(
         max_iterations: at most.
         coarse: False if the pre-alignment is right to 1 or 2 cm: the clouds are then not centred,
             and annealing begins finer.
+        other_starts: False if a few clouds may end at a wrong place.
 
     Raises:
         RegistrationError: the clouds could not be brought together.
@@ -349,7 +351,7 @@ def register_jointly(
         t = centre_clouds(state.clouds, R, t, [c.cut for c in state.observation.clouds])
     state.seed(R, t, COARSE_SIGMA_M if coarse else FINE_SIGMA_M)
     run = _alternated(state, R, t, max_iterations)
-    if coarse:
+    if coarse and other_starts:
         run = _from_other_starts(state, run, max_iterations)
     quadratic = state.expect(run.R, run.t)
     joint = quadratic.joint()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,10 +15,11 @@ from caliv_graph.errors import TargetError
 from caliv_graph.products import IntArray, Recording, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.constellation import match_objects, one_object, static_objects
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
-from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor, Tally
+from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor
 from caliv_graph.targets.cloud.scans import scans_to_decode, thinned
+from caliv_graph.targets.cloud.tally import Tally
 from caliv_graph.targets.cloud.views import clouds_per_lidar
-from caliv_graph.targets.search import find_target
+from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 REMEDY = (
@@ -31,17 +32,61 @@ SCANS_OF_A_PLACE = 10
 of it: more would average the noise but not the sampling by the beams."""
 
 
+@dataclass(frozen=True)
+class TriedCandidate:
+    """An object that the search proposes as the target of a drive, and its clouds.
+
+    Attributes:
+        found: what the search knows of it.
+        observations: its placements.
+    """
+
+    found: FoundTarget
+    observations: tuple[TargetObservation, ...]
+
+    @property
+    def lidars(self) -> frozenset[str]:
+        """Names of the LiDARs that see it often enough."""
+        return frozenset(cloud.lidar for o in self.observations for cloud in o.clouds)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which candidate is the target.
+
+    Attributes:
+        index: of the candidate.
+        reasons: about it and the others, a line each.
+    """
+
+    index: int
+    reasons: tuple[str, ...] = ()
+
+
+Choose = Callable[[Sequence[TriedCandidate], VehicleTrajectory, Config], Choice]
+
+
+def first_candidate(
+    candidates: Sequence[TriedCandidate], trajectory: VehicleTrajectory, config: Config
+) -> Choice:
+    """The one that is seen best, whether or not its clouds agree."""
+    return Choice(0)
+
+
 def extract_targets(
     recordings: Sequence[Recording],
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
+    choose: Choose = first_candidate,
+    searched: Sequence[FoundTarget] = (),
 ) -> tuple[TargetObservation, ...]:
     """Reads every scan once and keeps the points of the targets (paper III-D.2).
 
     Scans outside the span of their drive's trajectory are left out, LiDARs that saw the target in
     fewer than `extraction.min_scans` scans too, with a warning. `progress` advances with every
-    scan.
+    scan. Where no region is given, the search proposes objects (`searched`, of each drive, if it
+    has been done), and `choose` decides by their clouds.
 
     Returns:
         One observation per drive and region, clouds in order of LiDAR and stamp; one per object
@@ -52,7 +97,13 @@ def extract_targets(
         TargetError: no LiDAR sees a target, or none was found.
         RecordingError: a cloud could not be read.
     """
-    regions, labels, hints = _regions(recordings, trajectories, config, progress)
+    if config.target is None and not searched:
+        searched = find_target(recordings, trajectories, config, progress)
+    regions: list[tuple[TargetRegion, ...]] = (
+        [tuple(f.region for f in (found, *found.others)) for found in searched]
+        if config.target is None
+        else [config.target] * len(recordings)
+    )
     observations: list[TargetObservation] = []
     wanted = [
         {name: scans_to_decode(r, t, name, config, of_drive) for name in config.lidars}
@@ -70,49 +121,62 @@ def extract_targets(
                     for extractor, of_lidar in zip(extractors, seen, strict=True):
                         of_lidar[name].append(extractor.candidates(scan, drive))
                     advance()
-            for index, (extractor, of_lidar) in enumerate(zip(extractors, seen, strict=True)):
-                label = labels[drive] if len(extractors) == 1 else f"target {index + 1}"
-                if len(recordings) > 1:
-                    label += f" of {recording.name}"
-                for found in _placements(label, extractor, of_lidar, config, hints[drive]):
-                    observations.append(replace(found, placement=len(observations)))
+            of_drive = f" of {recording.name}" if len(recordings) > 1 else ""
+            if searched:
+                placements = _chosen(searched[drive], extractors, seen, config, of_drive, choose)
+            else:
+                placements = []
+                for index, (extractor, of_lidar) in enumerate(zip(extractors, seen, strict=True)):
+                    label = "target" if len(extractors) == 1 else f"target {index + 1}"
+                    placements += _placements(label + of_drive, extractor, of_lidar, config, ())
+            observations += [
+                replace(found, placement=len(observations) + n)
+                for n, found in enumerate(placements)
+            ]
     if not any(o.clouds for o in observations):
         why = observations[0].warnings[-1]
-        raise TargetError(why.removesuffix(f". {REMEDY}"), REMEDY)
+        what, _, remedy = why.rpartition(". ")  # the remedy is the last sentence
+        raise TargetError(what, remedy)
     return tuple(observations)
 
 
-def _regions(
-    recordings: Sequence[Recording],
-    trajectories: Sequence[VehicleTrajectory],
+def _chosen(
+    searched: FoundTarget,
+    extractors: Sequence[RegionExtractor],
+    seen: Sequence[Mapping[str, Sequence[Sequence[Candidate]]]],
     config: Config,
-    progress: Progress,
-) -> tuple[list[tuple[TargetRegion, ...]], list[str], list[tuple[str, ...]]]:
-    """Per drive the regions, given or found; the name of a target; and warnings about it."""
-    count = len(recordings)
-    if config.target is not None:
-        return [config.target] * count, ["target"] * count, [()] * count
-    regions: list[tuple[TargetRegion, ...]] = []
-    labels: list[str] = []
-    hints: list[tuple[str, ...]] = []
-    for found in find_target(recordings, trajectories, config, progress):
-        x, y, _ = found.centre_map
-        label = f"target found at ({x:.1f}, {y:.1f}) m of the map"
-        regions.append((found.region,))
-        labels.append(label)
-        lines = [
-            f"{label}: lidar '{name}' does not see it in any of the {found.looked_at[name]} scans "
-            "that were read"
-            for name, scans in found.scans.items()
-            if scans == 0 and found.looked_at[name]
-        ]
-        if found.others:
-            lines.append(
-                f"{label}: {found.extent_m:.1f} m wide, {found.height_m:.1f} m high; other "
-                f"objects fit too: {', '.join(found.others)}. Give a target region to choose"
-            )
-        hints.append(tuple(lines))
-    return regions, labels, hints
+    of_drive: str,
+    choose: Choose,
+) -> list[TargetObservation]:
+    """The placements of the candidate of a drive that is its target."""
+    tried = []
+    proposals = (searched, *searched.others)
+    for found, extractor, of_lidar in zip(proposals, extractors, seen, strict=True):
+        label = _label(found) + of_drive
+        hints = _hints(label, found, extractor)
+        tried.append(
+            TriedCandidate(found, tuple(_placements(label, extractor, of_lidar, config, hints)))
+        )
+    choice = choose(tried, extractors[0].trajectory, config)
+    first, *rest = tried[choice.index].observations
+    label = _label(tried[choice.index].found) + of_drive
+    lines = tuple(f"{label}: {reason}" for reason in choice.reasons)
+    return [replace(first, warnings=(*lines, *first.warnings)), *rest]
+
+
+def _label(found: FoundTarget) -> str:
+    x, y, _ = found.centre_map
+    return f"target found at ({x:.1f}, {y:.1f}) m of the map"
+
+
+def _hints(label: str, found: FoundTarget, extractor: RegionExtractor) -> tuple[str, ...]:
+    """A warning for each LiDAR in whose scans neither search nor extraction saw the candidate."""
+    return tuple(
+        f"{label}: lidar '{name}' does not see it in any of the {found.looked_at[name]} scans "
+        "that were read"
+        for name, scans in found.scans.items()
+        if scans == 0 and found.looked_at[name] and not extractor.tallies[name].kept
+    )
 
 
 def _placements(
@@ -314,7 +378,7 @@ def _observation(
             warnings.append(
                 f"{label}: lidar '{name}' sees it in {tally.kept} scans, needs "
                 f"{config.extraction.min_scans} (extraction.min_scans). Of {tally.scans} scans: "
-                f"{tally.reasons()}. Widen target.min/max or run 'caliv-graph inspect'"
+                f"{tally.reasons()}. {tally.remedy(config.extraction, config.target is not None)}"
             )
     if not kept:
         warnings = [_why_none(label, config, extractor.tallies)]
@@ -325,6 +389,8 @@ def _observation(
 def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
     """Why no LiDAR saw the target, in one line."""
     parts = []
+    is_given = config.target is not None
+    best = max(tallies.values(), key=lambda tally: (tally.kept, len(tally.sparse)))
     for name, tally in tallies.items():
         near = (
             f"nearest return {tally.nearest_m:.2f} m from the region"
@@ -335,4 +401,6 @@ def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
             f"lidar '{name}' in {tally.kept} of {tally.scans} scans, needs "
             f"{config.extraction.min_scans} ({near}; {tally.reasons() or 'nothing rejected'})"
         )
-    return f"{region}: no LiDAR sees the target: {'; '.join(parts)}. {REMEDY}"
+    is_remedied = bool(best.sparse) or not is_given
+    remedy = best.remedy(config.extraction, is_given) if is_remedied else REMEDY
+    return f"{region}: no LiDAR sees the target: {'; '.join(parts)}. {remedy}"

@@ -7,9 +7,8 @@ by the error that the initial guess may have: 3 degrees at 20 m displace the tar
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,6 +21,7 @@ from caliv_graph.targets.cloud.beams import (
     elevations,
 )
 from caliv_graph.targets.cloud.field_of_view import MOST_OF_A_SCAN, SeenEdges
+from caliv_graph.targets.cloud.tally import EMPTY, MOVED, NOTHING, OUTSIDE, Tally
 from caliv_graph.targets.cloud.track import CandidateSet
 from caliv_graph.targets.ground.fit import fit_ground, height_above
 from caliv_graph.targets.search.objects import connected
@@ -51,9 +51,11 @@ RIM_M = 0.1
 """Width of the rim of the widened region, half its margin at most: beams of common LiDARs are 2 to
 10 cm apart at 10 m, and what is cut off there has points in it."""
 
+FEWEST_NEAR = 3
+"""A scan with fewer points near the region is outside of it; with more, its objects are counted."""
+
 MOST_CANDIDATES = 4
 """Objects of one scan that are kept until the static one is known."""
-
 
 RINGS = 3.0
 """The ground is looked for so many distances between its rings around the region: no ring may be in
@@ -67,31 +69,6 @@ NEAR_RINGS_M = 0.5
 FARTHEST_RING_M = 6.0
 """Where the rings are nearer than the first, the ground in the region is enough; beyond the second
 it may be another ground."""
-
-
-@dataclass
-class Tally:
-    """Counts of the scans of one LiDAR, and how near its returns came to the region.
-
-    `cut` of the `kept` ones are cut off by the edge of the field of view.
-    """
-
-    scans: int = 0
-    kept: int = 0
-    cut: int = 0
-    nearest_m: float = math.inf
-    most_points: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-
-    def reasons(self) -> str:
-        """Why scans were rejected, the three most common reasons; and how many kept ones are cut.
-
-        Empty if there is nothing to say.
-        """
-        lines = [f"{n} {why}" for why, n in self.rejected.most_common(3)]
-        if self.cut:
-            lines.append(f"{self.cut} cut off by the edge of the field of view")
-        return ", ".join(lines)
 
 
 @dataclass(frozen=True)
@@ -216,13 +193,13 @@ class RegionExtractor:
         extraction = self._config.extraction
         R, t = (part[0] for part in self._lidar_poses(scan.lidar, [scan.stamp_ns]))
         if len(scan.points_lidar) == 0:
-            tally.rejected["empty within the range limits"] += 1
+            tally.rejected[EMPTY] += 1
             return []
         range_m = float(np.linalg.norm(self.centre - t))
         margin = widened_margin_m(self._config, scan.lidar, range_m)
         points, near = self._near_region(scan.points_lidar, R, t, margin, tally)
-        if len(near) < extraction.min_points:
-            tally.rejected["outside the region"] += 1
+        if len(near) < min(FEWEST_NEAR, extraction.min_points):
+            tally.rejected[OUTSIDE] += 1
             return []
         scan_elevations = elevations(scan.points_lidar)
         spacing = beam_spacing(scan.points_lidar[near], scan_elevations)
@@ -241,14 +218,14 @@ class RegionExtractor:
         linking = Linking.of(scan.points_lidar[near], spacing, range_m)
         objects = self._objects(points, linking)
         if not objects:
-            tally.rejected["nothing above the ground that is 0.2 to 2 m wide"] += 1
+            tally.rejected[NOTHING] += 1
             return []
         if len(objects[0]) <= MOST_OF_A_SCAN * len(scan.points_lidar):
             self._edges[scan.lidar].add(scan.points_lidar, scan_elevations)
-        out = []
+        out, sizes = [], []
         for chosen in objects:
             kept = near[chosen][_filtered(points[chosen], linking.places[chosen], extraction)]
-            tally.most_points = max(tally.most_points, len(kept))
+            sizes.append(len(kept))
             if len(kept) < extraction.min_points:
                 continue
             times = None if scan.point_times_s is None else scan.point_times_s[kept]
@@ -260,8 +237,10 @@ class RegionExtractor:
             centre, measured = 0.5 * (low + high), compact.points_lidar
             top_m = math.inf if plane is None else float(height[chosen].max())
             out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m))
+        tally.most_points = max(tally.most_points, *sizes)
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
+            tally.sparse.append(max(sizes))
         return out
 
     def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int]) -> tuple[Array, Array]:
@@ -340,7 +319,7 @@ class RegionExtractor:
         tally = self.tallies[lidar]
         lost = scans - len(chosen)
         if lost:
-            tally.rejected["something else stood there"] += lost
+            tally.rejected[MOVED] += lost
         tally.kept += len(chosen)
         tally.cut += sum(bool(candidate.cloud.cut) for candidate in chosen)
         return [candidate.cloud for candidate in chosen]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -14,8 +14,15 @@ from caliv_graph.common.progress import Advance, Progress
 from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, IntArray, Recording
-from caliv_graph.targets.search.align import align
-from caliv_graph.targets.search.history import LidarHistory
+from caliv_graph.targets.search.align import (
+    FAR_PAIRS,
+    FAR_RATIO,
+    GUESS_SIGMAS,
+    align,
+    align_anywhere,
+    concentration,
+)
+from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
     MAX_EXTENT_M,
@@ -43,6 +50,12 @@ STANDS_RAD = math.radians(2.0)
 STANDING_PERIODS = 4
 """While the vehicle stands, every fourth scan is read: other objects move."""
 
+MOST_TRIED = 4
+"""Candidates that are tried at most: each costs a registration of some of its clouds."""
+
+SAME_PLACE_M = 0.7
+"""Tracks whose places are nearer to each other than this are of one candidate: half of a target."""
+
 REGION_MARGIN_M = 0.3
 """Margin of the region about the object on each side."""
 
@@ -66,7 +79,11 @@ class FoundTarget:
         looked_at: per LiDAR, the number of scans that were read.
         aligned: per LiDAR, T_vehicle_lidar with corrected yaw and shift (`align`): better than the
             guess for associating objects, but no estimate.
-        others: other proposals, a phrase each.
+        doubtful: in the scans that were read it scatters, or is missing, more than a static object.
+        score: quality of the view.
+        others: the other candidates, the best first.
+        misplaced: LiDARs whose objects stand still only with a guess that is farther off than its
+            sigma allows, and the correction; `aligned` has it.
     """
 
     drive: int
@@ -77,7 +94,18 @@ class FoundTarget:
     scans: Mapping[str, int]
     looked_at: Mapping[str, int]
     aligned: Mapping[str, gtsam.Pose3]
-    others: tuple[str, ...]
+    doubtful: bool = False
+    score: float = 0.0
+    others: tuple[FoundTarget, ...] = ()
+    misplaced: Mapping[str, Alignment] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        x, y, _ = self.centre_map
+        seen_by = ", ".join(name for name, scans in self.scans.items() if scans)
+        return (
+            f"({x:.1f}, {y:.1f}) {self.extent_m:.1f} m wide {self.height_m:.1f} m high seen by "
+            f"{seen_by}"
+        )
 
 
 def find_target(
@@ -161,25 +189,73 @@ def _read_history(
 def _target_of_drive(
     drive: int, name: str, histories: Sequence[LidarHistory], config: Config
 ) -> FoundTarget:
-    """The best proposal of a drive."""
+    """The best proposal of a drive, and the others."""
     alignments = {history.name: align(history, config) for history in histories}
+    tracks, proposals = _proposals(histories, alignments, config)
+    misplaced = {h.name: a for h in histories if (a := _elsewhere(h, alignments[h.name], config))}
+    if misplaced:
+        tried = {**alignments, **misplaced}
+        other_tracks, others = _proposals(histories, tried, config)
+        if others and (not proposals or len(others[0].tracks) >= len(proposals[0].tracks)):
+            alignments, tracks, proposals = tried, other_tracks, others
+        else:
+            misplaced = {}
+    usable = [p for p in proposals if math.isfinite(p.height_m)]
+    if not usable:
+        raise TargetError(_why_none(name, histories, tracks, len(proposals)), REMEDY)
+    found = [_found(drive, p, histories, alignments) for p in usable[:MOST_TRIED]]
+    return replace(found[0], others=tuple(found[1:]), misplaced=misplaced)
+
+
+def _proposals(
+    histories: Sequence[LidarHistory], alignments: Mapping[str, Alignment], config: Config
+) -> tuple[list[Track], list[Proposal]]:
+    """All tracks, and the candidates: those without a doubt first."""
     tracks = [t for h in histories for t in judged_tracks(h, alignments[h.name], config)]
-    usable = matched([track for track in tracks if not track.verdict])
-    proposals = [c for c in usable if math.isfinite(c.height_m)]
-    if not proposals:
-        raise TargetError(_why_none(name, histories, tracks, len(usable)), REMEDY)
-    proposals.sort(key=Proposal.rank, reverse=True)
-    best = proposals[0]
+    proposals = _ranked(matched([track for track in tracks if not track.verdict]))
+    for doubtful in _ranked(matched([track for track in tracks if track.doubtful])):
+        apart = [float(np.linalg.norm((doubtful.place - p.place)[:2])) for p in proposals]
+        if min(apart, default=math.inf) > SAME_PLACE_M:
+            proposals.append(doubtful)
+    return tracks, proposals
+
+
+def _elsewhere(history: LidarHistory, near: Alignment, config: Config) -> Alignment | None:
+    """A correction beyond the guess's sigma under which much more stands still; None if none."""
+    lidar = config.lidars[history.name]
+    if lidar.fixed:
+        return None
+    far = align_anywhere(history, config)
+    prior = np.array([lidar.sigma.rpy_rad()[2], *lidar.sigma.xyz_m()[:2]])
+    if (np.abs([far.yaw_rad, *far.shift_m]) <= GUESS_SIGMAS * prior).all():
+        return None
+    least = FAR_RATIO * max(concentration(history, near), 0) + FAR_PAIRS
+    return far if concentration(history, far) > least else None
+
+
+def _ranked(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """The best first; those whose top no LiDAR sees last."""
+    return sorted(proposals, key=lambda p: (math.isfinite(p.height_m), p.rank()), reverse=True)
+
+
+def _found(
+    drive: int,
+    proposal: Proposal,
+    histories: Sequence[LidarHistory],
+    alignments: Mapping[str, Alignment],
+) -> FoundTarget:
+    tracks = proposal.tracks
     return FoundTarget(
         drive=drive,
-        region=_region(best),
-        centre_map=best.place + np.array([0.0, 0.0, 0.5 * best.height_m]),
-        extent_m=best.extent_m,
-        height_m=best.height_m,
-        scans={h.name: best.tracks[h.name].good if h.name in best.tracks else 0 for h in histories},
+        region=_region(proposal),
+        centre_map=proposal.place + np.array([0.0, 0.0, 0.5 * proposal.height_m]),
+        extent_m=proposal.extent_m,
+        height_m=proposal.height_m,
+        scans={h.name: tracks[h.name].good if h.name in tracks else 0 for h in histories},
         looked_at={h.name: len(h.scans) for h in histories},
         aligned={h.name: h.aligned(alignments[h.name]) for h in histories},
-        others=tuple(str(proposal) for proposal in proposals[1:]),
+        doubtful=any(track.doubtful for track in tracks.values()),
+        score=proposal.rank()[1],
     )
 
 

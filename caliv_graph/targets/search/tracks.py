@@ -43,6 +43,9 @@ guess 10 degrees off; 0.3 to 0.4 m for somebody who strolls about or waits."""
 WELL_SEEN_POINTS = 50
 """Width and height are judged by views with at least so many points, if there are enough."""
 
+MOVING = "moving or seldom there"
+"""Verdict on what does not stay where it is."""
+
 FULL_POINTS = 300
 """Number of points above which a view is not better."""
 
@@ -61,6 +64,8 @@ class Track:
         good: number of scans that extraction could use.
         score: quality of the view.
         verdict: why it is no target; empty if it may be one.
+        doubtful: only what the guesses or somebody beside it may cause speaks against it: its place
+            scatters, or is empty too often.
     """
 
     lidar: str
@@ -72,6 +77,7 @@ class Track:
     good: int
     score: float
     verdict: str
+    doubtful: bool = False
 
 
 def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -> list[Track]:
@@ -105,9 +111,7 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
         stays = scatter <= SCATTER_M + SCATTER_PER_EXTENT * extent and presence >= PRESENT
         # What rides on the vehicle stays at a place for as long as the vehicle does.
         rides = baseline < 3.0 * gate < 0.5 * travelled
-        if rides or not stays:
-            verdict = "moving or seldom there"
-        elif len(in_wide) > 0.5 * len(scans):
+        if len(in_wide) > 0.5 * len(scans):
             verdict = "part of something wide"
         else:
             verdict = _no_target(extent, height, _bottom(history, judged))
@@ -115,6 +119,9 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
             len(good) < 2 or len(good) * history.stride < config.extraction.min_scans
         ):
             verdict = "with too few points"
+        doubtful = not (verdict or rides or stays)
+        if rides or not stays:
+            verdict = MOVING
         out.append(
             Track(
                 lidar=history.name,
@@ -126,6 +133,7 @@ def judged_tracks(history: LidarHistory, alignment: Alignment, config: Config) -
                 good=len(good),
                 score=_score(history, good, place),
                 verdict=verdict,
+                doubtful=doubtful,
             )
         )
     return out
@@ -220,13 +228,6 @@ class Proposal:
         """Number of LiDARs that see it, and the lowest of their scores."""
         scores = [track.score for track in self.tracks.values()]
         return len(scores), min(scores)
-
-    def __str__(self) -> str:
-        x, y, _ = self.place
-        return (
-            f"({x:.1f}, {y:.1f}) {self.extent_m:.1f} m wide {self.height_m:.1f} m high seen by "
-            f"{', '.join(self.tracks)}"
-        )
 
 
 def matched(tracks: Sequence[Track]) -> list[Proposal]:

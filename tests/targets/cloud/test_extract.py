@@ -32,7 +32,8 @@ from caliv_graph.scenario.world_models import BoxModel, ChairModel, ObjectModel,
 from caliv_graph.simulation.lidar import SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.targets.cloud.extract import extract_targets
-from caliv_graph.targets.cloud.region import RegionExtractor, Tally, widened_margin_m
+from caliv_graph.targets.cloud.region import RegionExtractor, widened_margin_m
+from caliv_graph.targets.cloud.tally import Tally
 from caliv_graph.trajectory.select import GivenTrajectory
 
 FRONT = LidarModel(

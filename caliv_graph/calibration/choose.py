@@ -1,0 +1,247 @@
+"""Which of several candidates is the target: the one whose clouds agree on one place of the map.
+
+The search (`targets.search`) proposes by size and view. Here some clouds of every candidate are
+registered to each other, freely, which yields the object's centre in each cloud whatever side of it
+is visible; and one place, the guesses with their sigmas, must explain all centres
+(`targets.search.place`). What walks or is carried does not have one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.config.model import Config
+from caliv_graph.errors import RegistrationError, TargetError
+from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
+from caliv_graph.products import Array, TargetObservation
+from caliv_graph.registration.register import JointRegistration, register_jointly
+from caliv_graph.targets.cloud.extract import Choice, TriedCandidate
+from caliv_graph.targets.cloud.scans import thinned
+from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+
+CLOUDS = 16
+"""Clouds of a LiDAR that decide: evenly spread over the views."""
+
+POINTS = 100
+COMPONENTS = 100
+ITERATIONS = 25
+"""Size of the registration that decides: centimetres are enough."""
+
+AGREE_M = 0.05
+"""Scatter of the centres that poses and registrations explain: a candidate with less is static."""
+
+SAME_OBJECT_M = 0.4
+"""Candidates whose clouds are at places nearer than this to each other are one object: the guesses
+leave half a metre between what the search proposes and what is extracted there."""
+
+MOVES_M = 0.15
+"""Scatter above which an object moves, unless late stamps or a wrong guess explain it."""
+
+EXPLAINS = 0.5
+"""Factor on the scatter below which late stamps or another guess explain it."""
+
+LATE_S = 0.02
+"""Smallest lateness that is named: at 2 m/s it is 4 cm, which poses explain too."""
+
+AGREE_RATIO = 3.0
+"""Poses that are worse displace all candidates: one is static as well if it scatters by at most
+this many times as much as the one that scatters least."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well the clouds of a candidate agree.
+
+    Attributes:
+        scatter_m: of its centre in the map; infinite where there is nothing to compare.
+        place: where it stands.
+        sightings: the centres.
+    """
+
+    scatter_m: float
+    place: Place | None = None
+    sightings: Sightings | None = None
+
+
+def choose_static(
+    candidates: Sequence[TriedCandidate], trajectory: VehicleTrajectory, config: Config
+) -> Choice:
+    """The candidate that is static and that most LiDARs see best; with reasons.
+
+    One candidate without a doubt is not tried: there is nothing to choose.
+
+    Raises:
+        TargetError: all move.
+    """
+    if len(candidates) == 1 and not candidates[0].found.doubtful:
+        return Choice(0)
+    found = [agreement(candidate, trajectory, config) for candidate in candidates]
+    scatter = [each.scatter_m for each in found]
+    limit = max(AGREE_M, AGREE_RATIO * min(scatter))
+
+    def rank(i: int) -> tuple[bool, int, bool, float]:
+        of = candidates[i].found
+        static = scatter[i] <= limit and math.isfinite(scatter[i])
+        return static, len(candidates[i].lidars), not of.doubtful, of.score
+
+    apart = _different(candidates, found)
+    best = max(apart, key=rank)
+    cause = _cause(found[best], config)
+    others = [i for i in apart if i != best]
+    same = [i for i in others if rank(i)[0]]
+    moving = [i for i in others if math.isfinite(scatter[i]) and i not in same]
+    of = candidates[best].found
+    if of.doubtful and scatter[best] > MOVES_M and cause is None:
+        raise TargetError(_why_none_stands(candidates, scatter))
+    reasons = [] if cause is None else [cause]
+    if same:
+        listed = ", ".join(f"{candidates[i].found} (to {scatter[i]:.2f} m)" for i in same)
+        reasons.append(
+            f"{of.extent_m:.1f} m wide, {of.height_m:.1f} m high; its clouds agree on one place "
+            f"to {scatter[best]:.2f} m. Other static objects fit too: {listed}. Give a target "
+            "region to choose"
+        )
+    if moving:
+        listed = ", ".join(f"{candidates[i].found} (by {scatter[i]:.2f} m)" for i in moving)
+        reasons.append(
+            f"objects that are not at one place of the map were left out: {listed}; this one "
+            f"scatters by {scatter[best]:.2f} m"
+        )
+    return Choice(best, tuple(reasons))
+
+
+def _cause(of: Agreement, config: Config) -> str | None:
+    """What would bring the clouds of a candidate to one place; None if they are, or nothing does.
+
+    Late stamps shift an object along the course, by as much as the speed; a guess that is off
+    shifts it rigidly in the frame of the vehicle.
+    """
+    if of.sightings is None or of.scatter_m <= AGREE_M:
+        return None
+    names = [name for name in config.lidars if name in of.sightings.lidars]
+    guesses = _guesses(config)
+    enough = EXPLAINS * of.scatter_m
+    sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
+    tried = [fit_place(of.sightings, guesses, late=each) for each in sets]
+    late = min(tried, key=lambda place: place.scatter_m)
+    if late.scatter_m <= enough and max(map(abs, late.late_s.values())) > LATE_S:
+        by = " and ".join(f"those of '{name}' by {s:+.2f} s" for name, s in late.late_s.items())
+        return (
+            f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
+            f"{late.scatter_m:.2f} m if stamps are late: {by}. Check the clocks, or set "
+            "solve.time_offset"
+        )
+    for name in names:
+        T, sigmas = guesses[name]
+        far = fit_place(of.sightings, {**guesses, name: (T, np.maximum(sigmas, WIDE_SIGMAS))})
+        if far.scatter_m <= enough:
+            off = vehicle_axes_difference(far.T_vehicle_lidar[name], T)
+            degrees = math.degrees(float(np.linalg.norm(off[:3])))
+            return (
+                f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
+                f"{far.scatter_m:.2f} m if lidars.{name}.initial is off by about {degrees:.0f} "
+                f"degrees and {float(np.linalg.norm(off[3:])):.1f} m. Check it"
+            )
+    return None
+
+
+def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[float]) -> str:
+    listed = ", ".join(
+        f"{candidate.found} (its clouds scatter by {of:.2f} m)"
+        for candidate, of in zip(candidates, scatter, strict=True)
+        if math.isfinite(of)
+    )
+    return (
+        f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
+        "guess of one LiDAR explains it, so these objects move: let a target stand alone, or name "
+        "its box with target: {min: [x, y, z], max: [x, y, z]} in metres, frame map"
+    )
+
+
+def _guesses(config: Config) -> dict[str, tuple[gtsam.Pose3, Array]]:
+    """LiDAR -> its guess and the guess's sigmas."""
+    of = {name: configured_guess(config, name) for name in config.lidars}
+    return {name: (guess.T_vehicle_lidar, guess.sigmas) for name, guess in of.items()}
+
+
+def _different(candidates: Sequence[TriedCandidate], found: Sequence[Agreement]) -> list[int]:
+    """Indices of the candidates without those whose clouds are of the object of another one.
+
+    The region of a candidate, widened by the error of the guesses, may hold its neighbour too.
+    """
+
+    def off_m(i: int) -> float:
+        place = found[i].place
+        if place is None:
+            return math.inf
+        return float(np.linalg.norm((place.place_map - candidates[i].found.centre_map)[:2]))
+
+    out: list[int] = []
+    for i in sorted(range(len(candidates)), key=off_m):
+        place = found[i].place
+        places = [p.place_map for j in out if (p := found[j].place) is not None]
+        if place is None or all(
+            float(np.linalg.norm((place.place_map - p)[:2])) > SAME_OBJECT_M for p in places
+        ):
+            out.append(i)
+    return sorted(out)
+
+
+def agreement(
+    candidate: TriedCandidate, trajectory: VehicleTrajectory, config: Config
+) -> Agreement:
+    """Registers some of a candidate's clouds, and fits one place to its centres."""
+    observations = [o for o in candidate.observations if len(o.clouds) >= 2]
+    if not observations:
+        return Agreement(math.inf)
+    most = max(observations, key=lambda o: len(o.clouds))
+    clouds = [
+        cloud
+        for name in config.lidars
+        for cloud in thinned([c for c in most.clouds if c.lidar == name and not c.cut], CLOUDS)
+    ]
+    if len(clouds) < 2:
+        return Agreement(math.inf)
+    sightings = _sightings(replace(most, clouds=tuple(clouds)), trajectory, config)
+    if sightings is None:
+        return Agreement(math.inf)
+    place = fit_place(sightings, _guesses(config))
+    return Agreement(place.scatter_m, place, sightings)
+
+
+def _sightings(
+    observation: TargetObservation, trajectory: VehicleTrajectory, config: Config
+) -> Sightings | None:
+    """The object's centre in each cloud, by a small free registration; None if it failed."""
+    stamps = [cloud.stamp_ns for cloud in observation.clouds]
+    R, t = trajectory.poses_at(stamps)
+    poses = [
+        T.compose(config.lidars[cloud.lidar].initial.pose())
+        for T, cloud in zip(unstack(R, t), observation.clouds, strict=True)
+    ]
+    small = config.registration.model_copy(
+        update={"components": 2 * COMPONENTS, "max_points": POINTS}
+    )
+    try:
+        state = JointRegistration(
+            observation, config.model_copy(update={"registration": small}), rough=True
+        )
+        registered = register_jointly(state, poses, ITERATIONS, other_starts=False)
+    except RegistrationError:
+        return None
+    centres: Array = np.array([T.inverse().translation() for T in registered.T_target_lidar])
+    return Sightings(
+        lidars=tuple(cloud.lidar for cloud in observation.clouds),
+        centres_lidar=centres,
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        twists=twists_at(trajectory, stamps),
+        times_s=1e-9 * (np.array(stamps) - stamps[0]),
+    )

@@ -380,6 +380,13 @@ class LinearisedGraph:
         cloud_gradient: (6 J,) derivative of minus the clouds' log-likelihood.
         by_vehicle: (J, 6, 6) derivative of each cloud's pose with respect to its vehicle pose.
         by_extrinsic: (J, 6, 6) with respect to its LiDAR's T_vehicle_lidar, right perturbation.
+        starts: key of a variable -> its first coordinate.
+        pose_information: (6 n, 6 n) of the vehicle's poses alone, n in the order of
+            `Solution.T_map_vehicle`, which are the first 6 n coordinates: motion data or given
+            poses, no LiDAR.
+        pose_gradient: (6 n,) of the same.
+        to_vehicle_axes: (6 L, 6 L) from the last 6 L coordinates, the extrinsics, to vehicle axes
+            of the LiDARs in the order of `Solution.lidars`.
     """
 
     information: Array
@@ -390,6 +397,10 @@ class LinearisedGraph:
     cloud_gradient: Array
     by_vehicle: Array
     by_extrinsic: Array
+    starts: Mapping[int, int]
+    pose_information: Array
+    pose_gradient: Array
+    to_vehicle_axes: Array
 
 
 @dataclass(frozen=True)
@@ -559,6 +570,31 @@ class LidarResult:
 
 
 @dataclass(frozen=True)
+class Suspect:
+    """An input that could be wrong, and what freeing it would explain.
+
+    Attributes:
+        input: its name: a key of the config, or a part of the drive (`uncertainty/README.md`).
+        value: that it would take, a number per coordinate, in `units`.
+        sigma: 1 sigma of each.
+        change: `value` less what the input is now.
+        units: of each coordinate: m, deg, s, or 1.
+        explains: part of all contradictions that freeing it takes away, 0 to 1.
+        sigmas: of a normal variable with the same p-value, one sound input in mind.
+        sigmas_left: the same once the first of the ranking is freed; of the first, `sigmas`.
+    """
+
+    input: str
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    change: tuple[float, ...]
+    units: tuple[str, ...]
+    explains: float
+    sigmas: float
+    sigmas_left: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The result, as written to calibration.yaml (`results/README.md`).
 
@@ -579,6 +615,7 @@ class Calibration:
         earlier: data terms of earlier drives that served as a prior. They are part of the
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
+        suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
     """
 
     status: str
@@ -593,3 +630,4 @@ class Calibration:
     gradient_data: Array | None = None
     earlier: tuple[DataTerm, ...] = ()
     contradictions: tuple[str, ...] = ()
+    suspects: tuple[Suspect, ...] = ()

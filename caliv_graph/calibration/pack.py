@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import cloud_graph, merged
+from caliv_graph.calibration.graph import cloud_graph, merged, pose_graph
 from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
@@ -79,7 +79,9 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=reduced.linearised(problem),
+        linearised=reduced.linearised(
+            problem, pose_graph(problem, state.noise, state.motion)
+        ),
         time_offsets=time_offsets,
         gradient_data=reduced.c,
     )

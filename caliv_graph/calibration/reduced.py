@@ -76,9 +76,14 @@ class Reduced:
         rest = self._g - self._G @ tangent
         return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
 
-    def linearised(self, problem: Problem) -> LinearisedGraph:
-        """The same as numbers, with the guesses' information, for score tests."""
+    def linearised(self, problem: Problem, poses: CalibrationGraph) -> LinearisedGraph:
+        """The same as numbers, with the guesses' information, for score tests.
+
+        `poses` is the graph of the vehicle's poses alone (`graph.pose_graph`).
+        """
         H, gradient = self.clouds
+        alone = dense_system(problem, poses, self._values)
+        of_poses = slice(0, 6 * len(problem.poses))
         guesses = np.zeros_like(self.system.H)
         of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
         guesses[of_extrinsics, of_extrinsics] = self.in_tangents(problem.guess_information())
@@ -91,6 +96,10 @@ class Reduced:
             cloud_gradient=gradient,
             by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
             by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
+            starts=self.system.starts,
+            pose_information=alone.H[of_poses, of_poses],
+            pose_gradient=alone.b[of_poses],
+            to_vehicle_axes=self._to_axes,
         )
 
 

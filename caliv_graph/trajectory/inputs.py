@@ -43,6 +43,7 @@ class SmootherInput:
         positions: of the GNSS antenna in the map; None: GNSS is not used.
         orientation: whether the IMU's messages carry orientations.
         T_vehicle_imu: the IMU's extrinsic.
+        lever_arm: (3,) the GNSS antenna in the vehicle frame, metres.
         gravity_m_s2: along -z of the map.
     """
 
@@ -54,13 +55,13 @@ class SmootherInput:
     positions: Positions | None
     orientation: bool
     T_vehicle_imu: gtsam.Pose3
+    lever_arm: Array
     gravity_m_s2: float
 
     @property
     def arm_imu(self) -> Array:
         """(3,) the GNSS antenna in the imu frame, metres."""
-        arm = np.array(self.config.gnss.lever_arm)
-        return np.asarray(self.T_vehicle_imu.transformTo(arm))
+        return np.asarray(self.T_vehicle_imu.transformTo(self.lever_arm))
 
     @property
     def yaw_bias(self) -> bool:
@@ -109,6 +110,7 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         positions=positions,
         orientation=_has_orientation(motion.imu, inertial, name),
         T_vehicle_imu=config.imu.T_vehicle_imu.pose(),
+        lever_arm=np.array(config.gnss.lever_arm),
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
     )
     return data, warnings

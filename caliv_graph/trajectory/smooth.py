@@ -62,6 +62,8 @@ def smooth_trajectory(
         values=estimate.values,
         chain=chain_of(linear, len(nodes), data.yaw_bias),
         inertial=data.inertial,
+        data=data,
+        gnss_dropped=robust.dropped,
         factor_kinds=tuple(estimate.graph.kinds),
     )
 

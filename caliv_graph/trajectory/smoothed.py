@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
@@ -15,7 +16,9 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.parameters import UncertainParameter
 
 MERGE_NS = 1_000
 """Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
@@ -81,6 +84,26 @@ def within_span(
 
 
 @dataclass(frozen=True)
+class JointInformation:
+    """A Gaussian on m poses of the vehicle and p coordinates of parameters, about its estimate.
+
+    Minus its logarithm is `d^T information d / 2 - gradient^T d`, d the right perturbations of the
+    poses (rotation then translation, rad and m) and after them the moves of the parameters.
+
+    Attributes:
+        information: (6 m + p, 6 m + p), without the priors of the parameters.
+        gradient: (6 m + p,); of the poses it is zero but for the solver's tolerance.
+        T_map_vehicle: the m poses at the estimate.
+        parameters: names of the parameters, in order.
+    """
+
+    information: Array
+    gradient: Array
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class SmoothedTrajectory:
     """The vehicle's motion over one drive, as a Gaussian.
 
@@ -100,7 +123,10 @@ class SmoothedTrajectory:
         values: the estimate, as values of the graph.
         chain: the graph's information at the estimate.
         inertial: the IMU samples used.
+        data: the input as it was used, its parameters and the noise of the fixes as estimated.
+        gnss_dropped: (k,) indices of the fixes that the graph is without.
         factor_kinds: of each factor of the graph, in order (`build.TrajectoryGraph`).
+        parameters: of the input, in the chain after the yaw bias (`parameters.py`).
     """
 
     trajectory: Trajectory
@@ -118,7 +144,10 @@ class SmoothedTrajectory:
     values: gtsam.Values = field(repr=False)
     chain: Chain = field(repr=False)
     inertial: Inertial = field(repr=False)
+    data: SmootherInput = field(repr=False)
+    gnss_dropped: IntArray = field(repr=False)
     factor_kinds: tuple[str, ...] = field(default=(), repr=False)
+    parameters: tuple[UncertainParameter, ...] = ()
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -219,13 +248,78 @@ class SmoothedTrajectory:
         Raises:
             KeyError: a stamp has no node.
         """
+        joint = self.joint(stamps_ns)
+        return joint.information, joint.T_map_vehicle
+
+    def joint(
+        self, stamps_ns: Sequence[int] | IntArray, parameters: Sequence[str] = ()
+    ) -> JointInformation:
+        """The joint Gaussian of the vehicle's poses at wanted stamps (m,) and named parameters.
+
+        Parameters that are not named are eliminated under their prior; those without a prior are
+        held. The prior of a named parameter is not in the result: it is one for all drives.
+
+        Raises:
+            KeyError: a stamp has no node, or the chain does not have a parameter (`columns`).
+        """
         i = self._node_indices(stamps_ns)
-        m = len(i)
-        information = self.chain.pose_information(i).reshape(m, POSE, m, POSE)
-        # d_imu = Ad(T_imu_vehicle) d_vehicle, as T_map_vehicle = T_map_imu T_imu_vehicle.
-        Ad = np.asarray(self.T_vehicle_imu.AdjointMap())
-        inverse = np.linalg.inv(Ad)
-        rotated = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
-        information = rotated.reshape(POSE * m, POSE * m)
-        poses = poses_of_vehicle(self.states, i, self.T_vehicle_imu)
-        return 0.5 * (information + information.T), poses
+        m, names = len(i), [p.parameter.name for p in self.parameters]
+        missing = sorted(set(parameters) - set(names))
+        if missing:
+            raise KeyError(missing[0])
+        first = 0 if self.yaw_bias is None else 1
+        starts = first + np.cumsum([0, *(p.parameter.size for p in self.parameters)])
+        at = {
+            name: list(range(start, end))
+            for name, start, end in zip(names, starts[:-1], starts[1:], strict=True)
+        }
+        chain = self.chain
+        corner = chain.corner.copy()
+        held: list[int] = []
+        for p in self.parameters:
+            where = at[p.parameter.name]
+            if p.parameter.name in parameters:
+                continue
+            if p.sigmas is None:
+                held += where
+                continue
+            weight = p.sigmas**-2.0
+            corner[where, where] += weight
+            # The last common coordinate is the right-hand side.
+            pull = 0.0 if p.offset is None else weight * p.offset
+            corner[where, -1] -= pull
+            corner[-1, where] -= pull
+        right = len(corner) - 1
+        kept = [k for name in parameters for k in at[name]]
+        joint = replace(chain, corner=corner).pose_information(i, [*kept, right], held)
+        by_vehicle = self._substitution(m, parameters)
+        information = by_vehicle.T @ joint[:-1, :-1] @ by_vehicle
+        return JointInformation(
+            information=np.asarray(0.5 * (information + information.T)),
+            gradient=np.asarray(by_vehicle.T @ joint[:-1, -1]),
+            T_map_vehicle=poses_of_vehicle(self.states, i, self.T_vehicle_imu),
+            parameters=tuple(parameters),
+        )
+
+    def _substitution(self, m: int, names: Sequence[str]) -> scipy.sparse.csr_array:
+        """From perturbations of m vehicle's poses and named parameters to the IMU's poses and them.
+
+        `I = X T_vehicle_imu`, hence `xi_imu = Ad(T_imu_vehicle) xi_vehicle + moves d`, d moving
+        T_vehicle_imu.
+        """
+        of_name = {p.parameter.name: p.parameter for p in self.parameters}
+        back = np.asarray(self.T_vehicle_imu.inverse().AdjointMap())
+        moves = [np.zeros((POSE, 0)), *(of_name[n].imu_moves(self.data) for n in names)]
+        together = np.hstack(moves)
+        size = together.shape[1]
+        # Per pose its own block and the moves; at the end the parameters themselves.
+        own, moved = np.indices((m, POSE, POSE)), np.indices((m, POSE, size))
+        last = POSE * m + np.arange(size)
+        entries = np.concatenate(
+            [np.tile(back.ravel(), m), np.tile(together.ravel(), m), np.ones(size)]
+        )
+        rows = np.concatenate([(POSE * at[0] + at[1]).ravel() for at in (own, moved)])
+        columns = np.concatenate([(POSE * own[0] + own[2]).ravel(), POSE * m + moved[2].ravel()])
+        where = np.concatenate([rows, last]), np.concatenate([columns, last])
+        shape = (POSE * m + size, POSE * m + size)
+        return scipy.sparse.csr_array((entries, where), shape=shape)

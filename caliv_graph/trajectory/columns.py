@@ -57,7 +57,7 @@ def parameter_columns(
             for i, after, before in zip(touched, ahead, behind, strict=True):
                 change = (after - before) / (2.0 * parameter.steps[k])
                 factor = graph.factors.at(i)
-                out[starts[i] : starts[i + 1], column] = _whitened(factor, values, change)
+                out[starts[i] : starts[i + 1], column] = whitened(factor, values, change)
             column += 1
     return out
 
@@ -76,14 +76,11 @@ def _errors(
     return [factor.unwhitenedError(values) for factor in factors]
 
 
-def _whitened(factor: Any, values: gtsam.Values, change: Array) -> Array:
+def whitened(factor: Any, values: gtsam.Values, change: Array) -> Array:
     """A change of the residual, whitened as `linearize` does: with the root of a robust weight."""
-    noise: Any = factor.noiseModel()
-    white = noise.unweightedWhiten(change)
-    if isinstance(noise, gtsam.noiseModel.Robust):
-        residual = noise.unweightedWhiten(factor.unwhitenedError(values))
-        white = white * math.sqrt(noise.robust().weight(float(np.linalg.norm(residual))))
-    return np.asarray(white)
+    noise = factor.noiseModel()
+    residual = noise.unweightedWhiten(factor.unwhitenedError(values))
+    return np.asarray(noise.unweightedWhiten(change) * math.sqrt(noise.weight(residual)))
 
 
 def with_parameters(

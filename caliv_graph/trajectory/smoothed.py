@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -14,11 +14,11 @@ from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
-from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
-from caliv_graph.trajectory.parameters import UncertainParameter
+from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
 
 MERGE_NS = 1_000
 """Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
@@ -267,49 +267,45 @@ class SmoothedTrajectory:
         missing = sorted(set(parameters) - set(names))
         if missing:
             raise KeyError(missing[0])
-        first = 0 if self.yaw_bias is None else 1
-        starts = first + np.cumsum([0, *(p.parameter.size for p in self.parameters)])
-        at = {
-            name: list(range(start, end))
-            for name, start, end in zip(names, starts[:-1], starts[1:], strict=True)
-        }
-        chain = self.chain
-        corner = chain.corner.copy()
-        held: list[int] = []
-        for p in self.parameters:
-            where = at[p.parameter.name]
-            if p.parameter.name in parameters:
-                continue
-            if p.sigmas is None:
-                held += where
-                continue
-            weight = p.sigmas**-2.0
-            corner[where, where] += weight
-            # The last common coordinate is the right-hand side.
-            pull = 0.0 if p.offset is None else weight * p.offset
-            corner[where, -1] -= pull
-            corner[-1, where] -= pull
-        right = len(corner) - 1
-        kept = [k for name in parameters for k in at[name]]
-        joint = replace(chain, corner=corner).pose_information(i, [*kept, right], held)
-        by_vehicle = self._substitution(m, parameters)
+        # A parameter that moves T_vehicle_imu moves the vehicle: it is eliminated after the change
+        # of variables, not before.
+        free = [
+            p for p in self.parameters if p.parameter.name in parameters or p.sigmas is not None
+        ]
+        free.sort(key=lambda p: _place(parameters, p.parameter.name))
+        joint = self._over_imu(i, [p.parameter.name for p in free])
+        by_vehicle = self._substitution(m, [p.parameter for p in free])
         information = by_vehicle.T @ joint[:-1, :-1] @ by_vehicle
+        gradient = by_vehicle.T @ joint[:-1, -1]
+        keep = POSE * m + sum(p.parameter.size for p in free if p.parameter.name in parameters)
+        prior = [p for p in free if p.parameter.name not in parameters]
+        if prior:
+            information, gradient = _eliminated_under_prior(information, gradient, keep, prior)
         return JointInformation(
             information=np.asarray(0.5 * (information + information.T)),
-            gradient=np.asarray(by_vehicle.T @ joint[:-1, -1]),
+            gradient=np.asarray(gradient),
             T_map_vehicle=poses_of_vehicle(self.states, i, self.T_vehicle_imu),
             parameters=tuple(parameters),
         )
 
-    def _substitution(self, m: int, names: Sequence[str]) -> scipy.sparse.csr_array:
-        """From perturbations of m vehicle's poses and named parameters to the IMU's poses and them.
+    def _over_imu(self, nodes: IntArray, names: Sequence[str]) -> Array:
+        """Joint information of the IMU's poses, named parameters, and the right-hand side."""
+        at, start = {}, 0 if self.yaw_bias is None else 1
+        for p in self.parameters:
+            at[p.parameter.name] = list(range(start, start + p.parameter.size))
+            start += p.parameter.size
+        kept = [k for name in names for k in at[name]]
+        held = [k for name in at if name not in names for k in at[name]]
+        return self.chain.pose_information(nodes, [*kept, start], held)
+
+    def _substitution(self, m: int, parameters: Sequence[InputParameter]) -> scipy.sparse.csr_array:
+        """From perturbations of m vehicle's poses and parameters to those of the IMU and them.
 
         `I = X T_vehicle_imu`, hence `xi_imu = Ad(T_imu_vehicle) xi_vehicle + moves d`, d moving
         T_vehicle_imu.
         """
-        of_name = {p.parameter.name: p.parameter for p in self.parameters}
         back = np.asarray(self.T_vehicle_imu.inverse().AdjointMap())
-        moves = [np.zeros((POSE, 0)), *(of_name[n].imu_moves(self.data) for n in names)]
+        moves = [np.zeros((POSE, 0)), *(p.imu_moves(self.data) for p in parameters)]
         together = np.hstack(moves)
         size = together.shape[1]
         # Per pose its own block and the moves; at the end the parameters themselves.
@@ -323,3 +319,25 @@ class SmoothedTrajectory:
         where = np.concatenate([rows, last]), np.concatenate([columns, last])
         shape = (POSE * m + size, POSE * m + size)
         return scipy.sparse.csr_array((entries, where), shape=shape)
+
+
+def _place(names: Sequence[str], name: str) -> int:
+    """Index of a name; after all if it is not there."""
+    return list(names).index(name) if name in names else len(names)
+
+
+def _eliminated_under_prior(
+    information: Array, gradient: Array, keep: int, prior: Sequence[UncertainParameter]
+) -> tuple[Array, Array]:
+    """Adds the priors of the coordinates after the first `keep`, and eliminates these."""
+    weight = np.concatenate([np.asarray(p.sigmas) ** -2.0 for p in prior])
+    offset = np.concatenate(
+        [np.zeros(p.parameter.size) if p.offset is None else p.offset for p in prior]
+    )
+    inverse = inverse_of(information[keep:, keep:] + np.diag(weight))
+    to_keep = information[:keep, keep:] @ inverse
+    rest = gradient[keep:] - weight * offset
+    return (
+        information[:keep, :keep] - to_keep @ information[keep:, :keep],
+        gradient[:keep] - to_keep @ rest,
+    )

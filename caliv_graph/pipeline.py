@@ -126,7 +126,9 @@ def _calibrate(
         prepared.observations, prepared.trajectories, guessed, progress, prepared.grounds
     )
     calibration = assemble(solution, config, recordings, digests)
-    calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
+    calibration, doubts = check(
+        calibration, solution, recordings, prepared.trajectories, motions, guessed
+    )
     calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)

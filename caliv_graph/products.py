@@ -381,10 +381,9 @@ class LinearisedGraph:
         by_vehicle: (J, 6, 6) derivative of each cloud's pose with respect to its vehicle pose.
         by_extrinsic: (J, 6, 6) with respect to its LiDAR's T_vehicle_lidar, right perturbation.
         starts: key of a variable -> its first coordinate.
-        pose_information: (6 n, 6 n) of the vehicle's poses alone, n in the order of
-            `Solution.T_map_vehicle`, which are the first 6 n coordinates: motion data or given
-            poses, no LiDAR.
-        pose_gradient: (6 n,) of the same.
+        pose_information: (M, M) of motion data and given poses alone, no LiDAR. The vehicle's poses
+            are the first coordinates, in the order of `Solution.T_map_vehicle`.
+        pose_gradient: (M,) of the same.
         to_vehicle_axes: (6 L, 6 L) from the last 6 L coordinates, the extrinsics, to vehicle axes
             of the LiDARs in the order of `Solution.lidars`.
     """

@@ -248,7 +248,7 @@ def pose_problem(
         cloud_placement=np.array([m for m, _ in clouds]),
         placements=len(observations),
         motion={
-            d: _with_heave(
+            d: with_heave(
                 trajectory.joint_information([stamp for drive, stamp in poses if drive == d])[0]
             )
             for d, trajectory in enumerate(trajectories)
@@ -298,7 +298,7 @@ def _stated_covariances(
     return out if np.isfinite(out).any() else None
 
 
-def _with_heave(information: Array) -> Array:
+def with_heave(information: Array) -> Array:
     """Information (6 m, 6 m) on poses with a heave of its own each, along the vehicle's z."""
     cov = np.linalg.inv(information)
     z = np.arange(5, len(cov), 6)

@@ -82,11 +82,19 @@ class Reduced:
         `poses` is the graph of the vehicle's poses alone (`graph.pose_graph`).
         """
         H, gradient = self.clouds
-        alone = dense_system(problem, poses, self._values)
-        of_poses = slice(0, 6 * len(problem.poses))
         guesses = np.zeros_like(self.system.H)
         of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
         guesses[of_extrinsics, of_extrinsics] = self.in_tangents(problem.guess_information())
+        alone = dense_system(problem, poses, self._values)
+        where = np.concatenate(
+            [
+                self.system.offset(key) + np.arange(size)
+                for key, size in zip(alone.keys, alone.sizes, strict=True)
+            ]
+        )
+        pose_information, pose_gradient = np.zeros_like(guesses), np.zeros(len(guesses))
+        pose_information[np.ix_(where, where)] = alone.H
+        pose_gradient[where] = alone.b
         return LinearisedGraph(
             information=self.system.H,
             gradient=self.system.b,
@@ -97,8 +105,8 @@ class Reduced:
             by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
             by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
             starts=self.system.starts,
-            pose_information=alone.H[of_poses, of_poses],
-            pose_gradient=alone.b[of_poses],
+            pose_information=pose_information,
+            pose_gradient=pose_gradient,
             to_vehicle_axes=self._to_axes,
         )
 

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 import scipy.linalg
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
+from caliv_graph.calibration.motion_suspects import motion_parts
+from caliv_graph.calibration.problem import with_heave
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.conventions import key_ground
 from caliv_graph.errors import SolveError
@@ -68,11 +70,66 @@ class _Block:
 
 
 @dataclass
+class _Motion:
+    """What is known of the vehicle's poses without any LiDAR, and of the smoothers' inputs.
+
+    `information` (6 n, 6 n) and `gradient` (6 n,) at the estimate, the inputs as the user typed
+    them; `blocks` of the inputs, which are the first candidates; `own`, `own_gradient` of them with
+    all poses eliminated.
+    """
+
+    information: Array
+    gradient: Array
+    blocks: list[_Block]
+    own: Array
+    own_gradient: Array
+
+
+def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _Motion:
+    """The vehicle's poses: the graph's own of the given ones, the smoothers' of the others."""
+    graph, (drives, stamps) = solution.linearised, _drives(solution)
+    smoothed = {
+        d: t
+        for d, t in enumerate(trajectories)
+        if isinstance(t, SmoothedTrajectory) and (drives == d).any()
+    }
+    candidates, parts = motion_parts(smoothed, {d: stamps[drives == d] for d in smoothed})
+    size, whole = 6 * len(drives), sum(len(c.scale) for c in candidates)
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    columns = np.zeros((size, whole))
+    own, own_gradient = np.zeros((whole, whole)), np.zeros(whole)
+    given = np.repeat(~np.isin(drives, list(smoothed)), 6)
+    information[np.ix_(given, given)] = graph.pose_information[:size, :size][np.ix_(given, given)]
+    gradient[given] = graph.pose_gradient[:size][given]
+    poses = list(solution.T_map_vehicle.values())
+    for drive, part in parts.items():
+        at = np.repeat(drives == drive, 6)
+        W = with_heave(part.information)
+        mine = np.flatnonzero(drives == drive).tolist()
+        off = [
+            gtsam.Pose3.Logmap(T.between(poses[i]))
+            for i, T in zip(mine, part.T_map_vehicle, strict=True)
+        ]
+        information[np.ix_(at, at)] = W
+        gradient[at] = -W @ np.concatenate(off)
+        columns[at] = part.poses
+        own += part.own
+        own_gradient += part.gradient
+    ends = np.cumsum([len(c.scale) for c in candidates], dtype=np.int64).tolist()
+    blocks = [
+        _Block(c, poses=columns[:, end - len(c.scale) : end])
+        for c, end in zip(candidates, ends, strict=True)
+    ]
+    return _Motion(information, gradient, blocks, own, own_gradient)
+
+
+@dataclass
 class _Quadratic:
     """The blocks as one quadratic beside the graph's."""
 
     graph: LinearisedGraph
-    blocks: list[_Block] = field(default_factory=list)
+    motion: _Motion
+    blocks: list[_Block]
 
     def scores(self, information: Array, gradient: Array) -> Scores:
         """All variables eliminated; `information`, `gradient` of them with all evidence."""
@@ -80,7 +137,7 @@ class _Quadratic:
         ends = np.cumsum(sizes).tolist()
         whole = ends[-1]
         C = np.zeros((len(graph.cloud_gradient), whole))
-        P = np.zeros((len(graph.pose_gradient), whole))
+        P = np.zeros((len(self.motion.gradient), whole))
         B, c = np.zeros((whole, whole)), np.zeros(whole)
         cross = np.zeros((len(graph.gradient), whole))
         for block, size, end in zip(self.blocks, sizes, ends, strict=True):
@@ -98,10 +155,13 @@ class _Quadratic:
         cross += graph.cloud_jacobian.T @ seen
         B += C.T @ seen
         c -= C.T @ graph.cloud_gradient
-        moved = graph.pose_information @ P
+        moved = self.motion.information @ P
         cross[: len(P)] -= moved
         B += P.T @ moved
-        c -= P.T @ graph.pose_gradient
+        c -= P.T @ self.motion.gradient
+        own = slice(0, len(self.motion.own_gradient))
+        B[own, own] += self.motion.own
+        c[own] += self.motion.own_gradient
         candidates = [b.candidate for b in self.blocks]
         try:
             return assembled(candidates, B, c, cross, information, gradient)
@@ -124,15 +184,21 @@ def suspect_scores(
         SolveError: the graph is singular.
     """
     graph = solution.linearised
+    motion = _motion(solution, trajectories)
     blocks = [
+        *motion.blocks,
         *_of_clouds(CloudParts(solution, trajectories)),
         *_of_guesses(solution, guesses),
         *_of_height(solution),
         *_of_drift(solution, trajectories),
         *_of_given_frame(solution, trajectories),
     ]
-    information = graph.information.copy()
-    gradient = graph.gradient.copy()
+    # The smoother's inputs are parameters of their own here, as the user typed them.
+    information = graph.information - graph.pose_information
+    gradient = graph.gradient - graph.pose_gradient
+    size = len(motion.gradient)
+    information[:size, :size] += motion.information
+    gradient[:size] += motion.gradient
     for block in blocks:
         # A guess that is fixed is among the data, and so is the vehicle's height.
         if block.candidate.name.endswith(".initial") and block.prior is not None:
@@ -144,7 +210,7 @@ def suspect_scores(
         gradient -= rows.T @ residual / STANCE_RAD**2
     if not blocks:
         return Scores((), np.zeros((0, 0)), np.zeros(0))
-    return _Quadratic(graph, blocks).scores(information, gradient)
+    return _Quadratic(graph, motion, blocks).scores(information, gradient)
 
 
 def _of_clouds(parts: CloudParts) -> list[_Block]:

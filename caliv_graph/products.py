@@ -403,6 +403,22 @@ class LinearisedGraph:
 
 
 @dataclass(frozen=True)
+class VehicleParameter:
+    """Something that the user measured on the vehicle, and the solve estimated.
+
+    Attributes:
+        value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu in rad.
+        sigma: (3,) in the same unit; of a rotation about the vehicle's axes. The user's own sigma
+            is part of it.
+        determined: per coordinate whether the drive alone determines it.
+    """
+
+    value: Array
+    sigma: Array
+    determined: tuple[bool, bool, bool]
+
+
+@dataclass(frozen=True)
 class Solution:
     """The solved factor graph.
 
@@ -427,6 +443,8 @@ class Solution:
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
         held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
+        vehicle: `lever_arm` and `imu_rotation`, where they are uncertain.
+        information_knowing: of `vehicle`, (6n, 6n) of the data if that were known exactly.
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
         graph: the factor graph.
@@ -467,6 +485,8 @@ class Solution:
     warnings: tuple[str, ...] = ()
     gradient_data: Array | None = None
     range_bias_m: float = 0.0
+    vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
+    information_knowing: Mapping[str, Array] = field(default_factory=dict)
     course: tuple[Iteration, ...] = ()
 
 
@@ -615,6 +635,7 @@ class Calibration:
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
         suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
+        vehicle: `lever_arm` and `imu_rotation`, where the solve estimated them.
     """
 
     status: str
@@ -630,3 +651,4 @@ class Calibration:
     earlier: tuple[DataTerm, ...] = ()
     contradictions: tuple[str, ...] = ()
     suspects: tuple[Suspect, ...] = ()
+    vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)

@@ -48,15 +48,35 @@ class Reduced:
 
         `cov` is (6n, 6n) of the extrinsics, vehicle axes.
         """
-        inverse = np.linalg.inv(self._to_axes)
-        tangent = inverse @ cov @ inverse.T
         out = {}
         for i, name in enumerate(problem.lidars):
             if name in problem.offsets:
-                variance = self.system.covariance_of(key_offset(i), tangent)[0, 0]
+                variance = self.covariance_of(key_offset(i), cov)[0, 0]
                 value = float(self._values.atVector(key_offset(i))[0])
                 out[name] = (value, float(np.sqrt(variance)))
         return out
+
+    def covariance_of(self, key: int, cov: Array) -> Array:
+        """Marginal covariance of a variable that is no extrinsic; `cov` as in `time_offsets`."""
+        inverse = np.linalg.inv(self._to_axes)
+        return self.system.covariance_of(key, inverse @ cov @ inverse.T)
+
+    def information_knowing(self, key: int) -> Array:
+        """(6n, 6n) as D, if a variable that is no extrinsic were known exactly."""
+        system, at = self.system, self.system.keys.index(key)
+        keep = np.ones(len(system.b), dtype=bool)
+        keep[system.offset(key) : system.offset(key) + system.sizes[at]] = False
+        known = DenseSystem(
+            keys=system.keys[:at] + system.keys[at + 1 :],
+            sizes=system.sizes[:at] + system.sizes[at + 1 :],
+            H=system.H[np.ix_(keep, keep)],
+            b=system.b[keep],
+            extrinsics=system.extrinsics,
+        )
+        D, *_ = known.schur()
+        inverse = np.linalg.inv(self._to_axes)
+        D = inverse.T @ D @ inverse
+        return np.asarray(0.5 * (D + D.T))
 
     def in_tangents(self, information: Array) -> Array:
         """(6n, 6n) information of the extrinsics, vehicle axes, in tangents of the graph's."""

@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.suspects import DRIFT_WAVES
+from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.calibration.motion_suspects import motion_scores
+from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
 from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import retract_vehicle_axes
-from caliv_graph.products import Array, Guess, Suspect
-from caliv_graph.uncertainty.suspects import Freed, Ranked
+from caliv_graph.products import Array, Guess, MotionData, Solution, Suspect
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
+from caliv_graph.uncertainty.suspects import Freed, Ranked, ranking
+
+FREE_ARM_M = 2.0
+"""Sigma of a lever arm that is freed: antennas are within some metres of the vehicle's origin."""
+
+FREE_ROTATION_DEG = 30.0
+"""The same of the IMU's rotation, degrees."""
 
 _POSE_UNITS = ("m",) * 3 + ("deg",) * 3
 """Of a pose as the config has it: xyz, then roll, pitch, yaw."""
@@ -63,27 +77,34 @@ def solved_again(
     were those of the wrong one. What it explains stays what it is.
     """
     name = first.candidate.name
-    free = freed_config(config, name)
+    free = freed_in_smoother(config, name)
     if free is None:
         return first.freed
     try:
-        again = [
-            smooth_trajectory(motions[d], free, t.trajectory.stamps_ns)
+        again = {
+            d: smooth_trajectory(motions[d], free, t.trajectory.stamps_ns)
             for d, t in enumerate(trajectories)
             if isinstance(t, SmoothedTrajectory)
-        ]
-        scores = motion_scores(again)
+        }
+        scores = motion_scores(list(again.values()))
     except TrajectoryError:
         return first.freed
-    index = [c.name for c in scores.candidates].index(name)
-    found = scores.freed([index])
-    shift = np.zeros(3)
+    found = scores.freed([[c.name for c in scores.candidates].index(name)])
+    # Where the motion data alone do not tell, the clouds and the guesses did.
+    if not (np.diag(found.cov) <= 1.01 * np.diag(first.freed.cov)).any():
+        return first.freed
+    return replace(first.freed, change=found.change, cov=found.cov)
+
+
+def freed_in_smoother(config: Config, name: str) -> Config | None:
+    """The config with a wide sigma on an input that the smoother estimates; None: no such input."""
+    if name == LEVER_ARM.name:
+        gnss = config.gnss.model_copy(update={"lever_arm_sigma": FREE_ARM_M})
+        return config.model_copy(update={"gnss": gnss})
     if name == IMU_ROTATION.name:
-        shift = _turned(again[0], config)
-    elif config.gnss.lever_arm is not None:
-        shift = -np.array(config.gnss.lever_arm)
-    known = np.sqrt(np.diag(found.cov)) < np.sqrt(np.diag(first.freed.cov))
-    return first.freed
+        imu = config.imu.model_copy(update={"rotation_sigma_deg": FREE_ROTATION_DEG})
+        return config.model_copy(update={"imu": imu})
+    return None
 
 
 def named_suspects(

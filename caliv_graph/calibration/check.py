@@ -110,9 +110,7 @@ def check(
     sentences = [ranking_sentence(suspects)] if leads else []
     sentences += [contradiction_sentence(each, leads) for each in found]
     if sentences:
-        calibration = replace(
-            calibration, status="inconsistent", contradictions=tuple(sentences)
-        )
+        calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)
 

@@ -62,8 +62,7 @@ def motion_parts(
     sizes = [s.parameter.size for s in known.values()]
     ends = np.cumsum(sizes, dtype=np.int64).tolist()
     where = {
-        name: np.arange(end - size, end)
-        for name, size, end in zip(known, sizes, ends, strict=True)
+        name: np.arange(end - size, end) for name, size, end in zip(known, sizes, ends, strict=True)
     }
     parts = {
         d: _part(smoothed, suspects, stamps_ns[d], where, sum(sizes))

@@ -81,9 +81,7 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=reduced.linearised(
-            problem, pose_graph(problem, state.noise, state.motion)
-        ),
+        linearised=reduced.linearised(problem, pose_graph(problem, state.noise, state.motion)),
         time_offsets=time_offsets,
         gradient_data=reduced.c,
         vehicle={NAMES[name]: found for name, found in vehicle.items()},

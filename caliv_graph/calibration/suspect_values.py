@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import configured_guess
-from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
@@ -60,13 +59,16 @@ def ranked_suspects(
     guesses = {name: configured_guess(config, name) for name in solution.lidars}
     ranked = ranking(suspect_scores(solution, trajectories, guesses))
     if ranked and ranked[0].freed.sigmas > CONTRADICTION_SIGMAS:
-        solved = solved_again(ranked[0], trajectories, motions, config)
-        ranked = (replace(ranked[0], freed=solved), *ranked[1:])
+        again = solved_again(ranked[0], solution, trajectories, motions, config)
+        # How far the first linearisation contradicts stays; what it takes is known better now.
+        freed = replace(ranked[0].freed, change=again.change, cov=again.cov)
+        ranked = (replace(ranked[0], freed=freed), *ranked[1:])
     return named_suspects(ranked, config, guesses)
 
 
 def solved_again(
     first: Ranked,
+    solution: Solution,
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
@@ -74,26 +76,28 @@ def solved_again(
     """What freeing the first suspect gives, the smoother solved with it free, where that is one.
 
     A lever arm that is a metre off is far from linear: robust weights and the noise of the fixes
-    were those of the wrong one. What it explains stays what it is.
+    were those of the wrong one. The clouds are as they were registered.
     """
+    guesses = {name: configured_guess(config, name) for name in solution.lidars}
     name = first.candidate.name
     free = freed_in_smoother(config, name)
     if free is None:
         return first.freed
     try:
-        again = {
-            d: smooth_trajectory(motions[d], free, t.trajectory.stamps_ns)
-            for d, t in enumerate(trajectories)
+        again = [
+            smooth_trajectory(motions[d], free, t.trajectory.stamps_ns)
             if isinstance(t, SmoothedTrajectory)
-        }
-        scores = motion_scores(list(again.values()))
+            else t
+            for d, t in enumerate(trajectories)
+        ]
+        scores = suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
-    found = scores.freed([[c.name for c in scores.candidates].index(name)])
-    # Where the motion data alone do not tell, the clouds and the guesses did.
-    if not (np.diag(found.cov) <= 1.01 * np.diag(first.freed.cov)).any():
-        return first.freed
-    return replace(first.freed, change=found.change, cov=found.cov)
+    index = [c.name for c in scores.candidates].index(name)
+    # The sigma that freed it is no property of the input.
+    candidates = list(scores.candidates)
+    candidates[index] = first.candidate
+    return replace(scores, candidates=tuple(candidates)).freed([index])
 
 
 def freed_in_smoother(config: Config, name: str) -> Config | None:
@@ -130,9 +134,7 @@ def named_suspects(
     return tuple(out)
 
 
-def _quantity(
-    name: str, freed: Freed, config: Config, guesses: Mapping[str, Guess]
-) -> _Quantity:
+def _quantity(name: str, freed: Freed, config: Config, guesses: Mapping[str, Guess]) -> _Quantity:
     """The parameters of a candidate as the quantity that a user knows."""
     change, sigma = freed.change, np.sqrt(np.diag(freed.cov))
     if name == "gnss.lever_arm":
@@ -183,9 +185,7 @@ def _drift(change: Array, sigma: Array) -> _Quantity:
     axes = len(change) // DRIFT_WAVES
     waves = change.reshape(DRIFT_WAVES, axes)
     part = np.linspace(0.0, 1.0, 101)
-    course = sum(
-        np.cos(np.pi * (k + 1) * part)[:, None] * wave for k, wave in enumerate(waves)
-    )
+    course = sum(np.cos(np.pi * (k + 1) * part)[:, None] * wave for k, wave in enumerate(waves))
     size = np.ptp(course, axis=0)
     # A wave of one half goes from +1 to -1: its range is twice the amplitude.
     spread = 2.0 * np.linalg.norm(sigma.reshape(DRIFT_WAVES, axes), axis=0)

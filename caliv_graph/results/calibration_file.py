@@ -70,6 +70,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "reference": calibration.reference,
         "unmet": list(calibration.unmet),
         "contradictions": list(calibration.contradictions),
+        **_suspect_documents(calibration),
         "lidars": {name: _lidar_document(result) for name, result in calibration.lidars.items()},
         "sensor_to_sensor": [
             _pair_document(calibration, source, to)
@@ -140,6 +141,24 @@ def _check_finite(calibration: Calibration) -> None:
     for what, values in parts.items():
         if not np.isfinite(values).all():
             raise ValueError(f"calibration: the {what} is not finite")
+
+
+def _suspect_documents(calibration: Calibration) -> dict[str, Any]:
+    """The ranking of inputs that could be wrong, the first one first."""
+    documents = [
+        {
+            "input": s.input,
+            "value": list(s.value),
+            "sigma": list(s.sigma),
+            "change": list(s.change),
+            "units": list(s.units),
+            "explains": s.explains,
+            "sigmas": s.sigmas,
+            "sigmas_left": s.sigmas_left,
+        }
+        for s in calibration.suspects
+    ]
+    return {"suspects": documents} if documents else {}
 
 
 def _lidar_document(result: LidarResult) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from caliv_graph.products import (
     Direction,
     Guess,
     LidarResult,
+    Suspect,
     VehicleParameter,
 )
 from caliv_graph.uncertainty.observability import rigid_twist
@@ -333,6 +334,33 @@ class _VehiclePart(Part):
         return out
 
 
+class _SuspectPart(Part):
+    """An input that could be wrong."""
+
+    input: Text
+    value: list[Finite]
+    sigma: list[Finite]
+    explains: Finite
+    sigmas: Finite
+    # Other writers leave these out.
+    change: list[Finite] = []
+    units: list[Text] = []
+    sigmas_left: Finite = 0.0
+
+    def suspect(self) -> Suspect:
+        """The same as a product."""
+        return Suspect(
+            input=self.input,
+            value=tuple(self.value),
+            sigma=tuple(self.sigma),
+            change=tuple(self.change),
+            units=tuple(self.units),
+            explains=self.explains,
+            sigmas=self.sigmas,
+            sigmas_left=self.sigmas_left,
+        )
+
+
 class CalibrationModel(Part):
     """A calibration.yaml."""
 
@@ -345,6 +373,7 @@ class CalibrationModel(Part):
     sensor_to_sensor: list[_PairPart] | None = None
     unmet: tuple[Text, ...] = ()
     contradictions: tuple[Text, ...] = ()
+    suspects: tuple[_SuspectPart, ...] = ()
     provenance: dict[Text, Any] = Field({})
     vehicle: _VehiclePart = _VehiclePart()
 
@@ -389,6 +418,7 @@ class CalibrationModel(Part):
             weak=tuple(d.read(poses) for d in self.observability.weak),
             unmet=self.unmet,
             contradictions=self.contradictions,
+            suspects=tuple(part.suspect() for part in self.suspects),
             provenance=self.provenance,
             gradient_data=None if gradient is None else np.array(gradient),
             earlier=tuple(part.term() for part in joint.earlier),

@@ -27,20 +27,31 @@ def ranking_sentence(suspects: Sequence[Suspect]) -> str:
     )
 
 
+def suspect_row(suspect: Suspect) -> tuple[str, str, str, str, str]:
+    """Of a table: input, change with its sigma, value, sigmas, and sigmas with the first freed."""
+    return (
+        suspect.input,
+        f"{vector(suspect.change, suspect.units)} (sigma {vector(suspect.sigma, suspect.units)})",
+        vector(suspect.value, suspect.units),
+        f"{suspect.sigmas:.1f}",
+        f"{suspect.sigmas_left:.1f}",
+    )
+
+
 def _by(suspect: Suspect) -> str:
     """By how much the input is off, and the value that it would take."""
-    by = f"by {_vector(suspect.change, suspect.units)}"
+    by = f"by {vector(suspect.change, suspect.units)}"
     late = suspect.change[0]
     if suspect.input.endswith("time_offset"):
         way = "late" if late > 0.0 else "early"
         return f"the stamps are {abs(late):.3f} +- {suspect.sigma[0]:.3f} s {way}"
     value = ""
     if suspect.value != suspect.change:
-        value = f", so that it is {_vector(suspect.value, suspect.units)}"
-    return f"{by}{value} (sigma {_vector(suspect.sigma, suspect.units)})"
+        value = f", so that it is {vector(suspect.value, suspect.units)}"
+    return f"{by}{value} (sigma {vector(suspect.sigma, suspect.units)})"
 
 
-def _vector(numbers: Sequence[float], units: Sequence[str]) -> str:
+def vector(numbers: Sequence[float], units: Sequence[str]) -> str:
     """Numbers with their units, those of one unit in brackets together."""
     out = []
     for unit in dict.fromkeys(units):

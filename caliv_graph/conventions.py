@@ -64,6 +64,21 @@ def key_yaw_bias() -> int:
     return int(gtsam.symbol("y", 0))
 
 
+def key_parameters() -> int:
+    """Key of a trajectory's uncertain parameters, all in one vector of its linear graph."""
+    return int(gtsam.symbol("u", 0))
+
+
+def key_lever_arm() -> int:
+    """Key of the GNSS antenna in the vehicle frame, (3,) metres, one for all drives."""
+    return int(gtsam.symbol("l", 0))
+
+
+def key_imu_rotation() -> int:
+    """Key of R_vehicle_imu, a `gtsam.Rot3`, right perturbation, one for all drives."""
+    return int(gtsam.symbol("r", 0))
+
+
 def key_extrinsic() -> int:
     """Key of E = T_vehicle_ref, the extrinsic of the reference LiDAR."""
     return int(gtsam.symbol("e", 0))

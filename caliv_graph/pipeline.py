@@ -224,7 +224,9 @@ def _calibrate(
         prepared.observations, prepared.trajectories, prepared.config, progress, prepared.grounds
     )
     calibration = assemble(solution, config, recordings, digests)
-    calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
+    calibration, doubts = check(
+        calibration, solution, recordings, prepared.trajectories, motions, prepared.config
+    )
     calibration = contradicted(calibration, prepared.findings)
     if prepared.misplaced:
         found = (*prepared.misplaced, *calibration.contradictions)

@@ -402,6 +402,12 @@ class LinearisedGraph:
         cloud_gradient: (6 J,) derivative of minus the clouds' log-likelihood.
         by_vehicle: (J, 6, 6) derivative of each cloud's pose with respect to its vehicle pose.
         by_extrinsic: (J, 6, 6) with respect to its LiDAR's T_vehicle_lidar, right perturbation.
+        starts: key of a variable -> its first coordinate.
+        pose_information: (M, M) of motion data and given poses alone, no LiDAR. The vehicle's poses
+            are the first coordinates, in the order of `Solution.T_map_vehicle`.
+        pose_gradient: (M,) of the same.
+        to_vehicle_axes: (6 L, 6 L) from the last 6 L coordinates, the extrinsics, to vehicle axes
+            of the LiDARs in the order of `Solution.lidars`.
     """
 
     information: Array
@@ -412,6 +418,26 @@ class LinearisedGraph:
     cloud_gradient: Array
     by_vehicle: Array
     by_extrinsic: Array
+    starts: Mapping[int, int]
+    pose_information: Array
+    pose_gradient: Array
+    to_vehicle_axes: Array
+
+
+@dataclass(frozen=True)
+class VehicleParameter:
+    """Something that the user measured on the vehicle, and the solve estimated.
+
+    Attributes:
+        value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu in rad.
+        sigma: (3,) in the same unit; of a rotation about the vehicle's axes. The user's own sigma
+            is part of it.
+        determined: per coordinate whether the drive alone determines it.
+    """
+
+    value: Array
+    sigma: Array
+    determined: tuple[bool, bool, bool]
 
 
 @dataclass(frozen=True)
@@ -439,6 +465,8 @@ class Solution:
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
         held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
+        vehicle: `lever_arm` and `imu_rotation`, where they are uncertain.
+        information_knowing: of `vehicle`, (6n, 6n) of the data if that were known exactly.
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
         graph: the factor graph.
@@ -479,6 +507,8 @@ class Solution:
     warnings: tuple[str, ...] = ()
     gradient_data: Array | None = None
     range_bias_m: float = 0.0
+    vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
+    information_knowing: Mapping[str, Array] = field(default_factory=dict)
     course: tuple[Iteration, ...] = ()
 
 
@@ -581,6 +611,31 @@ class LidarResult:
 
 
 @dataclass(frozen=True)
+class Suspect:
+    """An input that could be wrong, and what freeing it would explain.
+
+    Attributes:
+        input: its name: a key of the config, or a part of the drive (`uncertainty/README.md`).
+        value: that it would take, a number per coordinate, in `units`.
+        sigma: 1 sigma of each.
+        change: `value` less what the input is now.
+        units: of each coordinate: m, deg, s, or 1.
+        explains: part of all contradictions that freeing it takes away, 0 to 1.
+        sigmas: of a normal variable with the same p-value, one sound input in mind.
+        sigmas_left: the same once the first of the ranking is freed; of the first, `sigmas`.
+    """
+
+    input: str
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    change: tuple[float, ...]
+    units: tuple[str, ...]
+    explains: float
+    sigmas: float
+    sigmas_left: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The result, as written to calibration.yaml (`results/README.md`).
 
@@ -601,6 +656,8 @@ class Calibration:
         earlier: data terms of earlier drives that served as a prior. They are part of the
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
+        suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
+        vehicle: `lever_arm` and `imu_rotation`, where the solve estimated them.
     """
 
     status: str
@@ -615,3 +672,5 @@ class Calibration:
     gradient_data: Array | None = None
     earlier: tuple[DataTerm, ...] = ()
     contradictions: tuple[str, ...] = ()
+    suspects: tuple[Suspect, ...] = ()
+    vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)

@@ -247,8 +247,8 @@ def compare_joint(
     chain: Chain, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, some: IntArray
 ) -> None:
     """Prints the time and difference of the joint information of some poses."""
-    keys = [key_imu(i) for i in some.tolist()]
-    ours, own_s = fastest(lambda: chain.pose_information(some))
+    keys, right = [key_imu(i) for i in some.tolist()], len(chain.corner) - 1
+    ours, own_s = fastest(lambda: chain.pose_information(some, held=[right]))
     theirs, seconds = fastest(
         lambda: gtsam.Marginals(graph, values).jointMarginalInformation(keys).fullMatrix()
     )

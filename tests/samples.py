@@ -161,6 +161,10 @@ def make_solution(placements: int = 1) -> Solution:
             cloud_gradient=np.zeros(6 * placements),
             by_vehicle=np.zeros((placements, 6, 6)),
             by_extrinsic=np.zeros((placements, 6, 6)),
+            starts={},
+            pose_information=np.zeros((12, 12)),
+            pose_gradient=np.zeros(12),
+            to_vehicle_axes=np.eye(12),
         ),
         stage_times_s={"solve": 0.5},
     )

@@ -57,7 +57,9 @@ def assemble(
         solution.time_offsets,
     )
     provenance = _provenance(config, recordings, solution, digests)
-    return unmet_requirements(replace(draft, provenance=provenance), config)
+    return unmet_requirements(
+        replace(draft, provenance=provenance, vehicle=dict(solution.vehicle)), config
+    )
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:

@@ -13,14 +13,32 @@ import numpy as np
 
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
-from caliv_graph.errors import SolveError
-from caliv_graph.products import Array, Calibration, IntArray, MotionData, Recording, Solution
+from caliv_graph.calibration.suspect_values import ranked_suspects
+from caliv_graph.config.model import Config
+from caliv_graph.errors import SolveError, TrajectoryError
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    IntArray,
+    MotionData,
+    Recording,
+    Solution,
+    Suspect,
+)
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
-from caliv_graph.uncertainty.consistency import Assumed, AssumedKind, CloudCount
+from caliv_graph.uncertainty.consistency import (
+    Assumed,
+    AssumedKind,
+    CloudCount,
+    Contradiction,
+    GuessContradiction,
+    ScoreTest,
+)
 from caliv_graph.wording.contradictions import contradiction_sentence
+from caliv_graph.wording.suspects import ranking_sentence
 
 
 def _headings(
@@ -42,12 +60,13 @@ def check(
     recordings: Sequence[Recording],
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
+    config: Config,
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Tests a calibration against its data and its initial guesses.
 
     `recordings` and `trajectories` are one per drive, `motions` by the index of the drive. Returns
-    the calibration, inconsistent if something contradicts something; and warnings: headings that
-    disagree, and what could not be tested.
+    the calibration, inconsistent if something contradicts something, with its suspects; and
+    warnings: headings that disagree, and what could not be tested.
     """
     headings = _headings(trajectories, motions)
     drives = [Path(recording.name).name for recording in recordings]
@@ -57,9 +76,10 @@ def check(
     untested: tuple[str, ...] = ()
     try:
         between = score_tests(solution, trajectories, trusted)
-    except SolveError as e:
+        suspects = ranked_suspects(solution, trajectories, motions, config)
+    except (SolveError, TrajectoryError) as e:
         # The result stands, and the user must know that it was not tested.
-        between = ()
+        between, suspects = (), ()
         untested = (f"parts of the drive were not tested against each other: {e}",)
     found = consistency.contradictions(
         consistency.CheckInputs(
@@ -83,11 +103,44 @@ def check(
             speed_m_s=typical_speed(solution, trajectories),
         )
     )
-    if found:
-        sentences = tuple(contradiction_sentence(each) for each in found)
-        calibration = replace(calibration, status="inconsistent", contradictions=sentences)
+    calibration = replace(calibration, suspects=suspects)
+    leads = bool(suspects) and suspects[0].sigmas > consistency.CONTRADICTION_SIGMAS
+    if leads:
+        found = unexplained(found, suspects)
+    sentences = [ranking_sentence(suspects)] if leads else []
+    sentences += [contradiction_sentence(each, leads) for each in found]
+    if sentences:
+        calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)
+
+
+def unexplained(
+    found: Sequence[Contradiction], suspects: Sequence[Suspect]
+) -> tuple[Contradiction, ...]:
+    """The findings that remain once the first suspect is freed; those that it states are its own.
+
+    Findings about many parameters at once (outliers, coarse registrations) have no suspect of their
+    own, and remain.
+    """
+    left = {s.input: s.sigmas_left for s in suspects[1:]}
+    left[suspects[0].input] = 0.0
+
+    def remains(each: Contradiction) -> bool:
+        match each:
+            case GuessContradiction():
+                name = f"lidars.{each.lidar}.initial"
+            case ScoreTest(kind="clock"):
+                name = f"lidars.{each.lidar}.time_offset"
+            case ScoreTest(kind="halves" | "turns"):
+                name = f"lidars.{each.lidar}.mount.{each.kind}"
+            case Assumed(kind="height"):
+                name = "ground.vehicle_height"
+            case _:
+                return True
+        return left.get(name, math.inf) > consistency.CONTRADICTION_SIGMAS
+
+    return tuple(filter(remains, found))
 
 
 def cloud_counts(

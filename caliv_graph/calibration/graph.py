@@ -15,6 +15,7 @@ from caliv_graph.calibration.factors import (
     target_pose_factor,
 )
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise
@@ -25,6 +26,7 @@ OFFSET_SIGMA_S = 0.05
 
 FactorKind = Literal[
     "motion",
+    "vehicle_parameter",
     "given_pose",
     "pose_error_start",
     "pose_error_step",
@@ -61,20 +63,30 @@ def pose_error_sigmas(noise: PoseNoise) -> Array:
 def motion_graph(problem: Problem) -> CalibrationGraph:
     """The joint Gaussian of motion data on the vehicle's poses, a factor per drive that has them.
 
-    It has the correlations of hundreds of poses and takes time to build.
+    Where lever arm and rotation of the IMU are uncertain they are variables of these factors, with
+    one prior each for all drives. A factor has the correlations of hundreds of poses and takes time
+    to build.
     """
     graph = CalibrationGraph()
     drives = problem.drives()
     for drive, information in problem.motion.items():
         of_drive = np.flatnonzero(drives == drive).tolist()
-        graph.append(
-            "motion",
-            marginal_factor(
-                [key_vehicle(i) for i in of_drive],
-                information,
-                tuple(problem.T_map_vehicle[i] for i in of_drive),
-            ),
-        )
+        keys = [key_vehicle(i) for i in of_drive]
+        poses = [problem.T_map_vehicle[i] for i in of_drive]
+        term = problem.motion_terms.get(drive)
+        if term is None:
+            graph.append("motion", marginal_factor(keys, information, poses))
+            continue
+        keys += [KEYS[name] for name in term.values]
+        means = [*poses, *term.values.values()]
+        factor = marginal_factor(keys, term.information, means, term.gradient, term.constant)
+        graph.append("motion", factor)
+    for name, prior in problem.parameters.items():
+        noise, mean = gtsam.noiseModel.Gaussian.Covariance(prior.cov), prior.mean
+        if isinstance(mean, gtsam.Rot3):
+            graph.append("vehicle_parameter", gtsam.PriorFactorRot3(KEYS[name], mean, noise))
+        else:
+            graph.append("vehicle_parameter", gtsam.PriorFactorVector(KEYS[name], mean, noise))
     return graph
 
 
@@ -162,6 +174,8 @@ def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.V
         values.insert(key, np.zeros(6))
     for key in problem.offset_keys():
         values.insert(key, np.zeros(1))
+    for key, value in problem.parameter_values().items():
+        values.insert(key, value)
     E = problem.guesses[problem.reference]
     values.insert(key_extrinsic(), E)
     for name in problem.lidars:
@@ -184,6 +198,8 @@ def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
         out.update(key_vehicle(i), T)
     for key in problem.pose_error_keys():
         out.update(key, np.zeros(6))
+    for key, value in problem.parameter_values().items():
+        out.update(key, value)
     return out
 
 

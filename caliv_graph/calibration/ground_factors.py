@@ -24,7 +24,7 @@ def plane_normal(g: Array) -> Array:
     return np.array([-a * inverse, -b * inverse, inverse])
 
 
-def _normal_jacobian(g: Array) -> Array:
+def normal_jacobian(g: Array) -> Array:
     """(3, 3) derivative of `plane_normal` by g."""
     # Written out, like the functions below: a graph calls this for hundreds of factors some fifty
     # times, and numpy takes microseconds for every small array.
@@ -124,7 +124,7 @@ def ground_plane_factor(
             J[:, :3] -= by_turn
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
-            jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ _normal_jacobian(g), by_plane])
+            jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
@@ -180,7 +180,7 @@ def parallel_factor(
             J = np.zeros((2, 6))
             J[:, :3] = skew(n_vehicle)[:2]
             jacobians[0] = J
-            jacobians[1] = R_vehicle_map[:2] @ _normal_jacobian(g)
+            jacobians[1] = R_vehicle_map[:2] @ normal_jacobian(g)
             jacobians[2] = -np.eye(2)
         return np.asarray(n_vehicle[:2] - values.atVector(key_tilt))
 

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import cloud_graph, merged
+from caliv_graph.calibration.graph import cloud_graph, merged, pose_graph
 from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
+from caliv_graph.calibration.vehicle_parameters import KEYS, NAMES, estimated_parameters
 from caliv_graph.conventions import key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, Registration, Solution
@@ -54,6 +55,7 @@ def packed_solution(
     roots = np.linalg.cholesky(information)
     whitened = np.einsum("jba,jb->ja", roots, cloud_residuals(reduced.lines, measured))
     cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
+    vehicle = estimated_parameters(problem.parameters, state.values, reduced, cov)
     return Solution(
         mode=state.config.solve.mode,
         lidars=problem.lidars,
@@ -79,9 +81,13 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=reduced.linearised(problem),
+        linearised=reduced.linearised(problem, pose_graph(problem, state.noise, state.motion)),
         time_offsets=time_offsets,
         gradient_data=reduced.c,
+        vehicle={NAMES[name]: found for name, found in vehicle.items()},
+        information_knowing={
+            NAMES[name]: reduced.information_knowing(KEYS[name]) for name in vehicle
+        },
     )
 
 

@@ -10,6 +10,14 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS, TRUSTED_SIGMAS
+from caliv_graph.calibration.vehicle_parameters import (
+    KEYS,
+    MotionTerm,
+    ParameterPrior,
+    ParameterValue,
+    motion_term,
+    parameter_priors,
+)
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
@@ -52,7 +60,10 @@ class Problem:
         cloud_placement: (J,) index of the placement.
         placements: number of placements.
         motion: per drive with a smoothed trajectory the (6 m, 6 m) information of the motion data
-            on its m poses, right perturbations. The poses of the other drives were given.
+            on its m poses, right perturbations, parameters of the vehicle eliminated. The poses of
+            the other drives were given.
+        motion_terms: the same with these parameters, of the drives whose poses depend on any.
+        parameters: the prior of each of them, one for all drives.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is.
@@ -76,6 +87,8 @@ class Problem:
     cloud_placement: IntArray
     placements: int
     motion: Mapping[int, Array] = field(default_factory=dict)
+    motion_terms: Mapping[int, MotionTerm] = field(default_factory=dict)
+    parameters: Mapping[str, ParameterPrior] = field(default_factory=dict)
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
     stated_cov: Array | None = None
@@ -142,6 +155,14 @@ class Problem:
     def offset_keys(self) -> tuple[int, ...]:
         """Time offsets that are free."""
         return tuple(key_offset(i) for i, name in enumerate(self.lidars) if name in self.offsets)
+
+    def parameter_values(self) -> dict[int, ParameterValue]:
+        """Lever arm and rotation of the IMU by key: as the smoother of the first drive found."""
+        out: dict[int, ParameterValue] = {}
+        for term in self.motion_terms.values():
+            for name, value in term.values.items():
+                out.setdefault(KEYS[name], value)
+        return out
 
     def guess_information(self) -> Array:
         """(6n, 6n) information of the guesses, vehicle axes; trusted ones with default sigmas.
@@ -238,6 +259,13 @@ def pose_problem(
         for (d, _), T in reversed(list(zip(poses, T_map_vehicle, strict=True)))
     }
     fixed = frozenset(n for n in lidars if config.lidars[n].fixed)
+    smoothed = {
+        d: trajectory
+        for d, trajectory in enumerate(trajectories)
+        if isinstance(trajectory, SmoothedTrajectory) and d in origins
+    }
+    of_drive = {d: [stamp for drive, stamp in poses if drive == d] for d in smoothed}
+    terms = {d: motion_term(t, of_drive[d], HEAVE_SIGMA_M) for d, t in smoothed.items()}
     of_pose = dict(zip(poses, T_map_vehicle, strict=True))
     return Problem(
         lidars=lidars,
@@ -257,12 +285,11 @@ def pose_problem(
         cloud_placement=np.array([m for m, _ in clouds]),
         placements=len(observations),
         motion={
-            d: _with_heave(
-                trajectory.joint_information([stamp for drive, stamp in poses if drive == d])[0]
-            )
-            for d, trajectory in enumerate(trajectories)
-            if isinstance(trajectory, SmoothedTrajectory) and d in origins
+            d: with_heave(trajectory.joint_information(of_drive[d])[0])
+            for d, trajectory in smoothed.items()
         },
+        motion_terms={d: term for d, term in terms.items() if term is not None},
+        parameters=parameter_priors(list(smoothed.values())),
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
@@ -307,7 +334,7 @@ def _stated_covariances(
     return out if np.isfinite(out).any() else None
 
 
-def _with_heave(information: Array) -> Array:
+def with_heave(information: Array) -> Array:
     """Information (6 m, 6 m) on poses with a heave of its own each, along the vehicle's z."""
     cov = np.linalg.inv(information)
     z = np.arange(5, len(cov), 6)

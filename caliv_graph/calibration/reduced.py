@@ -48,15 +48,35 @@ class Reduced:
 
         `cov` is (6n, 6n) of the extrinsics, vehicle axes.
         """
-        inverse = np.linalg.inv(self._to_axes)
-        tangent = inverse @ cov @ inverse.T
         out = {}
         for i, name in enumerate(problem.lidars):
             if name in problem.offsets:
-                variance = self.system.covariance_of(key_offset(i), tangent)[0, 0]
+                variance = self.covariance_of(key_offset(i), cov)[0, 0]
                 value = float(self._values.atVector(key_offset(i))[0])
                 out[name] = (value, float(np.sqrt(variance)))
         return out
+
+    def covariance_of(self, key: int, cov: Array) -> Array:
+        """Marginal covariance of a variable that is no extrinsic; `cov` as in `time_offsets`."""
+        inverse = np.linalg.inv(self._to_axes)
+        return self.system.covariance_of(key, inverse @ cov @ inverse.T)
+
+    def information_knowing(self, key: int) -> Array:
+        """(6n, 6n) as D, if a variable that is no extrinsic were known exactly."""
+        system, at = self.system, self.system.keys.index(key)
+        keep = np.ones(len(system.b), dtype=bool)
+        keep[system.offset(key) : system.offset(key) + system.sizes[at]] = False
+        known = DenseSystem(
+            keys=system.keys[:at] + system.keys[at + 1 :],
+            sizes=system.sizes[:at] + system.sizes[at + 1 :],
+            H=system.H[np.ix_(keep, keep)],
+            b=system.b[keep],
+            extrinsics=system.extrinsics,
+        )
+        D, *_ = known.schur()
+        inverse = np.linalg.inv(self._to_axes)
+        D = inverse.T @ D @ inverse
+        return np.asarray(0.5 * (D + D.T))
 
     def in_tangents(self, information: Array) -> Array:
         """(6n, 6n) information of the extrinsics, vehicle axes, in tangents of the graph's."""
@@ -76,12 +96,25 @@ class Reduced:
         rest = self._g - self._G @ tangent
         return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
 
-    def linearised(self, problem: Problem) -> LinearisedGraph:
-        """The same as numbers, with the guesses' information, for score tests."""
+    def linearised(self, problem: Problem, poses: CalibrationGraph) -> LinearisedGraph:
+        """The same as numbers, with the guesses' information, for score tests.
+
+        `poses` is the graph of the vehicle's poses alone (`graph.pose_graph`).
+        """
         H, gradient = self.clouds
         guesses = np.zeros_like(self.system.H)
         of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
         guesses[of_extrinsics, of_extrinsics] = self.in_tangents(problem.guess_information())
+        alone = dense_system(problem, poses, self._values)
+        where = np.concatenate(
+            [
+                self.system.offset(key) + np.arange(size)
+                for key, size in zip(alone.keys, alone.sizes, strict=True)
+            ]
+        )
+        pose_information, pose_gradient = np.zeros_like(guesses), np.zeros(len(guesses))
+        pose_information[np.ix_(where, where)] = alone.H
+        pose_gradient[where] = alone.b
         return LinearisedGraph(
             information=self.system.H,
             gradient=self.system.b,
@@ -91,6 +124,10 @@ class Reduced:
             cloud_gradient=gradient,
             by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
             by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
+            starts=self.system.starts,
+            pose_information=pose_information,
+            pose_gradient=pose_gradient,
+            to_vehicle_axes=self._to_axes,
         )
 
 

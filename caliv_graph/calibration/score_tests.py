@@ -17,15 +17,13 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, LinearisedGraph, Solution
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.uncertainty.consistency import ScoreTest, ScoreTestKind
+from caliv_graph.uncertainty.suspects import RIDGE
 
 MIN_YAW_RATE_RAD_S = 0.02
 """A cloud with a larger yaw rate was taken in a turn: 2 m/s on a radius of 100 m."""
 
 MIN_CLOUDS = 4
 """In each of two parts, for a test of their difference."""
-
-_RIDGE = 1e-9
-"""Of the scaled information of all variables: what nothing determines stays where it is."""
 
 
 def score_tests(
@@ -43,7 +41,7 @@ def score_tests(
     Raises:
         SolveError: the graph is singular.
     """
-    clouds = _Clouds(solution, trajectories)
+    clouds = CloudParts(solution, trajectories)
     parameters = [
         (name, kind, columns)
         for name in solution.lidars
@@ -70,7 +68,7 @@ def _score(graph: LinearisedGraph, columns: Array) -> tuple[Array, Array]:
     # Units differ by a million: the ridge is relative to each variable's own information.
     unit = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
     H = H * np.outer(unit, unit)
-    H[np.diag_indices_from(H)] += _RIDGE
+    H[np.diag_indices_from(H)] += RIDGE
     try:
         factor = scipy.linalg.cho_factor(H, lower=True, overwrite_a=True, check_finite=False)
     except scipy.linalg.LinAlgError:
@@ -82,10 +80,11 @@ def _score(graph: LinearisedGraph, columns: Array) -> tuple[Array, Array]:
     return 0.5 * (D + D.T), c
 
 
-class _Clouds:
+class CloudParts:
     """When and by which LiDAR the clouds were taken, and the derivatives of their poses."""
 
     def __init__(self, solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> None:
+        """Of a solved graph; `trajectories` are one per drive."""
         self.solution = solution
         observed = [c for r in solution.registrations for c in r.observation.clouds]
         self.lidar = np.array([solution.lidars.index(c.lidar) for c in observed])

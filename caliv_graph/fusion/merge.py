@@ -80,7 +80,12 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         dict.fromkeys(t for c in calibrations.values() for t in c.contradictions)
     )
     draft = replace(
-        first, provenance=provenance, unmet=(), earlier=(), contradictions=contradictions
+        first,
+        provenance=provenance,
+        unmet=(),
+        earlier=(),
+        contradictions=contradictions,
+        vehicle={},
     )
     calibration = _assembled(
         draft, _together_per_lidar(calibrations, guesses), fused, data, disagree

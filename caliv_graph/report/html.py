@@ -29,6 +29,7 @@ from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weigh
 from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
+from caliv_graph.wording.suspects import suspect_row
 
 MOST_LISTED = 40
 """Down-weighted clouds in the table; the figure shows all."""
@@ -69,6 +70,7 @@ def render_report(
         headline=_HEADLINES.get(calibration.status, calibration.status),
         verdicts=verdicts(calibration),
         contradictions=_contradictions(calibration, warnings),
+        suspects=[(*suspect_row(s), f"{s.explains:.0%}") for s in calibration.suspects],
         directions=_direction_rows(calibration),
         axes=SHOWN_AXES,
         extrinsics={n: extrinsic_row(r) for n, r in calibration.lidars.items()},

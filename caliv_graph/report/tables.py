@@ -14,8 +14,12 @@ from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import SHOWN_AXES, Cell, fixed, pair_cells, pose_cells
+from caliv_graph.wording.suspects import suspect_row
 
 _HELD = "held"
+
+MOST_SUSPECTS = 5
+"""Lines of the table of suspects; the report has all."""
 
 STATUS_STYLES = {"ok": "bold green", "partial": "bold yellow", "inconsistent": "bold red"}
 
@@ -34,6 +38,8 @@ def calibration_table(
         Text.assemble("Status: ", status, f". LiDARs: {names}; reference {calibration.reference}.")
     ]
     parts += sentences("Contradictions:", calibration.contradictions)
+    if calibration.contradictions and calibration.suspects:
+        parts += titled("What freeing an input would explain", _suspects(calibration))
     parts += titled(
         "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _extrinsics(calibration)
     )
@@ -105,6 +111,14 @@ def _extrinsics(calibration: Calibration) -> Table:
         no_target = Text("no\ntarget", style="bold yellow")
         scans = Text(str(result.scans_used)) if result.saw_target else no_target
         table.add_row(Text(name), *map(_text, cells), scans)
+    return table
+
+
+def _suspects(calibration: Calibration) -> Table:
+    table = new_table("input", "by (1 sigma)", "sigma", "with the first\nfreed")
+    for suspect in calibration.suspects[:MOST_SUSPECTS]:
+        name, by, _, sigmas, left = suspect_row(suspect)
+        table.add_row(Text(name), Text(by), Text(sigmas), Text(left))
     return table
 
 

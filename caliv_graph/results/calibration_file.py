@@ -37,6 +37,8 @@ _HEADER = """\
 # the LiDAR (of `from` in a pair). They include the priors; data_information does not.
 # determined, sigma_vehicle_axes and the directions of observability: the vehicle's axes, at the
 # LiDAR's origin. `determined` of a pair: the axes of `to`.
+# vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna, vehicle frame.
+# imu_rotation: roll, pitch, yaw of T_vehicle_imu, its sigmas about the vehicle's axes.
 """
 
 
@@ -68,6 +70,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "reference": calibration.reference,
         "unmet": list(calibration.unmet),
         "contradictions": list(calibration.contradictions),
+        **_suspect_documents(calibration),
         "lidars": {name: _lidar_document(result) for name, result in calibration.lidars.items()},
         "sensor_to_sensor": [
             _pair_document(calibration, source, to)
@@ -80,6 +83,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
             **({} if gradient is None else {"data_gradient": gradient.tolist()}),
             **_earlier_documents(calibration),
         },
+        **_vehicle_document(calibration),
         "observability": {
             "undetermined": [_direction_document(d) for d in calibration.undetermined],
             "weak": [_direction_document(d) for d in calibration.weak],
@@ -128,12 +132,33 @@ def _check_finite(calibration: Calibration) -> None:
     for term in calibration.earlier:
         parts["information of earlier data"] = term.information
         parts["gradient of earlier data"] = term.gradient
+    for name, found in calibration.vehicle.items():
+        parts[f"value of vehicle.{name}"] = found.value
+        parts[f"sigma of vehicle.{name}"] = found.sigma
     for name, result in calibration.lidars.items():
         parts[f"pose of '{name}'"] = result.T_vehicle_lidar.matrix()
         parts[f"covariance of '{name}'"] = result.cov
     for what, values in parts.items():
         if not np.isfinite(values).all():
             raise ValueError(f"calibration: the {what} is not finite")
+
+
+def _suspect_documents(calibration: Calibration) -> dict[str, Any]:
+    """The ranking of inputs that could be wrong, the first one first."""
+    documents = [
+        {
+            "input": s.input,
+            "value": list(s.value),
+            "sigma": list(s.sigma),
+            "change": list(s.change),
+            "units": list(s.units),
+            "explains": s.explains,
+            "sigmas": s.sigmas,
+            "sigmas_left": s.sigmas_left,
+        }
+        for s in calibration.suspects
+    ]
+    return {"suspects": documents} if documents else {}
 
 
 def _lidar_document(result: LidarResult) -> dict[str, Any]:
@@ -152,6 +177,20 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
         "saw_target": bool(result.saw_target),
         "scans_used": int(result.scans_used),
     }
+
+
+def _vehicle_document(calibration: Calibration) -> dict[str, Any]:
+    """Lever arm in metres, rotation of the IMU in degrees; nothing where both are exact."""
+    out = {}
+    for name, found in calibration.vehicle.items():
+        turn = name == "imu_rotation"
+        unit, suffix = (180.0 / math.pi, "_deg") if turn else (1.0, "")
+        out[name] = {
+            f"value{suffix}": (unit * found.value).tolist(),
+            f"sigma{suffix}": (unit * found.sigma).tolist(),
+            "determined": [bool(yes) for yes in found.determined],
+        }
+    return {"vehicle": out} if out else {}
 
 
 def _guess_document(guess: Guess) -> dict[str, Any]:

@@ -29,7 +29,16 @@ from scipy.linalg import block_diag
 from caliv_graph.config.model import checked_names
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
-from caliv_graph.products import Array, Calibration, DataTerm, Direction, Guess, LidarResult
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    DataTerm,
+    Direction,
+    Guess,
+    LidarResult,
+    Suspect,
+    VehicleParameter,
+)
 from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
 
@@ -293,6 +302,65 @@ class _PairPart(Part):
     covariance: PoseMatrix
 
 
+class _ArmPart(Part):
+    value: tuple[Finite, Finite, Finite]
+    sigma: tuple[Sigma, Sigma, Sigma]
+    determined: tuple[StrictBool, StrictBool, StrictBool]
+
+
+class _TurnPart(Part):
+    value_deg: tuple[Finite, Finite, Finite]
+    sigma_deg: tuple[Sigma, Sigma, Sigma]
+    determined: tuple[StrictBool, StrictBool, StrictBool]
+
+
+class _VehiclePart(Part):
+    """What was measured by hand on the vehicle, as it was estimated."""
+
+    lever_arm: _ArmPart | None = None
+    imu_rotation: _TurnPart | None = None
+
+    def parameters(self) -> dict[str, VehicleParameter]:
+        """In metres and radians."""
+        out = {}
+        if self.lever_arm is not None:
+            arm = self.lever_arm
+            value, sigma = np.array(arm.value), np.array(arm.sigma)
+            out["lever_arm"] = VehicleParameter(value, sigma, arm.determined)
+        if self.imu_rotation is not None:
+            turn = self.imu_rotation
+            value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
+            out["imu_rotation"] = VehicleParameter(value, sigma, turn.determined)
+        return out
+
+
+class _SuspectPart(Part):
+    """An input that could be wrong."""
+
+    input: Text
+    value: list[Finite]
+    sigma: list[Finite]
+    explains: Finite
+    sigmas: Finite
+    # Other writers leave these out.
+    change: list[Finite] = []
+    units: list[Text] = []
+    sigmas_left: Finite = 0.0
+
+    def suspect(self) -> Suspect:
+        """The same as a product."""
+        return Suspect(
+            input=self.input,
+            value=tuple(self.value),
+            sigma=tuple(self.sigma),
+            change=tuple(self.change),
+            units=tuple(self.units),
+            explains=self.explains,
+            sigmas=self.sigmas,
+            sigmas_left=self.sigmas_left,
+        )
+
+
 class CalibrationModel(Part):
     """A calibration.yaml."""
 
@@ -305,7 +373,9 @@ class CalibrationModel(Part):
     sensor_to_sensor: list[_PairPart] | None = None
     unmet: tuple[Text, ...] = ()
     contradictions: tuple[Text, ...] = ()
+    suspects: tuple[_SuspectPart, ...] = ()
     provenance: dict[Text, Any] = Field({})
+    vehicle: _VehiclePart = _VehiclePart()
 
     @model_validator(mode="after")
     def _knows_all_names(self) -> Self:
@@ -348,9 +418,11 @@ class CalibrationModel(Part):
             weak=tuple(d.read(poses) for d in self.observability.weak),
             unmet=self.unmet,
             contradictions=self.contradictions,
+            suspects=tuple(part.suspect() for part in self.suspects),
             provenance=self.provenance,
             gradient_data=None if gradient is None else np.array(gradient),
             earlier=tuple(part.term() for part in joint.earlier),
+            vehicle=self.vehicle.parameters(),
         )
 
     def cov_pairs(self, calibration: Calibration) -> dict[tuple[str, str], Array]:

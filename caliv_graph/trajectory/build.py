@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass, field
 
 import gtsam
@@ -44,18 +45,37 @@ class TrajectoryGraph:
         self.factors.add(factor)
         self.kinds.append(kind)
 
+    def only(self, kinds: Set[str]) -> TrajectoryGraph:
+        """The factors of some kinds, in order."""
+        out = TrajectoryGraph()
+        for number, kind in enumerate(self.kinds):
+            if kind in kinds:
+                out.add(kind, self.factors.at(number))
+        return out
+
+
+KINDS = frozenset({"imu", "gnss", "orientation", "velocity", "prior"})
+"""Kinds of the factors of a trajectory."""
+
 
 def build_graph(
-    data: SmootherInput, nodes: IntArray, states: States, dropped: IntArray, kernel: str
+    data: SmootherInput,
+    nodes: IntArray,
+    states: States,
+    dropped: IntArray,
+    kernel: str,
+    kinds: Set[str] = KINDS,
 ) -> TrajectoryGraph:
     """All factors; the measurements are integrated and carried with the biases of `states`.
 
     The GNSS fixes of indices `dropped` (k,) are left out. `kernel` is the robust kernel of the
-    others; only `huber` changes the noise model.
+    others; only `huber` changes the noise model. Factors of other kinds than `kinds` are left out.
     """
     graph = TrajectoryGraph()
-    carried = carry_to_nodes(data, nodes, without_bias(data.inertial, nodes, states))
-    _add_imu(graph, data, nodes, states)
+    dead = without_bias(data.inertial, nodes, states)
+    carried = carry_to_nodes(data, nodes, dead, kinds)
+    if kinds & {"imu", "prior"}:
+        _add_imu(graph, data, nodes, states)
     if carried.positions is not None:
         _add_positions(graph, data, carried.positions, dropped, kernel)
     if carried.orientations is not None:
@@ -64,7 +84,7 @@ def build_graph(
         _add_velocities(graph, data, carried.velocities)
     if data.positions is None:
         _add_gauge_prior(graph, data, states)
-    return graph
+    return graph if kinds == KINDS else graph.only(kinds)
 
 
 def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, states: States) -> None:

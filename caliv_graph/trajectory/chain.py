@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -50,14 +51,18 @@ class Chain:
         state_keys: Sequence[Sequence[int]],
         state_dims: Sequence[int],
         common_keys: Sequence[int],
+        columns: Array | None = None,
     ) -> Chain:
         """The Hessian of a whitened linear graph.
 
         Every factor touches one state, two neighbours, or common variables. `state_keys` are the
         keys of each state in the order of its coordinates, `state_dims` their dimensions, which add
-        up to 15. `common_keys` are the common variables, of one dimension each.
+        up to 15. `common_keys` are the common variables, of one dimension each. `columns` (rows of
+        the graph, p) are derivatives of its rows by p more common coordinates, which follow those
+        of the keys.
         """
-        n, k = len(state_keys), len(common_keys)
+        extra = 0 if columns is None else columns.shape[1]
+        n, k = len(state_keys), len(common_keys) + extra
         size = STATE * n + k
         place = {}
         for i, keys in enumerate(state_keys):
@@ -71,11 +76,15 @@ class Chain:
         coupling = np.zeros((max(n - 1, 0), STATE, STATE))
         border, corner = np.zeros((n, STATE, k)), np.zeros((k, k))
         # In parts: the triplets take ten times the memory of the blocks, gigabytes on a long drive.
+        row_from = 0
         for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
             some = gtsam.GaussianFactorGraph()
             for number in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
                 some.push_back(graph.at(number))
             J = _jacobian(some, place, size)
+            if columns is not None:
+                J = _with_columns(J, columns[row_from : row_from + J.shape[0]])
+                row_from += J.shape[0]
             H = (J.T @ J).tocoo()
             row, column = (np.asarray(index, np.int64) for index in H.coords)
             (a, r), (b, c), value = np.divmod(row, STATE), np.divmod(column, STATE), H.data
@@ -122,8 +131,14 @@ class Chain:
                 link = None if next_link is None else -link @ to_next
         return Chain(diagonal[wanted], coupling, border[wanted], corner.reshape(k, k))
 
-    def pose_information(self, wanted: IntArray) -> Array:
-        """(6 m, 6 m) joint information of the poses of the states `wanted`, all else eliminated."""
+    def pose_information(
+        self, wanted: IntArray, kept: Sequence[int] = (), held: Sequence[int] = ()
+    ) -> Array:
+        """Joint information of the poses of the states `wanted` (m,), all else eliminated.
+
+        Of the common coordinates those of indices `kept` follow the poses, those of `held` are
+        fixed, and the others are eliminated too. (6 m + p, 6 m + p), p the number of `kept`.
+        """
         chain = self.only(wanted)
         m, rest, k = len(wanted), STATE - POSE, chain.corner.shape[0]
         pose, other = slice(0, POSE), slice(POSE, STATE)
@@ -143,10 +158,20 @@ class Chain:
             raise TrajectoryError(UNDETERMINED) from None
         solved = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
         information = poses.toarray() - cross @ solved[:, : m * POSE]
-        if k:
-            edge = border_pose - cross @ solved[:, m * POSE :]
-            left = chain.corner - border_other.T @ solved[:, m * POSE :]
-            information -= edge @ inverse_of(left) @ edge.T
+        edge = border_pose - cross @ solved[:, m * POSE :]
+        corner = chain.corner - border_other.T @ solved[:, m * POSE :]
+        gone = [i for i in range(k) if i not in kept and i not in held]
+        stay = list(kept)
+        if gone:
+            inverse = inverse_of(corner[np.ix_(gone, gone)])
+            information -= edge[:, gone] @ inverse @ edge[:, gone].T
+        if stay:
+            cross_stay, corner_stay = edge[:, stay], corner[np.ix_(stay, stay)]
+            if gone:
+                to_stay = inverse @ corner[np.ix_(gone, stay)]
+                cross_stay = cross_stay - edge[:, gone] @ to_stay
+                corner_stay = corner_stay - corner[np.ix_(stay, gone)] @ to_stay
+            information = np.block([[information, cross_stay], [cross_stay.T, corner_stay]])
         return np.asarray(0.5 * (information + information.T))
 
 
@@ -160,7 +185,19 @@ def _jacobian(
     order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in keys)])
     keep = columns <= len(order)
     where = rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]
-    return scipy.sparse.csr_array((entries[keep], where), shape=(int(rows.max()), size))
+    # The triplets leave out zeros, so that their last row is not always that of the graph.
+    factors: list[Any] = [graph.at(number) for number in range(graph.size())]
+    count = sum(factor.rows() for factor in factors)
+    return scipy.sparse.csr_array((entries[keep], where), shape=(count, size))
+
+
+def _with_columns(J: scipy.sparse.csr_array, columns: Array) -> scipy.sparse.csr_array:
+    """J (r, c), its last columns, which are empty, filled with `columns` (r, p)."""
+    row, column = np.nonzero(columns)
+    where = row, column + J.shape[1] - columns.shape[1]
+    return scipy.sparse.csr_array(
+        J + scipy.sparse.csr_array((columns[row, column], where), shape=J.shape)
+    )
 
 
 def inverse_of(A: Array) -> Array:

@@ -6,6 +6,9 @@ the map. All Jacobians are analytic; the tests check them numerically.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -13,6 +16,9 @@ from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array
 
 NoiseModel = gtsam.noiseModel.Base
+
+POSE_SIZE, VECTOR_SIZE = 6, 3
+"""Coordinates of a pose; of a rotation or a vector in space."""
 
 
 def position_factor(
@@ -112,27 +118,41 @@ def orientation_factor(
 
 
 def marginal_factor(
-    keys: list[int], information: Array, poses: tuple[gtsam.Pose3, ...]
+    keys: Sequence[int],
+    information: Array,
+    means: Sequence[gtsam.Pose3 | gtsam.Rot3 | Array],
+    gradient: Array | None = None,
+    constant: float = 0.0,
 ) -> gtsam.LinearContainerFactor:
-    """A Gaussian on m poses at once as one native factor of a nonlinear graph.
+    """A Gaussian on several variables at once as one native factor of a nonlinear graph.
 
-    `information` is their joint one, (6 m, 6 m), of right perturbations (rotation then translation)
-    of the mean `poses`.
+    `information` is their joint one, square, of right perturbations (of poses rotation then
+    translation) about `means`, poses, rotations and vectors of 3. With a `gradient`, one number
+    per coordinate, twice the error is `d^T information d - 2 gradient^T d + constant`.
     """
-    m = len(keys)
-    blocks = information.reshape(m, 6, m, 6).swapaxes(1, 2)
-    zero, graph = np.zeros(6), gtsam.GaussianFactorGraph()
-    no_block = np.zeros((6, 6))
+    sizes = [POSE_SIZE if isinstance(mean, gtsam.Pose3) else VECTOR_SIZE for mean in means]
+    starts = np.cumsum([0, *sizes]).tolist()
+    parts = [slice(a, b) for a, b in itertools.pairwise(starts)]
+    linear = np.zeros(starts[-1]) if gradient is None else gradient
+    graph = gtsam.GaussianFactorGraph()
     # HessianFactor takes three keys at most from Python: a sum over pairs, merged by GTSAM.
-    for i in range(m):
-        graph.add(gtsam.HessianFactor(keys[i], blocks[i, i], zero, 0.0))
-        for j in range(i + 1, m):
+    for i, (key, own) in enumerate(zip(keys, parts, strict=True)):
+        f = constant if i == 0 else 0.0
+        graph.add(gtsam.HessianFactor(key, information[own, own], linear[own], f))
+        for j in range(i + 1, len(keys)):
             graph.add(
                 gtsam.HessianFactor(
-                    keys[i], keys[j], no_block, blocks[i, j], zero, no_block, zero, 0.0
+                    key,
+                    keys[j],
+                    np.zeros((sizes[i], sizes[i])),
+                    information[own, parts[j]],
+                    np.zeros(sizes[i]),
+                    np.zeros((sizes[j], sizes[j])),
+                    np.zeros(sizes[j]),
+                    0.0,
                 )
             )
     point = gtsam.Values()
-    for key, pose in zip(keys, poses, strict=True):
-        point.insert(key, pose)
+    for key, mean in zip(keys, means, strict=True):
+        point.insert(key, mean)
     return gtsam.LinearContainerFactor(gtsam.HessianFactor(graph), point)

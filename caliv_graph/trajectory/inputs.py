@@ -43,7 +43,10 @@ class SmootherInput:
         positions: of the GNSS antenna in the map; None: GNSS is not used.
         orientation: whether the IMU's messages carry orientations.
         T_vehicle_imu: the IMU's extrinsic.
+        lever_arm: (3,) the GNSS antenna in the vehicle frame, metres.
         gravity_m_s2: along -z of the map.
+        rotation_sigmas: (3,) of the rotation of `T_vehicle_imu` about the vehicle's axes, radians;
+            None: it is exact, or still to be guessed (`mounting.py`).
     """
 
     name: str
@@ -54,13 +57,14 @@ class SmootherInput:
     positions: Positions | None
     orientation: bool
     T_vehicle_imu: gtsam.Pose3
+    lever_arm: Array
     gravity_m_s2: float
+    rotation_sigmas: Array | None = None
 
     @property
     def arm_imu(self) -> Array:
         """(3,) the GNSS antenna in the imu frame, metres."""
-        arm = np.array(self.config.gnss.lever_arm)
-        return np.asarray(self.T_vehicle_imu.transformTo(arm))
+        return np.asarray(self.T_vehicle_imu.transformTo(self.lever_arm))
 
     @property
     def yaw_bias(self) -> bool:
@@ -100,6 +104,9 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
             f"{name}: no GNSS: the map's origin is the vehicle's start, and positions drift with "
             "the velocities"
         )
+    rotation_sigma = config.imu.rotation_sigma_rad()
+    mounting, arm = config.imu.T_vehicle_imu, config.gnss.lever_arm
+    known = mounting.rpy_deg is not None
     data = SmootherInput(
         name=name,
         config=config,
@@ -108,8 +115,12 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         noise=imu_noise(motion.imu, config),
         positions=positions,
         orientation=has_orientation(motion.imu, inertial, name),
-        T_vehicle_imu=config.imu.T_vehicle_imu.pose(),
+        T_vehicle_imu=(
+            mounting.pose() if known else gtsam.Pose3(gtsam.Rot3(), np.array(mounting.xyz))
+        ),
+        lever_arm=np.zeros(3) if arm is None else np.array(arm),
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
+        rotation_sigmas=None if rotation_sigma is None else np.full(3, rotation_sigma),
     )
     return data, warnings
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,16 +64,22 @@ def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
     return np.concatenate([*pieces, fixed[-1:]]).astype(np.int64)
 
 
-def carry_to_nodes(data: SmootherInput, nodes: IntArray, dead: DeadReckoning) -> NodeMeasurements:
-    """Carries every measurement to its nearest node; `dead` is the IMU without bias."""
+CARRIED = frozenset({"gnss", "orientation", "velocity"})
+"""Kinds of measurements that are carried to nodes."""
+
+
+def carry_to_nodes(
+    data: SmootherInput, nodes: IntArray, dead: DeadReckoning, kinds: Set[str] = CARRIED
+) -> NodeMeasurements:
+    """Carries the measurements of some kinds to their nearest nodes; `dead`: IMU without bias."""
     assert data.motion.imu is not None
     positions = orientations = velocities = None
-    if data.positions is not None:
+    if data.positions is not None and "gnss" in kinds:
         positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
-    if data.orientation:
+    if data.orientation and "orientation" in kinds:
         cov, _ = orientation_covariances(data.motion.imu, data.config)
         orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
-    if data.motion.twist is not None:
+    if data.motion.twist is not None and "velocity" in kinds:
         cov, _ = velocity_covariances(data.motion.twist, data.config)
         velocities = velocities_at_nodes(
             data.motion.twist, cov, nodes, dead, data.noise, data.T_vehicle_imu

@@ -291,7 +291,8 @@ def _axes(moving: Windows, inertial: Inertial, motion: MotionData, config: Confi
     leveled = np.column_stack([inertial.force, inertial.gyro]) @ np.kron(
         np.eye(2), (level(up) @ R_vehicle_imu).T
     )
-    arm = complex(*config.gnss.lever_arm[:2])
+    x, y, _ = config.gnss.lever_arm or (0.0, 0.0, 0.0)
+    arm = complex(x, y)
 
     def fit(delay_s: float, mirrored: bool = False) -> _Fit | None:
         means = means_over(inertial.stamps_ns, leveled, moving.stamps_ns, -delay_s)

@@ -19,8 +19,21 @@ from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sour
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.outliers import solve_without_outliers
+from caliv_graph.trajectory.parameters import UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
-from caliv_graph.trajectory.solve import chain_of, covariances_of, solve_from_the_start
+from caliv_graph.trajectory.solve import (
+    ROUGH_TOLERANCE,
+    chain_of,
+    covariances_of,
+    solve,
+    solve_from_the_start,
+)
+from caliv_graph.trajectory.uncertain import (
+    are_wide,
+    settle,
+    uncertain_parameters,
+    vehicle_covariances,
+)
 
 BIAS_SIGMAS = 5.0
 """Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
@@ -41,13 +54,24 @@ def smooth_trajectory(
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    parameters = uncertain_parameters(data)
+    if are_wide(parameters):
+        data, states, parameters = _roughly_settled(data, nodes, states, parameters)
     robust = solve_without_outliers(data, nodes, states)
     data, estimate, positions = robust.data, robust.estimate, robust.data.positions
+    columns: Array | None = None
+    if parameters:
+        kernel = data.config.robust.kernel
+        settled = settle(data, nodes, estimate, robust.dropped, kernel, parameters)
+        data, estimate, parameters = settled.data, settled.estimate, settled.parameters
+        columns = settled.columns
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
+    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+    cov = vehicle_covariances(settled, cov_imu) if parameters else Ad @ cov_imu @ Ad.T
     warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
-        trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov_imu),
+        trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov),
         lost_ns=tuple(lost.tolist()),
         warnings=tuple(warnings),
         noise_sources=noise_sources(data),
@@ -60,9 +84,12 @@ def smooth_trajectory(
         origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
-        chain=chain_of(linear, len(nodes), data.yaw_bias),
+        chain=chain_of(linear, len(nodes), data.yaw_bias, columns),
         inertial=data.inertial,
+        data=data,
+        gnss_dropped=robust.dropped,
         factor_kinds=tuple(estimate.graph.kinds),
+        parameters=parameters,
     )
 
 
@@ -89,16 +116,28 @@ def _within_span(
 
 
 def _at_wanted(
-    data: SmootherInput, wanted: IntArray, nodes: IntArray, states: States, cov_imu: Array
+    data: SmootherInput, wanted: IntArray, nodes: IntArray, states: States, cov: Array
 ) -> Trajectory:
-    """The vehicle's poses and covariances at the wanted stamps."""
+    """The vehicle's poses at the wanted stamps; `cov` (n, 6, 6) are those at the nodes."""
     i = nearest_node(nodes, wanted)
-    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
     return Trajectory(
         stamps_ns=wanted,
         T_map_vehicle=poses_of_vehicle(states, i, data.T_vehicle_imu),
-        cov=np.asarray(Ad @ cov_imu[i] @ Ad.T),
+        cov=np.asarray(cov[i]),
     )
+
+
+def _roughly_settled(
+    data: SmootherInput,
+    nodes: IntArray,
+    states: States,
+    parameters: tuple[UncertainParameter, ...],
+) -> tuple[SmootherInput, States, tuple[UncertainParameter, ...]]:
+    """Input, states and parameters with all fixes, outliers among them."""
+    none = np.zeros(0, dtype=np.int64)
+    estimate = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)
+    settled = settle(data, nodes, estimate, none, "huber", parameters, ROUGH_TOLERANCE)
+    return settled.data, settled.estimate.states, settled.parameters
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

@@ -8,14 +8,17 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
-from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
 
 MERGE_NS = 1_000
 """Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
@@ -81,6 +84,26 @@ def within_span(
 
 
 @dataclass(frozen=True)
+class JointInformation:
+    """A Gaussian on m poses of the vehicle and p coordinates of parameters, about its estimate.
+
+    Minus its logarithm is `d^T information d / 2 - gradient^T d`, d the right perturbations of the
+    poses (rotation then translation, rad and m) and after them the moves of the parameters.
+
+    Attributes:
+        information: (6 m + p, 6 m + p), without the priors of the parameters.
+        gradient: (6 m + p,); of the poses it is zero but for the solver's tolerance.
+        T_map_vehicle: the m poses at the estimate.
+        parameters: names of the parameters, in order.
+    """
+
+    information: Array
+    gradient: Array
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class SmoothedTrajectory:
     """The vehicle's motion over one drive, as a Gaussian.
 
@@ -100,7 +123,10 @@ class SmoothedTrajectory:
         values: the estimate, as values of the graph.
         chain: the graph's information at the estimate.
         inertial: the IMU samples used.
+        data: the input as it was used, its parameters and the noise of the fixes as estimated.
+        gnss_dropped: (k,) indices of the fixes that the graph is without.
         factor_kinds: of each factor of the graph, in order (`build.TrajectoryGraph`).
+        parameters: of the input, in the chain after the yaw bias (`parameters.py`).
     """
 
     trajectory: Trajectory
@@ -118,7 +144,10 @@ class SmoothedTrajectory:
     values: gtsam.Values = field(repr=False)
     chain: Chain = field(repr=False)
     inertial: Inertial = field(repr=False)
+    data: SmootherInput = field(repr=False)
+    gnss_dropped: IntArray = field(repr=False)
     factor_kinds: tuple[str, ...] = field(default=(), repr=False)
+    parameters: tuple[UncertainParameter, ...] = ()
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -219,13 +248,96 @@ class SmoothedTrajectory:
         Raises:
             KeyError: a stamp has no node.
         """
+        joint = self.joint(stamps_ns)
+        return joint.information, joint.T_map_vehicle
+
+    def joint(
+        self, stamps_ns: Sequence[int] | IntArray, parameters: Sequence[str] = ()
+    ) -> JointInformation:
+        """The joint Gaussian of the vehicle's poses at wanted stamps (m,) and named parameters.
+
+        Parameters that are not named are eliminated under their prior; those without a prior are
+        held. The prior of a named parameter is not in the result: it is one for all drives.
+
+        Raises:
+            KeyError: a stamp has no node, or the chain does not have a parameter (`columns`).
+        """
         i = self._node_indices(stamps_ns)
-        m = len(i)
-        information = self.chain.pose_information(i).reshape(m, POSE, m, POSE)
-        # d_imu = Ad(T_imu_vehicle) d_vehicle, as T_map_vehicle = T_map_imu T_imu_vehicle.
-        Ad = np.asarray(self.T_vehicle_imu.AdjointMap())
-        inverse = np.linalg.inv(Ad)
-        rotated = np.einsum("ca,icjd,db->iajb", inverse, information, inverse, optimize=True)
-        information = rotated.reshape(POSE * m, POSE * m)
-        poses = poses_of_vehicle(self.states, i, self.T_vehicle_imu)
-        return 0.5 * (information + information.T), poses
+        m, names = len(i), [p.parameter.name for p in self.parameters]
+        missing = sorted(set(parameters) - set(names))
+        if missing:
+            raise KeyError(missing[0])
+        # A parameter that moves T_vehicle_imu moves the vehicle: it is eliminated after the change
+        # of variables, not before.
+        free = [
+            p for p in self.parameters if p.parameter.name in parameters or p.sigmas is not None
+        ]
+        free.sort(key=lambda p: _place(parameters, p.parameter.name))
+        joint = self._over_imu(i, [p.parameter.name for p in free])
+        by_vehicle = self._substitution(m, [p.parameter for p in free])
+        information = by_vehicle.T @ joint[:-1, :-1] @ by_vehicle
+        gradient = by_vehicle.T @ joint[:-1, -1]
+        keep = POSE * m + sum(p.parameter.size for p in free if p.parameter.name in parameters)
+        prior = [p for p in free if p.parameter.name not in parameters]
+        if prior:
+            information, gradient = _eliminated_under_prior(information, gradient, keep, prior)
+        return JointInformation(
+            information=np.asarray(0.5 * (information + information.T)),
+            gradient=np.asarray(gradient),
+            T_map_vehicle=poses_of_vehicle(self.states, i, self.T_vehicle_imu),
+            parameters=tuple(parameters),
+        )
+
+    def _over_imu(self, nodes: IntArray, names: Sequence[str]) -> Array:
+        """Joint information of the IMU's poses, named parameters, and the right-hand side."""
+        at, start = {}, 0 if self.yaw_bias is None else 1
+        for p in self.parameters:
+            at[p.parameter.name] = list(range(start, start + p.parameter.size))
+            start += p.parameter.size
+        kept = [k for name in names for k in at[name]]
+        held = [k for name in at if name not in names for k in at[name]]
+        return self.chain.pose_information(nodes, [*kept, start], held)
+
+    def _substitution(self, m: int, parameters: Sequence[InputParameter]) -> scipy.sparse.csr_array:
+        """From perturbations of m vehicle's poses and parameters to those of the IMU and them.
+
+        `I = X T_vehicle_imu`, hence `xi_imu = Ad(T_imu_vehicle) xi_vehicle + moves d`, d moving
+        T_vehicle_imu.
+        """
+        back = np.asarray(self.T_vehicle_imu.inverse().AdjointMap())
+        moves = [np.zeros((POSE, 0)), *(p.imu_moves(self.data) for p in parameters)]
+        together = np.hstack(moves)
+        size = together.shape[1]
+        # Per pose its own block and the moves; at the end the parameters themselves.
+        own, moved = np.indices((m, POSE, POSE)), np.indices((m, POSE, size))
+        last = POSE * m + np.arange(size)
+        entries = np.concatenate(
+            [np.tile(back.ravel(), m), np.tile(together.ravel(), m), np.ones(size)]
+        )
+        rows = np.concatenate([(POSE * at[0] + at[1]).ravel() for at in (own, moved)])
+        columns = np.concatenate([(POSE * own[0] + own[2]).ravel(), POSE * m + moved[2].ravel()])
+        where = np.concatenate([rows, last]), np.concatenate([columns, last])
+        shape = (POSE * m + size, POSE * m + size)
+        return scipy.sparse.csr_array((entries, where), shape=shape)
+
+
+def _place(names: Sequence[str], name: str) -> int:
+    """Index of a name; after all if it is not there."""
+    return list(names).index(name) if name in names else len(names)
+
+
+def _eliminated_under_prior(
+    information: Array, gradient: Array, keep: int, prior: Sequence[UncertainParameter]
+) -> tuple[Array, Array]:
+    """Adds the priors of the coordinates after the first `keep`, and eliminates these."""
+    weight = np.concatenate([np.asarray(p.sigmas) ** -2.0 for p in prior])
+    offset = np.concatenate(
+        [np.zeros(p.parameter.size) if p.offset is None else p.offset for p in prior]
+    )
+    inverse = inverse_of(information[keep:, keep:] + np.diag(weight))
+    to_keep = information[:keep, keep:] @ inverse
+    rest = gradient[keep:] - weight * offset
+    return (
+        information[:keep, :keep] - to_keep @ information[keep:, :keep],
+        gradient[:keep] - to_keep @ rest,
+    )

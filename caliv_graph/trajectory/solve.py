@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -164,13 +165,23 @@ def _step(
         return values
 
 
-def chain_of(linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool) -> Chain:
-    """The information of a linearised graph over n nodes, as a chain of states."""
+def chain_of(
+    linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool, columns: Array | None = None
+) -> Chain:
+    """The information of a linearised graph over n nodes, as a chain of states.
+
+    The common coordinates are the yaw bias if there is one, those of `columns` (rows, p), the
+    derivatives of the graph's rows, and at last the graph's right-hand side: its products with the
+    others are the gradient of the log-likelihood.
+    """
+    factors: list[Any] = [linear.at(i) for i in range(linear.size())]
+    right = np.concatenate([factor.getb() for factor in factors])[:, None]
     return Chain.from_graph(
         linear,
         [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(n)],
         (6, 3, 6),
         [key_yaw_bias()] if yaw_bias else [],
+        right if columns is None else np.hstack([columns, right]),
     )
 
 

@@ -30,19 +30,22 @@ MOST_OF = 0.75
 """Fraction of the outliers that lie in one part of the drive from which that part is named."""
 
 
-def contradiction_sentence(found: Contradiction) -> str:
-    """A finding of `uncertainty.consistency.contradictions` for the user."""
+def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
+    """A finding of `uncertainty.consistency.contradictions` for the user.
+
+    `led`: a suspect is named before it. Findings without an input of their own then give no advice.
+    """
     match found:
         case GuessContradiction():
             return _guess(found)
         case CloudCount():
             return (
                 f"{_outliers(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
-                "many. The result follows the other clouds, which may be the wrong ones: check its "
-                "stamps, its mount and the target"
+                "many. The result follows the other clouds, which may be the wrong ones"
+                f"{'' if led else ': check its stamps, its mount and the target'}"
             )
         case CoarseRegistrations():
-            return _coarse(found)
+            return _coarse(found, led)
         case RangesDisagree():
             return _ranges(found)
         case ScoreTest():
@@ -126,10 +129,12 @@ def _where(count: CloudCount) -> str:
     return ""
 
 
-def _coarse(found: CoarseRegistrations) -> str:
+def _coarse(found: CoarseRegistrations, led: bool) -> str:
     rotation, shift = found.sigma
     likely = ""
-    if isinstance(found.likely, CloudCount):
+    if led:
+        pass
+    elif isinstance(found.likely, CloudCount):
         likely = f" It shows most here: {_outliers(found.likely)}."
     elif found.likely is not None:
         likely = f" It shows most here: {_score_test(found.likely)}."
@@ -138,9 +143,11 @@ def _coarse(found: CoarseRegistrations) -> str:
         f"the target clouds (lidars {names}) and the motion of the vehicle contradict each other: "
         f"they fit only with registration errors of {1e3 * rotation:.0f} mrad and "
         f"{1e3 * shift:.0f} mm, {found.scale:.0f} times what the scatter of their points gives "
-        f"(limit {SCALE_LIMIT:.0f}).{likely} Check the stamps of every LiDAR, and that no mount "
-        "and no target moved"
+        f"(limit {SCALE_LIMIT:.0f}).{likely}{'' if led else _COARSE_REMEDY}"
     )
+
+
+_COARSE_REMEDY = " Check the stamps of every LiDAR, and that no mount and no target moved"
 
 
 def _ranges(found: RangesDisagree) -> str:

@@ -1,0 +1,194 @@
+"""From parameters to the config's keys: the value that each suspect would take, in its unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import retract_vehicle_axes
+from caliv_graph.products import Array, Guess, MotionData, Solution, Suspect
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
+from caliv_graph.uncertainty.suspects import Freed, Ranked, ranking
+
+FREE_ARM_M = 2.0
+"""Sigma of a lever arm that is freed: antennas are within some metres of the vehicle's origin."""
+
+FREE_ROTATION_DEG = 30.0
+"""The same of the IMU's rotation, degrees."""
+
+_POSE_UNITS = ("m",) * 3 + ("deg",) * 3
+"""Of a pose as the config has it: xyz, then roll, pitch, yaw."""
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """A vector in the unit of its key: present value, change, its sigma."""
+
+    now: Array
+    change: Array
+    sigma: Array
+    units: tuple[str, ...]
+    value: Array | None = None
+
+
+def ranked_suspects(
+    solution: Solution,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Suspect, ...]:
+    """The inputs of a calibration that could be wrong, ranked, in the units of the config's keys.
+
+    `trajectories` are one per drive, `motions` by the index of the drive.
+
+    Raises:
+        SolveError: the graph is singular.
+        TrajectoryError: the motion data leave the poses undetermined.
+    """
+    guesses = {name: configured_guess(config, name) for name in solution.lidars}
+    ranked = ranking(suspect_scores(solution, trajectories, guesses))
+    if ranked and ranked[0].freed.sigmas > CONTRADICTION_SIGMAS:
+        again = solved_again(ranked[0], solution, trajectories, motions, config)
+        # How far the first linearisation contradicts stays; what it takes is known better now.
+        freed = replace(ranked[0].freed, change=again.change, cov=again.cov)
+        ranked = (replace(ranked[0], freed=freed), *ranked[1:])
+    return named_suspects(ranked, config, guesses)
+
+
+def solved_again(
+    first: Ranked,
+    solution: Solution,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> Freed:
+    """What freeing the first suspect gives, the smoother solved with it free, where that is one.
+
+    A lever arm that is a metre off is far from linear: robust weights and the noise of the fixes
+    were those of the wrong one. The clouds are as they were registered.
+    """
+    guesses = {name: configured_guess(config, name) for name in solution.lidars}
+    name = first.candidate.name
+    free = freed_in_smoother(config, name)
+    if free is None:
+        return first.freed
+    try:
+        again = [
+            smooth_trajectory(motions[d], free, t.trajectory.stamps_ns)
+            if isinstance(t, SmoothedTrajectory)
+            else t
+            for d, t in enumerate(trajectories)
+        ]
+        scores = suspect_scores(solution, again, guesses)
+    except TrajectoryError:
+        return first.freed
+    index = [c.name for c in scores.candidates].index(name)
+    # The sigma that freed it is no property of the input.
+    candidates = list(scores.candidates)
+    candidates[index] = first.candidate
+    return replace(scores, candidates=tuple(candidates)).freed([index])
+
+
+def freed_in_smoother(config: Config, name: str) -> Config | None:
+    """The config with a wide sigma on an input that the smoother estimates; None: no such input."""
+    if name == LEVER_ARM.name:
+        gnss = config.gnss.model_copy(update={"lever_arm_sigma": FREE_ARM_M})
+        return config.model_copy(update={"gnss": gnss})
+    if name == IMU_ROTATION.name:
+        imu = config.imu.model_copy(update={"rotation_sigma_deg": FREE_ROTATION_DEG})
+        return config.model_copy(update={"imu": imu})
+    return None
+
+
+def named_suspects(
+    ranked: Sequence[Ranked], config: Config, guesses: Mapping[str, Guess]
+) -> tuple[Suspect, ...]:
+    """The ranking for the result, values in the units of the config's keys."""
+    out = []
+    for each in ranked:
+        q = _quantity(each.candidate.name, each.freed, config, guesses)
+        value = q.now + q.change if q.value is None else q.value
+        out.append(
+            Suspect(
+                input=each.candidate.name,
+                value=tuple(value.tolist()),
+                sigma=tuple(q.sigma.tolist()),
+                change=tuple(q.change.tolist()),
+                units=q.units,
+                explains=each.explains,
+                sigmas=each.freed.sigmas,
+                sigmas_left=each.sigmas_left,
+            )
+        )
+    return tuple(out)
+
+
+def _quantity(name: str, freed: Freed, config: Config, guesses: Mapping[str, Guess]) -> _Quantity:
+    """The parameters of a candidate as the quantity that a user knows."""
+    change, sigma = freed.change, np.sqrt(np.diag(freed.cov))
+    if name == "gnss.lever_arm":
+        now = np.zeros(3) if config.gnss.lever_arm is None else np.array(config.gnss.lever_arm)
+        return _Quantity(now, change, sigma, ("m",) * 3)
+    if name == "ground.vehicle_height":
+        return _Quantity(np.array([config.ground.vehicle_height or 0.0]), change, sigma, ("m",))
+    if name == "imu.T_vehicle_imu":
+        return _imu_rotation(change, sigma, config)
+    if name.endswith((".drift",)) or ".drift." in name:
+        return _drift(change, sigma)
+    if name.endswith("time_offset"):
+        return _Quantity(np.zeros(1), change, sigma, ("s",))
+    if name == "imu.yaw_bias":
+        return _Quantity(np.zeros(1), np.degrees(change), np.degrees(sigma), ("deg",))
+    if name.endswith(".scale"):
+        return _Quantity(np.ones(1), change, sigma, ("1",))
+    moved, spread = _as_pose(change), _as_pose(sigma)
+    if name.endswith(".initial"):
+        guess = guesses[name.removeprefix("lidars.").removesuffix(".initial")].T_vehicle_lidar
+        T = retract_vehicle_axes(guess, change)
+        return _Quantity(_pose(guess), moved, spread, _POSE_UNITS, value=_pose(T))
+    return _Quantity(np.zeros(6), moved, spread, _POSE_UNITS)
+
+
+def _as_pose(d: Array) -> Array:
+    """(6,) rotation before translation, rad and m, as xyz and rpy in m and degrees."""
+    return np.concatenate([d[3:], np.degrees(d[:3])])
+
+
+def _pose(T: gtsam.Pose3) -> Array:
+    """(6,) xyz and rpy_deg of a config."""
+    return np.concatenate([T.translation(), np.degrees(T.rotation().rpy())])
+
+
+def _imu_rotation(change: Array, sigma: Array, config: Config) -> _Quantity:
+    """rpy_deg of T_vehicle_imu; the sigmas are those about the vehicle's axes."""
+    rpy_deg = config.imu.T_vehicle_imu.rpy_deg
+    now = np.radians(np.zeros(3) if rpy_deg is None else np.array(rpy_deg))
+    R = gtsam.Rot3.Expmap(change).compose(gtsam.Rot3.RzRyRx(*now))
+    value = np.degrees(R.rpy())
+    units = ("deg",) * 3
+    return _Quantity(np.degrees(now), np.degrees(change), np.degrees(sigma), units, value=value)
+
+
+def _drift(change: Array, sigma: Array) -> _Quantity:
+    """Range of the drift over the drive per map axis (and of the yaw, degrees)."""
+    axes = len(change) // DRIFT_WAVES
+    waves = change.reshape(DRIFT_WAVES, axes)
+    part = np.linspace(0.0, 1.0, 101)
+    course = sum(np.cos(np.pi * (k + 1) * part)[:, None] * wave for k, wave in enumerate(waves))
+    size = np.ptp(course, axis=0)
+    # A wave of one half goes from +1 to -1: its range is twice the amplitude.
+    spread = 2.0 * np.linalg.norm(sigma.reshape(DRIFT_WAVES, axes), axis=0)
+    unit = np.array([1.0] * 3 + [180.0 / np.pi] * (axes - 3))
+    units = ("m",) * 3 + ("deg",) * (axes - 3)
+    return _Quantity(np.zeros(axes), size * unit, spread * unit, units)

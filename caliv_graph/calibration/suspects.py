@@ -1,0 +1,367 @@
+"""The inputs of a calibration that could be wrong, as parameters that the graph leaves out.
+
+A parameter acts on the clouds' poses (a clock, a mount that moved), on the vehicle's poses (drift
+of given poses), or on a prior (a guess, the vehicle's height). Each becomes a block of one
+quadratic, which `uncertainty.suspects` ranks; `caliv_graph/calibration/README.md`, "Suspects".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
+from caliv_graph.calibration.motion_suspects import motion_parts
+from caliv_graph.calibration.problem import with_heave
+from caliv_graph.calibration.score_tests import CloudParts
+from caliv_graph.conventions import key_ground
+from caliv_graph.errors import SolveError
+from caliv_graph.geometry.se3 import skew, vehicle_axes_difference
+from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Solution
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.uncertainty.consistency import CLOCK_BIAS_S, REGISTRATION_BIAS
+from caliv_graph.uncertainty.suspects import Candidate, Scores, assembled
+
+STANCE_RAD = math.radians(0.2)
+"""1 sigma of the angle between a vehicle's horizontal plane and the ground it stands on: a frame is
+drawn for the nominal load. Five of them, one degree, are 49 mm of sag over a wheelbase of 2.8 m:
+the whole travel that a load takes out of the springs."""
+
+DRIFT_M = 0.02
+"""Allowance, 1 sigma per half wave: an RTK receiver's error that does not average out in minutes
+(multipath, troposphere) is one to two centimetres."""
+
+DRIFT_RAD = 1e-3
+"""The same of the yaw of given poses: 0.06 degrees, a good GNSS/INS."""
+
+DRIFT_WAVES = 3
+"""Half waves over the drive, of one, two and three: what is faster is not drift."""
+
+GUESS_SCALE = np.array([0.1] * 3 + [1.0] * 3)
+"""Of a guess and of given poses' frame, rad and m: a direction that is less well determined is left
+out of the test."""
+
+MOUNT_SCALE = np.array([1e-2] * 3 + [1e-1] * 3)
+"""The same of a mount in one part of the drive, rad and m."""
+
+CLOCK_SCALE_S = 0.05
+HEIGHT_SCALE_M = 1.0
+
+
+@dataclass
+class _Block:
+    """A candidate, and how its parameters act; None: not at all.
+
+    `clouds` (6 J, k): derivative of the clouds' poses. `poses` (6 n, k): of the vehicle's poses as
+    the motion data have them, right perturbations. `prior`: rows (m, M), residual (m,), weight
+    (m, m) and share (m, k) of a prior `rows z + residual - share d`.
+    """
+
+    candidate: Candidate
+    clouds: Array | None = None
+    poses: Array | None = None
+    prior: tuple[Array, Array, Array, Array] | None = None
+
+
+@dataclass
+class _Motion:
+    """What is known of the vehicle's poses without any LiDAR, and of the smoothers' inputs.
+
+    `information` (6 n, 6 n) and `gradient` (6 n,) at the estimate, the inputs as the user typed
+    them; `blocks` of the inputs, which are the first candidates; `own`, `own_gradient` of them with
+    all poses eliminated.
+    """
+
+    information: Array
+    gradient: Array
+    blocks: list[_Block]
+    own: Array
+    own_gradient: Array
+
+
+def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _Motion:
+    """The vehicle's poses: the graph's own of the given ones, the smoothers' of the others."""
+    graph, (drives, stamps) = solution.linearised, _drives(solution)
+    smoothed = {
+        d: t
+        for d, t in enumerate(trajectories)
+        if isinstance(t, SmoothedTrajectory) and (drives == d).any()
+    }
+    candidates, parts = motion_parts(smoothed, {d: stamps[drives == d] for d in smoothed})
+    size, whole = 6 * len(drives), sum(len(c.scale) for c in candidates)
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    columns = np.zeros((size, whole))
+    own, own_gradient = np.zeros((whole, whole)), np.zeros(whole)
+    given = np.repeat(~np.isin(drives, list(smoothed)), 6)
+    information[np.ix_(given, given)] = graph.pose_information[:size, :size][np.ix_(given, given)]
+    gradient[given] = graph.pose_gradient[:size][given]
+    poses = list(solution.T_map_vehicle.values())
+    for drive, part in parts.items():
+        at = np.repeat(drives == drive, 6)
+        W = with_heave(part.information)
+        mine = np.flatnonzero(drives == drive).tolist()
+        off = [
+            gtsam.Pose3.Logmap(T.between(poses[i]))
+            for i, T in zip(mine, part.T_map_vehicle, strict=True)
+        ]
+        information[np.ix_(at, at)] = W
+        gradient[at] = -W @ np.concatenate(off)
+        columns[at] = part.poses
+        own += part.own
+        own_gradient += part.gradient
+    ends = np.cumsum([len(c.scale) for c in candidates], dtype=np.int64).tolist()
+    blocks = [
+        _Block(c, poses=columns[:, end - len(c.scale) : end])
+        for c, end in zip(candidates, ends, strict=True)
+    ]
+    return _Motion(information, gradient, blocks, own, own_gradient)
+
+
+@dataclass
+class _Quadratic:
+    """The blocks as one quadratic beside the graph's."""
+
+    graph: LinearisedGraph
+    motion: _Motion
+    blocks: list[_Block]
+
+    def scores(self, information: Array, gradient: Array) -> Scores:
+        """All variables eliminated; `information`, `gradient` of them with all evidence."""
+        graph, sizes = self.graph, [len(b.candidate.scale) for b in self.blocks]
+        ends = np.cumsum(sizes).tolist()
+        whole = ends[-1]
+        C = np.zeros((len(graph.cloud_gradient), whole))
+        P = np.zeros((len(self.motion.gradient), whole))
+        B, c = np.zeros((whole, whole)), np.zeros(whole)
+        cross = np.zeros((len(graph.gradient), whole))
+        for block, size, end in zip(self.blocks, sizes, ends, strict=True):
+            part = slice(end - size, end)
+            if block.clouds is not None:
+                C[:, part] = block.clouds
+            if block.poses is not None:
+                P[:, part] = block.poses
+            if block.prior is not None:
+                rows, residual, weight, share = block.prior
+                cross[:, part] -= rows.T @ (weight @ share)
+                B[part, part] += share.T @ weight @ share
+                c[part] += share.T @ (weight @ residual)
+        seen = graph.cloud_information @ C
+        cross += graph.cloud_jacobian.T @ seen
+        B += C.T @ seen
+        c -= C.T @ graph.cloud_gradient
+        moved = self.motion.information @ P
+        cross[: len(P)] -= moved
+        B += P.T @ moved
+        c -= P.T @ self.motion.gradient
+        own = slice(0, len(self.motion.own_gradient))
+        B[own, own] += self.motion.own
+        c[own] += self.motion.own_gradient
+        candidates = [b.candidate for b in self.blocks]
+        try:
+            return assembled(candidates, B, c, cross, information, gradient)
+        except scipy.linalg.LinAlgError:
+            raise SolveError("the graph at the estimate is singular") from None
+
+
+def suspect_scores(
+    solution: Solution,
+    trajectories: Sequence[VehicleTrajectory],
+    guesses: Mapping[str, Guess],
+) -> Scores:
+    """The inputs of a calibration as left-out parameters, all variables eliminated.
+
+    The guesses are evidence here, in every mode: one wrong input shows as all estimates being off
+    their guesses alike. So is the vehicle's stance on the ground (`STANCE_RAD`), where the ground
+    is seen. `trajectories` are one per drive; `guesses` of the LiDARs of the solution.
+
+    Raises:
+        SolveError: the graph is singular.
+    """
+    graph = solution.linearised
+    motion = _motion(solution, trajectories)
+    blocks = [
+        *motion.blocks,
+        *_of_clouds(CloudParts(solution, trajectories)),
+        *_of_guesses(solution, guesses),
+        *_of_height(solution),
+        *_of_drift(solution, trajectories),
+        *_of_given_frame(solution, trajectories),
+    ]
+    # The smoother's inputs are parameters of their own here, as the user typed them.
+    information = graph.information - graph.pose_information
+    gradient = graph.gradient - graph.pose_gradient
+    size = len(motion.gradient)
+    information[:size, :size] += motion.information
+    gradient[:size] += motion.gradient
+    for block in blocks:
+        # A guess that is fixed is among the data, and so is the vehicle's height.
+        if block.candidate.name.endswith(".initial") and block.prior is not None:
+            rows, residual, weight, _ = block.prior
+            information += rows.T @ weight @ rows
+            gradient -= rows.T @ (weight @ residual)
+    for rows, residual in _stance(solution):
+        information += rows.T @ rows / STANCE_RAD**2
+        gradient -= rows.T @ residual / STANCE_RAD**2
+    if not blocks:
+        return Scores((), np.zeros((0, 0)), np.zeros(0))
+    return _Quadratic(graph, motion, blocks).scores(information, gradient)
+
+
+def _of_clouds(parts: CloudParts) -> list[_Block]:
+    """Clocks of the LiDARs, one by one and all together; mounts in parts of the drive."""
+    out, late = [], []
+    for name in parts.solution.lidars:
+        for kind, columns in parts.parameters(name, trusted=False):
+            if kind == "clock":
+                late.append(columns)
+                candidate = _clock(f"lidars.{name}.time_offset")
+            else:
+                candidate = Candidate(f"lidars.{name}.mount.{kind}", REGISTRATION_BIAS, MOUNT_SCALE)
+            out.append(_Block(candidate, clouds=columns))
+    if len(late) > 1:
+        together = np.sum(late, axis=0)
+        out.insert(0, _Block(_clock("lidars.*.time_offset"), clouds=np.asarray(together)))
+    return out
+
+
+def _clock(name: str) -> Candidate:
+    return Candidate(name, np.array([CLOCK_BIAS_S]), np.array([CLOCK_SCALE_S]))
+
+
+def _of_guesses(solution: Solution, guesses: Mapping[str, Guess]) -> list[_Block]:
+    """Each guess that is estimated, vehicle axes: its prior sees only the rest."""
+    graph, out = solution.linearised, []
+    size = 6 * len(solution.lidars)
+    for i, name in enumerate(solution.lidars):
+        guess = guesses.get(name)
+        if guess is None or guess.fixed:
+            continue
+        rows = np.zeros((6, len(graph.gradient)))
+        rows[:, -size:] = graph.to_vehicle_axes[6 * i : 6 * i + 6]
+        off = vehicle_axes_difference(solution.T_vehicle_lidar[name], guess.T_vehicle_lidar)
+        prior = (rows, off, np.diag(guess.sigmas**-2.0), np.eye(6))
+        candidate = Candidate(f"lidars.{name}.initial", np.zeros(6), GUESS_SCALE)
+        out.append(_Block(candidate, prior=prior))
+    return out
+
+
+def _of_height(solution: Solution) -> list[_Block]:
+    """The vehicle's height above ground, one for all drives, where the config states it."""
+    graph = solution.linearised
+    rows, residuals, weights = [], [], []
+    for index, kind in enumerate(solution.factor_kinds):
+        if kind == "ground_height":
+            factor = solution.graph.at(index)
+            key = factor.keys()[0]
+            if key not in graph.starts:
+                continue
+            row = np.zeros(len(graph.gradient))
+            row[graph.starts[key]] = 1.0
+            rows.append(row)
+            residuals.append(float(solution.values.atVector(key)[0]))
+            weights.append(_information(factor, solution.values))
+    if not rows:
+        return []
+    prior = (np.array(rows), np.array(residuals), np.diag(weights), np.ones((len(rows), 1)))
+    candidate = Candidate("ground.vehicle_height", np.zeros(1), np.array([HEIGHT_SCALE_M]))
+    return [_Block(candidate, prior=prior)]
+
+
+def _information(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> float:
+    """Of a factor of one variable of one dimension."""
+    return float(np.asarray(factor.linearize(values).information())[0, 0])
+
+
+def _drives(solution: Solution) -> tuple[IntArray, IntArray]:
+    """(n,) drive and stamp of every pose, in the order of the graph."""
+    places = np.array(list(solution.T_map_vehicle), dtype=np.int64).reshape(-1, 2)
+    return places[:, 0], places[:, 1]
+
+
+def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> list[_Block]:
+    """Slow errors of the vehicle's positions, map axes, and of the yaw of given poses.
+
+    Cosines of one to three half waves over each drive. A pose that is too far east by b pulls the
+    graph's pose to where it is less b.
+    """
+    drives, stamps = _drives(solution)
+    out = []
+    for drive, trajectory in enumerate(trajectories):
+        mine = np.flatnonzero(drives == drive)
+        if len(mine) < 2 * DRIFT_WAVES:
+            continue
+        given = not isinstance(trajectory, SmoothedTrajectory)
+        if not given and trajectory.origin_deg_m is None:
+            continue
+        begin, end = trajectory.span_ns
+        part = (stamps[mine] - begin) / (end - begin)
+        waves = [np.cos(math.pi * k * part) for k in range(1, DRIFT_WAVES + 1)]
+        axes = 4 if given else 3
+        columns = np.zeros((6 * len(stamps), axes * DRIFT_WAVES))
+        poses = list(solution.T_map_vehicle.values())
+        for j, i in enumerate(mine.tolist()):
+            R_vehicle_map = poses[i].rotation().matrix().T
+            for k, wave in enumerate(waves):
+                at = slice(axes * k, axes * k + 3)
+                columns[6 * i + 3 : 6 * i + 6, at] = wave[j] * R_vehicle_map
+                if given:
+                    columns[6 * i : 6 * i + 3, axes * k + 3] = wave[j] * R_vehicle_map[:, 2]
+        sigmas = np.array([DRIFT_M] * 3 + [DRIFT_RAD] * (axes - 3))
+        scale = np.array([1.0] * 3 + [0.1] * (axes - 3))
+        name = f"{'poses' if given else 'gnss'}.drift{_of_several(drive, trajectories)}"
+        candidate = Candidate(name, np.tile(sigmas, DRIFT_WAVES), np.tile(scale, DRIFT_WAVES))
+        out.append(_Block(candidate, poses=columns))
+    return out
+
+
+def _of_several(drive: int, trajectories: Sequence[VehicleTrajectory]) -> str:
+    """What tells a drive from the others in the name of a candidate."""
+    return f".{drive}" if len(trajectories) > 1 else ""
+
+
+def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> list[_Block]:
+    """Given poses that are those of another frame than the vehicle's: one transform for all."""
+    drives, _ = _drives(solution)
+    given = [d for d, t in enumerate(trajectories) if not isinstance(t, SmoothedTrajectory)]
+    of = np.isin(drives, given)
+    if not of.any():
+        return []
+    columns = np.kron(of[:, None], np.eye(6))
+    candidate = Candidate("poses.frame", np.zeros(6), GUESS_SCALE)
+    return [_Block(candidate, poses=columns)]
+
+
+def _stance(solution: Solution) -> list[tuple[Array, Array]]:
+    """Per drive the mean tilt of the vehicle against the ground, (2,) rad, and its rows (2, M).
+
+    x and y of the plane's normal in the vehicle frame. None where the config has the tilt already.
+    """
+    graph = solution.linearised
+    if "ground_tilt" in solution.factor_kinds:
+        return []
+    drives, _ = _drives(solution)
+    poses = list(solution.T_map_vehicle.values())
+    out = []
+    for drive in sorted(set(drives.tolist())):
+        key = key_ground(drive)
+        if key not in graph.starts:
+            continue
+        plane = solution.values.atVector(key)
+        normal, by_plane = plane_normal(plane), normal_jacobian(plane)
+        mine = np.flatnonzero(drives == drive).tolist()
+        rows, tilt = np.zeros((2, len(graph.gradient))), np.zeros(2)
+        for i in mine:
+            R_vehicle_map = poses[i].rotation().matrix().T
+            seen = R_vehicle_map @ normal
+            tilt += seen[:2] / len(mine)
+            rows[:, 6 * i : 6 * i + 3] = skew(seen)[:2] / len(mine)
+            start = graph.starts[key]
+            rows[:, start : start + 3] += (R_vehicle_map @ by_plane)[:2] / len(mine)
+        out.append((rows, tilt))
+    return out

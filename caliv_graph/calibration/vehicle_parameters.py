@@ -1,0 +1,186 @@
+"""Lever arm and rotation of the IMU in the calibration graph: one of each for all drives.
+
+The motion data of a drive are a Gaussian on its poses and on them (`README.md`, section 17).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.conventions import key_imu_rotation, key_lever_arm
+from caliv_graph.products import Array, VehicleParameter
+from caliv_graph.trajectory.chain import POSE
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
+
+ParameterValue = Array | gtsam.Rot3
+
+KEYS = {LEVER_ARM.name: key_lever_arm(), IMU_ROTATION.name: key_imu_rotation()}
+"""Parameter of the input -> its key: (3,) metres in the vehicle frame, and R_vehicle_imu."""
+
+NAMES = {LEVER_ARM.name: "lever_arm", IMU_ROTATION.name: "imu_rotation"}
+"""What they are called in a result."""
+
+USUAL_SIGMAS = {
+    LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
+    IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
+}
+"""A parameter that nobody measured is determined if the drive knows it better than the usual guess
+of a mount."""
+
+
+@dataclass(frozen=True)
+class MotionTerm:
+    """What the motion data of a drive say of its m poses and of k parameters.
+
+    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`: right perturbations of the
+    poses, then of the parameters about `values`.
+
+    Attributes:
+        information: (6 m + 3 k, 6 m + 3 k), heave included, priors of the parameters not.
+        gradient: (6 m + 3 k,).
+        constant: at least twice what the quadratic falls below zero.
+        values: of the parameters where it was linearised, by name, in order.
+    """
+
+    information: Array
+    gradient: Array
+    constant: float
+    values: Mapping[str, ParameterValue]
+
+
+@dataclass(frozen=True)
+class ParameterPrior:
+    """The prior of a parameter of the vehicle: its mean, and (3, 3) of its perturbation.
+
+    `sigmas` (3,) are those of the lever arm's x, y, z, or of the rotation about the vehicle's axes.
+    """
+
+    mean: ParameterValue
+    cov: Array
+    sigmas: Array
+
+
+def motion_term(
+    trajectory: SmoothedTrajectory, stamps_ns: Sequence[int], heave_m: float
+) -> MotionTerm | None:
+    """The term of one drive's wanted poses; None if none of its parameters is uncertain."""
+    names = [name for name in KEYS if name in _uncertain(trajectory)]
+    if not names:
+        return None
+    joint = _in_tangents(trajectory, trajectory.joint(stamps_ns, names))
+    return _with_heave(joint, {name: _value(trajectory, name) for name in names}, heave_m)
+
+
+def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, ParameterPrior]:
+    """The prior of each uncertain parameter, counted once for all drives; the first drive's.
+
+    They differ between drives only where the rotation of the IMU was guessed from the data.
+    """
+    out: dict[str, ParameterPrior] = {}
+    for trajectory in trajectories:
+        for name, (sigmas, offset) in _uncertain(trajectory).items():
+            value, cov = _value(trajectory, name), np.diag(sigmas**2)
+            mean: ParameterValue
+            if isinstance(value, gtsam.Rot3):
+                mean = gtsam.Rot3.Expmap(-offset).compose(value)
+                cov = mean.matrix().T @ cov @ mean.matrix()
+            else:
+                mean = value - offset
+            out.setdefault(name, ParameterPrior(mean, cov, sigmas))
+    return {name: out[name] for name in KEYS if name in out}
+
+
+class _Marginals(Protocol):
+    """The solved problem, as `reduced.Reduced` has it."""
+
+    def covariance_of(self, key: int, cov: Array) -> Array:
+        """Marginal covariance of a variable, `cov` that of the extrinsics."""
+
+
+def estimated_parameters(
+    priors: Mapping[str, ParameterPrior], values: gtsam.Values, solved: _Marginals, cov: Array
+) -> dict[str, VehicleParameter]:
+    """Value, sigma and verdict of each parameter; `cov` is that of the extrinsics."""
+    out = {}
+    for name, prior in priors.items():
+        own = solved.covariance_of(KEYS[name], cov)
+        if isinstance(prior.mean, gtsam.Rot3):
+            R = values.atRot3(KEYS[name])
+            value, own = R.rpy(), R.matrix() @ own @ R.matrix().T
+        else:
+            value = values.atVector(KEYS[name])
+        variance = np.diag(own)
+        # What the drive knows is what the result knows beyond the prior.
+        by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
+        limit = np.minimum(prior.sigmas, USUAL_SIGMAS[name])
+        x, y, z = (by_drive > limit**-2.0).tolist()
+        out[name] = VehicleParameter(np.asarray(value), np.sqrt(variance), (x, y, z))
+    return out
+
+
+def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]:
+    """Sigmas of the prior, and the offset from its mean, of each parameter that has one."""
+    return {
+        p.parameter.name: (p.sigmas, np.zeros(p.parameter.size) if p.offset is None else p.offset)
+        for p in trajectory.parameters
+        if p.sigmas is not None and p.parameter.name in KEYS
+    }
+
+
+def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
+    if name == LEVER_ARM.name:
+        return np.asarray(trajectory.data.lever_arm)
+    return trajectory.data.T_vehicle_imu.rotation()
+
+
+def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> JointInformation:
+    """The same, a rotation of the IMU as a right perturbation instead of one in vehicle axes."""
+    if IMU_ROTATION.name not in joint.parameters:
+        return joint
+    m = len(joint.T_map_vehicle)
+    R_vehicle_imu = trajectory.data.T_vehicle_imu.rotation().matrix()
+    blocks = [R_vehicle_imu if n == IMU_ROTATION.name else np.eye(3) for n in joint.parameters]
+    turn = np.asarray(block_diag(*blocks))
+    information, gradient = joint.information.copy(), joint.gradient.copy()
+    information[:, POSE * m :] = information[:, POSE * m :] @ turn
+    information[POSE * m :] = turn.T @ information[POSE * m :]
+    gradient[POSE * m :] = turn.T @ gradient[POSE * m :]
+    return JointInformation(information, gradient, joint.T_map_vehicle, joint.parameters)
+
+
+def _with_heave(
+    joint: JointInformation, values: Mapping[str, ParameterValue], heave_m: float
+) -> MotionTerm:
+    """Adds a heave of its own to each pose, along the vehicle's z; the parameters' share stays.
+
+    Given the parameters the poses are Gaussian: the heave adds to that covariance.
+    """
+    size = POSE * len(joint.T_map_vehicle)
+    A, B, C = (
+        joint.information[:size, :size],
+        joint.information[:size, size:],
+        joint.information[size:, size:],
+    )
+    a, c = joint.gradient[:size], joint.gradient[size:]
+    cov = np.linalg.inv(A)
+    follows, moved = cov @ B, cov @ a
+    own, pull = C - B.T @ follows, c - B.T @ moved  # the parameters' marginal
+    z = np.arange(5, size, POSE)
+    cov[z, z] += heave_m**2
+    A_heave = np.linalg.inv(cov)
+    B_heave, a_heave = A_heave @ follows, A_heave @ moved
+    information = np.block([[A_heave, B_heave], [B_heave.T, own + follows.T @ B_heave]])
+    return MotionTerm(
+        information=np.asarray(0.5 * (information + information.T)),
+        gradient=np.concatenate([a_heave, pull + follows.T @ a_heave]),
+        constant=float(a_heave @ moved + pull @ np.linalg.pinv(own, 1e-12, hermitian=True) @ pull),
+        values=values,
+    )

@@ -1,0 +1,101 @@
+"""Parameters of the smoother's input: what the user typed or a sensor scales, as coordinates.
+
+A parameter moves the input, so that its derivatives need no formula: those of every factor's
+residual are central differences (`README.md`, section 12). It enters the linearised graph as common
+coordinates, beside the yaw bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.products import Array
+from caliv_graph.trajectory.inputs import SmootherInput
+
+XYZ = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class InputParameter:
+    """Something constant over a drive that the input of the smoother depends on.
+
+    Attributes:
+        name: of the config's key, or what it is called in messages: `gnss.lever_arm`.
+        axes: names of its p coordinates.
+        unit: of the coordinates: m, rad, s, or empty.
+        steps: (p,) steps of the central differences, in that unit.
+        kinds: of the factors whose residuals it moves (`build.KINDS`).
+        moved: the input with the parameter moved by (p,), from its present value.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    unit: str
+    steps: Array
+    kinds: frozenset[str]
+    moved: Callable[[SmootherInput, Array], SmootherInput] = field(repr=False)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.axes)
+
+    def stepped(self, data: SmootherInput, coordinate: int, sign: float) -> SmootherInput:
+        """The input, one coordinate moved by its step times `sign`."""
+        d = np.zeros(self.size)
+        d[coordinate] = sign * self.steps[coordinate]
+        return self.moved(data, d)
+
+    def imu_moves(self, data: SmootherInput) -> Array:
+        """(6, p) derivative of T_vehicle_imu, a right perturbation; zero for most parameters."""
+        out = np.zeros((6, self.size))
+        for k in range(self.size):
+            ahead, behind = (self.stepped(data, k, sign).T_vehicle_imu for sign in (1.0, -1.0))
+            out[:, k] = gtsam.Pose3.Logmap(behind.between(ahead)) / (2.0 * self.steps[k])
+        return out
+
+
+@dataclass(frozen=True)
+class UncertainParameter:
+    """A parameter in the chain of a trajectory.
+
+    Attributes:
+        parameter: what it is.
+        sigmas: (p,) of its prior; None: without one it is held where nobody asks for it.
+        offset: (p,) its present value less the prior's mean.
+    """
+
+    parameter: InputParameter
+    sigmas: Array | None = None
+    offset: Array | None = None
+
+
+def _arm_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, lever_arm=data.lever_arm + d)
+
+
+def _imu_turned(data: SmootherInput, d: Array) -> SmootherInput:
+    T = data.T_vehicle_imu
+    R = gtsam.Rot3.Expmap(d).compose(T.rotation())
+    return replace(data, T_vehicle_imu=gtsam.Pose3(R, T.translation()))
+
+
+LEVER_ARM = InputParameter(
+    "gnss.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"gnss"}), _arm_moved
+)
+"""The GNSS antenna in the vehicle frame. The residuals are linear in it."""
+
+IMU_ROTATION = InputParameter(
+    "imu.T_vehicle_imu",
+    ("roll", "pitch", "yaw"),
+    "rad",
+    np.full(3, 1e-3),
+    frozenset({"gnss", "velocity"}),
+    _imu_turned,
+)
+"""Rotation of T_vehicle_imu about the vehicle's axes, the IMU's origin fixed: Exp(d) R. Of a step
+of 1 mrad the central difference neglects a part of 2e-7."""

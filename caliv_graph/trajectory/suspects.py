@@ -1,0 +1,213 @@
+"""Inputs of the smoother that could be wrong, and by how much a sound one may be off.
+
+Each is a parameter of the input (`parameters.py`): what freeing it would explain follows from the
+chain of the estimate, without another solve. `uncertainty.suspects` ranks them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from caliv_graph.products import Array, ImuSamples, TwistSamples
+from caliv_graph.trajectory.columns import with_parameters
+from caliv_graph.trajectory.imu import interpolate, log_so3
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+ARM_M = 0.01
+"""Allowance, 1 sigma, of a lever arm without a sigma: the error of an RTK receiver that does not
+average out over a drive is about as large."""
+
+ROTATION_RAD = math.radians(0.1)
+"""The same of the IMU's rotation: a mount on a surface that was made for it."""
+
+GNSS_CLOCK_S = 5e-3
+"""The same of the stamps of the fixes: half the sample period of an IMU at 100 Hz; at 2 m/s it is
+the centimetre of `ARM_M`."""
+
+SPEED_SCALE = 0.02
+"""The same of the scale of wheel speeds: tyres lose 1 to 2 % of their radius with pressure, load
+and wear."""
+
+SENSOR_SCALE = 0.01
+"""The same of the scales of gyroscope and accelerometer: data sheets of MEMS sensors state 0.1 to
+1 %."""
+
+HEADING_RAD = math.radians(0.2)
+"""The same of the heading of an orientation source, as `heading.FLOOR_RAD`."""
+
+_VELOCITY_NS = 50_000_000
+"""Half the time over which the antenna's velocity is taken."""
+
+
+@dataclass(frozen=True)
+class SuspectParameter:
+    """A parameter that could be wrong.
+
+    Attributes:
+        parameter: how it moves the input.
+        allowance: (p,) 1 sigma of what a sound one may be off by.
+        scale: (p,) largest sigma at which a direction counts as determined.
+        offset: (p,) the estimate's value less the user's.
+    """
+
+    parameter: InputParameter
+    allowance: Array
+    scale: Array
+    offset: Array
+
+
+def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, ...]:
+    """The inputs of a smoothed trajectory that could be wrong: those that it has."""
+    data, out = smoothed.data, []
+    if data.positions is not None:
+        out.append(_known(smoothed, LEVER_ARM, ARM_M, 3.0))
+        out.append(_plain(_gnss_clock(smoothed), GNSS_CLOCK_S, 1.0))
+    if data.positions is not None or data.motion.twist is not None:
+        out.append(_known(smoothed, IMU_ROTATION, ROTATION_RAD, 0.5))
+    if data.motion.twist is not None:
+        out.append(_plain(_wheels(smoothed), SPEED_SCALE, 1.0))
+    if data.orientation and not data.yaw_bias:
+        out.append(_plain(_HEADING, HEADING_RAD, 1.0))
+    out += [_plain(scale, SENSOR_SCALE, 1.0) for scale in _inertial_scales(smoothed)]
+    return tuple(out)
+
+
+def with_suspects(
+    smoothed: SmoothedTrajectory,
+) -> tuple[SmoothedTrajectory, tuple[SuspectParameter, ...]]:
+    """The trajectory with its suspects in the chain, for `joint`; and these."""
+    suspects = suspect_parameters(smoothed)
+    return with_parameters(smoothed, [s.parameter for s in suspects]), suspects
+
+
+def _known(
+    smoothed: SmoothedTrajectory, parameter: InputParameter, allowance: float, scale: float
+) -> SuspectParameter:
+    """A parameter that the smoother may have estimated under a prior: its sigma is the allowance.
+
+    One that the user asked to be estimated has no right value: it is no suspect beyond its prior.
+    """
+    for p in smoothed.parameters:
+        if p.parameter.name == parameter.name and p.sigmas is not None:
+            offset = np.zeros(parameter.size) if p.offset is None else p.offset
+            wide = np.maximum(scale, 3.0 * p.sigmas)
+            return SuspectParameter(parameter, np.asarray(p.sigmas), wide, offset)
+    return _plain(parameter, allowance, scale)
+
+
+def _plain(parameter: InputParameter, allowance: float, scale: float) -> SuspectParameter:
+    size = parameter.size
+    return SuspectParameter(
+        parameter, np.full(size, allowance), np.full(size, scale), np.zeros(size)
+    )
+
+
+def _gnss_clock(smoothed: SmoothedTrajectory) -> InputParameter:
+    """Stamps of the fixes less their true times: a fix that is late was taken before.
+
+    It moves the fixes along the antenna's estimated path, so that each stays with its node.
+    """
+    assert smoothed.data.positions is not None
+    begin, end = smoothed.span_ns
+    stamps = smoothed.data.positions.stamps_ns
+    before = np.clip(stamps - _VELOCITY_NS, begin, end)
+    after = np.clip(stamps + _VELOCITY_NS, begin, end)
+    places = []
+    for at in (before, after):
+        R, t = smoothed.poses_at(at)
+        places.append(t + R @ smoothed.data.lever_arm)
+    seconds = np.maximum((after - before) * 1e-9, 1e-9)
+    velocity_map = (places[1] - places[0]) / seconds[:, None]
+
+    def moved(data: SmootherInput, d: Array) -> SmootherInput:
+        assert data.positions is not None
+        shifted = data.positions.position_map + d[0] * velocity_map
+        return replace(data, positions=replace(data.positions, position_map=shifted))
+
+    return _scalar("gnss.time_offset", "s", "gnss", moved)
+
+
+def _wheels(smoothed: SmoothedTrajectory) -> InputParameter:
+    """Measured over true velocities, less one.
+
+    Estimated velocities are scaled, not the measured ones: these are noise times noise.
+    """
+    twist = smoothed.data.motion.twist
+    assert twist is not None
+    begin, end = smoothed.span_ns
+    inside = np.clip(twist.stamps_ns, begin, end)
+    velocity, _ = smoothed.velocities_at(inside)
+
+    def moved(data: SmootherInput, d: Array) -> SmootherInput:
+        assert data.motion.twist is not None
+        scaled: TwistSamples = replace(
+            data.motion.twist, velocity=data.motion.twist.velocity - d[0] * velocity
+        )
+        return replace(data, motion=replace(data.motion, twist=scaled))
+
+    return _scalar("twist.scale", "", "velocity", moved)
+
+
+def _inertial_scales(smoothed: SmoothedTrajectory) -> tuple[InputParameter, InputParameter]:
+    """Measured over true angular velocities and specific forces, less one; estimates are scaled.
+
+    Both are those between the estimated nodes.
+    """
+    states, nodes = smoothed.states, smoothed.nodes_ns
+    seconds = (np.diff(nodes) * 1e-9)[:, None]
+    R, back = states.R_map_imu, np.swapaxes(states.R_map_imu[:-1], 1, 2)
+    gyro = log_so3(back @ R[1:]) / seconds
+    gravity = np.array([0.0, 0.0, -smoothed.gravity_m_s2])
+    force = np.einsum("nij,nj->ni", back, np.diff(states.velocity_map, axis=0) / seconds - gravity)
+    middles = nodes[:-1] + np.diff(nodes) // 2
+    stamps = smoothed.inertial.stamps_ns
+
+    def scaled(field: str, signal: Array, data: SmootherInput, d: Array) -> SmootherInput:
+        less: Mapping[str, Array] = {field: getattr(data.inertial, field) - d[0] * signal}
+        return replace(data, inertial=replace(data.inertial, **less))
+
+    return (
+        _scalar(
+            "imu.gyroscope.scale",
+            "",
+            "imu",
+            partial(scaled, "gyro", interpolate(stamps, middles, gyro)),
+        ),
+        _scalar(
+            "imu.accelerometer.scale",
+            "",
+            "imu",
+            partial(scaled, "force", interpolate(stamps, middles, force)),
+        ),
+    )
+
+
+def _heading_turned(data: SmootherInput, d: Array) -> SmootherInput:
+    imu = data.motion.imu
+    assert imu is not None
+    assert imu.orientation_xyzw is not None
+    turned: ImuSamples = replace(imu, orientation_xyzw=_turned_about_z(imu.orientation_xyzw, -d[0]))
+    return replace(data, motion=replace(data.motion, imu=turned))
+
+
+def _turned_about_z(xyzw: Array, angle_rad: float) -> Array:
+    """(n, 4) quaternions of `Rz(angle) R`."""
+    x, y, z, w = xyzw.T
+    c, s = math.cos(0.5 * angle_rad), math.sin(0.5 * angle_rad)
+    return np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=1)
+
+
+def _scalar(
+    name: str, unit: str, kind: str, moved: Callable[[SmootherInput, Array], SmootherInput]
+) -> InputParameter:
+    return InputParameter(name, ("value",), unit, np.full(1, 1e-3), frozenset({kind}), moved)
+
+
+_HEADING = _scalar("imu.yaw_bias", "rad", "orientation", _heading_turned)

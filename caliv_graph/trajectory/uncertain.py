@@ -1,0 +1,209 @@
+"""Estimating the parameters that the user measured: lever arm and rotation of the IMU.
+
+Gauss-Newton over all states and the parameters at once, the parameters as one more variable of the
+linear graph (`README.md`, section 12). After a step the input is moved and the graph built anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import key_imu, key_parameters
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.chain import UNDETERMINED, inverse_of
+from caliv_graph.trajectory.columns import parameter_columns
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.marginals import node_ordering
+from caliv_graph.trajectory.parameters import (
+    IMU_ROTATION,
+    LEVER_ARM,
+    UncertainParameter,
+)
+from caliv_graph.trajectory.solve import ERROR_TOLERANCE, Estimate, solve
+
+MAX_STEPS = 15
+"""Of the parameters. Sound figures take one or two; a lever arm that is unknown about five, under
+the weights of Huber's kernel."""
+
+STEP_SIGMAS = 0.01
+"""Step of a parameter, in sigmas of what is then known of it, at which it has converged."""
+
+WIDE_SIGMAS = {LEVER_ARM.name: 0.05, IMU_ROTATION.name: np.radians(1.0)}
+"""From these prior sigmas on (m, rad) an error would make sound fixes look like outliers: three
+times the noise of a good fix, and what 1 degree is at 3 m. The parameter is then estimated before
+fixes are rejected."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """An estimate of states and parameters.
+
+    Attributes:
+        data: the input with its parameters as estimated.
+        estimate: of the states, with that input.
+        parameters: with the offsets from their priors' means.
+        columns: (rows, p) derivatives of the estimate's whitened residuals by the parameters.
+        cov: (p, p) of the parameters, priors included.
+    """
+
+    data: SmootherInput
+    estimate: Estimate
+    parameters: tuple[UncertainParameter, ...]
+    columns: Array
+    cov: Array
+
+
+def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
+    """The parameters of the input that have a sigma, at their priors' means."""
+    out = []
+    arm = data.config.gnss.arm_sigma()
+    if arm is not None and data.positions is not None:
+        out.append(UncertainParameter(LEVER_ARM, np.full(3, arm), np.zeros(3)))
+    if data.rotation_sigmas is not None:
+        out.append(UncertainParameter(IMU_ROTATION, data.rotation_sigmas, np.zeros(3)))
+    return tuple(out)
+
+
+def are_wide(parameters: Sequence[UncertainParameter]) -> bool:
+    """Whether a parameter has to be estimated before outliers are looked for."""
+    return any(
+        p.sigmas is not None and p.sigmas.max() > WIDE_SIGMAS[p.parameter.name] for p in parameters
+    )
+
+
+def settle(
+    data: SmootherInput,
+    nodes: IntArray,
+    estimate: Estimate,
+    dropped: IntArray,
+    kernel: str,
+    parameters: Sequence[UncertainParameter],
+    tolerance: float = ERROR_TOLERANCE,
+) -> Settled:
+    """Moves states and parameters until their joint step is small.
+
+    Args:
+        data: the input.
+        nodes: (n,) stamps.
+        estimate: of the states with this input.
+        dropped: (k,) indices of fixes that are left out.
+        kernel: robust kernel of the others.
+        parameters: at least one, each with sigmas and an offset.
+        tolerance: of the solves between the steps.
+
+    Raises:
+        TrajectoryError: the graph is singular.
+    """
+    parameters = tuple(parameters)
+    sigmas = np.concatenate([np.asarray(p.sigmas) for p in parameters])
+    for number in range(MAX_STEPS + 1):
+        columns = parameter_columns(
+            data,
+            nodes,
+            estimate.states,
+            estimate.graph,
+            estimate.values,
+            dropped,
+            [p.parameter for p in parameters],
+        )
+        linear = _with_variable(estimate.graph.factors.linearize(estimate.values), columns)
+        offset = np.concatenate([np.asarray(p.offset) for p in parameters])
+        step, cov = _step(linear, len(nodes), data.yaw_bias, -offset, sigmas)
+        small = (np.abs(step) < STEP_SIGMAS * np.sqrt(np.diag(cov))).all()
+        if small or number == MAX_STEPS:
+            break
+        data, parameters = _moved(data, parameters, step)
+        estimate = solve(data, nodes, estimate.states, dropped, kernel, tolerance)
+    return Settled(data, estimate, parameters, columns, cov)
+
+
+def _moved(
+    data: SmootherInput, parameters: Sequence[UncertainParameter], step: Array
+) -> tuple[SmootherInput, tuple[UncertainParameter, ...]]:
+    """The input and the offsets after a step of all parameters."""
+    out, start = [], 0
+    for p in parameters:
+        d = step[start : start + p.parameter.size]
+        start += p.parameter.size
+        data = p.parameter.moved(data, d)
+        out.append(replace(p, offset=np.asarray(p.offset) + d))
+    return data, tuple(out)
+
+
+def _with_variable(linear: gtsam.GaussianFactorGraph, columns: Array) -> gtsam.GaussianFactorGraph:
+    """A linear graph in which the parameters are a variable, of the dimension of `columns`."""
+    out, start = gtsam.GaussianFactorGraph(), 0
+    make: Any = gtsam.JacobianFactor
+    for number in range(linear.size()):
+        factor: Any = linear.at(number)
+        own = columns[start : start + factor.rows()]
+        start += factor.rows()
+        if not own.any():
+            out.push_back(factor)
+            continue
+        A, terms, first = factor.getA(), [], 0
+        for key in factor.keys():  # noqa: SIM118 - a factor is no dict
+            size = _DIMS[chr(gtsam.symbolChr(key))]
+            terms += [key, A[:, first : first + size]]
+            first += size
+        unit = gtsam.noiseModel.Unit.Create(len(own))
+        out.add(make(*terms, key_parameters(), own, factor.getb(), unit))
+    return out
+
+
+_DIMS = {"i": 6, "v": 3, "b": 6, "y": 1}
+"""Coordinates of the variables of a trajectory, by letter."""
+
+
+def _step(
+    linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool, mean: Array, sigmas: Array
+) -> tuple[Array, Array]:
+    """Step (p,) of the parameters under a prior, and their covariance (p, p)."""
+    tree = _eliminated(linear, n, yaw_bias, mean, sigmas)
+    root = tree.marginalFactor(key_parameters(), gtsam.EliminateQR)
+    return np.asarray(tree.optimize().at(key_parameters())), inverse_of(root.information())
+
+
+def _eliminated(
+    linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool, mean: Array, sigmas: Array
+) -> gtsam.GaussianBayesTree:
+    """The Bayes tree of a graph with a prior on the parameters, which are its root."""
+    graph = linear.clone()
+    unit = gtsam.noiseModel.Unit.Create(len(sigmas))
+    graph.add(gtsam.JacobianFactor(key_parameters(), np.diag(1.0 / sigmas), mean / sigmas, unit))
+    ordering = node_ordering(n, yaw_bias)
+    ordering.push_back(key_parameters())
+    try:
+        return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+    except RuntimeError:  # GTSAM's report of a singular system
+        raise TrajectoryError(UNDETERMINED) from None
+
+
+def vehicle_covariances(settled: Settled, cov_imu: Array) -> Array:
+    """(n, 6, 6) covariances of the vehicle's poses, the parameters' included.
+
+    `cov_imu` (n, 6, 6) is that of the IMU's poses where the parameters are known.
+    """
+    data, n = settled.data, len(cov_imu)
+    sigmas = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters])
+    estimate = settled.estimate
+    linear = _with_variable(estimate.graph.factors.linearize(estimate.values), settled.columns)
+    # The states follow a parameter linearly, whatever moves it: here another mean of its prior.
+    moves, states = [], []
+    for mean in np.vstack([np.zeros(len(sigmas)), np.diag(sigmas)]):
+        solution = _eliminated(linear, n, data.yaw_bias, mean, 1e-3 * sigmas).optimize()
+        moves.append(solution.at(key_parameters()))
+        states.append([solution.at(key_imu(i)) for i in range(n)])
+    moved, poses = np.array(moves[1:]) - moves[0], np.array(states[1:]) - np.array(states[0])
+    by_parameter = np.einsum("kl,lni->nik", np.linalg.inv(moved), poses)
+    # X = I T_vehicle_imu^-1: the vehicle also moves where the parameter is that transform.
+    by_parameter -= np.hstack([p.parameter.imu_moves(data) for p in settled.parameters])
+    total = cov_imu + by_parameter @ settled.cov @ np.swapaxes(by_parameter, 1, 2)
+    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+    return np.asarray(Ad @ total @ Ad.T)

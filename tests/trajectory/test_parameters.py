@@ -1,0 +1,90 @@
+"""Parameters of the smoother's input: what a moved one does is known by smoothing again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Array
+from caliv_graph.trajectory.columns import whitened, with_parameters
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
+
+COURSE = Course(eight_drive(12.0), rough=1.0)
+SENSORS = replace(mounted_askew(), gnss_delay_s=0.033, twist_hz=50.0, twist_delay_s=0.017)
+MOTION = record(COURSE, SENSORS, 1)
+WANTED = stamps(12.0, 2.0, 0.0512)
+CONFIG = config_for(SENSORS, robust={"kernel": "none"})
+
+
+def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
+    """The drive again, with a parameter of the config moved by d."""
+    if parameter is LEVER_ARM:
+        arm = np.array(CONFIG.gnss.lever_arm) + d
+        return smooth_trajectory(MOTION, config_of({"gnss": {"lever_arm": tuple(arm)}}), WANTED)
+    T = CONFIG.imu.T_vehicle_imu.pose()
+    rpy = gtsam.Rot3.Expmap(d).compose(T.rotation()).rpy()
+    mounting = {"xyz": tuple(T.translation()), "rpy_deg": tuple(np.degrees(rpy))}
+    return smooth_trajectory(MOTION, config_of({"imu": {"T_vehicle_imu": mounting}}), WANTED)
+
+
+def config_of(changes: dict[str, dict[str, object]]) -> Config:
+    raw = CONFIG.model_dump()
+    for section, keys in changes.items():
+        raw[section] |= keys
+    return Config.model_validate(raw)
+
+
+def test_derivatives_are_whitened_as_the_residuals_are() -> None:
+    huber = smooth_trajectory(
+        MOTION, config_of({"robust": {"kernel": "huber", "huber_k": 0.7}}), WANTED
+    )
+    linear = huber.graph.linearize(huber.values)
+    weights = []
+    for number in range(huber.graph.size()):
+        factor: Any = huber.graph.at(number)
+        white = whitened(factor, huber.values, factor.unwhitenedError(huber.values))
+        right: Any = linear.at(number)
+        np.testing.assert_allclose(white, -right.getb(), atol=1e-9)
+        weights.append(factor.noiseModel().weight(white))
+    assert min(weights) < 0.8  # some fixes are beyond the bend of the kernel
+
+
+@pytest.mark.parametrize(
+    ("parameter", "d"),
+    [(LEVER_ARM, np.array([0.02, -0.03, 0.01])), (IMU_ROTATION, np.array([1.0, -2.0, 1.5]) * 1e-3)],
+    ids=["lever arm", "imu rotation"],
+)
+def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
+    parameter: InputParameter, d: Array
+) -> None:
+    smoothed = with_parameters(smooth_trajectory(MOTION, CONFIG, WANTED), [parameter])
+
+    joint = smoothed.joint(WANTED, [parameter.name])
+
+    moved = smoothed_with(parameter, d)
+    seen = np.concatenate(
+        [
+            gtsam.Pose3.Logmap(before.between(after))
+            for before, after in zip(
+                joint.T_map_vehicle, moved.trajectory.T_map_vehicle, strict=True
+            )
+        ]
+    )
+    size = 6 * len(WANTED)
+    poses, cross = joint.information[:size, :size], joint.information[:size, size:]
+    expected = np.linalg.solve(poses, joint.gradient[:size] - cross @ d)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(seen, expected, atol=0.02 * scale)
+    # The sum of squares: minus its half is the log-likelihood whose gradient is stated.
+    reduced = joint.information[size:, size:] - cross.T @ np.linalg.solve(poses, cross)
+    slope = joint.gradient[size:] - cross.T @ np.linalg.solve(poses, joint.gradient[:size])
+    gained = moved.graph.error(moved.values) - smoothed.graph.error(smoothed.values)
+    assert gained == pytest.approx(0.5 * d @ reduced @ d - slope @ d, rel=0.05, abs=0.05)

@@ -57,9 +57,8 @@ def assemble(
         solution.time_offsets,
     )
     provenance = _provenance(config, recordings, solution, digests)
-    return unmet_requirements(
-        replace(draft, provenance=provenance, vehicle=dict(solution.vehicle)), config
-    )
+    result = replace(draft, provenance=provenance, vehicle=dict(solution.vehicle))
+    return unmet_requirements(result, config)
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:

@@ -170,6 +170,7 @@ def _vehicle_document(calibration: Calibration) -> dict[str, Any]:
             f"value{suffix}": (unit * found.value).tolist(),
             f"sigma{suffix}": (unit * found.sigma).tolist(),
             "determined": [bool(yes) for yes in found.determined],
+            "limits": list(found.limits),
         }
     return {"vehicle": out} if out else {}
 

@@ -27,6 +27,9 @@ FREE_ARM_M = 2.0
 FREE_ROTATION_DEG = 30.0
 """The same of the IMU's rotation, degrees."""
 
+KNOWN = 0.1
+"""Sigma over the candidate's scale below which the linear change is where the next solve begins."""
+
 _POSE_UNITS = ("m",) * 3 + ("deg",) * 3
 """Of a pose as the config has it: xyz, then roll, pitch, yaw."""
 
@@ -73,14 +76,15 @@ def solved_again(
     motions: Mapping[int, MotionData],
     config: Config,
 ) -> Freed:
-    """What freeing the first suspect gives, the smoother solved with it free, where that is one.
+    """The value of the first suspect, the smoother solved with it free, where it is one of its.
 
     A lever arm that is a metre off is far from linear: robust weights and the noise of the fixes
     were those of the wrong one. The clouds are as they were registered.
     """
-    guesses = {name: configured_guess(config, name) for name in solution.lidars}
-    name = first.candidate.name
-    free = freed_in_smoother(config, name)
+    name, guesses = first.candidate.name, {n: configured_guess(config, n) for n in solution.lidars}
+    known = np.sqrt(np.diag(first.freed.cov)) < KNOWN * first.candidate.scale
+    begun = np.where(known, first.freed.change, 0.0)
+    free = freed_in_smoother(config, name, begun)
     if free is None:
         return first.freed
     try:
@@ -97,18 +101,34 @@ def solved_again(
     # The sigma that freed it is no property of the input.
     candidates = list(scores.candidates)
     candidates[index] = first.candidate
-    return replace(scores, candidates=tuple(candidates)).freed([index])
+    found = replace(scores, candidates=tuple(candidates)).freed([index])
+    return replace(found, change=_after(name, begun, found.change))
 
 
-def freed_in_smoother(config: Config, name: str) -> Config | None:
-    """The config with a wide sigma on an input that the smoother estimates; None: no such input."""
+def freed_in_smoother(config: Config, name: str, change: Array) -> Config | None:
+    """The config with an input moved, with a wide sigma; None: the smoother does not estimate it.
+
+    `change` (3,) is of the lever arm, metres, or of the IMU's rotation about the vehicle's axes.
+    """
     if name == LEVER_ARM.name:
-        gnss = config.gnss.model_copy(update={"lever_arm_sigma": FREE_ARM_M})
-        return config.model_copy(update={"gnss": gnss})
-    if name == IMU_ROTATION.name:
-        imu = config.imu.model_copy(update={"rotation_sigma_deg": FREE_ROTATION_DEG})
-        return config.model_copy(update={"imu": imu})
+        arm = np.zeros(3) if config.gnss.lever_arm is None else np.array(config.gnss.lever_arm)
+        moved = {"lever_arm": tuple((arm + change).tolist()), "lever_arm_sigma": FREE_ARM_M}
+        return config.model_copy(update={"gnss": config.gnss.model_copy(update=moved)})
+    if name == IMU_ROTATION.name and config.imu.T_vehicle_imu.rpy_deg is not None:
+        R = gtsam.Rot3.Expmap(change).compose(config.imu.T_vehicle_imu.pose().rotation())
+        rpy_deg = tuple(np.degrees(R.rpy()).tolist())
+        T_vehicle_imu = config.imu.T_vehicle_imu.model_copy(update={"rpy_deg": rpy_deg})
+        turned = {"T_vehicle_imu": T_vehicle_imu, "rotation_sigma_deg": FREE_ROTATION_DEG}
+        return config.model_copy(update={"imu": config.imu.model_copy(update=turned)})
     return None
+
+
+def _after(name: str, first: Array, second: Array) -> Array:
+    """Two changes after each other, as one."""
+    if name != IMU_ROTATION.name:
+        return first + second
+    both = gtsam.Rot3.Expmap(second).compose(gtsam.Rot3.Expmap(first))
+    return np.asarray(gtsam.Rot3.Logmap(both))
 
 
 def named_suspects(

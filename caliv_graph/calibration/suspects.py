@@ -297,7 +297,7 @@ def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> 
         if len(mine) < 2 * DRIFT_WAVES:
             continue
         given = not isinstance(trajectory, SmoothedTrajectory)
-        if not given and trajectory.origin_deg_m is None:
+        if isinstance(trajectory, SmoothedTrajectory) and trajectory.origin_deg_m is None:
             continue
         begin, end = trajectory.span_ns
         part = (stamps[mine] - begin) / (end - begin)
@@ -332,7 +332,7 @@ def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory
     of = np.isin(drives, given)
     if not of.any():
         return []
-    columns = np.kron(of[:, None], np.eye(6))
+    columns = np.asarray(np.kron(of[:, None], np.eye(6)), np.float64)
     candidate = Candidate("poses.frame", np.zeros(6), GUESS_SCALE)
     return [_Block(candidate, poses=columns)]
 

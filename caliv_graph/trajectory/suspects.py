@@ -7,9 +7,8 @@ chain of the estimate, without another solve. `uncertainty.suspects` ranks them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -169,23 +168,19 @@ def _inertial_scales(smoothed: SmoothedTrajectory) -> tuple[InputParameter, Inpu
     middles = nodes[:-1] + np.diff(nodes) // 2
     stamps = smoothed.inertial.stamps_ns
 
-    def scaled(field: str, signal: Array, data: SmootherInput, d: Array) -> SmootherInput:
-        less: Mapping[str, Array] = {field: getattr(data.inertial, field) - d[0] * signal}
-        return replace(data, inertial=replace(data.inertial, **less))
+    rates, forces = interpolate(stamps, middles, gyro), interpolate(stamps, middles, force)
+
+    def turned(data: SmootherInput, d: Array) -> SmootherInput:
+        changed = replace(data.inertial, gyro=data.inertial.gyro - d[0] * rates)
+        return replace(data, inertial=changed)
+
+    def pushed(data: SmootherInput, d: Array) -> SmootherInput:
+        changed = replace(data.inertial, force=data.inertial.force - d[0] * forces)
+        return replace(data, inertial=changed)
 
     return (
-        _scalar(
-            "imu.gyroscope.scale",
-            "",
-            "imu",
-            partial(scaled, "gyro", interpolate(stamps, middles, gyro)),
-        ),
-        _scalar(
-            "imu.accelerometer.scale",
-            "",
-            "imu",
-            partial(scaled, "force", interpolate(stamps, middles, force)),
-        ),
+        _scalar("imu.gyroscope.scale", "", "imu", turned),
+        _scalar("imu.accelerometer.scale", "", "imu", pushed),
     )
 
 

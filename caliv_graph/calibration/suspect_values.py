@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
@@ -94,7 +95,10 @@ def solved_again(
             else t
             for d, t in enumerate(trajectories)
         ]
-        scores = suspect_scores(solution, again, guesses)
+        # A lever arm moves the fixes only. A rotation also turns the vehicle frame, of which the
+        # ground and the guesses say more.
+        arm = name == LEVER_ARM.name
+        scores = motion_scores(again) if arm else suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
     index = [c.name for c in scores.candidates].index(name)

@@ -222,8 +222,8 @@ class _SuspectPart(Part):
     explains: Finite
     sigmas: Finite
     # Other writers leave these out.
-    change: list[Finite] = []
-    units: list[Text] = []
+    change: tuple[Finite, ...] = ()
+    units: tuple[Text, ...] = ()
     sigmas_left: Finite = 0.0
 
     def suspect(self) -> Suspect:

@@ -12,8 +12,10 @@ from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.errors import TargetError, TrajectoryError
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.products import (
@@ -28,6 +30,7 @@ from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.wording.suspects import motion_sentence
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,10 @@ def prepare(
     """
     with progress.stage("smoothing the trajectory", None):
         rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-    observations = extract_targets(recordings, rough, config, progress)
+    try:
+        observations = extract_targets(recordings, rough, config, progress)
+    except TargetError as e:
+        raise TargetError(f"{e}{_doubts_about_motion(rough, motions, config)}") from None
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations)
@@ -78,6 +84,20 @@ def prepare(
     return Prepared(
         tuple(trajectories), tuple(observations), tuple(grounds), (*warnings, *ground_warnings)
     )
+
+
+def _doubts_about_motion(
+    trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData], config: Config
+) -> str:
+    """What is most likely wrong by the motion data alone, for the end of a message; or nothing.
+
+    A wrong lever arm lets a target wander, and none is found.
+    """
+    try:
+        said = motion_sentence(motion_suspects(trajectories, motions, config))
+    except TrajectoryError:
+        return ""
+    return f". {said}" if said else ""
 
 
 def _stamps_seen(drives: int, observations: Sequence[TargetObservation]) -> list[list[int]]:

@@ -62,17 +62,47 @@ def ranked_suspects(
     """
     guesses = {name: configured_guess(config, name) for name in solution.lidars}
     ranked = ranking(suspect_scores(solution, trajectories, guesses))
-    if ranked and ranked[0].freed.sigmas > CONTRADICTION_SIGMAS:
-        again = solved_again(ranked[0], solution, trajectories, motions, config)
-        # How far the first linearisation contradicts stays; what it takes is known better now.
-        freed = replace(ranked[0].freed, change=again.change, cov=again.cov)
-        ranked = (replace(ranked[0], freed=freed), *ranked[1:])
+    ranked = _first_solved(ranked, solution, trajectories, motions, config)
     return named_suspects(ranked, config, guesses)
+
+
+def motion_suspects(
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Suspect, ...]:
+    """What the motion data alone say of the smoothers' inputs, ranked: no cloud is needed.
+
+    Arguments as of `ranked_suspects`. Empty where all poses were given.
+
+    Raises:
+        TrajectoryError: the motion data leave the trajectory undetermined.
+    """
+    ranked = ranking(motion_scores(trajectories))
+    ranked = _first_solved(ranked, None, trajectories, motions, config)
+    return named_suspects(ranked, config, {})
+
+
+def _first_solved(
+    ranked: tuple[Ranked, ...],
+    solution: Solution | None,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Ranked, ...]:
+    """The ranking with the value of its first suspect as `solved_again` has it, if it matters."""
+    if not ranked or ranked[0].freed.sigmas <= CONTRADICTION_SIGMAS:
+        return ranked
+    first, *rest = ranked
+    again = solved_again(first, solution, trajectories, motions, config)
+    # How far the first linearisation contradicts stays; what the input takes is known better now.
+    freed = replace(first.freed, change=again.change, cov=again.cov)
+    return (replace(first, freed=freed), *rest)
 
 
 def solved_again(
     first: Ranked,
-    solution: Solution,
+    solution: Solution | None,
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
@@ -80,9 +110,10 @@ def solved_again(
     """The value of the first suspect, the smoother solved with it free, where it is one of its.
 
     A lever arm that is a metre off is far from linear: robust weights and the noise of the fixes
-    were those of the wrong one. The clouds are as they were registered.
+    were those of the wrong one. The clouds are as they were registered; without a `solution` the
+    motion data say it alone.
     """
-    name, guesses = first.candidate.name, {n: configured_guess(config, n) for n in solution.lidars}
+    name = first.candidate.name
     known = np.sqrt(np.diag(first.freed.cov)) < KNOWN * first.candidate.scale
     begun = np.where(known, first.freed.change, 0.0)
     free = freed_in_smoother(config, name, begun)
@@ -97,8 +128,11 @@ def solved_again(
         ]
         # A lever arm moves the fixes only. A rotation also turns the vehicle frame, of which the
         # ground and the guesses say more.
-        arm = name == LEVER_ARM.name
-        scores = motion_scores(again) if arm else suspect_scores(solution, again, guesses)
+        if solution is None or name == LEVER_ARM.name:
+            scores = motion_scores(again)
+        else:
+            guesses = {n: configured_guess(config, n) for n in solution.lidars}
+            scores = suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
     index = [c.name for c in scores.candidates].index(name)

@@ -7,7 +7,7 @@ Needs the environment that scripts/demo makes:
     .venv/bin/python scripts/benchmark_suspects.py --summary
 
 A figure-eight whose antenna is at (1.2, 0.3, 0.85) m and whose IMU is turned by (1, -2, 5) degrees,
-clouds at 4 Hz. Each row changes one input of the config or one clock, and leaves the drive as it
+clouds at 2 Hz. Each row changes one input of the config or one clock, and leaves the drive as it
 is; signs and directions are drawn per seed. A run is
 a line in out/suspects/runs.jsonl, written when it ends; a second start runs the missing ones.
 Runs of another version of the program do not count unless --any-version is given.
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def scenario() -> Scenario:
     """The figure-eight with an antenna and an IMU that are not at the vehicle's origin."""
     model = load_scenario(REPOSITORY / "configs" / "scenarios" / "figure_eight.yaml")
-    lidars = {n: m.model_copy(update={"rate_hz": 4.0}) for n, m in model.lidars.items()}
+    lidars = {n: m.model_copy(update={"rate_hz": 2.0}) for n, m in model.lidars.items()}
     mounting = PoseConfig(xyz=(0.3, 0.1, 0.4), rpy_deg=IMU_RPY_DEG)
     return model.model_copy(
         update={

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 import scipy.linalg
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
-from caliv_graph.calibration.motion_suspects import motion_parts
+from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
 from caliv_graph.calibration.problem import with_heave
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.conventions import key_ground
@@ -210,7 +210,8 @@ def suspect_scores(
         gradient -= rows.T @ residual / STANCE_RAD**2
     if not blocks:
         return Scores((), np.zeros((0, 0)), np.zeros(0))
-    return _Quadratic(graph, motion, blocks).scores(information, gradient)
+    scores = _Quadratic(graph, motion, blocks).scores(information, gradient)
+    return replace(scores, misfit=worst_misfit(trajectories))
 
 
 def _of_clouds(parts: CloudParts) -> list[_Block]:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from caliv_graph.products import Array, ImuSamples, TwistSamples
 from caliv_graph.trajectory.columns import with_parameters
@@ -84,6 +86,23 @@ def with_suspects(
     """The trajectory with its suspects in the chain, for `joint`; and these."""
     suspects = suspect_parameters(smoothed)
     return with_parameters(smoothed, [s.parameter for s in suspects]), suspects
+
+
+def misfit(smoothed: SmoothedTrajectory) -> float:
+    """Variance of the residuals over what the noise of the sensors states; 1 or more.
+
+    The largest of GNSS, velocities and orientations, each by the median of its squared residuals:
+    outliers do not matter, and a single wrong input is small in most of them.
+    """
+    squares: dict[str, list[float]] = {kind: [] for kind in ("gnss", "velocity", "orientation")}
+    for number, kind in enumerate(smoothed.factor_kinds):
+        if kind in squares:
+            factor: Any = smoothed.graph.at(number)
+            residual = factor.unwhitenedError(smoothed.values)
+            white = factor.noiseModel().unweightedWhiten(residual)
+            squares[kind].append(float(white @ white))
+    usual = float(chdtri(3, 0.5))
+    return max([1.0, *(float(np.median(some)) / usual for some in squares.values() if some)])
 
 
 def _known(

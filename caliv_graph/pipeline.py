@@ -13,6 +13,7 @@ from caliv_graph.calibration.check import check
 from caliv_graph.calibration.choose import choose_static
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, TargetError, TrajectoryError
@@ -43,6 +44,7 @@ from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.wording.suspects import motion_sentence
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def prepare(
     raw = raw_findings(motions, config)
     raise_fatal(raw)
     findings = causes = raw
+    rough: Sequence[VehicleTrajectory] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
@@ -96,6 +99,9 @@ def prepare(
         causes = (*findings, *heading_findings(rough, motions, config, raw))
         config, doubts, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
+        said = "" if causes else _doubts_about_motion(rough, motions, config)
+        if said and isinstance(error, TargetError):
+            raise TargetError(error.what, said) from error
         raise with_cause(error, causes) from error
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
@@ -176,6 +182,19 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         return Look(None, findings, tuple(problems))
     return Look(observations, findings, tuple(problems))
+
+
+def _doubts_about_motion(
+    trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData], config: Config
+) -> str:
+    """What is most likely wrong by the motion data alone, for the end of a message; or nothing.
+
+    A wrong lever arm lets a target wander, and none is found.
+    """
+    try:
+        return motion_sentence(motion_suspects(trajectories, motions, config))
+    except TrajectoryError:
+        return ""
 
 
 def _stamps_seen(drives: int, observations: Sequence[TargetObservation]) -> list[list[int]]:

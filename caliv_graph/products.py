@@ -433,11 +433,13 @@ class VehicleParameter:
         sigma: (3,) in the same unit; of a rotation about the vehicle's axes. The user's own sigma
             is part of it.
         determined: per coordinate whether the drive alone determines it.
+        limits: axes of S2V of which half the variance or more comes from it.
     """
 
     value: Array
     sigma: Array
     determined: tuple[bool, bool, bool]
+    limits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

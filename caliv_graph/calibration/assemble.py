@@ -15,10 +15,10 @@ from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array, Calibration, Guess, Recording, Solution
+from caliv_graph.products import Array, Calibration, Guess, Recording, Solution, VehicleParameter
 from caliv_graph.uncertainty.assemble import assemble_matrices
-from caliv_graph.uncertainty.observability import assess
-from caliv_graph.wording.directions import named
+from caliv_graph.uncertainty.observability import assess, limited_axes
+from caliv_graph.wording.directions import named, same_as_parameters
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -43,6 +43,9 @@ def assemble(
         ),
         solution.T_vehicle_lidar,
     )
+    uncertainty = same_as_parameters(
+        uncertainty, solution.information_data, solution.information_knowing
+    )
     guesses = {name: configured_guess(config, name) for name in config.lidar_order()}
     information, gradient = _without_trust(solution, guesses)
     draft = assemble_matrices(
@@ -57,9 +60,8 @@ def assemble(
         solution.time_offsets,
     )
     provenance = _provenance(config, recordings, solution, digests)
-    return unmet_requirements(
-        replace(draft, provenance=provenance, vehicle=dict(solution.vehicle)), config
-    )
+    result = replace(draft, provenance=provenance, vehicle=_vehicle(solution))
+    return unmet_requirements(result, config)
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
@@ -86,6 +88,21 @@ def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Ar
             if gradient is not None:
                 gradient[rows] = 0.0
     return information, gradient
+
+
+def _vehicle(solution: Solution) -> dict[str, VehicleParameter]:
+    """Lever arm and rotation of the IMU, with the axes of S2V that they limit."""
+    return {
+        name: replace(
+            found,
+            limits=limited_axes(
+                solution.information_data,
+                solution.information_knowing[name],
+                solution.information_prior,
+            ),
+        )
+        for name, found in solution.vehicle.items()
+    }
 
 
 def _scans_used(solution: Solution) -> dict[str, int]:

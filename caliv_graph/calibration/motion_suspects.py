@@ -17,7 +17,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.suspects import SuspectParameter, with_suspects
+from caliv_graph.trajectory.suspects import SuspectParameter, misfit, with_suspects
 from caliv_graph.uncertainty.suspects import Candidate, Scores
 
 
@@ -86,7 +86,13 @@ def motion_scores(trajectories: Sequence[VehicleTrajectory]) -> Scores:
     for part in parts.values():
         own += part.own
         gradient += part.gradient
-    return Scores(candidates, own, gradient)
+    return Scores(candidates, own, gradient, worst_misfit(trajectories))
+
+
+def worst_misfit(trajectories: Sequence[VehicleTrajectory]) -> float:
+    """Of all drives (`trajectory.suspects.misfit`)."""
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    return max([1.0, *map(misfit, smoothed)])
 
 
 def _part(

@@ -28,6 +28,7 @@ def packed_solution(
     iterations: int,
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
+    tested: Reduced | None = None,
 ) -> Solution:
     """Packs the result, the whole graph and its linearisation: long for the fields of a record.
 
@@ -42,6 +43,7 @@ def packed_solution(
         iterations: of the loop.
         converged: whether its last step was below its tolerance.
         time_offsets: LiDAR -> offset and sigma, seconds.
+        tested: linearisation for score tests; None: `reduced`.
 
     Raises:
         SolveError: the covariance is not finite.
@@ -81,7 +83,9 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=reduced.linearised(problem, pose_graph(problem, state.noise, state.motion)),
+        linearised=(tested or reduced).linearised(
+            problem, pose_graph(problem, state.noise, state.motion)
+        ),
         time_offsets=time_offsets,
         gradient_data=reduced.c,
         vehicle={NAMES[name]: found for name, found in vehicle.items()},

@@ -6,6 +6,7 @@ orientations of the components eliminated, all clouds coupled) in the place of t
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -44,6 +45,7 @@ from caliv_graph.registration.register import (
     left_step,
 )
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry, refit
+from caliv_graph.uncertainty.consistency import RANGE_BIAS_LIMIT_M
 from caliv_graph.uncertainty.observability import (
     covariance_with_prior_in_null_space,
     spectrum,
@@ -163,11 +165,22 @@ class _Loop:
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
-    def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
-        clouds = shapes.joint(self.state.scale)
-        clouds = without_bias(*clouds, shapes.biases, self.state.range_bias_m)
+    def _without_bias(
+        self, shapes: _Shapes, lines: CloudLinearisation, most_m: float = math.inf
+    ) -> Reduced:
+        """The graph with the clouds' quadratic, the biases of the ranges eliminated.
+
+        `most_m` is the largest sigma of these, metres.
+        """
+        sigma_m = min(self.state.range_bias_m, most_m)
+        clouds = without_bias(*shapes.joint(self.state.scale), shapes.biases, sigma_m)
         return self._reduced(clouds, lines)
+
+    def tested(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
+        """The linearisation for score tests: biases beyond those of LiDARs explain nothing."""
+        if self.state.range_bias_m <= RANGE_BIAS_LIMIT_M:
+            return reduced
+        return self._without_bias(shapes, reduced.lines, RANGE_BIAS_LIMIT_M)
 
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
@@ -365,4 +378,5 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
         iterations=iterations,
         converged=converged,
         time_offsets=reduced.time_offsets(problem, cov),
+        tested=loop.tested(shapes, reduced),
     )

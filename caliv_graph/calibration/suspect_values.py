@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
@@ -26,6 +27,9 @@ FREE_ARM_M = 2.0
 
 FREE_ROTATION_DEG = 30.0
 """The same of the IMU's rotation, degrees."""
+
+KNOWN = 0.1
+"""Sigma over the candidate's scale below which the linear change is where the next solve begins."""
 
 _POSE_UNITS = ("m",) * 3 + ("deg",) * 3
 """Of a pose as the config has it: xyz, then roll, pitch, yaw."""
@@ -58,29 +62,61 @@ def ranked_suspects(
     """
     guesses = {name: configured_guess(config, name) for name in solution.lidars}
     ranked = ranking(suspect_scores(solution, trajectories, guesses))
-    if ranked and ranked[0].freed.sigmas > CONTRADICTION_SIGMAS:
-        again = solved_again(ranked[0], solution, trajectories, motions, config)
-        # How far the first linearisation contradicts stays; what it takes is known better now.
-        freed = replace(ranked[0].freed, change=again.change, cov=again.cov)
-        ranked = (replace(ranked[0], freed=freed), *ranked[1:])
+    ranked = _first_solved(ranked, solution, trajectories, motions, config)
     return named_suspects(ranked, config, guesses)
+
+
+def motion_suspects(
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Suspect, ...]:
+    """What the motion data alone say of the smoothers' inputs, ranked: no cloud is needed.
+
+    Arguments as of `ranked_suspects`. Empty where all poses were given.
+
+    Raises:
+        TrajectoryError: the motion data leave the trajectory undetermined.
+    """
+    ranked = ranking(motion_scores(trajectories))
+    ranked = _first_solved(ranked, None, trajectories, motions, config)
+    return named_suspects(ranked, config, {})
+
+
+def _first_solved(
+    ranked: tuple[Ranked, ...],
+    solution: Solution | None,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Ranked, ...]:
+    """The ranking with the value of its first suspect as `solved_again` has it, if it matters."""
+    if not ranked or ranked[0].freed.sigmas <= CONTRADICTION_SIGMAS:
+        return ranked
+    first, *rest = ranked
+    again = solved_again(first, solution, trajectories, motions, config)
+    # How far the first linearisation contradicts stays; what the input takes is known better now.
+    freed = replace(first.freed, change=again.change, cov=again.cov)
+    return (replace(first, freed=freed), *rest)
 
 
 def solved_again(
     first: Ranked,
-    solution: Solution,
+    solution: Solution | None,
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
 ) -> Freed:
-    """What freeing the first suspect gives, the smoother solved with it free, where that is one.
+    """The value of the first suspect, the smoother solved with it free, where it is one of its.
 
     A lever arm that is a metre off is far from linear: robust weights and the noise of the fixes
-    were those of the wrong one. The clouds are as they were registered.
+    were those of the wrong one. The clouds are as they were registered; without a `solution` the
+    motion data say it alone.
     """
-    guesses = {name: configured_guess(config, name) for name in solution.lidars}
     name = first.candidate.name
-    free = freed_in_smoother(config, name)
+    known = np.sqrt(np.diag(first.freed.cov)) < KNOWN * first.candidate.scale
+    begun = np.where(known, first.freed.change, 0.0)
+    free = freed_in_smoother(config, name, begun)
     if free is None:
         return first.freed
     try:
@@ -90,25 +126,47 @@ def solved_again(
             else t
             for d, t in enumerate(trajectories)
         ]
-        scores = suspect_scores(solution, again, guesses)
+        # A lever arm moves the fixes only. A rotation also turns the vehicle frame, of which the
+        # ground and the guesses say more.
+        if solution is None or name == LEVER_ARM.name:
+            scores = motion_scores(again)
+        else:
+            guesses = {n: configured_guess(config, n) for n in solution.lidars}
+            scores = suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
     index = [c.name for c in scores.candidates].index(name)
     # The sigma that freed it is no property of the input.
     candidates = list(scores.candidates)
     candidates[index] = first.candidate
-    return replace(scores, candidates=tuple(candidates)).freed([index])
+    found = replace(scores, candidates=tuple(candidates)).freed([index])
+    return replace(found, change=_after(name, begun, found.change))
 
 
-def freed_in_smoother(config: Config, name: str) -> Config | None:
-    """The config with a wide sigma on an input that the smoother estimates; None: no such input."""
+def freed_in_smoother(config: Config, name: str, change: Array) -> Config | None:
+    """The config with an input moved, with a wide sigma; None: the smoother does not estimate it.
+
+    `change` (3,) is of the lever arm, metres, or of the IMU's rotation about the vehicle's axes.
+    """
     if name == LEVER_ARM.name:
-        gnss = config.gnss.model_copy(update={"lever_arm_sigma": FREE_ARM_M})
-        return config.model_copy(update={"gnss": gnss})
-    if name == IMU_ROTATION.name:
-        imu = config.imu.model_copy(update={"rotation_sigma_deg": FREE_ROTATION_DEG})
-        return config.model_copy(update={"imu": imu})
+        arm = np.zeros(3) if config.gnss.lever_arm is None else np.array(config.gnss.lever_arm)
+        moved = {"lever_arm": tuple((arm + change).tolist()), "lever_arm_sigma": FREE_ARM_M}
+        return config.model_copy(update={"gnss": config.gnss.model_copy(update=moved)})
+    if name == IMU_ROTATION.name and config.imu.T_vehicle_imu.rpy_deg is not None:
+        R = gtsam.Rot3.Expmap(change).compose(config.imu.T_vehicle_imu.pose().rotation())
+        rpy_deg = tuple(np.degrees(R.rpy()).tolist())
+        T_vehicle_imu = config.imu.T_vehicle_imu.model_copy(update={"rpy_deg": rpy_deg})
+        turned = {"T_vehicle_imu": T_vehicle_imu, "rotation_sigma_deg": FREE_ROTATION_DEG}
+        return config.model_copy(update={"imu": config.imu.model_copy(update=turned)})
     return None
+
+
+def _after(name: str, first: Array, second: Array) -> Array:
+    """Two changes after each other, as one."""
+    if name != IMU_ROTATION.name:
+        return first + second
+    both = gtsam.Rot3.Expmap(second).compose(gtsam.Rot3.Expmap(first))
+    return np.asarray(gtsam.Rot3.Logmap(both))
 
 
 def named_suspects(

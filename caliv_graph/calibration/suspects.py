@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 import scipy.linalg
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
-from caliv_graph.calibration.motion_suspects import motion_parts
+from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
 from caliv_graph.calibration.problem import with_heave
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.conventions import key_ground
@@ -210,7 +210,8 @@ def suspect_scores(
         gradient -= rows.T @ residual / STANCE_RAD**2
     if not blocks:
         return Scores((), np.zeros((0, 0)), np.zeros(0))
-    return _Quadratic(graph, motion, blocks).scores(information, gradient)
+    scores = _Quadratic(graph, motion, blocks).scores(information, gradient)
+    return replace(scores, misfit=worst_misfit(trajectories))
 
 
 def _of_clouds(parts: CloudParts) -> list[_Block]:
@@ -297,7 +298,7 @@ def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> 
         if len(mine) < 2 * DRIFT_WAVES:
             continue
         given = not isinstance(trajectory, SmoothedTrajectory)
-        if not given and trajectory.origin_deg_m is None:
+        if isinstance(trajectory, SmoothedTrajectory) and trajectory.origin_deg_m is None:
             continue
         begin, end = trajectory.span_ns
         part = (stamps[mine] - begin) / (end - begin)
@@ -332,7 +333,7 @@ def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory
     of = np.isin(drives, given)
     if not of.any():
         return []
-    columns = np.kron(of[:, None], np.eye(6))
+    columns = np.asarray(np.kron(of[:, None], np.eye(6)), np.float64)
     candidate = Candidate("poses.frame", np.zeros(6), GUESS_SCALE)
     return [_Block(candidate, poses=columns)]
 

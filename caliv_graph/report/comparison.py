@@ -10,6 +10,8 @@ from rich.text import Text
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.compare import Comparison, Movement
 from caliv_graph.fusion.merge import Merger
+from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.products import Calibration
 from caliv_graph.report.layout import (
     UNKNOWN,
     axis_headings,
@@ -17,8 +19,8 @@ from caliv_graph.report.layout import (
     sentences,
     titled,
 )
-from caliv_graph.report.numbers import SHOWN_AXES, value_and_sigma
-from caliv_graph.report.tables import calibration_table
+from caliv_graph.report.numbers import SHOWN_AXES, fixed, value_and_sigma
+from caliv_graph.report.tables import STATUS_STYLES, calibration_table
 
 
 def comparison_table(comparison: Comparison, labels: tuple[str, str], p_value: float) -> Group:
@@ -168,3 +170,22 @@ def _verdict(movement: Movement) -> list[Text]:
 
 def _tests(comparison: Comparison) -> int:
     return sum(len(m.tests) for m in comparison.movements)
+
+
+def trial_table(first: Calibration, second: Calibration, change: str) -> RenderableType:
+    """The run with the first suspect freed beside the first run; `change` of the config."""
+    table = new_table("", *axis_headings("mm", "mrad"))
+    for name, lidar in second.lidars.items():
+        moved = vehicle_axes_difference(lidar.T_vehicle_lidar, first.lidars[name].T_vehicle_lidar)
+        cells = [Text(fixed(1e3 * float(moved[AXES.index(axis)]), 2)) for axis in SHOWN_AXES]
+        table.add_row(Text(f"S2V {name}"), *cells)
+    style = STATUS_STYLES.get(second.status, "bold")
+    parts: list[RenderableType] = [
+        "",
+        Text.assemble(
+            f"Tried: {change}. Status: {first.status} before, ", (second.status, style), " now."
+        ),
+    ]
+    parts += sentences("Contradictions that are left:", second.contradictions)
+    parts += titled("What the extrinsics change by, vehicle axes", table)
+    return Group(*parts)

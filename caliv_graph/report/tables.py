@@ -15,6 +15,7 @@ from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import SHOWN_AXES, Cell, fixed, pair_cells, pose_cells
 from caliv_graph.wording.suspects import suspect_row
+from caliv_graph.wording.vehicle import vehicle_text
 
 _HELD = "held"
 
@@ -57,6 +58,8 @@ def calibration_table(
             )
         )
     parts += sentences("Clocks (header stamp minus true acquisition):", _offset_texts(calibration))
+    measured = [vehicle_text(name, found) for name, found in calibration.vehicle.items()]
+    parts += sentences("Measured by hand, as the drive sees it:", measured)
     unseen = [
         f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess"
         for name, result in calibration.lidars.items()

@@ -37,8 +37,8 @@ _HEADER = """\
 # the LiDAR (of `from` in a pair). They include the priors; data_information does not.
 # determined, sigma_vehicle_axes and the directions of observability: the vehicle's axes, at the
 # LiDAR's origin. `determined` of a pair: the axes of `to`.
-# vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna, vehicle frame.
-# imu_rotation: roll, pitch, yaw of T_vehicle_imu, its sigmas about the vehicle's axes.
+# vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna in the vehicle's
+# axes. imu_rotation: roll, pitch, yaw of T_vehicle_imu, its sigmas about the vehicle's axes.
 """
 
 
@@ -189,6 +189,7 @@ def _vehicle_document(calibration: Calibration) -> dict[str, Any]:
             f"value{suffix}": (unit * found.value).tolist(),
             f"sigma{suffix}": (unit * found.sigma).tolist(),
             "determined": [bool(yes) for yes in found.determined],
+            "limits": list(found.limits),
         }
     return {"vehicle": out} if out else {}
 

@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Annotated, Any, Literal, Self, get_args
 
 import gtsam
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
     Field,
     StrictBool,
     ValidationInfo,
@@ -37,8 +33,23 @@ from caliv_graph.products import (
     Guess,
     LidarResult,
     Suspect,
-    VehicleParameter,
 )
+from caliv_graph.results.fields import (
+    Count,
+    Finite,
+    Matrix,
+    Number,
+    Part,
+    PoseMatrix,
+    Sigma,
+    Text,
+    Vector6,
+    check_matrix,
+    near,
+    symmetric,
+    unit,
+)
+from caliv_graph.results.vehicle import VehiclePart
 from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
 
@@ -47,112 +58,12 @@ Schema = Literal["caliv-graph/calibration/1"]
 
 Status = Literal["ok", "partial", "inconsistent"]
 
-_NORM_TOLERANCE = 1e-3
-"""Of a quaternion, as in the readers: the effect of rounding to three decimals."""
-
-_MOST_COUNT = 10**15
-"""Whole numbers up to here are exact as floats."""
-
-_MOST_M = 1e8
-"""Of a distance between two frames: the earth is 12,742 km wide."""
-
-_MOST_OF_A_MATRIX = 1e60
-"""Of a covariance or an information: products of such numbers stay finite."""
-
-_SYMMETRY_TOLERANCE = 1e-6
-_EIGENVALUE_TOLERANCE = 1e-6
-"""Both of a matrix scaled to ones on its diagonal: well above the effect of writing six digits."""
-
-
-def _no_flag(raw: Any) -> Any:
-    if isinstance(raw, bool):
-        raise ValueError("must be a number")
-    return raw
-
-
-def _to_text(raw: Any) -> Any:
-    """YAML takes some names and sentences for a number, a date, a flag or nothing."""
-    return raw if isinstance(raw, Mapping | list | set) else str(raw)
-
-
-def _near(xyz: tuple[float, float, float]) -> tuple[float, float, float]:
-    if max(map(abs, xyz)) > _MOST_M:
-        raise ValueError(f"must be within {_MOST_M:g} m")
-    return xyz
-
-
-def _unit(xyzw: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    norm = float(np.linalg.norm(xyzw))
-    if abs(norm - 1.0) > _NORM_TOLERANCE:
-        raise ValueError(f"must have norm 1 within {_NORM_TOLERANCE:g}, has {norm:.6g}")
-    return xyzw
-
-
-def _check_matrix(rows: list[list[float]], size: int) -> list[list[float]]:
-    """Refuses rows that are no covariance or information of this size."""
-    if len(rows) != size:
-        raise ValueError(f"must be {size} rows of {size} numbers, has {len(rows)} rows")
-    for number, row in enumerate(rows, start=1):
-        if len(row) != size:
-            raise ValueError(f"must have {size} numbers in row {number}, has {len(row)}")
-    matrix = np.array(rows)
-    if np.abs(matrix).max() > _MOST_OF_A_MATRIX:
-        i, j = divmod(int(np.abs(matrix).argmax()), size)
-        raise ValueError(
-            f"must be within +-{_MOST_OF_A_MATRIX:g}, has {matrix[i, j]:g} in row {i + 1}, column "
-            f"{j + 1}"
-        )
-    diagonal = np.diag(matrix)
-    if np.any(diagonal < 0.0):
-        i = int(np.argmin(diagonal))
-        raise ValueError(f"is no covariance: {diagonal[i]:g} on the diagonal, in row {i + 1}")
-    sigma = np.sqrt(diagonal)
-    # A row of zeros stays zero; other numbers beside a zero on the diagonal show as indefinite.
-    scale = np.where(sigma > 0.0, sigma, sigma.max() or 1.0)
-    scaled = matrix / np.outer(scale, scale)
-    asymmetry = np.abs(scaled - scaled.T)
-    if asymmetry.max() > _SYMMETRY_TOLERANCE:
-        i, j = divmod(int(asymmetry.argmax()), size)
-        raise ValueError(
-            f"is not symmetric: {matrix[i, j]:g} in row {i + 1}, column {j + 1}, but "
-            f"{matrix[j, i]:g} in row {j + 1}, column {i + 1}"
-        )
-    smallest = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
-    if smallest < -_EIGENVALUE_TOLERANCE:
-        raise ValueError(
-            "is not positive semidefinite: scaled to ones on its diagonal it has the eigenvalue "
-            f"{smallest:.3g}"
-        )
-    return rows
-
-
-def _symmetric(rows: list[list[float]]) -> Array:
-    """The matrix of `_check_matrix`, without the rounding errors of its writer."""
-    matrix = np.array(rows)
-    return np.asarray((matrix + matrix.T) / 2.0)
-
-
-Text = Annotated[str, BeforeValidator(_to_text)]
-Count = Annotated[int, Field(ge=0, le=_MOST_COUNT), BeforeValidator(_no_flag)]
-Number = Annotated[float, BeforeValidator(_no_flag)]
-Finite = Annotated[float, Field(allow_inf_nan=False), BeforeValidator(_no_flag)]
-Sigma = Annotated[float, Field(allow_inf_nan=False, gt=0.0), BeforeValidator(_no_flag)]
-Vector6 = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
-Matrix = list[list[Finite]]
-PoseMatrix = Annotated[Matrix, AfterValidator(partial(_check_matrix, size=6))]
-
-
-class Part(BaseModel):
-    """A part of a result's file. Unknown keys are ignored: other programs add their own."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
 
 class PosePart(Part):
     """A pose `T_a_b`, metres. `rpy_deg` beside these is for people, and is not read."""
 
-    translation: Annotated[tuple[Finite, Finite, Finite], AfterValidator(_near)]
-    quaternion_xyzw: Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_unit)]
+    translation: Annotated[tuple[Finite, Finite, Finite], AfterValidator(near)]
+    quaternion_xyzw: Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(unit)]
 
     def pose(self) -> gtsam.Pose3:
         """`T_a_b`."""
@@ -206,7 +117,7 @@ class _LidarPart(Part):
         offset = self.time_offset
         return LidarResult(
             T_vehicle_lidar=self.T_vehicle_lidar.pose(),
-            cov=_symmetric(self.covariance),
+            cov=symmetric(self.covariance),
             determined={axis: getattr(self.determined, axis) for axis in AXES},
             scans_used=self.scans_used,
             saw_target=has_data if self.saw_target is None else self.saw_target,
@@ -229,7 +140,7 @@ class _OrderedPart(Part):
         order = info.data.get("order", ())
         size = 6 * len(order)
         if size and info.field_name in ("covariance", "data_information"):
-            _check_matrix(value, size)
+            check_matrix(value, size)
         if size and info.field_name == "data_gradient" and value is not None and len(value) != size:
             raise ValueError(f"must be {size} numbers, has {len(value)}")
         if info.field_name == "T_vehicle_lidar" and not set(order) <= value.keys():
@@ -252,7 +163,7 @@ class _EarlierPart(_OrderedPart):
         return DataTerm(
             sources=tuple(self.drive_sha256),
             T_vehicle_lidar=poses,
-            information=axes @ _symmetric(self.data_information) @ axes.T,
+            information=axes @ symmetric(self.data_information) @ axes.T,
             gradient=axes @ np.array(self.data_gradient),
         )
 
@@ -302,38 +213,6 @@ class _PairPart(Part):
     covariance: PoseMatrix
 
 
-class _ArmPart(Part):
-    value: tuple[Finite, Finite, Finite]
-    sigma: tuple[Sigma, Sigma, Sigma]
-    determined: tuple[StrictBool, StrictBool, StrictBool]
-
-
-class _TurnPart(Part):
-    value_deg: tuple[Finite, Finite, Finite]
-    sigma_deg: tuple[Sigma, Sigma, Sigma]
-    determined: tuple[StrictBool, StrictBool, StrictBool]
-
-
-class _VehiclePart(Part):
-    """What was measured by hand on the vehicle, as it was estimated."""
-
-    lever_arm: _ArmPart | None = None
-    imu_rotation: _TurnPart | None = None
-
-    def parameters(self) -> dict[str, VehicleParameter]:
-        """In metres and radians."""
-        out = {}
-        if self.lever_arm is not None:
-            arm = self.lever_arm
-            value, sigma = np.array(arm.value), np.array(arm.sigma)
-            out["lever_arm"] = VehicleParameter(value, sigma, arm.determined)
-        if self.imu_rotation is not None:
-            turn = self.imu_rotation
-            value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
-            out["imu_rotation"] = VehicleParameter(value, sigma, turn.determined)
-        return out
-
-
 class _SuspectPart(Part):
     """An input that could be wrong."""
 
@@ -343,8 +222,8 @@ class _SuspectPart(Part):
     explains: Finite
     sigmas: Finite
     # Other writers leave these out.
-    change: list[Finite] = []
-    units: list[Text] = []
+    change: tuple[Finite, ...] = ()
+    units: tuple[Text, ...] = ()
     sigmas_left: Finite = 0.0
 
     def suspect(self) -> Suspect:
@@ -375,7 +254,7 @@ class CalibrationModel(Part):
     contradictions: tuple[Text, ...] = ()
     suspects: tuple[_SuspectPart, ...] = ()
     provenance: dict[Text, Any] = Field({})
-    vehicle: _VehiclePart = _VehiclePart()
+    vehicle: VehiclePart = VehiclePart()
 
     @model_validator(mode="after")
     def _knows_all_names(self) -> Self:
@@ -401,7 +280,7 @@ class CalibrationModel(Part):
     def calibration(self) -> Calibration:
         """The calibration. The LiDARs are in the order of the matrices."""
         joint = self.joint
-        information = _symmetric(joint.data_information)
+        information = symmetric(joint.data_information)
         lidars = {
             name: self.lidars[name].result(bool(np.any(information[6 * i : 6 * i + 6])))
             for i, name in enumerate(joint.order)
@@ -412,7 +291,7 @@ class CalibrationModel(Part):
             status=self.status,
             reference=self.reference,
             lidars=lidars,
-            cov_joint=_symmetric(joint.covariance),
+            cov_joint=symmetric(joint.covariance),
             information_data=information,
             undetermined=tuple(d.read(poses) for d in self.observability.undetermined),
             weak=tuple(d.read(poses) for d in self.observability.weak),
@@ -430,9 +309,7 @@ class CalibrationModel(Part):
         if self.sensor_to_sensor is None:
             pairs = sensor_pairs(calibration.lidars, calibration.reference)
             return {pair: pair_covariance(calibration, *pair) for pair in pairs}
-        return {
-            (pair.from_, pair.to): _symmetric(pair.covariance) for pair in self.sensor_to_sensor
-        }
+        return {(pair.from_, pair.to): symmetric(pair.covariance) for pair in self.sensor_to_sensor}
 
 
 class _TrueLidarPart(Part):

@@ -17,3 +17,9 @@ RESULT_FILES = (
     "graph.values.gtsam",
 )
 """Patterns for `common.files.output_folder`, the main file first."""
+
+SUSPECT_FOLDER = "suspect"
+"""Of the run with the first suspect freed (`calibrate --try-suspects`), beside the first run."""
+
+FILES_OF_BOTH_RUNS = (*RESULT_FILES, *(f"{SUSPECT_FOLDER}/{name}" for name in RESULT_FILES))
+"""The same with that run."""

@@ -8,6 +8,7 @@ origin, and without an orientation source its heading is the x axis.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from caliv_graph.products import Array, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.initial import first_states
 from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources
 from caliv_graph.trajectory.measurements import nearest_node
+from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.outliers import solve_without_outliers
 from caliv_graph.trajectory.parameters import UncertainParameter
@@ -53,6 +55,8 @@ def smooth_trajectory(
     data, warnings = check_input(motion, config)
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
+    if needs_guess(data):
+        data = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
     parameters = uncertain_parameters(data)
     if are_wide(parameters):
@@ -125,6 +129,13 @@ def _at_wanted(
         T_map_vehicle=poses_of_vehicle(states, i, data.T_vehicle_imu),
         cov=np.asarray(cov[i]),
     )
+
+
+def _solved_roughly(nodes: IntArray, data: SmootherInput) -> States:
+    """The states of an input, outliers among its fixes."""
+    states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    none = np.zeros(0, dtype=np.int64)
+    return solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE).states
 
 
 def _roughly_settled(

@@ -7,11 +7,12 @@ chain of the estimate, without another solve. `uncertainty.suspects` ranks them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from caliv_graph.products import Array, ImuSamples, TwistSamples
 from caliv_graph.trajectory.columns import with_parameters
@@ -85,6 +86,23 @@ def with_suspects(
     """The trajectory with its suspects in the chain, for `joint`; and these."""
     suspects = suspect_parameters(smoothed)
     return with_parameters(smoothed, [s.parameter for s in suspects]), suspects
+
+
+def misfit(smoothed: SmoothedTrajectory) -> float:
+    """Variance of the residuals over what the noise of the sensors states; 1 or more.
+
+    The largest of GNSS, velocities and orientations, each by the median of its squared residuals:
+    outliers do not matter, and a single wrong input is small in most of them.
+    """
+    squares: dict[str, list[float]] = {kind: [] for kind in ("gnss", "velocity", "orientation")}
+    for number, kind in enumerate(smoothed.factor_kinds):
+        if kind in squares:
+            factor: Any = smoothed.graph.at(number)
+            residual = factor.unwhitenedError(smoothed.values)
+            white = factor.noiseModel().unweightedWhiten(residual)
+            squares[kind].append(float(white @ white))
+    usual = float(chdtri(3, 0.5))
+    return max([1.0, *(float(np.median(some)) / usual for some in squares.values() if some)])
 
 
 def _known(
@@ -169,23 +187,19 @@ def _inertial_scales(smoothed: SmoothedTrajectory) -> tuple[InputParameter, Inpu
     middles = nodes[:-1] + np.diff(nodes) // 2
     stamps = smoothed.inertial.stamps_ns
 
-    def scaled(field: str, signal: Array, data: SmootherInput, d: Array) -> SmootherInput:
-        less: Mapping[str, Array] = {field: getattr(data.inertial, field) - d[0] * signal}
-        return replace(data, inertial=replace(data.inertial, **less))
+    rates, forces = interpolate(stamps, middles, gyro), interpolate(stamps, middles, force)
+
+    def turned(data: SmootherInput, d: Array) -> SmootherInput:
+        changed = replace(data.inertial, gyro=data.inertial.gyro - d[0] * rates)
+        return replace(data, inertial=changed)
+
+    def pushed(data: SmootherInput, d: Array) -> SmootherInput:
+        changed = replace(data.inertial, force=data.inertial.force - d[0] * forces)
+        return replace(data, inertial=changed)
 
     return (
-        _scalar(
-            "imu.gyroscope.scale",
-            "",
-            "imu",
-            partial(scaled, "gyro", interpolate(stamps, middles, gyro)),
-        ),
-        _scalar(
-            "imu.accelerometer.scale",
-            "",
-            "imu",
-            partial(scaled, "force", interpolate(stamps, middles, force)),
-        ),
+        _scalar("imu.gyroscope.scale", "", "imu", turned),
+        _scalar("imu.accelerometer.scale", "", "imu", pushed),
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from caliv_graph.conventions import key_imu, key_parameters
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.build import from_values
 from caliv_graph.trajectory.chain import UNDETERMINED, inverse_of
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
@@ -31,8 +32,9 @@ MAX_STEPS = 15
 """Of the parameters. Sound figures take one or two; a lever arm that is unknown about five, under
 the weights of Huber's kernel."""
 
-STEP_SIGMAS = 0.01
-"""Step of a parameter, in sigmas of what is then known of it, at which it has converged."""
+STEP_SIGMAS, ROUGH_STEP_SIGMAS = 0.01, 0.1
+"""Step of a parameter, in sigmas of what is then known of it, at which it has converged; while
+outliers are still in the graph."""
 
 WIDE_SIGMAS = {LEVER_ARM.name: 0.05, IMU_ROTATION.name: np.radians(1.0)}
 """From these prior sigmas on (m, rad) an error would make sound fixes look like outliers: three
@@ -114,12 +116,19 @@ def settle(
         )
         linear = _with_variable(estimate.graph.factors.linearize(estimate.values), columns)
         offset = np.concatenate([np.asarray(p.offset) for p in parameters])
-        step, cov = _step(linear, len(nodes), data.yaw_bias, -offset, sigmas)
-        small = (np.abs(step) < STEP_SIGMAS * np.sqrt(np.diag(cov))).all()
-        if small or number == MAX_STEPS:
+        tree = _eliminated(linear, len(nodes), data.yaw_bias, -offset, sigmas)
+        solution = tree.optimize()
+        step = np.asarray(solution.at(key_parameters()))
+        root = tree.marginalFactor(key_parameters(), gtsam.EliminateQR)
+        cov = inverse_of(root.information())
+        enough = STEP_SIGMAS if tolerance == ERROR_TOLERANCE else ROUGH_STEP_SIGMAS
+        if (np.abs(step) < enough * np.sqrt(np.diag(cov))).all() or number == MAX_STEPS:
             break
         data, parameters = _moved(data, parameters, step)
-        estimate = solve(data, nodes, estimate.states, dropped, kernel, tolerance)
+        # The states move with the parameters: an antenna that is a metre off leaves its fixes with
+        # small robust weights.
+        states = from_values(estimate.values.retract(solution), len(nodes), data)
+        estimate = solve(data, nodes, states, dropped, kernel, tolerance)
     return Settled(data, estimate, parameters, columns, cov)
 
 
@@ -159,15 +168,6 @@ def _with_variable(linear: gtsam.GaussianFactorGraph, columns: Array) -> gtsam.G
 
 _DIMS = {"i": 6, "v": 3, "b": 6, "y": 1}
 """Coordinates of the variables of a trajectory, by letter."""
-
-
-def _step(
-    linear: gtsam.GaussianFactorGraph, n: int, yaw_bias: bool, mean: Array, sigmas: Array
-) -> tuple[Array, Array]:
-    """Step (p,) of the parameters under a prior, and their covariance (p, p)."""
-    tree = _eliminated(linear, n, yaw_bias, mean, sigmas)
-    root = tree.marginalFactor(key_parameters(), gtsam.EliminateQR)
-    return np.asarray(tree.optimize().at(key_parameters())), inverse_of(root.information())
 
 
 def _eliminated(

@@ -34,6 +34,9 @@ RIGID_COSINE = 0.98
 """Of the angle between a rigid motion and the undetermined subspace, above which the motion is
 undetermined."""
 
+SAME_SHARE = 0.5
+"""An uncertain parameter of the vehicle is named where it makes up half of a variance or more."""
+
 AXIS_SHARE = 0.05
 LIDAR_SHARE = 0.01
 """An axis is undetermined if it has more than the first fraction of its LiDAR's part of the
@@ -193,6 +196,26 @@ def _directions(
             )
         )
     return tuple(out)
+
+
+def looks_the_same(direction: Direction, D: Array, D_knowing: Array) -> bool:
+    """Whether an undetermined direction is one because a parameter of the vehicle is uncertain.
+
+    `D` and `D_knowing` (6n, 6n) are the information of the data, the parameter free and known, over
+    the LiDARs of the direction.
+    """
+    vector = np.concatenate(list(direction.vector.values()))
+    return float(vector @ D @ vector) < SAME_SHARE * float(vector @ D_knowing @ vector)
+
+
+def limited_axes(D: Array, D_knowing: Array, prior: Array) -> tuple[str, ...]:
+    """Axes of S2V with `SAME_SHARE` of their variance or more from a parameter, of any LiDAR.
+
+    All (6n, 6n): information of the data, the same if the parameter were known, of the guesses.
+    """
+    known, free = (np.diag(np.linalg.inv(A + prior)).reshape(-1, 6) for A in (D_knowing, D))
+    limited = np.asarray((known < (1.0 - SAME_SHARE) * free).any(axis=0))
+    return tuple(axis for axis, yes in zip(AXES, limited.tolist(), strict=True) if yes)
 
 
 def simplified(basis: Array) -> Array:

@@ -106,11 +106,14 @@ class Scores:
         candidates: in the order of the parameters.
         information: (K, K).
         gradient: (K,).
+        misfit: variance of the data over what their model states, at least 1: where noise is
+            stated too small, scores spread by as much more.
     """
 
     candidates: tuple[Candidate, ...]
     information: Array
     gradient: Array
+    misfit: float = 1.0
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -152,7 +155,7 @@ class Scores:
         known = values > 1.0
         V, values = vectors[:, known], values[known]
         along = (V.T @ c_i) / values
-        cov = np.diag(1.0 / values)
+        cov = np.diag(self.misfit / values)
         null = cov + (V.T * allowance[of] ** 2) @ V
         squares = float(along @ np.linalg.solve(null, along)) if len(along) else 0.0
         unit, lost = self.scale[of], vectors[:, ~known]
@@ -168,16 +171,6 @@ class Scores:
         """Parameters of some candidates, ascending."""
         parts = [np.arange(*self.slices[i].indices(len(self.scale))) for i in sorted(which)]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
-
-    def among(self, wanted: Collection[str]) -> Scores:
-        """The same of some candidates by name: the others are taken for exactly right."""
-        which = [i for i, c in enumerate(self.candidates) if c.name in wanted]
-        rows = self._rows(which)
-        return Scores(
-            tuple(self.candidates[i] for i in which),
-            self.information[np.ix_(rows, rows)],
-            self.gradient[rows],
-        )
 
 
 def ranking(scores: Scores) -> tuple[Ranked, ...]:

@@ -10,7 +10,12 @@ import numpy as np
 
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Array, Direction, Uncertainty
-from caliv_graph.uncertainty.observability import UNIT, rigid_twist, undetermined_twists
+from caliv_graph.uncertainty.observability import (
+    UNIT,
+    looks_the_same,
+    rigid_twist,
+    undetermined_twists,
+)
 from caliv_graph.uncertainty.predicted import PredictedCovariance
 
 NOTABLE = 0.2
@@ -48,6 +53,35 @@ REMEDY_SYMMETRY = (
     "use a target without rotational symmetry, such as a chair, and let these LiDARs see the same "
     "side of it: pass it in both directions, or add a second target"
 )
+
+
+PARAMETER_KEYS = {"lever_arm": "gnss.lever_arm", "imu_rotation": "imu.T_vehicle_imu"}
+"""What was measured by hand on the vehicle -> its key in the config."""
+
+
+def same_as_parameters(
+    uncertainty: Uncertainty, D: Array, knowing: Mapping[str, Array]
+) -> Uncertainty:
+    """The named findings, with the parameters of the vehicle that look the same as a direction.
+
+    `D` (6n, 6n) is the information of the data, `knowing` the same if a parameter were known.
+    """
+    undetermined = []
+    for direction in uncertainty.undetermined:
+        keys = [
+            PARAMETER_KEYS[name]
+            for name, D_knowing in knowing.items()
+            if looks_the_same(direction, D, D_knowing)
+        ]
+        if keys:
+            which = _listed(keys)
+            direction = replace(
+                direction,
+                text=f"{direction.text}; an error of {which} looks the same",
+                remedy=f"measure {which} and state its sigma, or {direction.remedy}",
+            )
+        undetermined.append(direction)
+    return replace(uncertainty, undetermined=tuple(undetermined))
 
 
 def named(uncertainty: Uncertainty, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Uncertainty:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from caliv_graph.products import Suspect
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
 
 MOST_NEXT = 2
 """Suspects that are named after the first."""
@@ -25,6 +26,13 @@ def ranking_sentence(suspects: Sequence[Suspect]) -> str:
         f"most likely: {first.input}, {_by(first)}; it explains {100.0 * first.explains:.0f} "
         f"percent of the contradiction ({first.sigmas:.0f} sigma){then}. {remedy(first)}"
     )
+
+
+def motion_sentence(suspects: Sequence[Suspect]) -> str:
+    """What the motion data alone contradict; empty if nothing is beyond 5 sigma."""
+    if not suspects or suspects[0].sigmas <= CONTRADICTION_SIGMAS:
+        return ""
+    return f"The motion data contradict each other, {ranking_sentence(suspects)}"
 
 
 def suspect_row(suspect: Suspect) -> tuple[str, str, str, str, str]:

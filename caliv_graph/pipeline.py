@@ -99,9 +99,10 @@ def prepare(
         causes = (*findings, *heading_findings(rough, motions, config, raw))
         config, doubts, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
-        said = "" if causes else _doubts_about_motion(rough, motions, config)
-        if said and isinstance(error, TargetError):
-            raise TargetError(error.what, said) from error
+        if isinstance(error, TargetError) and not causes:
+            said = _doubts_about_motion(rough, motions, config)
+            if said:
+                raise TargetError(error.what, said) from error
         raise with_cause(error, causes) from error
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):

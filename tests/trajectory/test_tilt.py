@@ -66,7 +66,7 @@ def test_in_reverse_the_climb_counts_backwards() -> None:
 
 def leaning(*rpy_deg: float, parallel_sigma_deg: float | None = None) -> Config:
     """The config of a user who takes the IMU for turned by these angles."""
-    mounted = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [*rpy_deg, 0.0]}}
+    mounted: dict[str, object] = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [*rpy_deg, 0.0]}}
     ground: dict[str, object] = {"parallel_sigma_deg": parallel_sigma_deg}
     return config_for(Sensors(), imu=mounted, ground=ground)
 

@@ -1,6 +1,6 @@
 """The raw sensors of a drive against each other and against `imu.T_vehicle_imu`, in closed form.
 
-Nothing is smoothed here, so it finds why smoothing fails. `README.md`, section 11; the sentences
+Nothing is smoothed here, so it finds why smoothing fails. `README.md`, section 13; the sentences
 are in `wording.physics`.
 """
 

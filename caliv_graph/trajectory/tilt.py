@@ -2,7 +2,7 @@
 
 An error of roll and pitch of `imu.T_vehicle_imu` turns every LiDAR's S2V by the same angles. The
 slope of the ground is told apart by the climb of the path and by changes of heading (`README.md`,
-section 11).
+section 13).
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from tests.robustness.hostile_drives import (
+    FRONT,
     GNSS,
     IMU,
     LIDARS,
@@ -133,6 +134,20 @@ def _always_the_first(topic: str, record_ns: int, message: Any) -> Iterable[tupl
     return [(record_ns, message)]
 
 
+def _one_lidar_twice(convert: Callable[[Any], Any]) -> Change:
+    """The rear LiDAR has the front one's clouds, in another frame perhaps."""
+    last: list[Any] = []
+
+    def change(topic: str, record_ns: int, message: Any) -> Iterable[tuple[int, Any]]:
+        if topic == FRONT:
+            last[:] = [points_of(message).copy()]
+        if topic == REAR and last:
+            set_points(message, convert(last[0]))
+        return [(record_ns, message)]
+
+    return change
+
+
 def _twice(topic: str, record_ns: int, message: Any) -> Iterable[tuple[int, Any]]:
     return [(record_ns, message), (record_ns + 1000, message)]
 
@@ -238,6 +253,8 @@ SPOILED: Mapping[str, Change] = {
         _every(4, lambda message: set_points(message, np.empty((0, 3))))
     ),
     "all clouds the same": _always_the_first,
+    "one LiDAR under two names": _one_lidar_twice(lambda p: p),
+    "one LiDAR in two frames": _one_lidar_twice(lambda p: p * [-1, -1, 1] + [2, 0, 0.5]),
     "one point many times": on(*LIDARS)(
         lambda message: set_points(message, np.full((500, 3), [10.0, 1.0, -1.0]))
     ),

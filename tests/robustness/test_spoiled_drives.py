@@ -40,6 +40,8 @@ EXPECTED = {
     "stamps backwards": (2, ""),
     "one stamp for all clouds": (2, ""),
     "an hour between LiDARs and the rest": (2, ""),
+    "one LiDAR under two names": (2, "hold the same clouds: they are one LiDAR"),
+    "one LiDAR in two frames": (2, "2.062 m and 180.00 degrees apart"),
     "only NaN": (2, "no LiDAR sees the target"),
     "only NaN in the IMU": (2, "no IMU"),
     "clouds without a point": (2, "no LiDAR sees the target"),
@@ -78,6 +80,7 @@ def test_a_spoiled_recording(name: str, drive: Path, tmp_path: Path) -> None:
     ("sections", "said"),
     [
         ({"lidars__front__initial__rpy_deg": [0.0, 0.17, 3.14]}, "no LiDAR sees the target"),
+        ({"imu": {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [90, 0, 0]}}}, "gravity is along"),
         ({"lidars__front__initial__xyz": [1e300, 0.0, 0.0]}, "xyz.0': must be within +-1e+12"),
         ({"lidars__front__initial__xyz": [2000.0, 0.0, 2000.0]}, "in metres, not millimetres"),
         ({"gnss": {"lever_arm": [0.0, 0.0, 1500.0]}}, "in metres, not millimetres"),

@@ -7,7 +7,7 @@ distances between consecutive points to a fraction of a millimetre, whatever fra
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,14 +15,20 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray, Recording
 
-SCANS = 3
-"""Of each LiDAR that are compared: all must be copies."""
+SCANS = 5
+"""Of each LiDAR that are compared: all that show enough must be copies."""
+
+MIN_COMPARED = 2
+"""Of these, with enough points."""
 
 MAX_POINTS = 20_000
 """Of a scan: the first ones, which follow each other as they were measured."""
 
 MIN_POINTS = 100
 """Of a scan that can be compared, and of points that correspond."""
+
+MIN_EXTENT_M = 1.0
+"""Of a cloud along its longest axis."""
 
 SAME_M = 1e-3
 """Points of copies agree to it: single precision is 1e-5 m at 100 m, some drivers round to 1 mm.
@@ -82,16 +88,20 @@ def copies(recording: Recording) -> tuple[Copy, ...]:
             clouds[name, scan.stamp_ns] = scan.points_lidar[:MAX_POINTS]
     found = []
     for first, second in itertools.combinations(known, 2):
-        fits = [
-            _fit(clouds.get(one), clouds.get(other))
+        pairs = [
+            (clouds.get(one, NOTHING), clouds.get(other, NOTHING))
             for one, other in wanted[first]
             if other[0] == second
         ]
-        if fits and all(fit is not None for fit in fits):
-            moved, turned = np.median([fit for fit in fits if fit is not None], axis=0).tolist()
+        fits = [_fit(a, b) for a, b in pairs if _tells(a) and _tells(b)]
+        same = [fit for fit in fits if fit is not None]
+        if len(same) == len(fits) >= MIN_COMPARED:
+            moved, turned = np.median(same, axis=0).tolist()
             found.append(Copy((first, second), moved, turned))
     return tuple(found)
 
+
+NOTHING = np.zeros((0, 3))
 
 Taken = tuple[str, int]
 """A LiDAR and the stamp of one of its scans."""
@@ -112,31 +122,37 @@ def _pairs_with(
     return out
 
 
-def _fit(one: Array | None, other: Array | None) -> tuple[float, float] | None:
+def _tells(points: Array) -> bool:
+    """Whether a cloud (n, 3) shows enough: not all returns are at one place."""
+    return len(points) >= MIN_POINTS and float(np.ptp(points, axis=0).max()) > MIN_EXTENT_M
+
+
+def _fit(one: Array, other: Array) -> tuple[float, float] | None:
     """Translation and rotation between two clouds (n, 3) and (m, 3); None if they are no copies."""
-    if one is None or other is None or min(len(one), len(other)) < MIN_POINTS:
-        return None
-    # All returns at one place have no shape that could be compared.
-    if min(np.ptp(one, axis=0).max(), np.ptp(other, axis=0).max()) < 1.0:
-        return None
-    starts = [_corresponding(one, other)]
-    if len(one) == len(other):
-        starts.insert(0, (np.arange(len(one)), np.arange(len(one))))
     smaller, larger = (one, other) if len(one) <= len(other) else (other, one)
     judged = smaller[_decisive(smaller)]
     if len(judged) < MIN_POINTS:
         return None
-    for i, j in starts:
-        T = _transform(one, other, i, j)
-        if T is None:
-            continue
-        R, t = T
+    tree = cKDTree(larger)
+    for R, t in _transforms(one, other):
         moved = judged @ R.T + t if smaller is one else (judged - t) @ R
-        distance, _ = cKDTree(larger).query(moved, distance_upper_bound=SAME_M)
+        distance, _ = tree.query(moved, distance_upper_bound=SAME_M)
         if float(np.isfinite(distance).mean()) >= MIN_SHARE:
             cosine = 0.5 * (float(np.trace(R)) - 1.0)
             return float(np.linalg.norm(t)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return None
+
+
+def _transforms(one: Array, other: Array) -> Iterator[tuple[Array, Array]]:
+    """R and t that may bring one cloud to the other: none, point by point, by likeness."""
+    yield np.eye(3), np.zeros(3)
+    starts = [_corresponding(one, other)]
+    if len(one) == len(other):
+        starts.insert(0, (np.arange(len(one)), np.arange(len(one))))
+    for i, j in starts:
+        T = _transform(one, other, i, j)
+        if T is not None:
+            yield T
 
 
 def _decisive(points: Array) -> IntArray:

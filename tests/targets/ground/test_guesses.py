@@ -1,0 +1,97 @@
+"""Heights and tilts of all guesses against the ground together: by hand, and what is to blame."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
+from caliv_graph.targets.ground.guesses import HEIGHT_FLOOR_M, LidarGround, Misfit, misfits
+from caliv_graph.wording.physics import guess_findings
+
+SIGMA_M, GROUND_M = 0.058, 0.005
+
+
+def config(heights: dict[str, float], vehicle_height: float | None = 0.5) -> Config:
+    """LiDARs above the vehicle's origin, so that its tilt lifts none."""
+    lidars = {
+        name: {"topic": name, "initial": {"xyz": [0, 0, z]}, "sigma": {"xyz": SIGMA_M}}
+        for name, z in heights.items()
+    }
+    ground = {"vehicle_height": vehicle_height, "sigma": GROUND_M}
+    return parse_config({"lidars": lidars, "ground": ground}, "made up", Path())
+
+
+def seen(name: str, height_m: float, roll_deg: float = 0.0) -> LidarGround:
+    return LidarGround(name, height_m, np.radians([roll_deg, 0.0]), 8)
+
+
+def of(quantity: str, found: tuple[Misfit, ...]) -> Misfit:
+    return next(misfit for misfit in found if misfit.quantity == quantity)
+
+
+def test_what_all_lidars_have_in_common_is_the_vehicle_height() -> None:
+    # Both are 0.3 m lower than their guesses and the vehicle's height say.
+    guessed = config({"front": 2.0, "rear": 1.5})
+    grounds = [seen("front", 2.2), seen("rear", 1.7)]
+
+    found = of("height", misfits(grounds, guessed))
+
+    own = SIGMA_M**2 + HEIGHT_FLOOR_M**2
+    sigma = math.sqrt(own / 2.0 + GROUND_M**2)
+    assert (found.lidar, found.dof) == ("", 2)
+    assert found.value == pytest.approx(-0.3)
+    assert found.sigma == pytest.approx(sigma)
+    assert found.sigmas == pytest.approx(0.3 / sigma)
+    assert found.chi2 == pytest.approx((0.3 / sigma) ** 2)
+    (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
+    assert (finding.input, finding.severity) == ("ground.vehicle_height", "contradiction")
+    assert finding.value == pytest.approx((0.2,))
+    assert "vehicle_height 0.20 +- 0.04 m would fit" in finding.sentence
+
+
+def test_what_one_lidar_has_alone_is_its_guess() -> None:
+    guessed = config({"front": 2.0, "rear": 1.5, "left": 1.0})
+    grounds = [seen("front", 2.5), seen("rear", 2.0), seen("left", 1.9)]
+
+    found = of("height", misfits(grounds, guessed))
+
+    assert found.lidar == "left"
+    # Freed, it is where its own measurement puts it, given that the others fit.
+    assert found.value == pytest.approx(0.4, abs=0.01)
+    (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
+    assert finding.input == "lidars.left.initial.xyz"
+    assert finding.value == pytest.approx((1.4,), abs=0.01)
+
+
+def test_guesses_within_their_sigmas_are_no_finding() -> None:
+    # The corners of uniform errors of +-0.1 m, whose sigma is 0.058 m.
+    for errors in ((0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)):
+        guessed = config({"front": 2.0, "rear": 1.5})
+        grounds = [seen("front", 2.5 + errors[0]), seen("rear", 2.0 + errors[1])]
+        assert guess_findings("drive", misfits(grounds, guessed), guessed) == ()
+
+
+def test_without_a_vehicle_height_none_is_tested() -> None:
+    found = misfits([seen("front", 9.0)], config({"front": 2.0}, vehicle_height=None))
+    assert {misfit.quantity for misfit in found} == {"roll", "pitch"}
+    assert misfits([], config({"front": 2.0})) == ()
+
+
+def test_a_guess_that_is_turned_is_named_with_what_would_be_level() -> None:
+    guessed = config({"front": 2.0, "rear": 1.5})
+    grounds = [seen("front", 2.5, roll_deg=12.0), seen("rear", 2.0, roll_deg=0.5)]
+
+    found = guess_findings("drive", misfits(grounds, guessed), guessed)
+
+    (finding,) = found
+    assert (finding.input, finding.severity) == (
+        "lidars.front.initial.rpy_deg",
+        "contradiction",
+    )
+    assert finding.value[0] == pytest.approx(-12.0, abs=0.2)
+    assert "'front' sees is not level: roll by +1" in finding.sentence

@@ -1,0 +1,50 @@
+"""Findings of the raw data: the cause of an error, and contradictions of a calibration."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pytest
+
+from caliv_graph.errors import TargetError, TrajectoryError
+from caliv_graph.physics import contradicted, raise_fatal, warnings_of, with_cause
+from caliv_graph.products import Finding
+from tests.samples import make_calibration
+
+
+def finding(
+    sigmas: float, severity: Literal["fatal", "contradiction", "warning"] = "contradiction"
+) -> Finding:
+    key = "imu.T_vehicle_imu" if sigmas > 10.0 else "ground.vehicle_height"
+    return Finding(key, (), 0.1, sigmas, severity, f"it is off by {sigmas:.0f} sigma")
+
+
+def test_the_most_significant_finding_takes_the_place_of_a_wrong_remedy() -> None:
+    error = TargetError("target: none found", "Add target: ...")
+    assert str(error) == "target: none found. Add target: ..."
+
+    blamed = with_cause(error, [finding(6.0), finding(20.0), finding(4.0, "warning")])
+
+    assert isinstance(blamed, TargetError)
+    assert str(blamed) == (
+        "target: none found. Most likely because of imu.T_vehicle_imu: it is off by 20 sigma"
+    )
+    assert with_cause(error, []) is error
+    assert str(with_cause(TrajectoryError("no"), [finding(6.0)])).startswith("no. Most likely")
+
+
+def test_only_fatal_findings_stop() -> None:
+    raise_fatal([finding(20.0), finding(4.0, "warning")])
+    with pytest.raises(TrajectoryError, match="off by 12 sigma"):
+        raise_fatal([finding(20.0), finding(7.0, "fatal"), finding(12.0, "fatal")])
+
+
+def test_contradictions_make_a_calibration_inconsistent_and_warnings_do_not() -> None:
+    calibration = make_calibration("front", "rear")
+    assert contradicted(calibration, [finding(4.0, "warning")]) is calibration
+
+    found = contradicted(calibration, [finding(6.0), finding(4.0, "warning")])
+
+    assert found.status == "inconsistent"
+    assert found.contradictions == (*calibration.contradictions, "it is off by 6 sigma")
+    assert warnings_of([finding(6.0), finding(4.0, "warning")]) == ("it is off by 4 sigma",)

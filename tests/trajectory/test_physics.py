@@ -1,0 +1,177 @@
+"""Raw sensors against each other and the config: each mistake is named, a sound drive is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.physics import raise_fatal, raw_findings
+from caliv_graph.products import Array, Finding, MotionData
+from caliv_graph.trajectory.physics import motion_physics
+from tests.trajectory.motions import (
+    Course,
+    Sensors,
+    arc_drive,
+    config_for,
+    eight_drive,
+    mounted_askew,
+    record,
+)
+
+EIGHT, ARC = Course(eight_drive(31.0)), Course(arc_drive())
+SEEDS = range(3)
+
+
+@cache
+def recorded(course: Course, seed: int, askew: bool = False) -> MotionData:
+    return record(course, mounted_askew() if askew else Sensors(), seed)
+
+
+def imu(motion: MotionData, **changes: Callable[[Array], Array]) -> MotionData:
+    """Motion data with other readings of the IMU."""
+    assert motion.imu is not None
+    new: dict[str, Any] = {n: change(getattr(motion.imu, n)) for n, change in changes.items()}
+    return replace(motion, imu=replace(motion.imu, **new))
+
+
+def mounted(*rpy_deg: float) -> dict[str, object]:
+    return {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": list(rpy_deg)}}
+
+
+def found_in(motion: MotionData, **sections: dict[str, object]) -> tuple[Finding, ...]:
+    return raw_findings({0: motion}, config_for(Sensors(), **sections))
+
+
+@pytest.mark.parametrize("course", [EIGHT, ARC, Course(eight_drive(31.0), rough=1.0)], ids=str)
+@pytest.mark.parametrize("without", ["", "orientation", "twist", "gnss"])
+def test_a_sound_drive_has_no_finding(course: Course, without: str) -> None:
+    for seed in SEEDS:
+        motion = recorded(course, seed, askew=True)
+        if without == "orientation":
+            assert motion.imu is not None
+            motion = replace(motion, imu=replace(motion.imu, orientation_xyzw=None))
+        elif without:
+            motion = (
+                replace(motion, twist=None) if without == "twist" else replace(motion, gnss=None)
+            )
+        assert raw_findings({0: motion}, config_for(mounted_askew())) == ()
+
+
+@pytest.mark.parametrize("course", [EIGHT, ARC], ids=["eight", "arc"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_imu_on_its_side_is_named_with_the_rotation_that_fits(
+    course: Course, sign: float
+) -> None:
+    # Its y axis is up (down): y_imu = +-z_vehicle, z_imu = -+y_vehicle.
+    R_imu_vehicle = np.array([[1.0, 0, 0], [0, 0, sign], [0, -sign, 0]])
+    for seed in SEEDS:
+        motion = imu(
+            recorded(course, seed),
+            specific_force=lambda f: f @ R_imu_vehicle.T,
+            angular_velocity=lambda w: w @ R_imu_vehicle.T,
+            orientation_xyzw=lambda q: np.full_like(q, np.nan),
+        )
+        (found,) = found_in(motion)
+
+        assert (found.input, found.severity) == ("imu.T_vehicle_imu", "fatal")
+        axis = "+y" if sign > 0 else "-y"
+        assert f"gravity is along {axis} of the IMU, " in found.sentence
+        assert np.allclose(found.value, [sign * 90.0, 0.0, 0.0], atol=20.0)
+        assert np.allclose(found.value[:2], [sign * 90.0, 0.0], atol=3.0)
+        with pytest.raises(TrajectoryError, match="gravity is along"):
+            raise_fatal((found,))
+        assert found_in(motion, imu=mounted(sign * 90.0, 0.0, 0.0)) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "severity", "said"),
+    [
+        ({"angular_velocity": np.degrees}, "topics.imu", "fatal", "degrees per second"),
+        ({"angular_velocity": np.negative}, "topics.imu", "fatal", "opposite sign"),
+        (
+            {"angular_velocity": lambda w: 1.5 * w},
+            "topics.imu",
+            "contradiction",
+            "the gyroscope turns 1.5",
+        ),
+        (
+            {"orientation_xyzw": lambda q: q * [-1, -1, -1, 1]},
+            "topics.imu",
+            "contradiction",
+            "the orientation of the same messages",
+        ),
+        (
+            {
+                "specific_force": lambda f: f[:, [1, 0, 2]],
+                "angular_velocity": lambda w: w[:, [1, 0, 2]],
+            },
+            "topics.imu",
+            "contradiction",
+            "left-handed",
+        ),
+    ],
+    ids=["degrees", "sign", "scale", "inverse orientation", "left-handed"],
+)
+def test_a_wrong_imu_is_named(
+    change: dict[str, Callable[[Array], Array]], key: str, severity: str, said: str
+) -> None:
+    for seed in SEEDS:
+        (found,) = found_in(imu(recorded(EIGHT, seed), **change))
+        assert (found.input, found.severity) == (key, severity)
+        assert said in found.sentence
+
+
+def test_the_unit_of_the_velocities_is_named() -> None:
+    motion = recorded(EIGHT, 0)
+    assert motion.twist is not None
+    fast = replace(motion, twist=replace(motion.twist, velocity=3.6 * motion.twist.velocity))
+    (found,) = found_in(fast)
+    assert (found.input, found.severity) == ("topics.twist", "fatal")
+    assert "km/h" in found.sentence
+
+
+@pytest.mark.parametrize("course", [EIGHT, ARC], ids=["eight", "arc"])
+def test_a_quarter_turn_of_yaw_is_named_and_corrected(course: Course) -> None:
+    for seed in SEEDS:
+        found = found_in(recorded(course, seed), imu=mounted(0.0, 0.0, 90.0))
+        turned = [f for f in found if f.input == "imu.T_vehicle_imu"]
+        assert len(turned) == 1
+        assert abs(turned[0].value[2]) < max(5.0 * turned[0].sigma, 5.0)
+
+
+@pytest.mark.parametrize("late_s", [0.3, -0.2])
+def test_a_late_gnss_clock_is_named_in_its_own_seconds(late_s: float) -> None:
+    for seed in SEEDS:
+        motion = recorded(EIGHT, seed)
+        assert motion.gnss is not None
+        stamps = motion.gnss.stamps_ns + round(1e9 * late_s)
+        (found,) = found_in(replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps)))
+        assert found.input == "topics.gnss"
+        assert found.value[0] == pytest.approx(late_s, abs=5.0 * found.sigma)
+
+
+def test_a_wrong_lever_arm_is_no_clock() -> None:
+    # A metre ahead of the origin, an antenna swings in curves as if its stamps were 0.5 s early.
+    motion = recorded(EIGHT, 0, askew=True)
+    config = config_for(replace(mounted_askew(), lever_arm=(0.0, 0.0, 0.0)))
+    assert not [f for f in raw_findings({0: motion}, config) if f.input == "topics.gnss"]
+
+
+def test_ratios_and_delays_are_within_their_sigmas() -> None:
+    for seed in range(5):
+        found = motion_physics(recorded(EIGHT, seed), config_for(Sensors()))
+        assert found is not None
+        assert found.speed is not None
+        for ratio in (*found.gyroscope, found.speed):
+            assert abs(ratio.value - 1.0) < 4.0 * ratio.sigma
+            assert ratio.sigma < 0.06
+        assert found.axes is not None
+        assert found.axes.delay_s is not None
+        delay_s, sigma_s = found.axes.delay_s
+        assert abs(delay_s) < 4.0 * sigma_s < 0.2

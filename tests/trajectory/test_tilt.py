@@ -1,0 +1,90 @@
+"""Roll and pitch of the vehicle's axes over a drive: a slope of the ground is not taken for it."""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Trajectory
+from caliv_graph.trajectory.select import GivenTrajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.tilt import vehicle_tilt
+from caliv_graph.wording.physics import tilt_finding
+from tests.trajectory.motions import Course, Sensors, config_for, eight_drive, record
+
+CONFIG = config_for(Sensors())
+SPEED_M_S, RADIUS_M = 2.0, 9.0
+
+
+def drive(slope: float, turning: bool, rpy: tuple[float, float]) -> GivenTrajectory:
+    """60 s over a plane that rises by `slope` towards +x; the axes turned by (roll, pitch)."""
+    t = np.arange(0.0, 60.0, 0.1)
+    yaw = SPEED_M_S / RADIUS_M * t if turning else 0.0 * t
+    x = RADIUS_M * np.sin(yaw) if turning else SPEED_M_S * t
+    y = RADIUS_M * (1.0 - np.cos(yaw)) if turning else 0.0 * t
+    # A turn about y by -atan(slope) lifts +x: the ground's normal leans back.
+    R_map_ground = gtsam.Rot3.Ry(-math.atan(slope))
+    tilt = gtsam.Rot3.RzRyRx(*rpy, 0.0)
+    poses = tuple(
+        gtsam.Pose3(R_map_ground.compose(gtsam.Rot3.Rz(psi)).compose(tilt), p)
+        for psi, p in zip(yaw, np.stack([x, y, slope * x], 1), strict=True)
+    )
+    return GivenTrajectory(Trajectory(np.round(1e9 * t).astype(np.int64), poses))
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.05, -0.1])
+@pytest.mark.parametrize("rpy", [(0.0, 0.0), (0.035, -0.02)], ids=["level", "tilted"])
+def test_on_a_slope_a_circle_tells_the_tilt(slope: float, rpy: tuple[float, float]) -> None:
+    found = vehicle_tilt(drive(slope, True, rpy), "drive", CONFIG)
+
+    assert found.roll_pitch_rad == pytest.approx(np.array(rpy), abs=0.003)
+    assert (found.sigma_rad < 0.01).all()
+    assert (tilt_finding(found, CONFIG) is not None) == (rpy != (0.0, 0.0))
+
+
+def test_straight_uphill_pitch_is_known_and_roll_is_not() -> None:
+    found = vehicle_tilt(drive(0.08, False, (0.03, 0.0)), "drive", CONFIG)
+
+    # The climb of the path is the slope ahead; nothing tells the slope to the side.
+    assert found.roll_pitch_rad[1] == pytest.approx(0.0, abs=0.003)
+    assert found.sigma_rad[1] < 0.01 < 0.03 < found.sigma_rad[0]
+    assert tilt_finding(found, CONFIG) is None
+
+
+def test_in_reverse_the_climb_counts_backwards() -> None:
+    forward = drive(0.08, False, (0.0, 0.02)).trajectory
+    back = Trajectory(forward.stamps_ns, tuple(reversed(forward.T_map_vehicle)))
+
+    found = vehicle_tilt(GivenTrajectory(back), "drive", CONFIG)
+
+    assert found.roll_pitch_rad[1] == pytest.approx(0.02, abs=0.003)
+
+
+def leaning(*rpy_deg: float, parallel_sigma_deg: float | None = None) -> Config:
+    """The config of a user who takes the IMU for turned by these angles."""
+    mounted: dict[str, object] = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [*rpy_deg, 0.0]}}
+    ground: dict[str, object] = {"parallel_sigma_deg": parallel_sigma_deg}
+    return config_for(Sensors(), imu=mounted, ground=ground)
+
+
+@pytest.mark.parametrize("rpy_deg", [(2.0, 0.0), (0.0, -2.0)], ids=["roll", "pitch"])
+def test_two_degrees_of_the_imu_are_said_with_their_sigma(rpy_deg: tuple[float, float]) -> None:
+    course = Course(eight_drive(31.0))
+    for seed in range(2):
+        motion, config = record(course, Sensors(), seed), leaning(*rpy_deg)
+        found = vehicle_tilt(smooth_trajectory(motion, config, []), motion.name, config)
+
+        off = np.degrees(found.roll_pitch_rad) + rpy_deg
+        assert (np.abs(off) < 3.0 * np.degrees(found.sigma_rad)).all()
+        finding = tilt_finding(found, config)
+        assert finding is not None
+        assert (finding.input, finding.severity) == ("imu.T_vehicle_imu", "contradiction")
+        assert finding.value == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
+        # Who says that the vehicle leans is believed.
+        config = leaning(*rpy_deg, parallel_sigma_deg=2.0)
+        found = vehicle_tilt(smooth_trajectory(motion, config, []), motion.name, config)
+        assert tilt_finding(found, config) is None

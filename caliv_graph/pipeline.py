@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
-from caliv_graph.calibration.choose import choose_static
+from caliv_graph.calibration.choose import choose_static, displaced
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.common.progress import Progress
@@ -43,7 +43,7 @@ class Prepared:
         grounds: the ground as the LiDARs saw it.
         warnings: for the user, a line each.
         config: the config, with the guesses that the search for the target had to replace.
-        misplaced: how these guesses contradict what the LiDARs see, a sentence each.
+        contradictions: how guesses and stamps contradict what the LiDARs see, a sentence each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -51,7 +51,7 @@ class Prepared:
     grounds: tuple[GroundObservation, ...]
     warnings: tuple[str, ...]
     config: Config
-    misplaced: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
 
 
 def prepare(
@@ -74,7 +74,7 @@ def prepare(
     with progress.stage("smoothing the trajectory", None):
         rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
     searched = find_target(recordings, rough, config, progress) if config.target is None else []
-    config, doubts = realigned(config, searched)
+    config, misplaced = realigned(config, searched)
     observations = extract_targets(recordings, rough, config, progress, choose_static, searched)
     grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
     with progress.stage("smoothing the trajectory at the target's scans", None):
@@ -90,7 +90,7 @@ def prepare(
         tuple(grounds),
         (*warnings, *ground_warnings),
         config,
-        doubts,
+        (*misplaced, *displaced(observations, trajectories, config)),
     )
 
 
@@ -141,8 +141,8 @@ def _calibrate(
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(calibration, solution, recordings, prepared.trajectories, motions)
-    if prepared.misplaced:
-        found = (*prepared.misplaced, *calibration.contradictions)
+    if prepared.contradictions:
+        found = (*prepared.contradictions, *calibration.contradictions)
         calibration = replace(calibration, status="inconsistent", contradictions=found)
     calibration, conflicts = with_prior(calibration, prior, config)
 

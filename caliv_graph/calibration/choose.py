@@ -193,8 +193,8 @@ def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[flo
     )
     return (
         f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
-        "guess of one LiDAR explains it, so these objects move: let a target stand alone, or name "
-        "its box with target: {min: [x, y, z], max: [x, y, z]} in metres, frame map"
+        "guess of one LiDAR explains it: the objects move, or the poses are wrong. Check the "
+        "trajectory with 'caliv-graph inspect', and drive past a chair that nobody stands beside"
     )
 
 

@@ -26,6 +26,7 @@ from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
     MAX_EXTENT_M,
+    MOVING,
     Proposal,
     Track,
     judged_tracks,
@@ -286,9 +287,32 @@ def _why_none(
     if wide:
         found.append(f"wider ones {wide} times")
     sight = f"; no ground in any scan of {', '.join(blind)}" if blind else ""
+    moving = any(track.verdict == MOVING for track in tracks)
     return (
         f"{name}: target: none found in {scans} scans: needs a static object on the ground, "
         f"0.3 to {MAX_EXTENT_M} m wide, at most 2 m high, seen well in several scans. Seen: "
         f"{', '.join(found) or 'nothing above the ground'}{sight}. "
-        "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
+        f"{_remedy(blind, bool(found), moving)}"
+    )
+
+
+def _remedy(blind: Sequence[str], seen: bool, moving: bool) -> str:
+    """What to do about it: a region helps only if something is there to be named."""
+    if blind:
+        return (
+            f"Check initial of {', '.join(blind)} (roll, pitch and height: a LiDAR whose tilt is "
+            "wrong sees no level ground), its topic, min_range and max_range"
+        )
+    if not seen:
+        return "Drive past a chair, and check the topics, min_range and max_range of the LiDARs"
+    if moving:
+        return (
+            "If one of them is the target: what makes a static object smear is an initial guess "
+            "that is farther off than its sigma, stamps that are late, or poses that drift: check "
+            "these with 'caliv-graph inspect'. If none stood still, drive past a chair, or give "
+            "the box of what shall serve as target.min and target.max"
+        )
+    return (
+        "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config, about "
+        "the object that shall serve; or drive past a chair"
     )

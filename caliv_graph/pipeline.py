@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
-from caliv_graph.calibration.choose import choose_static
+from caliv_graph.calibration.choose import choose_static, displaced
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.suspect_values import motion_suspects
@@ -58,7 +58,7 @@ class Prepared:
         findings: values of the config that the raw data contradict.
         warnings: for the user, a line each.
         config: the config, with the guesses that the search for the target had to replace.
-        misplaced: how these guesses contradict what the LiDARs see, a sentence each.
+        contradictions: how guesses and stamps contradict what the LiDARs see, a sentence each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -67,7 +67,7 @@ class Prepared:
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
     config: Config
-    misplaced: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
 
 
 def prepare(
@@ -97,7 +97,7 @@ def prepare(
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         causes = (*findings, *heading_findings(rough, motions, config, raw))
-        config, doubts, observations = _targets(recordings, rough, config, progress)
+        config, misplaced, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         if isinstance(error, TargetError) and not causes:
             said = _doubts_about_motion(rough, motions, config)
@@ -119,7 +119,7 @@ def prepare(
         findings,
         (*warnings, *ground_warnings, *warnings_of(findings)),
         config,
-        doubts,
+        (*misplaced, *displaced(observations, trajectories, config)),
     )
 
 
@@ -136,11 +136,11 @@ def _targets(
     searched = (
         find_target(recordings, trajectories, config, progress) if config.target is None else []
     )
-    config, doubts = realigned(config, searched)
+    config, misplaced = realigned(config, searched)
     observations = extract_targets(
         recordings, trajectories, config, progress, choose_static, searched
     )
-    return config, doubts, observations
+    return config, misplaced, observations
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,8 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
-        _, doubts, observations = _targets([recording], trajectories, config, progress)
-        problems += doubts
+        near, misplaced, observations = _targets([recording], trajectories, config, progress)
+        problems += (*misplaced, *displaced(observations, trajectories, near))
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         return Look(None, findings, tuple(problems))
@@ -248,8 +248,8 @@ def _calibrate(
         calibration, solution, recordings, prepared.trajectories, motions, prepared.config
     )
     calibration = contradicted(calibration, prepared.findings)
-    if prepared.misplaced:
-        found = (*prepared.misplaced, *calibration.contradictions)
+    if prepared.contradictions:
+        found = (*prepared.contradictions, *calibration.contradictions)
         calibration = replace(calibration, status="inconsistent", contradictions=found)
     calibration, conflicts = with_prior(calibration, prior, config)
 

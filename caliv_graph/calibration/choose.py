@@ -9,7 +9,7 @@ is visible; and one place, the guesses with their sigmas, must explain all centr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -44,8 +44,13 @@ leave half a metre between what the search proposes and what is extracted there.
 MOVES_M = 0.15
 """Scatter above which an object moves, unless late stamps or a wrong guess explain it."""
 
-EXPLAINS = 0.5
-"""Factor on the scatter below which late stamps or another guess explain it."""
+EXPLAINS = 1.0 / 3.0
+"""Factor on the scatter below which late stamps or another guess explain it: poses that drift do
+not look like either."""
+
+FEWER = 1.3
+"""The stamps of one LiDAR explain the scatter as well as those of all if it is at most this many
+times as large."""
 
 LATE_S = 0.02
 """Smallest lateness that is named: at 2 m/s it is 4 cm, which poses explain too."""
@@ -93,14 +98,13 @@ def choose_static(
 
     apart = _different(candidates, found)
     best = max(apart, key=rank)
-    cause = _cause(found[best], config)
     others = [i for i in apart if i != best]
     same = [i for i in others if rank(i)[0]]
     moving = [i for i in others if math.isfinite(scatter[i]) and i not in same]
     of = candidates[best].found
-    if of.doubtful and scatter[best] > MOVES_M and cause is None:
+    if of.doubtful and scatter[best] > MOVES_M and cause_of(found[best], config) is None:
         raise TargetError(_why_none_stands(candidates, scatter))
-    reasons = [] if cause is None else [cause]
+    reasons = []
     if same:
         listed = ", ".join(f"{candidates[i].found} (to {scatter[i]:.2f} m)" for i in same)
         reasons.append(
@@ -117,8 +121,29 @@ def choose_static(
     return Choice(best, tuple(reasons))
 
 
-def _cause(of: Agreement, config: Config) -> str | None:
-    """What would bring the clouds of a candidate to one place; None if they are, or nothing does.
+def displaced(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+) -> tuple[str, ...]:
+    """Late stamps and guesses far off, by targets that are at one place only then; a sentence each.
+
+    The clouds of a circle to the left agree on one place, and those of a circle to the right on
+    another: the registration takes both for one target, and no residual of the graph shows it.
+    """
+    out = []
+    for observation in observations:
+        if not observation.clouds:
+            continue
+        found = _agreement(observation, trajectories[observation.clouds[0].drive], config)
+        cause = cause_of(found, config)
+        if cause is not None:
+            out.append(f"{observation.name}: {cause}")
+    return tuple(out)
+
+
+def cause_of(of: Agreement, config: Config) -> str | None:
+    """What would bring clouds to one place; None if they are, or if nothing does.
 
     Late stamps shift an object along the course, by as much as the speed; a guess that is off
     shifts it rigidly in the frame of the vehicle.
@@ -128,15 +153,13 @@ def _cause(of: Agreement, config: Config) -> str | None:
     names = [name for name in config.lidars if name in of.sightings.lidars]
     guesses = _guesses(config)
     enough = EXPLAINS * of.scatter_m
-    sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
-    tried = [fit_place(of.sightings, guesses, late=each) for each in sets]
-    late = min(tried, key=lambda place: place.scatter_m)
-    if late.scatter_m <= enough and max(map(abs, late.late_s.values())) > LATE_S:
+    begin = f"its clouds lie at one place of the map to {of.scatter_m:.2f} m only, but to "
+    late = None if config.solve.time_offset else _late(of.sightings, guesses, names)
+    if late is not None and late.scatter_m <= enough:
         by = " and ".join(f"those of '{name}' by {s:+.2f} s" for name, s in late.late_s.items())
         return (
-            f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
-            f"{late.scatter_m:.2f} m if stamps are late: {by}. Check the clocks, or set "
-            "solve.time_offset"
+            f"{begin}{late.scatter_m:.2f} m if stamps are late: {by}. The displacement grows with "
+            "the speed and changes with the turn. Correct the clocks, or set solve.time_offset"
         )
     for name in names:
         T, sigmas = guesses[name]
@@ -145,11 +168,21 @@ def _cause(of: Agreement, config: Config) -> str | None:
             off = vehicle_axes_difference(far.T_vehicle_lidar[name], T)
             degrees = math.degrees(float(np.linalg.norm(off[:3])))
             return (
-                f"its clouds lie at one place of the map to {of.scatter_m:.2f} m, but to "
-                f"{far.scatter_m:.2f} m if lidars.{name}.initial is off by about {degrees:.0f} "
-                f"degrees and {float(np.linalg.norm(off[3:])):.1f} m. Check it"
+                f"{begin}{far.scatter_m:.2f} m if lidars.{name}.initial is off by about "
+                f"{degrees:.0f} degrees and {float(np.linalg.norm(off[3:])):.1f} m. Check it"
             )
     return None
+
+
+def _late(
+    seen: Sightings, guesses: Mapping[str, tuple[gtsam.Pose3, Array]], names: Sequence[str]
+) -> Place | None:
+    """The fewest LiDARs whose late stamps explain the scatter; None if they would not be late."""
+    sets = [(name,) for name in names] + ([tuple(names)] if len(names) > 1 else [])
+    tried = [fit_place(seen, guesses, late=each) for each in sets]
+    least = min(place.scatter_m for place in tried)
+    first = next(place for place in tried if place.scatter_m <= FEWER * least)
+    return first if max(map(abs, first.late_s.values())) > LATE_S else None
 
 
 def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[float]) -> str:
@@ -160,8 +193,8 @@ def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[flo
     )
     return (
         f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
-        "guess of one LiDAR explains it, so these objects move: let a target stand alone, or name "
-        "its box with target: {min: [x, y, z], max: [x, y, z]} in metres, frame map"
+        "guess of one LiDAR explains it: the objects move, or the poses are wrong. Check the "
+        "trajectory with 'caliv-graph inspect', and drive past a chair that nobody stands beside"
     )
 
 
@@ -198,18 +231,26 @@ def agreement(
     candidate: TriedCandidate, trajectory: VehicleTrajectory, config: Config
 ) -> Agreement:
     """Registers some of a candidate's clouds, and fits one place to its centres."""
-    observations = [o for o in candidate.observations if len(o.clouds) >= 2]
+    observations = [o for o in candidate.observations if o.clouds]
     if not observations:
         return Agreement(math.inf)
-    most = max(observations, key=lambda o: len(o.clouds))
+    return _agreement(max(observations, key=lambda o: len(o.clouds)), trajectory, config)
+
+
+def _agreement(
+    observation: TargetObservation, trajectory: VehicleTrajectory, config: Config
+) -> Agreement:
+    """The same of one placement."""
     clouds = [
         cloud
         for name in config.lidars
-        for cloud in thinned([c for c in most.clouds if c.lidar == name and not c.cut], CLOUDS)
+        for cloud in thinned(
+            [c for c in observation.clouds if c.lidar == name and not c.cut], CLOUDS
+        )
     ]
     if len(clouds) < 2:
         return Agreement(math.inf)
-    sightings = _sightings(replace(most, clouds=tuple(clouds)), trajectory, config)
+    sightings = _sightings(replace(observation, clouds=tuple(clouds)), trajectory, config)
     if sightings is None:
         return Agreement(math.inf)
     place = fit_place(sightings, _guesses(config))

@@ -153,10 +153,8 @@ def _chosen(
     proposals = (searched, *searched.others)
     for found, extractor, of_lidar in zip(proposals, extractors, seen, strict=True):
         label = _label(found) + of_drive
-        hints = _hints(label, found, extractor)
-        tried.append(
-            TriedCandidate(found, tuple(_placements(label, extractor, of_lidar, config, hints)))
-        )
+        placements = tuple(_placements(label, extractor, of_lidar, config, ()))
+        tried.append(TriedCandidate(found, placements))
     choice = choose(tried, extractors[0].trajectory, config)
     first, *rest = tried[choice.index].observations
     label = _label(tried[choice.index].found) + of_drive
@@ -167,16 +165,6 @@ def _chosen(
 def _label(found: FoundTarget) -> str:
     x, y, _ = found.centre_map
     return f"target found at ({x:.1f}, {y:.1f}) m of the map"
-
-
-def _hints(label: str, found: FoundTarget, extractor: RegionExtractor) -> tuple[str, ...]:
-    """A warning for each LiDAR in whose scans neither search nor extraction saw the candidate."""
-    return tuple(
-        f"{label}: lidar '{name}' does not see it in any of the {found.looked_at[name]} scans "
-        "that were read"
-        for name, scans in found.scans.items()
-        if scans == 0 and found.looked_at[name] and not extractor.tallies[name].kept
-    )
 
 
 def _placements(

@@ -26,6 +26,7 @@ from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
     MAX_EXTENT_M,
+    MOVING,
     Proposal,
     Track,
     judged_tracks,
@@ -58,9 +59,6 @@ SAME_PLACE_M = 0.7
 
 REGION_MARGIN_M = 0.3
 """Margin of the region about the object on each side."""
-
-
-REMEDY = "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config"
 
 
 @dataclass(frozen=True)
@@ -202,7 +200,7 @@ def _target_of_drive(
             misplaced = {}
     usable = [p for p in proposals if math.isfinite(p.height_m)]
     if not usable:
-        raise TargetError(_why_none(name, histories, tracks, len(proposals)), REMEDY)
+        raise TargetError(*_why_none(name, histories, tracks, len(proposals)))
     found = [_found(drive, p, histories, alignments) for p in usable[:MOST_TRIED]]
     return replace(found[0], others=tuple(found[1:]), misplaced=misplaced)
 
@@ -274,8 +272,8 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 def _why_none(
     name: str, histories: Sequence[LidarHistory], tracks: Sequence[Track], without_top: int
-) -> str:
-    """Why a drive shows no target, in one line."""
+) -> tuple[str, str]:
+    """Why a drive shows no target, in one line; and what to do about it."""
     scans = ", ".join(f"{len(h.scans)} of '{h.name}'" for h in histories)
     blind = [f"'{h.name}'" for h in histories if not any(s.has_ground for s in h.scans)]
     found = []
@@ -289,8 +287,32 @@ def _why_none(
     if wide:
         found.append(f"wider ones {wide} times")
     sight = f"; no ground in any scan of {', '.join(blind)}" if blind else ""
-    return (
+    moving = any(track.verdict == MOVING for track in tracks)
+    what = (
         f"{name}: target: none found in {scans} scans: needs a static object on the ground, "
         f"0.3 to {MAX_EXTENT_M} m wide, at most 2 m high, seen well in several scans. Seen: "
         f"{', '.join(found) or 'nothing above the ground'}{sight}"
+    )
+    return what, _remedy(blind, bool(found), moving)
+
+
+def _remedy(blind: Sequence[str], seen: bool, moving: bool) -> str:
+    """What to do about it: a region helps only if something is there to be named."""
+    if blind:
+        return (
+            f"Check initial of {', '.join(blind)} (roll, pitch and height: a LiDAR whose tilt is "
+            "wrong sees no level ground), its topic, min_range and max_range"
+        )
+    if not seen:
+        return "Drive past a chair, and check the topics, min_range and max_range of the LiDARs"
+    if moving:
+        return (
+            "If one of them is the target: what makes a static object smear is an initial guess "
+            "that is farther off than its sigma, stamps that are late, or poses that drift: check "
+            "these with 'caliv-graph inspect'. If none stood still, drive past a chair, or give "
+            "the box of what shall serve as target.min and target.max"
+        )
+    return (
+        "Add target: {min: [x, y, z], max: [x, y, z]} in metres, frame map, to the config, about "
+        "the object that shall serve; or drive past a chair"
     )

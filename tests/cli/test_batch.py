@@ -20,7 +20,7 @@ import yaml
 
 from caliv_graph.results.calibration_file import read_calibration
 from tests.batch.tiny import tiny_drive
-from tests.cli.commands import ROOT, run
+from tests.cli.commands import ROOT, called, run
 
 PATIENCE_S = 120.0
 
@@ -392,7 +392,7 @@ def test_a_bad_manifest_is_one_line(tmp_path: Path, manifest: str | None, said: 
         path.write_text(manifest)
     before = sorted(tmp_path.iterdir())
 
-    result = run("batch", path, "--out", tmp_path / "out")
+    result = called("batch", path, "--out", tmp_path / "out")
 
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith(f"error: {path}: {said}")
@@ -403,7 +403,7 @@ def test_a_bad_manifest_is_one_line(tmp_path: Path, manifest: str | None, said: 
 def test_a_folder_of_something_else_is_refused(fleet: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
 
-    result = run("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
+    result = called("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
 
     assert result.returncode == 2
     assert "is not the folder of a batch (no summary.json). Give another --out" in result.stderr

@@ -51,7 +51,8 @@ def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
 
     `work` should release the interpreter's lock for most of its time.
     """
-    threads = min(THREADS, cores())
+    items = list(items)
+    threads = min(THREADS, cores(), len(items))
     if threads < 2:
         for item in items:
             work(item)

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import subprocess
 import sys
+import types
+from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import yaml
 
+from caliv_graph.cli import main
+
 ROOT = Path(__file__).resolve().parents[2]
 
-_WITH_PIPELINE = """
-import sys, types
-sys.path.insert(0, {root!r})
+_MADE_UP = """
+import types
 from tests.samples import make_calibration, make_solution, unseen
 def run_of(calibration, warnings=()):
     return types.SimpleNamespace(
         calibration=calibration, solution=make_solution(), observations=(), warnings=warnings,
         record=None,
     )
+"""
+
+_WITH_PIPELINE = """
+import sys, types
+sys.path.insert(0, {root!r})
 {pipeline}
 module = types.ModuleType("caliv_graph.pipeline")
 module.calibrate = calibrate
@@ -40,7 +51,7 @@ def start(*arguments: object, pipeline: str = "", cwd: Path = ROOT) -> subproces
     """
     program = ["-m", "caliv_graph"]
     if pipeline:
-        program = ["-c", _WITH_PIPELINE.format(root=str(ROOT), pipeline=pipeline)]
+        program = ["-c", _WITH_PIPELINE.format(root=str(ROOT), pipeline=_MADE_UP + pipeline)]
     return subprocess.Popen(
         [sys.executable, *program, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -60,6 +71,25 @@ def run(
     process = start(*arguments, pipeline=pipeline, cwd=cwd)
     out, err = process.communicate(timeout=60)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def called(*arguments: object, pipeline: str = "") -> subprocess.CompletedProcess[str]:
+    """Runs the program in this process, which has imported what takes a second; see `start`."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _made_up(pipeline):
+        code = main.run([str(argument) for argument in arguments])
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def _made_up(pipeline: str) -> Iterator[None]:
+    if not pipeline:
+        yield
+        return
+    module = types.ModuleType("caliv_graph.pipeline")
+    exec(_MADE_UP + pipeline, module.__dict__)
+    with mock.patch.dict(sys.modules, {module.__name__: module}):
+        yield
 
 
 def write_drive(folder: Path, sensors: int = 2, frames: int = 3) -> Path:

@@ -20,7 +20,7 @@ import yaml
 
 from caliv_graph.results.calibration_file import read_calibration
 from tests.batch.tiny import tiny_drive
-from tests.cli.commands import ROOT, run
+from tests.cli.commands import ROOT, called
 
 PATIENCE_S = 120.0
 
@@ -181,7 +181,7 @@ def test_one_failure_does_not_stop_the_others(
 def test_a_result_is_what_calibrate_writes(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]]
 ) -> None:
-    alone = run("calibrate", fleet / "mon/config.yaml", "--out", fleet / "alone")
+    alone = called("calibrate", fleet / "mon/config.yaml", "--out", fleet / "alone")
 
     assert alone.returncode == 0, alone.stderr
     names = {file.name for file in (fleet / "alone").iterdir()}
@@ -287,12 +287,11 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     dask = (sys.executable, "-m", "dask")
     local = ("--no-dashboard", "--host", "127.0.0.1")
+    # Without the process beside each worker that would start it again.
+    worker = (*dask, "worker", address, *local, "--nthreads", "1", "--no-nanny")
     commands = [
         (*dask, "scheduler", *local, "--port", address.rpartition(":")[2]),
-        *[
-            (*dask, "worker", address, *local, "--nthreads", "1", "--local-directory", tmp_path)
-            for _ in range(2)
-        ],
+        *[(*worker, "--local-directory", tmp_path) for _ in range(2)],
     ]
     processes = [
         subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -392,7 +391,7 @@ def test_a_bad_manifest_is_one_line(tmp_path: Path, manifest: str | None, said: 
         path.write_text(manifest)
     before = sorted(tmp_path.iterdir())
 
-    result = run("batch", path, "--out", tmp_path / "out")
+    result = called("batch", path, "--out", tmp_path / "out")
 
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith(f"error: {path}: {said}")
@@ -403,7 +402,7 @@ def test_a_bad_manifest_is_one_line(tmp_path: Path, manifest: str | None, said: 
 def test_a_folder_of_something_else_is_refused(fleet: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
 
-    result = run("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
+    result = called("batch", fleet / "good.yaml", "--out", tmp_path, "--force")
 
     assert result.returncode == 2
     assert "is not the folder of a batch (no summary.json). Give another --out" in result.stderr

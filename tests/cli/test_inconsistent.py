@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from caliv_graph.results.calibration_file import read_calibration
-from tests.cli.commands import run, write_config, write_drive
+from tests.cli.commands import called, write_config, write_drive
 
 SENTENCE = "lidar 'front': its stamps and the motion of the vehicle contradict each other"
 
@@ -25,7 +25,7 @@ def calibrate(recordings, config, progress, prior):
 def test_a_contradiction_is_exit_4_even_if_something_was_not_reached(tmp_path: Path) -> None:
     write_drive(tmp_path / "drive")
     config = write_config(tmp_path / "config.yaml")
-    done = run("calibrate", config, "--out", tmp_path / "out", pipeline=INCONSISTENT)
+    done = called("calibrate", config, "--out", tmp_path / "out", pipeline=INCONSISTENT)
     assert done.returncode == 4, done.stderr
     assert SENTENCE in done.stderr
     assert "Contradictions:" in done.stdout
@@ -40,7 +40,7 @@ def test_json_has_the_contradictions(tmp_path: Path) -> None:
     write_drive(tmp_path / "drive")
     config = write_config(tmp_path / "config.yaml")
     out = tmp_path / "out"
-    done = run("calibrate", config, "--out", out, "--json", pipeline=INCONSISTENT)
+    done = called("calibrate", config, "--out", out, "--json", pipeline=INCONSISTENT)
     assert done.returncode == 4
     document = json.loads(done.stdout)
     assert document["contradictions"] == [SENTENCE]

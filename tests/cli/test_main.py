@@ -13,7 +13,7 @@ import pytest
 
 from caliv_graph import __version__
 from caliv_graph.cli import streams
-from tests.cli.commands import ROOT, run, start, write_config, write_drive
+from tests.cli.commands import ROOT, called, run, start, write_config, write_drive
 
 HEAVY = {
     *("gtsam", "open3d", "numpy", "scipy", "yaml", "rosbags", "plotly", "jinja2"),
@@ -125,7 +125,7 @@ def test_calibrating_a_folder_imports_only_what_it_uses() -> None:
 
 @pytest.mark.parametrize("command", ["init", "inspect", "simulate", "calibrate", "evaluate"])
 def test_every_command_explains_itself_with_an_example(command: str) -> None:
-    result = run(command, "--help")
+    result = called(command, "--help")
 
     assert result.returncode == 0
     assert f"Example: caliv-graph {command} " in result.stdout
@@ -163,8 +163,12 @@ def test_version() -> None:
         (["calibrate", "nowhere.yaml", "--out", "o"], "error: nowhere.yaml: no such file\n"),
     ],
 )
-def test_bad_usage_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
-    result = run(*arguments, cwd=tmp_path)
+def test_bad_usage_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    result = called(*arguments)
 
     assert result.returncode == 2
     assert result.stdout == ""
@@ -179,7 +183,7 @@ def test_bad_input_is_one_line_and_no_output(config: Path, form: list[str]) -> N
     # The warning about 'ground' must not join the error.
     write_config(config, ground={"use": True})
 
-    result = run("calibrate", config, "--out", out, *form, pipeline=FAILS)
+    result = called("calibrate", config, "--out", out, *form, pipeline=FAILS)
 
     assert result.returncode == 2
     assert result.stderr == (
@@ -240,7 +244,7 @@ def test_json_is_one_document_and_nothing_else(config: Path) -> None:
 
 
 def test_progress_is_lines_where_stdout_is_no_terminal(config: Path) -> None:
-    result = run("calibrate", config, "--out", config.parent / "out", pipeline=SUCCEEDS)
+    result = called("calibrate", config, "--out", config.parent / "out", pipeline=SUCCEEDS)
 
     lines = result.stdout.splitlines()
     assert lines[0] == "solving: started"
@@ -289,7 +293,7 @@ def test_the_end_of_a_file_is_no_interrupt(config: Path) -> None:
     """Typer takes an EOFError for the end of what a person types."""
     pipeline = "def calibrate(*_): raise EOFError('marshal data too short')"
 
-    result = run("calibrate", config, "--out", config.parent / "out", pipeline=pipeline)
+    result = called("calibrate", config, "--out", config.parent / "out", pipeline=pipeline)
 
     assert result.returncode == 1
     assert "this is a defect of caliv-graph" in result.stderr

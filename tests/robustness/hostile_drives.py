@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +12,12 @@ import yaml
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from caliv_graph.cli.main import run
 from caliv_graph.conventions import AXES
 from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.truth_file import read_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s
+from tests.cli.commands import called
 
 FRONT, REAR = "/lidar/front/points", "/lidar/rear/points"
 IMU, GNSS, TWIST = "/imu/data", "/gnss/fix", "/vehicle/twist"
@@ -75,10 +73,8 @@ class Outcome:
 
 def command(*arguments: object) -> Outcome:
     """Runs the program, in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = run([str(argument) for argument in arguments])
-    return Outcome(code, out.getvalue(), err.getvalue())
+    done = called(*arguments)
+    return Outcome(done.returncode, done.stdout, done.stderr)
 
 
 def simulate(folder: Path, output: str = "both") -> Path:

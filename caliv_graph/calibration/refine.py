@@ -19,12 +19,7 @@ from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
-from caliv_graph.calibration.range_bias import (
-    TYPICAL_BIAS_M,
-    bias_directions,
-    fit_bias_sigma,
-    without_bias,
-)
+from caliv_graph.calibration.range_bias import fit_bias_sizes, range_biases, without_bias
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
@@ -68,7 +63,7 @@ SCALED_EVERY = 3
 """Iterations at the noise level from one estimate of the registration's scale to the next."""
 
 BIAS_AFTER = 4
-"""Iterations at the noise level after which the sigma of the biases is estimated, once: with the
+"""Iterations at the noise level after which the sigmas of the biases are estimated, once: with the
 biases free the shapes fit each other, and contradict nothing any more."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
@@ -97,7 +92,6 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
-    state.range_bias_m = TYPICAL_BIAS_M
     loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
     _begin_shapes(state, states, normals=False)
     course: list[Iteration] = []
@@ -152,12 +146,10 @@ class _Loop:
         return self._without_bias(shapes, lines)
 
     def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """Estimates the sigma of the biases at a linearisation, and applies it to that."""
+        """Estimates the sigmas of the biases at a linearisation, and applies them to that."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
-        directions = bias_directions(self.states, shapes.poses)
-        self.state.range_bias_m = fit_bias_sigma(
-            reduced, directions, reduced.in_tangents(self.prior)
-        )
+        biases = range_biases(self.states, shapes.poses)
+        self.state.bias_sizes = fit_bias_sizes(reduced, biases, reduced.in_tangents(self.prior))
         return self._without_bias(shapes, lines)
 
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
@@ -165,8 +157,8 @@ class _Loop:
 
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
-        directions = bias_directions(self.states, shapes.poses)
-        clouds = without_bias(*shapes.joint(self.state.scale), directions, self.state.range_bias_m)
+        directions = range_biases(self.states, shapes.poses).directions(self.state.bias_sizes)
+        clouds = without_bias(*shapes.joint(self.state.scale), directions)
         return self._reduced(clouds, lines)
 
     def iterate(self, number: int) -> Iteration:

@@ -38,6 +38,7 @@ from caliv_graph.calibration.noise import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
+from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config.model import Config, RobustConfig
 from caliv_graph.geometry.se3 import vehicle_axes_difference
@@ -79,8 +80,8 @@ class SolveState:
     turns: tuple[Symmetry | None, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
-    range_bias_m: float = 0.0
-    """1 sigma of the biases of the ranges; 0: none is looked for."""
+    bias_sizes: BiasSizes = UNKNOWN
+    """1 sigma of the biases of the ranges; before the joint loop none are looked for."""
 
 
 def solve_registered(

@@ -3,8 +3,8 @@
 The ranges of real LiDARs are off by some millimetres, by material, incidence and unit: the same for
 all points of one LiDAR on one target, or slowly changing over it, and so no noise that averages
 out. An offset moves all clouds of a LiDAR on a target along their mean beams; a smooth error moves
-and tilts those of one side. Both are nuisances with normal priors. The sizes of these are integrated
-out (`caliv_graph/calibration/README.md`, "Bias of the ranges").
+and tilts those of one side. Both are nuisances with normal priors, whose sizes are integrated over
+(`caliv_graph/calibration/README.md`, "Bias of the ranges").
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LOG_SPREAD = math.log(2.5)
 """1 sigma of both logarithms: the offsets of two units in three are between 1.2 and 7.5 mm."""
 
 OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
-"""Sigmas of the offsets over which is integrated: quantisation of ranges to the worst data sheet."""
+"""Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
 
 SMOOTHS = np.geomspace(0.02, 5.0, 12)
 """The same of the smooth errors, over the roughness."""
@@ -110,7 +110,9 @@ def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, 
     points = clouds.moved(R, t)
     middles = clouds.sum_per_cloud(points) / sizes
     apart = points - middles[clouds.cloud]
-    across = apart - np.einsum("na,na->n", apart, views[clouds.cloud])[:, None] * views[clouds.cloud]
+    across = (
+        apart - np.einsum("na,na->n", apart, views[clouds.cloud])[:, None] * views[clouds.cloud]
+    )
     # Per axis at right angles to the beams: an error of its size there, in the root mean square.
     radii = np.sqrt(0.5 * clouds.sum_per_cloud((across**2).sum(axis=1)) / clouds.sizes)
     roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))

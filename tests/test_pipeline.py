@@ -417,10 +417,6 @@ def test_names_do_not_matter(quiet: list[Tried]) -> None:
     assert apart(quiet[0], other, names) < 1e-9
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="expectation-maximisation ends at another of several near optima: 0.4 sigma apart",
-)
 def test_the_map_does_not_matter(quiet: list[Tried]) -> None:
     # What is left is rounding, and at worst a point that it moves from one component to the next.
     # A hundredth of a sigma is 15 um and 5 urad here.

@@ -1,4 +1,4 @@
-"""Where a registration begins, and how large the target is: in axes of the views, not of the map."""
+"""Where a registration begins, and how large the target is, in axes of the views, not the map."""
 
 from __future__ import annotations
 

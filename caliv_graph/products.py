@@ -461,8 +461,8 @@ class Solution:
         residuals: whitened pose-factor residuals, (J, 6) per placement.
         pose_noise: error model of the given poses that was used; None: no poses were given.
         registration_scale: factor on the sigmas of the registration, estimated from the data.
-        range_bias_m: 1 sigma of a bias of the ranges of each LiDAR on each target, estimated; 0:
-            none was looked for.
+        range_bias_m: 1 sigma of a bias of the ranges of each LiDAR on each target is at least this,
+            by the data, with a probability of 99 percent; 0: none was looked for.
         information_data: (6n, 6n) of the data alone, no prior on the extrinsics.
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.

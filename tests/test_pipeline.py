@@ -425,10 +425,6 @@ def test_names_do_not_matter(coarse: Tried) -> None:
     assert apart(coarse, other, names) < 1e-9
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="expectation-maximisation ends at another of several near optima: 0.4 sigma apart",
-)
 def test_the_map_does_not_matter(coarse: Tried) -> None:
     # What is left is rounding, and at worst a point that it moves from one component to the next.
     # A hundredth of a sigma is 15 um and 5 urad here.

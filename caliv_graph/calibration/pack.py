@@ -73,7 +73,7 @@ def packed_solution(
         residuals=tuple(np.split(whitened, cuts)),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
-        range_bias_m=state.range_bias_m,
+        range_bias_m=state.bias_sizes.least_m,
         information_data=information_data,
         information_prior=problem.guess_information(),
         cov=cov,

@@ -1,82 +1,189 @@
-"""A bias of the ranges of each LiDAR on each target: eliminated, its size estimated.
+"""Biases of the ranges on a target: eliminated, their sizes found by what they contradict.
 
 The ranges of real LiDARs are off by some millimetres, by material, incidence and unit: the same for
-all points of one LiDAR on one target, nearly, and so no noise that averages out. A bias b of LiDAR
-a on target m moves all its clouds there along their mean beams. It is a nuisance with a normal
-prior; the prior's sigma is estimated where targets and LiDARs contradict each other
-(`caliv_graph/calibration/README.md`).
+all points of one LiDAR on one target, or slowly changing over it, and so no noise that averages
+out. An offset moves all clouds of a LiDAR on a target along their mean beams; a smooth error moves
+and tilts those of one side. Both are nuisances with normal priors, whose sizes are integrated over
+(`caliv_graph/calibration/README.md`, "Bias of the ranges").
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize_scalar
 
 from caliv_graph.calibration.linear import cloud_rows
 from caliv_graph.calibration.reduced import Reduced
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array
+from caliv_graph.registration.heights import LEAST_SIGMA_M
 from caliv_graph.registration.register import JointRegistration
 
-TYPICAL_BIAS_M = 1e-3
-"""Median of the prior of a bias's sigma. Data sheets state an accuracy of 10 to 30 mm over all
-ranges and materials; two OS1-128 differ by 4.4 mm each on three boxes of one material."""
+TYPICAL_OFFSET_M = 3e-3
+"""Median of the prior of the offsets' sigma. Data sheets state an accuracy of 10 to 30 mm at most
+over all ranges and materials, and a repeatability of 3 to 10 mm."""
+
+TYPICAL_SMOOTH = 0.5
+"""Median of the prior of the smooth errors' sigma, over the roughness: what repeated scans of the
+target share is partly the same for neighbouring beams. Between none and all."""
 
 LOG_SPREAD = math.log(2.5)
-"""1 sigma of its logarithm: 4.4 mm are 1.6 sigmas."""
+"""1 sigma of both logarithms: the offsets of two units in three are between 1.2 and 7.5 mm."""
 
-EVIDENCE = 8.0
-"""Logarithm of the ratio of likelihoods above which the sigma is not `TYPICAL_BIAS_M`: what a few
-clouds on one target seem to say of biases is chance, and takes what they say of the mountings."""
+OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
+"""Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
 
-LEAST_BIAS_M, LARGEST_BIAS_M = 1e-4, 0.05
-"""Bounds of the sigma."""
+SMOOTHS = np.geomspace(0.02, 5.0, 12)
+"""The same of the smooth errors, over the roughness."""
+
+VIEW_RAD = math.radians(20.0)
+"""Angle between views, about the target, at which their smooth errors are alike by e^-1/2: what
+depends on incidence changes by a third from 30 to 50 degrees."""
+
+RANK_PART = 1e-4
+"""Eigenvectors of the correlation of views with less than this part of the largest eigenvalue are
+left out: numerical."""
+
+SURE = 0.99
+"""Probability with which the offsets are at least `BiasSizes.least_m`."""
 
 
-def bias_directions(
-    states: Sequence[JointRegistration], poses: Sequence[tuple[Array, Array]]
-) -> Array:
-    """(6 J, B) how the clouds' poses seem to move by a metre of bias of each LiDAR and placement.
+@dataclass(frozen=True)
+class BiasSizes:
+    """1 sigma of the biases.
 
-    Left perturbations of `T_target_lidar` at the poses (J, 3, 3), (J, 3) of each placement.
+    Attributes:
+        offset_m: of each LiDAR on each target, metres.
+        smooth: of the smooth errors, over the roughness.
+        least_m: the offsets' is at least this, by the data, metres (`SURE`).
     """
-    blocks = []
-    for state, (R, _) in zip(states, poses, strict=True):
-        clouds = state.clouds
-        beams = clouds.sum_per_cloud(clouds.rotated(R, clouds.beams)) / clouds.sizes[:, None]
-        out = np.zeros((clouds.count, 6, clouds.lidars))
-        out[np.arange(clouds.count), 3:, clouds.lidar] = beams
-        blocks.append(out.reshape(6 * clouds.count, clouds.lidars))
-    return np.asarray(scipy.linalg.block_diag(*blocks))
+
+    offset_m: float
+    smooth: float
+    least_m: float = 0.0
 
 
-def without_bias(
-    H: Array, gradient: Array, directions: Array, sigma_m: float
-) -> tuple[Array, Array]:
-    """(6 J, 6 J) and (6 J,) of the clouds with the biases of sigma `sigma_m` eliminated."""
+UNKNOWN = BiasSizes(float(OFFSETS_M[0]), 0.0)
+"""Before they are estimated: shapes that were made with large biases contradict nothing."""
+
+
+@dataclass(frozen=True)
+class RangeBiases:
+    """How the poses of J clouds seem to move by biases of their ranges, left perturbations.
+
+    Attributes:
+        offsets: (6 J, B) by a metre of the offset of each LiDAR and placement.
+        smooth: (6 J, C) by smooth errors of the size of the roughness, as independent ones.
+    """
+
+    offsets: Array
+    smooth: Array
+
+    def directions(self, sizes: BiasSizes) -> Array:
+        """(6 J, B + C) by biases of sigma 1."""
+        return np.hstack([sizes.offset_m * self.offsets, sizes.smooth * self.smooth])
+
+
+def range_biases(
+    states: Sequence[JointRegistration], poses: Sequence[tuple[Array, Array]]
+) -> RangeBiases:
+    """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each."""
+    both = [_of_placement(state, R, t) for state, (R, t) in zip(states, poses, strict=True)]
+    return RangeBiases(
+        np.asarray(scipy.linalg.block_diag(*(offsets for offsets, _ in both))),
+        np.asarray(scipy.linalg.block_diag(*(smooth for _, smooth in both))),
+    )
+
+
+def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, Array]:
+    """`RangeBiases.offsets` and `.smooth` of a placement."""
+    clouds = state.clouds
+    sizes = clouds.sizes[:, None]
+    beams = clouds.sum_per_cloud(clouds.rotated(R, clouds.beams)) / sizes
+    offsets = np.zeros((clouds.count, 6, clouds.lidars))
+    offsets[np.arange(clouds.count), 3:, clouds.lidar] = beams
+    views = beams / np.linalg.norm(beams, axis=1)[:, None]
+    points = clouds.moved(R, t)
+    middles = clouds.sum_per_cloud(points) / sizes
+    apart = points - middles[clouds.cloud]
+    across = (
+        apart - np.einsum("na,na->n", apart, views[clouds.cloud])[:, None] * views[clouds.cloud]
+    )
+    # Per axis at right angles to the beams: an error of its size there, in the root mean square.
+    radii = np.sqrt(0.5 * clouds.sum_per_cloud((across**2).sum(axis=1)) / clouds.sizes)
+    roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))
+    smooth = [np.zeros((clouds.count, 6, 0))]
+    for a in np.flatnonzero(roughness > 0.0).tolist():
+        own = np.flatnonzero(clouds.lidar == a)
+        moves = np.zeros((len(own), 6, 4))
+        moves[:, 3:, 0] = views[own]
+        tilts = np.eye(3) - views[own, :, None] * views[own, None, :]
+        moves[:, :3, 1:] = tilts / max(float(np.median(radii[own])), LEAST_SIGMA_M)
+        moves[:, 3:, 1:] = skew(middles[own]) @ moves[:, :3, 1:]
+        root = roughness[a] * _root_of_views(views[own])
+        out = np.zeros((clouds.count, 6, 4 * root.shape[1]))
+        out[own] = np.einsum("jac,jk->jack", moves, root).reshape(len(own), 6, -1)
+        smooth.append(out)
+    flat = 6 * clouds.count
+    return offsets.reshape(flat, -1), np.concatenate(smooth, axis=2).reshape(flat, -1)
+
+
+def _root_of_views(views: Array) -> Array:
+    """(J, r) root of the correlation of smooth errors in views (J, 3), unit vectors."""
+    angles = np.arccos(np.clip(views @ views.T, -1.0, 1.0))
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * (angles / VIEW_RAD) ** 2))
+    kept = values > RANK_PART * values[-1]
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def without_bias(H: Array, gradient: Array, directions: Array) -> tuple[Array, Array]:
+    """(6 J, 6 J) and (6 J,) of the clouds with biases of sigma 1 along `directions` eliminated."""
     seen = H @ directions
-    own = directions.T @ seen + np.eye(directions.shape[1]) / sigma_m**2
-    factor = scipy.linalg.cho_factor(own, lower=True)
+    factor = scipy.linalg.cho_factor(np.eye(directions.shape[1]) + directions.T @ seen, lower=True)
     pull = scipy.linalg.cho_solve(factor, directions.T @ gradient)
     return H - seen @ scipy.linalg.cho_solve(factor, seen.T), gradient - seen @ pull
 
 
-def fit_bias_sigma(reduced: Reduced, directions: Array, prior: Array) -> float:
-    """The sigma of the biases, metres, by restricted maximum likelihood with its prior.
+def fit_bias_sizes(reduced: Reduced, biases: RangeBiases, prior: Array) -> BiasSizes:
+    """The sigmas of the biases: root mean squares of their posterior.
 
-    `TYPICAL_BIAS_M` if the data do not contradict that (`EVIDENCE`).
-
-    Extrinsics, poses, targets and shape are integrated out: a bias that a mounting can make up for
-    says nothing.
+    By the restricted likelihood: extrinsics, poses, targets and shape are integrated out, so that a
+    bias that a mounting can make up for says nothing.
 
     Args:
         reduced: the linearised problem with the clouds' quadratic, no bias eliminated.
-        directions: of `bias_directions`.
+        biases: of the same clouds.
         prior: (6n, 6n) information of the guesses, tangents of the graph's extrinsics.
     """
+    information, pull = _information(reduced, np.hstack([biases.offsets, biases.smooth]), prior)
+    smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)
+    count = biases.offsets.shape[1]
+    cost = np.zeros((len(OFFSETS_M), len(smooths)))
+    for i, offset_m in enumerate(OFFSETS_M):
+        for k, smooth in enumerate(smooths):
+            sigma = np.full(len(pull), smooth)
+            sigma[:count] = offset_m
+            cost[i, k] = _cost(sigma[:, None] * information * sigma, sigma * pull)
+    cost += 0.5 * (np.log(OFFSETS_M / TYPICAL_OFFSET_M) / LOG_SPREAD)[:, None] ** 2
+    if biases.smooth.shape[1]:
+        cost += 0.5 * (np.log(smooths / TYPICAL_SMOOTH) / LOG_SPREAD) ** 2
+    weights = np.exp(cost.min() - cost)
+    weights /= weights.sum()
+    of_offsets = weights.sum(axis=1)
+    least = int(np.searchsorted(np.cumsum(of_offsets), 1.0 - SURE))
+    return BiasSizes(
+        offset_m=float(np.sqrt(of_offsets @ OFFSETS_M**2)),
+        smooth=float(np.sqrt(weights.sum(axis=0) @ smooths**2)),
+        least_m=float(OFFSETS_M[least]),
+    )
+
+
+def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Array, Array]:
+    """(B, B) and (B,) of the biases along `directions`, all other variables eliminated."""
     H, gradient = reduced.clouds
     system = reduced.system
     rows = cloud_rows(system, reduced.lines)
@@ -89,17 +196,11 @@ def fit_bias_sigma(reduced: Reduced, directions: Array, prior: Array) -> float:
     information = directions.T @ seen - across.T @ scipy.linalg.cho_solve(factor, across)
     # Minus the gradient of the negative logarithm, what the other variables follow taken off.
     pull = -(directions.T @ gradient) - across.T @ scipy.linalg.cho_solve(factor, system.b)
-    own, axes = np.linalg.eigh(0.5 * (information + information.T))
-    own, pull = np.maximum(own, 0.0), axes.T @ pull
+    return 0.5 * (information + information.T), pull
 
-    def cost(logarithm: float) -> float:
-        variance = math.exp(2.0 * logarithm)
-        surprise = ((logarithm - math.log(TYPICAL_BIAS_M)) / LOG_SPREAD) ** 2
-        fit = np.sum(np.log1p(variance * own) - pull**2 / (1.0 / variance + own))
-        return 0.5 * (float(fit) + surprise)
 
-    bounds = (math.log(LEAST_BIAS_M), math.log(LARGEST_BIAS_M))
-    found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
-    if cost(math.log(TYPICAL_BIAS_M)) - cost(float(found.x)) < EVIDENCE:
-        return TYPICAL_BIAS_M
-    return math.exp(float(found.x))
+def _cost(information: Array, pull: Array) -> float:
+    """Minus the logarithm of the restricted likelihood, of biases in units of their sigmas."""
+    L = np.linalg.cholesky(np.eye(len(pull)) + information)
+    y = scipy.linalg.solve_triangular(L, pull, lower=True)
+    return float(np.log(np.diag(L)).sum() - 0.5 * y @ y)

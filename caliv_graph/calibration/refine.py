@@ -22,9 +22,9 @@ from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import (
-    TYPICAL_BIAS_M,
-    bias_directions,
-    fit_bias_sigma,
+    RangeBiases,
+    fit_bias_sizes,
+    range_biases,
     without_bias,
 )
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
@@ -71,7 +71,7 @@ SCALED_EVERY = 3
 """Iterations at the noise level from one estimate of the registration's scale to the next."""
 
 BIAS_AFTER = 4
-"""Iterations at the noise level after which the sigma of the biases is estimated, once: with the
+"""Iterations at the noise level after which the sigmas of the biases are estimated, once: with the
 biases free the shapes fit each other, and contradict nothing any more."""
 
 STEP_TOLERANCE = (5e-5, 3e-4)
@@ -100,7 +100,6 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
-    state.range_bias_m = TYPICAL_BIAS_M
     loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
     _begin_shapes(state, states, normals=False)
     course: list[Iteration] = []
@@ -155,9 +154,9 @@ class _Loop:
         return self._without_bias(shapes, lines)
 
     def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """Estimates the sigma of the biases at a linearisation, and applies it to that."""
+        """Estimates the sigmas of the biases at a linearisation, and applies them to that."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
-        self.state.range_bias_m = fit_bias_sigma(
+        self.state.bias_sizes = fit_bias_sizes(
             reduced, shapes.biases, reduced.in_tangents(self.prior)
         )
         return self._without_bias(shapes, lines)
@@ -170,15 +169,16 @@ class _Loop:
     ) -> Reduced:
         """The graph with the clouds' quadratic, the biases of the ranges eliminated.
 
-        `most_m` is the largest sigma of these, metres.
+        `most_m` is the largest sigma of the offsets, metres.
         """
-        sigma_m = min(self.state.range_bias_m, most_m)
-        clouds = without_bias(*shapes.joint(self.state.scale), shapes.biases, sigma_m)
+        sizes = self.state.bias_sizes
+        sizes = replace(sizes, offset_m=min(sizes.offset_m, most_m))
+        clouds = without_bias(*shapes.joint(self.state.scale), shapes.biases.directions(sizes))
         return self._reduced(clouds, lines)
 
     def tested(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
         """The linearisation for score tests: biases beyond those of LiDARs explain nothing."""
-        if self.state.range_bias_m <= RANGE_BIAS_LIMIT_M:
+        if self.state.bias_sizes.offset_m <= RANGE_BIAS_LIMIT_M:
             return reduced
         return self._without_bias(shapes, reduced.lines, RANGE_BIAS_LIMIT_M)
 
@@ -273,7 +273,7 @@ def _expect(
         None if turn is None else refit(turn, state.mixture)
         for turn, state in zip(turns, states, strict=True)
     ]
-    return _Shapes(poses, quadratics, fitted, bias_directions(states, poses))
+    return _Shapes(poses, quadratics, fitted, range_biases(states, poses))
 
 
 def per_placement(problem: Problem, lines: CloudLinearisation) -> list[tuple[Array, Array]]:
@@ -289,15 +289,12 @@ def _hand_weights(state: SolveState, states: Sequence[JointRegistration]) -> Non
 
 @dataclass
 class _Shapes:
-    """The clouds' quadratic over all placements at one set of poses.
-
-    `biases` (6 J, B): `bias_directions` there.
-    """
+    """The clouds' quadratic over all placements at one set of poses, and the biases there."""
 
     poses: list[tuple[Array, Array]]
     quadratics: list[ShapeQuadratic]
     turns: list[Symmetry | None]
-    biases: Array
+    biases: RangeBiases
 
     def joint(self, scale: float) -> tuple[Array, Array]:
         """(6 J, 6 J) and (6 J,) of all placements."""

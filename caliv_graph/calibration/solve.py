@@ -37,6 +37,7 @@ from caliv_graph.calibration.noise import (
     squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.config.model import Config, RobustConfig
@@ -79,8 +80,8 @@ class SolveState:
     turns: tuple[Symmetry | None, ...] = ()
     ground_weights: GroundWeights | None = None
     graph_seconds: float = 0.0
-    range_bias_m: float = 0.0
-    """1 sigma of the biases of the ranges; 0: none is looked for."""
+    bias_sizes: BiasSizes = UNKNOWN
+    """1 sigma of the biases of the ranges; before the joint loop none are looked for."""
 
 
 def solve_registered(

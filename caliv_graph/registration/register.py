@@ -21,6 +21,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, Mixture, Registration, Side, TargetObservation
+from caliv_graph.registration.centring import centre_clouds, depth_of
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
@@ -59,9 +60,6 @@ DAMPING = 1e-3
 
 LEFT_OUT = 1e-9
 """Weight of a cloud that shall neither shape the target nor move."""
-
-UP = np.array([0.0, 0.0, 1.0])
-"""Axis of the target frame."""
 
 UNSEEN = 1e-6
 """Damping of directions in which a cloud has no information, relative to the mean of all."""
@@ -179,9 +177,7 @@ class JointRegistration:
 
     def seed(self, R: Array, t: Array, sigma_m: float) -> None:
         """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
-        points = self.clouds.moved(R, t)
-        low, high = np.percentile(points, [1, 99], axis=0)
-        self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
+        self._depth_m = depth_of(self.clouds.moved(R, t))
         self._floor = max(sigma_m, self._floor_end)
         distinct = float((self.clouds.sizes * self.view_weights).sum())
         trusted = self.weights > TRUSTED_WEIGHT
@@ -253,46 +249,6 @@ class JointRegistration:
         )
 
 
-def centre_clouds(
-    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
-) -> Array:
-    """(J, 3) translations that put the middle of every cloud's extent at the origin.
-
-    An initial guess displaces the target by up to 1 m (3 degrees at 20 m). All clouds of a target
-    have about the same extent, whatever the density of their points. Where the edge of the field of
-    view cuts a cloud off (`cut`, of each cloud; empty: of none), its middle is half the median
-    extent of the others away from the side that is whole.
-    """
-    points = clouds.moved(R, t)
-    beams = clouds.rotated(R, clouds.beams)
-    out = t.copy()
-    ends = np.append(clouds.starts, len(points))
-    sides = cut or [frozenset()] * clouds.count
-    # Per cloud, at right angles to the view and upwards: direction, low, high, which ends are cut.
-    spans = []
-    for j, own_sides in enumerate(sides):
-        own = slice(ends[j], ends[j + 1])
-        low, high = np.percentile(points[own], [2, 98], axis=0)
-        out[j] -= 0.5 * (low + high)
-        view = beams[own].mean(axis=0)
-        left = np.array([-view[1], view[0], 0.0]) / max(float(np.hypot(*view[:2])), 1e-9)
-        across = np.percentile(points[own] @ left, [2, 98])
-        spans.append(
-            (
-                (left, across, ("right" in own_sides, "left" in own_sides)),
-                (UP, np.array([low[2], high[2]]), ("bottom" in own_sides, "top" in own_sides)),
-            )
-        )
-    for axis in (0, 1):
-        whole = [np.ptp(span[axis][1]) for span in spans if not any(span[axis][2])]
-        typical = float(np.median(whole or [max(np.ptp(span[axis][1]) for span in spans)]))
-        for j, span in enumerate(spans):
-            direction, (low, high), (cut_low, cut_high) = span[axis]
-            lacks = max(typical - (high - low), 0.0)
-            out[j] += 0.5 * lacks * (float(cut_low) - float(cut_high)) * direction
-    return out
-
-
 def left_step(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
     """Applies left perturbations (J, 6) to (R, t) of shape (J, 3, 3), (J, 3)."""
     dR, dt = stack([gtsam.Pose3.Expmap(dj) for dj in d])
@@ -319,8 +275,13 @@ def free_step(quadratic: ShapeQuadratic) -> Array:
         return np.full((count, 6), np.nan)
     d = -scipy.linalg.cho_solve(factor, quadratic.gradient.ravel()).reshape(count, 6)
     d -= d.mean(axis=0)  # the gauge
-    largest = np.abs(d).max()
+    largest = _sizes(d).max()
     return np.asarray(d * min(1.0, MAX_STEP / largest) if largest > 0 else d)
+
+
+def _sizes(d: Array) -> Array:
+    """(2, J) rad and m, of steps (J, 6)."""
+    return np.asarray(np.linalg.norm(d.reshape(-1, 2, 3), axis=2).T)
 
 
 def register_jointly(
@@ -387,10 +348,8 @@ def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: in
         R, t = left_step(R, t, d)
         state.maximise(R, t)
         # The median cloud: one sparse cloud that slides along a surface does not matter.
-        step = (
-            float(np.median(np.abs(d[:, :3]).max(axis=1))),
-            float(np.median(np.abs(d[:, 3:]).max(axis=1))),
-        )
+        turn, shift = np.median(_sizes(d), axis=1).tolist()
+        step = (turn, shift)
         fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
         converged = state.finest and fine
     return _Run(R, t, iteration, converged, step)

@@ -171,7 +171,7 @@ class CheckInputs:
         counts: of outliers.
         registration_scale: sigmas of the registrations over what their points' scatter gives.
         registration_sigma: rad and m, of the median cloud, scaled.
-        range_bias_m: 1 sigma of the biases of the ranges, metres.
+        range_bias_m: 1 sigma of the biases of the ranges is at least this, metres.
         assumed: quantities that the config assumes.
         headings: of the drives that have one.
         speed_m_s: median over the clouds.
@@ -237,7 +237,7 @@ class RangesDisagree:
     """Ranges of LiDARs on several targets that no mounting brings together.
 
     Attributes:
-        sigma_m: of the biases of each LiDAR on each target, metres.
+        sigma_m: of the biases of each LiDAR on each target, at least, metres.
         lidars: that take part.
     """
 

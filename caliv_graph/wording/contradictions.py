@@ -155,7 +155,7 @@ def _ranges(found: RangesDisagree) -> str:
     sigma, limit = 1e3 * found.sigma_m, 1e3 * RANGE_BIAS_LIMIT_M
     return (
         f"the ranges of the lidars {names} on the targets contradict each other: no mounting "
-        f"brings them together unless each range on each target is off by {sigma:.0f} mm "
+        f"brings them together unless each range on each target is off by at least {sigma:.0f} mm "
         f"(1 sigma; limit {limit:.0f} mm). Check the range calibration of the LiDARs and that no "
         "target moved; use matt targets of one material, and see each from several sides"
     )

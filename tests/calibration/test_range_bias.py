@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.graph import pose_graph
-from caliv_graph.calibration.linear import linearise_clouds
+from caliv_graph.calibration.linear import cloud_rows, linearise_clouds
 from caliv_graph.calibration.range_bias import (
-    LEAST_BIAS_M,
-    TYPICAL_BIAS_M,
-    bias_directions,
-    fit_bias_sigma,
+    LOG_SPREAD,
+    TYPICAL_OFFSET_M,
+    BiasSizes,
+    RangeBiases,
+    fit_bias_sizes,
+    range_biases,
     without_bias,
 )
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
@@ -51,7 +56,7 @@ def test_biases_are_eliminated_as_variables_are() -> None:
     pull = both.T @ gradient
     follows = np.linalg.solve(full[18:, 18:], np.column_stack([full[18:, :18], pull[18:]]))
     expected = full[:18, :18] - full[:18, 18:] @ follows[:, :18]
-    found, found_gradient = without_bias(H, gradient, D, sigma_m)
+    found, found_gradient = without_bias(H, gradient, sigma_m * D)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(
         found_gradient, pull[:18] - full[:18, 18:] @ follows[:, 18], atol=1e-9
@@ -62,14 +67,14 @@ def test_eliminated_biases_add_to_the_covariance() -> None:
     # Woodbury: the poses are known by the clouds and by what the biases move them by, added.
     H, gradient = quadratic(2, 3)
     D = any_directions(2, 2, 4)
-    less, _ = without_bias(H, gradient, D, 0.5)
+    less, _ = without_bias(H, gradient, 0.5 * D)
     np.testing.assert_allclose(np.linalg.inv(less), np.linalg.inv(H) + 0.25 * D @ D.T, atol=1e-9)
     assert np.linalg.eigvalsh(H - less).min() > -1e-9
 
 
 def test_biases_that_do_not_exist_change_nothing() -> None:
     H, gradient = quadratic(2, 5)
-    found, found_gradient = without_bias(H, gradient, any_directions(2, 3, 6), 1e-9)
+    found, found_gradient = without_bias(H, gradient, 1e-9 * any_directions(2, 3, 6))
     np.testing.assert_allclose(found, H, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found_gradient, gradient, rtol=1e-9, atol=1e-9)
 
@@ -77,7 +82,7 @@ def test_biases_that_do_not_exist_change_nothing() -> None:
 def test_nothing_is_known_along_a_bias_that_may_be_any() -> None:
     H, gradient = quadratic(2, 7)
     D = any_directions(2, 1, 8)
-    found, found_gradient = without_bias(H, gradient, D, 1e6)
+    found, found_gradient = without_bias(H, gradient, 1e6 * D)
     assert (D.T @ found @ D)[0, 0] == pytest.approx(0.0, abs=1e-6)
     assert (D.T @ found_gradient)[0] == pytest.approx(0.0, abs=1e-6)
 
@@ -85,28 +90,37 @@ def test_nothing_is_known_along_a_bias_that_may_be_any() -> None:
 # ------------------------------------------------------------------ directions
 
 
-def placement(number: int, names: tuple[str, ...]) -> tuple[JointRegistration, tuple[Array, Array]]:
+def placement(
+    number: int, names: tuple[str, ...], apart_deg: float = 12.0, roughness_m: float = 0.0
+) -> tuple[JointRegistration, tuple[Array, Array]]:
     """A small plate, seen by the named LiDARs from about it, and the poses of the clouds."""
     rng = np.random.default_rng(number)
     clouds, poses = [], []
     for j, name in enumerate(names):
-        T = looking_at_target(40.0 * number + 12.0 * j, 6.0 + j)
+        T = looking_at_target(40.0 * number + apart_deg * j, 6.0 + j)
         corner = np.array([0.0, -0.1, -0.1])
         plate = rectangle_points(rng, 40, corner, np.array([0, 0.2, 0]), np.array([0, 0, 0.2]))
         clouds.append(TargetCloud(name, 0, j, seen_from(T, plate, 0.0, rng), f"{j}.pcd"))
         poses.append(T)
     observation = TargetObservation(number, f"target_{number}", np.zeros(3), tuple(clouds))
-    return JointRegistration(observation, config_of()), matrices(poses)
+    state = JointRegistration(observation, config_of())
+    # The floor of 1 mm is taken off: ranges are quantised to millimetres.
+    state.noise = replace(
+        state.noise, roughness_m2=np.full(state.clouds.lidars, roughness_m**2 + 1e-6)
+    )
+    return state, matrices(poses)
 
 
-def test_a_bias_moves_the_clouds_of_one_lidar_and_placement_along_their_beams() -> None:
+def test_an_offset_moves_the_clouds_of_one_lidar_and_placement_along_their_beams() -> None:
     names = [("front", "rear", "front"), ("rear", "front", "rear", "left")]
     states, poses = zip(*[placement(m, n) for m, n in enumerate(names)], strict=True)
-    directions = bias_directions(states, poses)
+    biases = range_biases(states, poses)
     # Two LiDARs at the first target, three at the second; numbered as they come.
-    assert directions.shape == (6 * 7, 2 + 3)
+    assert biases.offsets.shape == (6 * 7, 2 + 3)
+    # Nothing is rough.
+    assert biases.smooth.shape == (6 * 7, 0)
     column = [0, 1, 0, 2, 3, 2, 4]
-    by_cloud = directions.reshape(7, 6, 5)
+    by_cloud = biases.offsets.reshape(7, 6, 5)
     t = np.concatenate([t for _, t in poses])
     for j, own in enumerate(column):
         other = np.delete(by_cloud[j], own, axis=1)
@@ -116,6 +130,60 @@ def test_a_bias_moves_the_clouds_of_one_lidar_and_placement_along_their_beams() 
         beam = by_cloud[j, 3:, own]
         assert np.linalg.norm(beam) == pytest.approx(1.0, abs=1e-3)
         assert beam == pytest.approx(-t[j] / np.linalg.norm(t[j]), abs=0.01)
+
+
+def displacements(smooth: Array, y: Array) -> Array:
+    """(N, 3, C) how the points (N, 3) of a cloud move by its left perturbations (6, C)."""
+    turned = np.cross(smooth[None, :3], y[:, :, None], axisa=1, axisb=1, axisc=1)
+    return np.asarray(smooth[None, 3:] + turned)
+
+
+def smooth_errors(apart_deg: float, *names: str) -> tuple[Array, list[Array], Array]:
+    """(J, 6, C) for a plate of 3 mm roughness, its points in each cloud, and the (J, 3) views."""
+    state, (R, t) = placement(0, names, apart_deg, 3e-3)
+    smooth = range_biases([state], [(R, t)]).smooth
+    points = np.split(state.clouds.moved(R, t), state.clouds.starts[1:])
+    views = np.array([y.mean(axis=0) - t[j] for j, y in enumerate(points)])
+    views /= np.linalg.norm(views, axis=1)[:, None]
+    return smooth.reshape(len(names), 6, -1), points, views
+
+
+def test_smooth_errors_are_as_large_as_the_roughness_and_its_slopes() -> None:
+    smooth, points, views = smooth_errors(0.0, "front", "rear")
+    # The plate is at right angles to the beams. A constant part and two slopes, each of the
+    # roughness in the root mean square of the points.
+    for j in range(2):
+        depths = np.einsum("nac,a->nc", displacements(smooth[j], points[j]), views[j])
+        size = np.sqrt(np.mean(np.sum(depths**2, axis=1)))
+        assert size == pytest.approx(np.sqrt(3.0) * 3e-3, rel=0.02)
+
+
+def test_smooth_errors_neither_move_the_middle_aside_nor_turn_about_the_beams() -> None:
+    smooth, points, views = smooth_errors(0.0, "front", "rear")
+    moved = displacements(smooth[0], points[0].mean(axis=0, keepdims=True))[0]
+    assert np.abs(moved - np.outer(views[0], views[0] @ moved)).max() < 1e-5
+    assert np.abs(views[0] @ smooth[0, :3]).max() < 1e-3 * np.abs(smooth[0, :3]).max()
+
+
+@pytest.mark.parametrize(
+    ("apart_deg", "names", "alike"),
+    [
+        (0.0, ("front", "front"), 1.0),
+        (20.0, ("front", "front"), math.exp(-0.5)),
+        (80.0, ("front", "front"), 0.0),
+        (0.0, ("front", "rear"), 0.0),
+    ],
+)
+def test_smooth_errors_are_those_of_a_lidar_and_a_side(
+    apart_deg: float, names: tuple[str, str], alike: float
+) -> None:
+    smooth, points, views = smooth_errors(apart_deg, *names)
+    depth = [
+        views[j] @ displacements(smooth[j], points[j].mean(axis=0, keepdims=True))[0]
+        for j in range(2)
+    ]
+    sizes = [np.linalg.norm(d) for d in depth]
+    assert depth[0] @ depth[1] / (sizes[0] * sizes[1]) == pytest.approx(alike, abs=0.02)
 
 
 # ------------------------------------------------------------------ their size
@@ -156,26 +224,32 @@ def biased(bias_m: float, seed: int, *, placements: int = 6) -> tuple[Reduced, A
     return reduced, directions, drawn
 
 
-def fitted(bias_m: float, seed: int) -> tuple[float, Array]:
+def fitted(bias_m: float, seed: int) -> tuple[BiasSizes, Array]:
     reduced, directions, drawn = biased(bias_m, seed)
     prior = reduced.in_tangents(make_case().problem.guess_information())
-    return fit_bias_sigma(reduced, directions, prior), drawn
+    biases = RangeBiases(directions, np.zeros((len(directions), 0)))
+    return fit_bias_sizes(reduced, biases, prior), drawn
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_biases_are_small_where_the_targets_agree(seed: int) -> None:
+def test_offsets_are_small_where_the_targets_agree(seed: int) -> None:
     found, _ = fitted(0.0, seed)
-    assert LEAST_BIAS_M <= found < 1.5e-3
+    assert found.offset_m < 0.6 * TYPICAL_OFFSET_M
+    assert found.least_m < 5e-4
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("bias_m", [5e-3, 0.015])
-def test_biases_are_as_large_as_the_targets_contradict_each_other(bias_m: float, seed: int) -> None:
+def test_offsets_are_as_large_as_the_targets_contradict_each_other(
+    bias_m: float, seed: int
+) -> None:
     found, drawn = fitted(bias_m, seed)
-    assert 0.5 < found / np.sqrt(np.mean(drawn**2)) < 2.0
+    size = np.sqrt(np.mean(drawn**2))
+    assert 0.5 < found.offset_m / size < 2.0
+    assert 0.2 * size < found.least_m < size
 
 
-def test_a_bias_that_the_place_of_a_target_makes_up_for_says_nothing() -> None:
+def test_offsets_that_the_place_of_a_target_makes_up_for_say_nothing() -> None:
     # All clouds of one target shifted alike, by 20 mm: its frame goes along. The prior is left.
     case = make_case("front", count=4)
     H = np.asarray(block_diag(*case.information))
@@ -188,4 +262,25 @@ def test_a_bias_that_the_place_of_a_target_makes_up_for_says_nothing() -> None:
         linearise_clouds(case.problem, case.truth),
     )
     prior = reduced.in_tangents(case.problem.guess_information())
-    assert fit_bias_sigma(reduced, common, prior) == pytest.approx(TYPICAL_BIAS_M, rel=0.1)
+    found = fit_bias_sizes(reduced, RangeBiases(common, np.zeros((24, 0))), prior)
+    # The root mean square of a log-normal distribution, but for its tail beyond 30 mm.
+    assert found.offset_m == pytest.approx(TYPICAL_OFFSET_M * np.exp(LOG_SPREAD**2), rel=0.2)
+    assert found.least_m < 0.5e-3
+
+
+def test_turned_faces_are_told_from_offsets() -> None:
+    # Four clouds with smooth errors of three times the roughness, and no offsets.
+    reduced, offsets, _ = biased(0.0, 1)
+    rng = np.random.default_rng(5)
+    smooth = 2e-3 * rng.normal(size=(len(offsets), 40))
+    H, gradient = reduced.clouds
+    drawn = 3.0 * rng.normal(size=40)
+    moved = replace(reduced, clouds=(H, gradient - H @ smooth @ drawn))
+    # The other variables see the same clouds.
+    rows = cloud_rows(reduced.system, reduced.lines)
+    system = replace(reduced.system, b=reduced.system.b + rows.T @ H @ smooth @ drawn)
+    moved = replace(moved, system=system)
+    prior = reduced.in_tangents(make_case().problem.guess_information())
+    found = fit_bias_sizes(moved, RangeBiases(offsets, smooth), prior)
+    assert 2.0 < found.smooth < 4.5
+    assert found.offset_m < TYPICAL_OFFSET_M

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, Side
+from caliv_graph.registration.centring import centre_clouds
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.register import (
     JointRegistration,
-    centre_clouds,
     register_jointly,
 )
 from caliv_graph.registration.starts import suspicious

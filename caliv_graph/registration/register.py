@@ -20,7 +20,7 @@ import scipy.linalg
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
-from caliv_graph.products import Array, IntArray, Mixture, Registration, Side, TargetObservation
+from caliv_graph.products import Array, IntArray, Mixture, Registration, TargetObservation
 from caliv_graph.registration.centring import centre_clouds, depth_of
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.heights import HeightNoise

@@ -11,7 +11,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from caliv_graph.config.load import dump_config, load_config, parse_config
-from caliv_graph.config.model import Config, GnssConfig, ImuConfig, PoseSigmaConfig
+from caliv_graph.config.model import Config, PoseSigmaConfig
+from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.errors import ConfigError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

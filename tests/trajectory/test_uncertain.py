@@ -74,9 +74,8 @@ def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
 
     assert rough.trajectory.cov is not None
     assert exact.trajectory.cov is not None
-    sigma, least = (
-        np.sqrt(np.diagonal(t.trajectory.cov, axis1=1, axis2=2)) for t in (rough, exact)
-    )
+    covs = rough.trajectory.cov, exact.trajectory.cov
+    sigma, least = (np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) for cov in covs)
     # 10 mm of the lever arm less what the drive tells of it; 0.1 degrees of pitch and yaw.
     assert (sigma[:, 3:] > least[:, 3:] + 0.003).all()
     assert (sigma[:, :3] > 1e-3).all()
@@ -92,7 +91,7 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
     R = gtsam.Rot3.RzRyRx(*np.radians(rpy_deg))
     T = gtsam.Pose3(R, np.array([1.2, -0.4, 0.6]))
     sensors = replace(SENSORS, T_vehicle_imu=T)
-    unknown = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
 
     smoothed = smooth_trajectory(
         record(COURSE, sensors, 4), config_for(sensors, imu=unknown), WANTED
@@ -107,7 +106,7 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
 
 def test_a_course_needs_gnss() -> None:
     motion = replace(record(COURSE, SENSORS, 5), gnss=None)
-    unknown = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
 
     with pytest.raises(TrajectoryError, match="measure the rotation of the IMU"):
         smooth_trajectory(motion, config_for(SENSORS, imu=unknown), WANTED)

@@ -20,7 +20,7 @@ from tests.trajectory.motions import Course, config_for, eight_drive, mounted_as
 
 COURSE = Course(eight_drive(16.0), rough=1.0)
 SENSORS = replace(mounted_askew(), twist_hz=50.0)
-CONFIG = config_for(SENSORS)
+CONFIG = config_for(SENSORS, measured=True)
 WANTED = stamps(16.0, 0.5, 0.3)
 
 
@@ -98,9 +98,11 @@ def test_several_drives_share_one_prior() -> None:
 
 def test_exact_figures_are_no_variables() -> None:
     sensors = replace(SENSORS, T_vehicle_imu=gtsam.Pose3(), lever_arm=(0.0, 0.0, 0.0))
-    trajectory = smooth_trajectory(record(COURSE, sensors, 1), config_for(sensors), WANTED)
+    trajectory = smooth_trajectory(
+        record(COURSE, sensors, 1), config_for(sensors, measured=True), WANTED
+    )
 
-    problem = problem_of([trajectory], config_for(sensors))
+    problem = problem_of([trajectory], config_for(sensors, measured=True))
 
     assert trajectory.parameters == ()
     assert motion_graph(problem).kinds == ["motion"]

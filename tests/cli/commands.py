@@ -78,7 +78,8 @@ def called(*arguments: object, pipeline: str = "") -> subprocess.CompletedProces
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _made_up(pipeline):
         code = main.run([str(argument) for argument in arguments])
-    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+    asked = [str(argument) for argument in arguments]
+    return subprocess.CompletedProcess(asked, code, out.getvalue(), err.getvalue())
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -189,19 +190,26 @@ def first_fix_map(motion: MotionData) -> Array:
     return np.concatenate(first)
 
 
-def config_for(sensors: Sensors, **sections: dict[str, object]) -> Config:
-    """A config that knows the extrinsics."""
+def config_for(
+    sensors: Sensors, *, measured: bool = False, **sections: Mapping[str, object]
+) -> Config:
+    """A config that knows the extrinsics: exactly, or `measured` with the default sigmas."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},
-        "gnss": {"lever_arm": list(sensors.lever_arm)},
         **sections,
+        "gnss": {
+            "lever_arm": list(sensors.lever_arm),
+            **({} if measured or not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-6}),
+            **sections.get("gnss", {}),
+        },
     }
     raw["imu"] = {
         "T_vehicle_imu": {
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),
         },
+        **({} if measured or not rpy.any() else {"rotation_sigma_deg": 1e-5}),
         **sections.get("imu", {}),
     }
     return parse_config(raw, "test", Path())

@@ -51,7 +51,7 @@ def nees(motion: MotionData, smoothed: SmoothedTrajectory) -> float:
 
 def test_an_unknown_lever_arm_is_found() -> None:
     motion = record(COURSE, SENSORS, 1)
-    config = config_for(SENSORS, gnss={"lever_arm": None})
+    config = config_for(SENSORS, measured=True, gnss={"lever_arm": None})
 
     smoothed = smooth_trajectory(motion, config, WANTED)
 
@@ -66,11 +66,9 @@ def test_an_unknown_lever_arm_is_found() -> None:
 
 def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
     motion = record(COURSE, SENSORS, 3)
-    fine = {"gnss": {"lever_arm": SENSORS.lever_arm, "lever_arm_sigma": 1e-6}}
-    known = config_for(SENSORS, **fine, imu={"rotation_sigma_deg": 1e-4})
-    rough = smooth_trajectory(motion, config_for(SENSORS), WANTED)
+    rough = smooth_trajectory(motion, config_for(SENSORS, measured=True), WANTED)
 
-    exact = smooth_trajectory(motion, known, WANTED)
+    exact = smooth_trajectory(motion, config_for(SENSORS), WANTED)
 
     assert rough.trajectory.cov is not None
     assert exact.trajectory.cov is not None
@@ -94,7 +92,7 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
     unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
 
     smoothed = smooth_trajectory(
-        record(COURSE, sensors, 4), config_for(sensors, imu=unknown), WANTED
+        record(COURSE, sensors, 4), config_for(sensors, measured=True, imu=unknown), WANTED
     )
 
     off = gtsam.Rot3.Logmap(smoothed.data.T_vehicle_imu.rotation().compose(R.inverse()))
@@ -109,12 +107,12 @@ def test_a_course_needs_gnss() -> None:
     unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
 
     with pytest.raises(TrajectoryError, match="measure the rotation of the IMU"):
-        smooth_trajectory(motion, config_for(SENSORS, imu=unknown), WANTED)
+        smooth_trajectory(motion, config_for(SENSORS, measured=True, imu=unknown), WANTED)
 
 
 def test_a_vehicle_frame_that_is_the_imu_s_has_no_parameters() -> None:
     motion = record(COURSE, Sensors(), 6)
 
-    smoothed = smooth_trajectory(motion, config_for(Sensors()), WANTED)
+    smoothed = smooth_trajectory(motion, config_for(Sensors(), measured=True), WANTED)
 
     assert smoothed.parameters == ()

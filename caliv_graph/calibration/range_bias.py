@@ -196,7 +196,9 @@ def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Arr
     information = directions.T @ seen - across.T @ scipy.linalg.cho_solve(factor, across)
     # Minus the gradient of the negative logarithm, what the other variables follow taken off.
     pull = -(directions.T @ gradient) - across.T @ scipy.linalg.cho_solve(factor, system.b)
-    return 0.5 * (information + information.T), pull
+    # Positive semidefinite but for rounding.
+    own, axes = np.linalg.eigh(0.5 * (information + information.T))
+    return (axes * np.maximum(own, 0.0)) @ axes.T, pull
 
 
 def _cost(information: Array, pull: Array) -> float:

@@ -6,7 +6,9 @@ LiDAR's stamps are 20 ms late, and every cloud is a sweep of 0.1 s.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +21,8 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array
+from caliv_graph.products import Array, LidarScan, TargetObservation
+from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording
@@ -120,23 +123,42 @@ def test_no_pose_noise_is_reported_where_no_poses_were_given() -> None:
     assert "pose_noise" not in run().calibration.provenance
 
 
-def centres_map(which: Drive) -> Array:
-    """Middle of every extracted cloud in the map, through the true poses and extrinsics."""
-    recording, config = which.recording, which.config
+@dataclass(frozen=True)
+class Counting(ForwardingRecording):
+    """A recording that counts the scans that it hands out, per LiDAR."""
+
+    decoded: Counter[str] = field(default_factory=Counter)
+
+    def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
+        for scan in super().scans(lidar, wanted):
+            self.decoded[lidar] += 1
+            yield scan
+
+
+@cache
+def extracted() -> tuple[TargetObservation, Mapping[str, int]]:
+    """The clouds of the target, and how many scans of each LiDAR were decoded for them."""
+    recording, config = Counting(drive().recording), drive().config
     trajectories = smooth_trajectories([recording], config, [[]])
     (observation,) = extract_targets([recording], trajectories, config, SilentProgress())
+    return observation, recording.decoded
+
+
+def centres_map() -> Array:
+    """Middle of every extracted cloud in the map, through the true poses and extrinsics."""
+    truth = drive().recording.truth
     out = []
-    for cloud in observation.clouds:
-        late_ns = round(1e9 * recording.truth.time_offset_s[cloud.lidar])
-        (T_map_vehicle,) = recording.truth.T_map_vehicle(np.array([cloud.stamp_ns - late_ns]))
-        T = T_map_vehicle.compose(recording.truth.T_vehicle_lidar[cloud.lidar])
+    for cloud in extracted()[0].clouds:
+        late_ns = round(1e9 * truth.time_offset_s[cloud.lidar])
+        (T_map_vehicle,) = truth.T_map_vehicle(np.array([cloud.stamp_ns - late_ns]))
+        T = T_map_vehicle.compose(truth.T_vehicle_lidar[cloud.lidar])
         points = T.transformFrom(cloud.points_lidar.T).T
         out.append(0.5 * (points.min(axis=0) + points.max(axis=0)))
     return np.array(out)
 
 
 def test_the_walker_is_not_taken_for_the_chair() -> None:
-    centres = centres_map(drive())
+    centres = centres_map()
     assert len(centres) == 80
     off = np.linalg.norm(centres[:, :2] - np.median(centres[:, :2], axis=0), axis=1)
     # In a dozen of these scans the walker is the largest thing in the region, up to 3 m away.
@@ -145,28 +167,9 @@ def test_the_walker_is_not_taken_for_the_chair() -> None:
 
 
 def test_scans_that_cannot_see_the_target_are_not_decoded() -> None:
-    recording, config = drive().recording, drive().config
-    decoded: dict[str, int] = {}
-
-    class Counting:
-        """The recording, counting what it hands out."""
-
-        name = recording.name
-        lidars = recording.lidars
-        scan_stamps_ns = staticmethod(recording.scan_stamps_ns)
-        motion = staticmethod(recording.motion)
-        warnings = staticmethod(recording.warnings)
-
-        @staticmethod
-        def scans(lidar: str, wanted: object = None) -> object:
-            for scan in recording.scans(lidar, wanted):  # type: ignore[arg-type]
-                decoded[lidar] = decoded.get(lidar, 0) + 1
-                yield scan
-
-    trajectories = smooth_trajectories([recording], config, [[]])
-    extract_targets([Counting()], trajectories, config, SilentProgress())  # type: ignore[list-item]
-    for name in config.lidars:
-        assert 100 < decoded[name] < 0.8 * len(recording.scan_stamps_ns(name))
+    for name, decoded in extracted()[1].items():
+        assert 100 < decoded < 0.8 * len(drive().recording.scan_stamps_ns(name))
+    assert set(extracted()[1]) == set(drive().config.lidars)
 
 
 def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:

@@ -142,7 +142,7 @@ class HeightSums:
         weight, f2 = alpha / variance**2, cosine**2
 
         def summed(values: Array) -> Array:
-            return np.asarray(np.bincount(lidar, values.sum(axis=1), lidars))
+            return np.asarray(np.bincount(lidar, np.einsum("nk->n", values), lidars))
 
         normal = np.empty((lidars, 2, 2))
         normal[:, 0, 0] = summed(weight * f2 * f2)

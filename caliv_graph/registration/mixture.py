@@ -157,7 +157,7 @@ class _Surfels:
         visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 0.0, 1.0)
         there = np.exp(self.aside[found] * np.maximum(aside2, 0.0)) * visible
         # Where the beam returns from, if it does: surfels share it.
-        presence = there / (there.sum(axis=1)[:, None] + BESIDE)
+        presence = there / (np.einsum("nk->n", there)[:, None] + BESIDE)
         return found, presence * _agreement(flatness, agreement), height, slide, facing
 
 
@@ -220,7 +220,7 @@ def expect(
         # The range is what is measured: a density per metre along the beam.
         density = presence * np.exp(-0.5 * height**2 / variance)
         density *= cosine / np.sqrt(2.0 * np.pi * variance)
-        inliers = density.sum(axis=1)
+        inliers = np.einsum("nk->n", density)
         slides[part] = np.einsum("nk,nk->n", density, slide) / np.maximum(inliers, 1e-300)
         density /= inliers[:, None] + outlier_density
         near[part], alpha[part] = found, density
@@ -239,7 +239,7 @@ def expect(
     share_out(of_part, range(len(pieces)))
     moved = [(forces * direction[:, None]).ravel() for direction in directions.T]
     on_surfels = [np.bincount(near.ravel(), m, len(mixture.weights)) for m in moved]
-    explained = alpha.sum(axis=1)
+    explained = np.einsum("nk->n", alpha)
     return Responsibilities(
         component=near,
         weight=weights,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -156,6 +157,38 @@ def test_clouds_of_few_views_tell_nothing() -> None:
     # That all differ is what no views say.
     every = replace(chair.problem, views=np.ones(CLOUDS))
     assert chair.scale(every) == chair.scale()
+
+
+def test_clouds_that_are_left_out_have_no_part() -> None:
+    chair = seen_chair()
+    which = np.arange(0, CLOUDS, 2)
+    R, t = matrices(chair.lines.predicted)
+    alone = chair.state.only(which).expect(R[which], t[which])
+    # As beside clouds of no weight.
+    beside = copy(chair.state)
+    beside.weights = np.where(np.isin(np.arange(CLOUDS), which), 1.0, 1e-12)
+    expected = beside.expect(R, t)
+    size = np.abs(expected.gradient[which]).max()
+    assert alone.gradient / size == pytest.approx(expected.gradient[which] / size, abs=1e-6)
+    np.testing.assert_allclose(alone.blocks, expected.blocks[which], rtol=1e-9, atol=1e-6)
+
+
+def test_a_placement_may_lose_all_its_clouds() -> None:
+    # Two clouds of a second placement: a part by themselves.
+    chair = seen_chair()
+    problem = replace(
+        chair.problem,
+        cloud_lidar=np.append(chair.problem.cloud_lidar, [0, 0]),
+        cloud_pose=np.append(chair.problem.cloud_pose, [0, 1]),
+        cloud_placement=np.append(chair.problem.cloud_placement, [1, 1]),
+        placements=2,
+    )
+    states = [chair.state, chair.state.only(np.array([0, 1]))]
+    predicted = (*chair.lines.predicted, *chair.lines.predicted[:2])
+    lines = replace(chair.lines, predicted=predicted)
+    assert _groups(problem)[-2:].tolist() == [0, 0]
+    scale = jackknife_scale(problem, [chair.extrinsic], states, lines)
+    assert scale == pytest.approx(chair.scale(), rel=0.2)
 
 
 def test_few_clouds_tell_nothing() -> None:

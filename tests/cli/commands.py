@@ -76,10 +76,10 @@ def run(
 def called(*arguments: object, pipeline: str = "") -> subprocess.CompletedProcess[str]:
     """Runs the program in this process, which has imported what takes a second; see `start`."""
     out, err = io.StringIO(), io.StringIO()
+    line = [str(argument) for argument in arguments]
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _made_up(pipeline):
-        code = main.run([str(argument) for argument in arguments])
-    asked = [str(argument) for argument in arguments]
-    return subprocess.CompletedProcess(asked, code, out.getvalue(), err.getvalue())
+        code = main.run(line)
+    return subprocess.CompletedProcess(line, code, out.getvalue(), err.getvalue())
 
 
 @contextlib.contextmanager

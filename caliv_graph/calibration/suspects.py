@@ -26,19 +26,12 @@ from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Soluti
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.consistency import CLOCK_BIAS_S, REGISTRATION_BIAS
-from caliv_graph.uncertainty.suspects import Candidate, Scores, assembled
+from caliv_graph.uncertainty.suspects import DRIFT_M, DRIFT_RAD, Candidate, Scores, assembled
 
 STANCE_RAD = math.radians(0.2)
 """1 sigma of the angle between a vehicle's horizontal plane and the ground it stands on: a frame is
 drawn for the nominal load. Five of them, one degree, are 49 mm of sag over a wheelbase of 2.8 m:
 the whole travel that a load takes out of the springs."""
-
-DRIFT_M = 0.02
-"""Allowance, 1 sigma per half wave: an RTK receiver's error that does not average out in minutes
-(multipath, troposphere) is one to two centimetres."""
-
-DRIFT_RAD = 1e-3
-"""The same of the yaw of given poses: 0.06 degrees, a good GNSS/INS."""
 
 DRIFT_WAVES = 3
 """Half waves over the drive, of one, two and three: what is faster is not drift."""
@@ -99,8 +92,10 @@ def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _M
     columns = np.zeros((size, whole))
     own, own_gradient = np.zeros((whole, whole)), np.zeros(whole)
     given = np.repeat(~np.isin(drives, list(smoothed)), 6)
-    information[np.ix_(given, given)] = graph.pose_information[:size, :size][np.ix_(given, given)]
-    gradient[given] = graph.pose_gradient[:size][given]
+    information[np.ix_(given, given)] = graph.sound_pose_information[:size, :size][
+        np.ix_(given, given)
+    ]
+    gradient[given] = graph.sound_pose_gradient[:size][given]
     poses = list(solution.T_map_vehicle.values())
     for drive, part in parts.items():
         at = np.repeat(drives == drive, 6)

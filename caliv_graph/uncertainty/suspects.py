@@ -18,6 +18,13 @@ from scipy.special import gammaincc, gammaln, ndtri_exp
 
 from caliv_graph.products import Array
 
+DRIFT_M = 0.02
+"""Allowance, 1 sigma per half wave: an RTK receiver's error that does not average out in minutes
+(multipath, troposphere) is one to two centimetres."""
+
+DRIFT_RAD = 1e-3
+"""The same of the yaw of given poses: 0.06 degrees, a good GNSS/INS."""
+
 FREED = 30.0
 """1 sigma of the weak prior on parameters that are freed beside the tested one, in their scales:
 it only keeps the elimination invertible where two parameters have the same effect."""

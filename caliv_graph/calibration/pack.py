@@ -31,7 +31,6 @@ def packed_solution(
     iterations: int,
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
-    tested: Reduced | None = None,
 ) -> Solution:
     """Packs the result, the whole graph and its linearisation: long for the fields of a record.
 
@@ -46,7 +45,6 @@ def packed_solution(
         iterations: of the loop.
         converged: whether its last step was below its tolerance.
         time_offsets: LiDAR -> offset and sigma, seconds.
-        tested: linearisation for score tests; None: `reduced`.
 
     Raises:
         SolveError: the covariance is not finite.
@@ -86,7 +84,7 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=(tested or reduced).linearised(
+        linearised=reduced.linearised(
             problem,
             pose_graph(problem, state.noise, state.motion),
             pose_graph(problem, sound_noise(state.noise, state.config.noise), state.motion)

@@ -120,8 +120,8 @@ def unexplained(
 ) -> tuple[Contradiction, ...]:
     """The findings that remain once the first suspect is freed, without what its sentence says.
 
-    A guess that is far off has many causes, which its own sentence names. Findings about many parameters at once (outliers, coarse registrations) have no suspect of their
-    own, and remain.
+    A guess that is far off has many causes, which its own sentence names. Findings about many
+    parameters at once (outliers, coarse registrations) have no suspect of their own, and remain.
     """
     left = {s.input: s.sigmas_left for s in suspects}
     if not suspects[0].input.endswith(".initial"):

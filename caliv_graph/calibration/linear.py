@@ -17,9 +17,10 @@ from caliv_graph.conventions import key_target
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array
 
-GAUGE = 1e-9
+GAUGE = 1e-12
 """Relative ridge under which a dense system is solved: unobservable
-directions (the clouds' poses when all weights vanish) stay where they are."""
+directions (the clouds' poses when all weights vanish) stay where they are. It also holds what moves
+the whole map, as the height of the antenna does: at 1e-9, with clouds known to 0.2 mm, by 0.4 m."""
 
 GAUGE_PRIOR = 1.0
 """Gauge prior on a target frame, information per radian^2 and metre^2. The place and orientation of

@@ -121,8 +121,13 @@ def estimated_parameters(
         # What the drive knows is what the result knows beyond the prior.
         by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
         limit = np.minimum(prior.sigmas, USUAL_SIGMAS[name])
-        x, y, z = (by_drive > limit**-2.0).tolist()
-        out[name] = VehicleParameter(np.asarray(value), np.sqrt(variance), (x, y, z))
+        determined = by_drive > limit**-2.0
+        # Of what nobody knows the linearised graph knows too much: the noise of the poses' tilt
+        # looks like one that would tell the height of the antenna (`README.md`, section 17).
+        unknown = ~determined & (prior.sigmas > USUAL_SIGMAS[name])
+        sigma = np.where(unknown, prior.sigmas, np.sqrt(variance))
+        x, y, z = determined.tolist()
+        out[name] = VehicleParameter(np.asarray(value), sigma, (x, y, z))
     return out
 
 

@@ -13,33 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from caliv_graph.config.mounting import GnssConfig, ImuConfig
+from caliv_graph.config.mounting import PoseConfig as PoseConfig
 from caliv_graph.config.sections import (
     Finite,
     NonNegative,
-    Place,
     Positive,
     PositiveTriple,
     Section,
     Triple,
 )
-from caliv_graph.errors import ConfigError
 
 _LEAST_SIGMA = 1e-6
 """Of a guess, metres or degrees: GTSAM treats much smaller ones as constraints."""
 
 
-_ARM_SIGMA_M = 0.01
-"""Of a lever arm from a tape measure or a drawing."""
-
-_UNKNOWN_ARM_SIGMA_M = 2.0
-"""Of a lever arm that nobody measured: antennas are within some metres of the vehicle's origin."""
-
-_ROTATION_SIGMA_DEG = 0.1
-"""Of an IMU's mount on a surface that was made for it."""
-
 if TYPE_CHECKING:
-    import gtsam
-
     from caliv_graph.products import Array
 
 SolveMode = Literal["auto", "staged", "joint"]
@@ -74,51 +63,6 @@ def checked_names(lidars: dict[str, Lidar]) -> dict[str, Lidar]:
     for problem in filter(None, map(name_problem, lidars)):
         raise ValueError(problem)
     return lidars
-
-
-class PoseConfig(Section):
-    """A pose as people measure it: `T_parent_child`."""
-
-    xyz: Place = Field(description="metres, in the parent frame")
-    rpy_deg: Triple = Field(
-        (0.0, 0.0, 0.0), description="roll, pitch, yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll)"
-    )
-
-    def pose(self) -> gtsam.Pose3:
-        """`T_parent_child`."""
-        import gtsam  # here: `--help` and `init` need no gtsam, which takes 0.4 s to import
-        import numpy as np
-
-        roll, pitch, yaw = (math.radians(a) for a in self.rpy_deg)
-        return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(self.xyz))
-
-
-class ImuPoseConfig(PoseConfig):
-    """`T_vehicle_imu`; its rotation may be unknown."""
-
-    # pydantic keeps the field, mypy wants the same type as that of a pose.
-    rpy_deg: Triple | None = Field(  # type: ignore[assignment]
-        (0.0, 0.0, 0.0),
-        description="roll, pitch, yaw in degrees; null: estimated from gravity and the drive",
-    )
-
-    def pose(self) -> gtsam.Pose3:
-        """`T_vehicle_imu`.
-
-        Raises:
-            ConfigError: its rotation is unknown.
-        """
-        if self.rpy_deg is None:
-            raise ConfigError(
-                "imu.T_vehicle_imu.rpy_deg is null: the rotation of the IMU is unknown here. Enter "
-                "vehicle.imu_rotation.value_deg of a calibration.yaml"
-            )
-        return super().pose()
-
-    @property
-    def exact(self) -> bool:
-        """Whether the vehicle frame is that of the IMU."""
-        return not any(self.xyz) and self.rpy_deg is not None and not any(self.rpy_deg)
 
 
 class PoseSigmaConfig(Section):
@@ -219,56 +163,6 @@ class GroundConfig(Section):
     parallel_sigma_deg: Positive | None = Field(
         None, description="degrees; given: the vehicle stands parallel to the ground to this sigma"
     )
-
-
-class ImuConfig(Section):
-    """The IMU on the vehicle."""
-
-    T_vehicle_imu: ImuPoseConfig = ImuPoseConfig(xyz=(0.0, 0.0, 0.0))
-    rotation_sigma_deg: Positive | None = Field(
-        None,
-        description="degrees, sigma of the rotation of T_vehicle_imu about each vehicle axis; "
-        "absent: 0.1, and none where T_vehicle_imu is absent or the identity",
-    )
-    gravity_m_s2: Positive | None = Field(
-        None, description="m/s^2, local gravity; absent: by latitude and altitude"
-    )
-    yaw_bias: bool = Field(
-        False, description="estimate a constant yaw error of the IMU's orientation"
-    )
-    yaw_bias_sigma_deg: Positive = Field(
-        5.0, description="degrees, how large that yaw error may be, 1 sigma"
-    )
-
-    def rotation_sigma_rad(self) -> float | None:
-        """Sigma of a rotation that was measured, radians; None: it is exact, or unknown."""
-        if self.T_vehicle_imu.rpy_deg is None:
-            return None
-        if self.rotation_sigma_deg is None and self.T_vehicle_imu.exact:
-            return None
-        return math.radians(self.rotation_sigma_deg or _ROTATION_SIGMA_DEG)
-
-
-class GnssConfig(Section):
-    """The GNSS antenna on the vehicle."""
-
-    lever_arm: Place | None = Field(
-        (0.0, 0.0, 0.0),
-        description="metres, antenna in the vehicle frame; null: unknown, estimated",
-    )
-    lever_arm_sigma: Positive | None = Field(
-        None,
-        description="metres, sigma of the lever arm per axis; absent: 0.01, 2 where it is unknown, "
-        "and none where it is exactly zero",
-    )
-
-    def arm_sigma(self) -> float | None:
-        """Sigma of the lever arm per axis, metres; None: it is exact."""
-        if self.lever_arm_sigma is not None:
-            return self.lever_arm_sigma
-        if self.lever_arm is None:
-            return _UNKNOWN_ARM_SIGMA_M
-        return _ARM_SIGMA_M if any(self.lever_arm) else None
 
 
 class NoiseConfig(Section):

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import Config, ImuConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import ImuConfig
 from caliv_graph.errors import ExportError
 from caliv_graph.export.consumers import check_options, find_consumer
 from caliv_graph.export.edit import read_base

@@ -127,13 +127,13 @@ def serialisable(
 
 
 def _insert(point: gtsam.Values, values: gtsam.Values, key: int) -> None:
-    """Copies a pose or a vector from one `Values` to another."""
+    """Copies a pose, a rotation or a vector from one `Values` to another."""
     read: Callable[[int], object]
-    for read in (values.atPose3, values.atVector):
+    for read in (values.atPose3, values.atRot3, values.atVector):
         try:
             value = read(key)
         except RuntimeError:
             continue
         point.insert(key, value)
         return
-    raise ValueError(f"{gtsam.DefaultKeyFormatter(key)}: is neither a pose nor a vector")
+    raise ValueError(f"{gtsam.DefaultKeyFormatter(key)}: is no pose, rotation or vector")

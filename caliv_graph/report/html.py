@@ -30,6 +30,7 @@ from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
 from caliv_graph.wording.suspects import suspect_row
+from caliv_graph.wording.vehicle import vehicle_text
 
 MOST_LISTED = 40
 """Down-weighted clouds in the table; the figure shows all."""
@@ -75,6 +76,7 @@ def render_report(
         axes=SHOWN_AXES,
         extrinsics={n: extrinsic_row(r) for n, r in calibration.lidars.items()},
         pairs=pair_cells(calibration),
+        measured=[vehicle_text(name, found) for name, found in calibration.vehicle.items()],
         moves=_move_rows(calibration),
         residuals=all_residuals(solution, record),
         clouds=[_cloud_row(c, record) for c in clouds[:MOST_LISTED]],

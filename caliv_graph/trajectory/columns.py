@@ -1,4 +1,4 @@
-"""Derivatives of the smoother's residuals by parameters of its input (`README.md`, section 12)."""
+"""Derivatives of the smoother's residuals by parameters of its input (`README.md`, section 13)."""
 
 from __future__ import annotations
 

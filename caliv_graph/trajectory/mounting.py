@@ -1,7 +1,7 @@
 """The rotation of an IMU that nobody measured: a guess from gravity and the drive.
 
 A vehicle stands upright on average, and its origin goes where its x axis points (`README.md`,
-section 12). What the drive says more precisely is left to the smoother.
+section 13). What the drive says more precisely is left to the smoother.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Parameters of the smoother's input: what the user typed or a sensor scales, as coordinates.
 
 A parameter moves the input, so that its derivatives need no formula: those of every factor's
-residual are central differences (`README.md`, section 12). It enters the linearised graph as common
+residual are central differences (`README.md`, section 13). It enters the linearised graph as common
 coordinates, beside the yaw bias.
 """
 

@@ -1,7 +1,7 @@
 """Estimating the parameters that the user measured: lever arm and rotation of the IMU.
 
 Gauss-Newton over all states and the parameters at once, the parameters as one more variable of the
-linear graph (`README.md`, section 12). After a step the input is moved and the graph built anew.
+linear graph (`README.md`, section 13). After a step the input is moved and the graph built anew.
 """
 
 from __future__ import annotations

@@ -170,7 +170,11 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
             if guess.T_vehicle_sensor is None:
                 unknown.append(key)
             xyz, rpy_deg = guess.numbers()
-            sections += template.format(origin=guess.origin, xyz=_list(xyz), rpy_deg=_list(rpy_deg))
+            # An unknown lever arm is estimated; zeros would say that it is exactly zero.
+            arm = "null" if guess.T_vehicle_sensor is None else _list(xyz)
+            sections += template.format(
+                origin=guess.origin, xyz=_list(xyz), rpy_deg=_list(rpy_deg), arm=arm
+            )
     text = _align(
         _TEMPLATE.format(
             format="rosbag\t# a ROS 2 bag (folder, .mcap) or a ROS 1 .bag",
@@ -439,6 +443,6 @@ imu:
 
 _GNSS_TEMPLATE = """\
 gnss:\t# the antenna in the vehicle frame, {origin}
-  lever_arm: {xyz}\t# metres forward, left, up
+  lever_arm: {arm}\t# metres forward, left, up; null: unknown, estimated from the drive
 
 """

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from caliv_graph.config.load import dump_config, load_config, parse_config
 from caliv_graph.config.model import Config, PoseSigmaConfig
+from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.errors import ConfigError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -348,3 +349,40 @@ def test_a_key_that_stands_twice_is_an_error(tmp_path: Path) -> None:
 
     with pytest.raises(ConfigError, match="in line 3: key 'front' is given twice"):
         load_config(path)
+
+
+@pytest.mark.parametrize(
+    ("gnss", "sigma_m"),
+    [
+        ({}, None),
+        ({"lever_arm": [0, 0, 0]}, None),
+        ({"lever_arm": [0, 0, 0], "lever_arm_sigma": 0.02}, 0.02),
+        ({"lever_arm": [0, 0, 1.5]}, 0.01),
+        ({"lever_arm": None}, 2.0),
+        ({"lever_arm": None, "lever_arm_sigma": 0.5}, 0.5),
+    ],
+)
+def test_the_sigma_of_a_lever_arm(gnss: dict[str, object], sigma_m: float | None) -> None:
+    assert GnssConfig.model_validate(gnss).arm_sigma() == sigma_m
+
+
+@pytest.mark.parametrize(
+    ("imu", "sigma_deg"),
+    [
+        ({}, None),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0]}}, None),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0]}, "rotation_sigma_deg": 1.0}, 1.0),
+        ({"T_vehicle_imu": {"xyz": [0.5, 0, 0]}}, 0.1),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 90]}}, 0.1),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": None}}, None),
+    ],
+)
+def test_the_sigma_of_the_imu_s_rotation(imu: dict[str, object], sigma_deg: float | None) -> None:
+    sigma = ImuConfig.model_validate(imu).rotation_sigma_rad()
+    assert sigma == (None if sigma_deg is None else pytest.approx(math.radians(sigma_deg)))
+
+
+def test_an_unknown_rotation_is_no_pose() -> None:
+    config = ImuConfig.model_validate({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": None}})
+    with pytest.raises(ConfigError, match="the rotation of the IMU is unknown"):
+        config.T_vehicle_imu.pose()

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ConfigError, OutputError
-from caliv_graph.products import DataTerm, Direction, Guess
+from caliv_graph.products import DataTerm, Direction, Guess, VehicleParameter
 from caliv_graph.results.calibration_file import (
     read_calibration,
     read_calibration_file,
@@ -498,3 +498,25 @@ def test_names_that_yaml_takes_for_something_else(written: Path) -> None:
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         read_calibration(tmp_path / "nowhere.yaml")
+
+
+def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> None:
+    arm = VehicleParameter(
+        np.array([1.2, 0.3, 0.85]), np.array([0.01, 0.02, 2.0]), (True, True, False), ("x", "y")
+    )
+    turn = VehicleParameter(np.radians([90.0, 0.0, 2.0]), np.radians([0.1, 0.1, 0.2]), (False,) * 3)
+    calibration = replace(make_calibration(), vehicle={"lever_arm": arm, "imu_rotation": turn})
+
+    write_calibration(calibration, tmp_path / "calibration.yaml")
+
+    document = yaml.safe_load((tmp_path / "calibration.yaml").read_text())["vehicle"]
+    assert document["lever_arm"]["value"] == [1.2, 0.3, 0.85]
+    assert document["lever_arm"]["determined"] == [True, True, False]
+    assert document["imu_rotation"]["value_deg"] == pytest.approx([90.0, 0.0, 2.0])
+    assert document["imu_rotation"]["sigma_deg"] == pytest.approx([0.1, 0.1, 0.2])
+    found = read_calibration(tmp_path / "calibration.yaml").vehicle
+    for name, expected in calibration.vehicle.items():
+        np.testing.assert_allclose(found[name].value, expected.value, atol=1e-12)
+        np.testing.assert_allclose(found[name].sigma, expected.sigma, atol=1e-12)
+        assert found[name].determined == expected.determined
+        assert found[name].limits == expected.limits

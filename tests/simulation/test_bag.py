@@ -350,7 +350,7 @@ def test_config_is_ready_to_run_on_the_bag(folder: Path) -> None:
         "twist": "/vehicle/twist",
         "pose": None,
     }
-    assert config.imu.T_vehicle_imu == SCENARIO.imu.mounting
+    assert config.imu.T_vehicle_imu.model_dump() == SCENARIO.imu.mounting.model_dump()
     assert config.gnss.lever_arm == (0.5, -0.2, 1.7)
     assert config.lidars["ouster"].topic == "/lidar/ouster/points"
     # All but the LiDARs' noise is in the messages.

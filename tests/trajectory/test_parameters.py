@@ -43,7 +43,9 @@ def config_of(changes: dict[str, dict[str, object]]) -> Config:
 
 
 def test_derivatives_are_whitened_as_the_residuals_are() -> None:
-    huber = smooth_trajectory(MOTION, config_of({"robust": {"kernel": "huber", "huber_k": 0.7}}), WANTED)
+    huber = smooth_trajectory(
+        MOTION, config_of({"robust": {"kernel": "huber", "huber_k": 0.7}}), WANTED
+    )
     linear = huber.graph.linearize(huber.values)
     weights = []
     for number in range(huber.graph.size()):

@@ -38,7 +38,9 @@ def test_an_allowance_is_no_contradiction() -> None:
 
 def test_the_allowance_of_another_input_is_considered() -> None:
     """Both say the same of the data; b may be off by 2, so that a is known to 2 only."""
-    both = scores([candidate("a"), candidate("b", allowance=2.0)], np.ones((2, 2)) * 1e6, [3e6, 3e6])
+    both = scores(
+        [candidate("a"), candidate("b", allowance=2.0)], np.ones((2, 2)) * 1e6, [3e6, 3e6]
+    )
     a = both.freed([0])
     assert a.sigmas == pytest.approx(1.5, abs=1e-3)
 
@@ -74,7 +76,10 @@ def test_the_order_of_the_inputs_does_not_matter() -> None:
     found = {r.candidate.name: r for r in ranking(scores(parts, A.T @ A, c))}
     turned = [parts[2], parts[0], parts[1]]
     order = [i for p in turned for i in columns[p.name]]
-    again = {r.candidate.name: r for r in ranking(scores(turned, (A.T @ A)[np.ix_(order, order)], c[order]))}
+    again = {
+        r.candidate.name: r
+        for r in ranking(scores(turned, (A.T @ A)[np.ix_(order, order)], c[order]))
+    }
     for name, r in found.items():
         assert again[name].freed.squares == pytest.approx(r.freed.squares)
         assert again[name].sigmas_left == pytest.approx(r.sigmas_left)

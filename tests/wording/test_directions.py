@@ -13,9 +13,9 @@ import yaml
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import retract_vehicle_axes
-from caliv_graph.products import Array
+from caliv_graph.products import Array, VehicleParameter
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
-from caliv_graph.uncertainty.observability import UNIT, assess, scaling
+from caliv_graph.uncertainty.observability import UNIT, assess, limited_axes, scaling
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import (
     REMEDY_APART,
@@ -30,7 +30,9 @@ from caliv_graph.wording.directions import (
     named,
     named_prediction,
     remedy,
+    same_as_parameters,
 )
+from caliv_graph.wording.vehicle import vehicle_text
 from tests.drives_with_chair import RADIUS_M
 from tests.samples import MOUNTINGS, pose, turn_about, twist_of_all
 
@@ -235,3 +237,39 @@ def test_names_do_not_change_the_numbers() -> None:
     ):
         assert replace(after, text="", remedy="") == before
     assert found.determined == plain.determined
+
+
+def test_a_direction_that_a_lever_arm_shares_says_so() -> None:
+    prior = np.diag(np.tile(SIGMAS**-2.0, 2))
+    D_knowing = np.diag(np.tile(SIGMAS**-2.0, 2)) * 1e4
+    along = np.concatenate(list(twist_of_all([0, 0, 0, 1, 0, 0], LIDARS).values()))
+    # A lever arm of 2 m hides the forward shift of all LiDARs.
+    lost = D_knowing @ along
+    D = D_knowing - np.outer(lost, lost) / (0.25 + along @ lost)
+    found = named(assess(D, prior, LIDARS), LIDARS)
+    assert len(found.undetermined) == 1
+
+    shared = same_as_parameters(found, D, {"lever_arm": D_knowing, "imu_rotation": D})
+
+    (direction,) = shared.undetermined
+    assert direction.text.startswith("shift of all LiDARs together forward: x")
+    assert direction.text.endswith("; an error of gnss.lever_arm looks the same")
+    assert direction.remedy.startswith("measure gnss.lever_arm")
+    assert limited_axes(D, D_knowing, prior) == ("x",)
+    assert limited_axes(D, D, prior) == ()
+
+
+def test_a_measured_figure_comes_with_what_it_limits() -> None:
+    arm = VehicleParameter(
+        np.array([1.2, 0.3, 0.85]), np.array([0.01, 0.02, 2.0]), (True, True, False), ("x",)
+    )
+    turn = VehicleParameter(np.radians([90.0, 0.0, 2.0]), np.radians([0.1] * 3), (False,) * 3)
+
+    assert vehicle_text("lever_arm", arm) == (
+        "gnss.lever_arm: (1.200, 0.300, 0.850) m, sigma (0.0100, 0.0200, 2.0000) m; the drive "
+        "determines x, y. Half or more of the variance of S2V x comes from it"
+    )
+    assert vehicle_text("imu_rotation", turn) == (
+        "imu.T_vehicle_imu: (90.00, 0.00, 2.00) degrees, sigma (0.100, 0.100, 0.100) degrees; the "
+        "drive adds nothing"
+    )

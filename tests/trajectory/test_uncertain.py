@@ -1,0 +1,120 @@
+"""Lever arm and rotation of the IMU, measured roughly or not at all, against known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, MotionData
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from tests.trajectory.motions import (
+    Course,
+    Sensors,
+    config_for,
+    eight_drive,
+    errors,
+    mounted_askew,
+    record,
+    stamps,
+)
+
+COURSE = Course(eight_drive(24.0), rough=1.0)
+SENSORS = replace(mounted_askew(), twist_hz=50.0, twist_delay_s=0.017)
+WANTED = stamps(24.0, 2.0, 0.0512)
+
+
+def marginals(smoothed: SmoothedTrajectory) -> Array:
+    """Covariance of all its uncertain parameters, their priors included."""
+    names = [p.parameter.name for p in smoothed.parameters]
+    joint = smoothed.joint(WANTED[:2], names)
+    information = joint.information.copy()
+    at = np.arange(12, len(information))
+    information[at, at] += np.concatenate([np.asarray(p.sigmas) for p in smoothed.parameters]) ** -2
+    return np.asarray(np.linalg.inv(information)[12:, 12:])
+
+
+def nees(motion: MotionData, smoothed: SmoothedTrajectory) -> float:
+    """Mean over the wanted poses; 6 for a covariance that is right."""
+    trajectory = smoothed.trajectory
+    R, t = stack(trajectory.T_map_vehicle)
+    turn, shift = errors(COURSE, motion, trajectory.stamps_ns, R, t)
+    e = np.hstack([turn, np.einsum("nji,nj->ni", R, shift)])
+    assert trajectory.cov is not None
+    return float(np.einsum("ni,nij,nj->n", e, np.linalg.inv(trajectory.cov), e).mean())
+
+
+def test_an_unknown_lever_arm_is_found() -> None:
+    motion = record(COURSE, SENSORS, 1)
+    config = config_for(SENSORS, gnss={"lever_arm": None})
+
+    smoothed = smooth_trajectory(motion, config, WANTED)
+
+    sigma = np.sqrt(np.diag(marginals(smoothed)))[:3]
+    off = smoothed.data.lever_arm - SENSORS.lever_arm
+    assert sigma[:2].max() < 0.03
+    assert sigma[2] < 0.2  # the drive rolls and pitches by some degrees
+    assert np.abs(off / sigma).max() < 3.0
+    assert len(smoothed.gnss_rejected) == 0
+    assert nees(motion, smoothed) < 16.0
+
+
+def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
+    motion = record(COURSE, SENSORS, 3)
+    fine = {"gnss": {"lever_arm": SENSORS.lever_arm, "lever_arm_sigma": 1e-6}}
+    known = config_for(SENSORS, **fine, imu={"rotation_sigma_deg": 1e-4})
+    rough = smooth_trajectory(motion, config_for(SENSORS), WANTED)
+
+    exact = smooth_trajectory(motion, known, WANTED)
+
+    assert rough.trajectory.cov is not None
+    assert exact.trajectory.cov is not None
+    covs = rough.trajectory.cov, exact.trajectory.cov
+    sigma, least = (np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) for cov in covs)
+    # 10 mm of the lever arm less what the drive tells of it; 0.1 degrees of pitch and yaw.
+    assert (sigma[:, 3:] > least[:, 3:] + 0.003).all()
+    assert (sigma[:, :3] > 1e-3).all()
+    # Two ways to the same marginals: GTSAM's Bayes tree, and the chain.
+    cov = np.linalg.inv(rough.joint_information(WANTED)[0])
+    blocks = [cov[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(WANTED))]
+    np.testing.assert_allclose(rough.trajectory.cov, blocks, rtol=1e-5, atol=1e-12)
+    assert nees(motion, rough) < 12.0
+
+
+@pytest.mark.parametrize("rpy_deg", [(90.0, 3.0, 40.0), (0.0, 90.0, 20.0)], ids=str)
+def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> None:
+    R = gtsam.Rot3.RzRyRx(*np.radians(rpy_deg))
+    T = gtsam.Pose3(R, np.array([1.2, -0.4, 0.6]))
+    sensors = replace(SENSORS, T_vehicle_imu=T)
+    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+
+    smoothed = smooth_trajectory(
+        record(COURSE, sensors, 4), config_for(sensors, imu=unknown), WANTED
+    )
+
+    off = gtsam.Rot3.Logmap(smoothed.data.T_vehicle_imu.rotation().compose(R.inverse()))
+    sigma = np.sqrt(np.diag(marginals(smoothed)))[3:]
+    assert np.degrees(sigma[1:]).max() < 0.2
+    assert np.degrees(sigma[0]) < 1.0  # of roll the lever arm tells, and the mean of the drive
+    assert np.abs(off / sigma).max() < 3.0
+
+
+def test_a_course_needs_gnss() -> None:
+    motion = replace(record(COURSE, SENSORS, 5), gnss=None)
+    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+
+    with pytest.raises(TrajectoryError, match="measure the rotation of the IMU"):
+        smooth_trajectory(motion, config_for(SENSORS, imu=unknown), WANTED)
+
+
+def test_a_vehicle_frame_that_is_the_imu_s_has_no_parameters() -> None:
+    motion = record(COURSE, Sensors(), 6)
+
+    smoothed = smooth_trajectory(motion, config_for(Sensors()), WANTED)
+
+    assert smoothed.parameters == ()

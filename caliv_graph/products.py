@@ -406,6 +406,8 @@ class LinearisedGraph:
         pose_information: (M, M) of motion data and given poses alone, no LiDAR. The vehicle's poses
             are the first coordinates, in the order of `Solution.T_map_vehicle`.
         pose_gradient: (M,) of the same.
+        sound_pose_information: (M, M) the same, given poses with the noise of sound ones at most.
+        sound_pose_gradient: (M,) of that.
         to_vehicle_axes: (6 L, 6 L) from the last 6 L coordinates, the extrinsics, to vehicle axes
             of the LiDARs in the order of `Solution.lidars`.
     """
@@ -421,6 +423,8 @@ class LinearisedGraph:
     starts: Mapping[int, int]
     pose_information: Array
     pose_gradient: Array
+    sound_pose_information: Array
+    sound_pose_gradient: Array
     to_vehicle_axes: Array
 
 

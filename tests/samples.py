@@ -164,6 +164,8 @@ def make_solution(placements: int = 1) -> Solution:
             starts={},
             pose_information=np.zeros((12, 12)),
             pose_gradient=np.zeros(12),
+            sound_pose_information=np.zeros((12, 12)),
+            sound_pose_gradient=np.zeros(12),
             to_vehicle_axes=np.eye(12),
         ),
         stage_times_s={"solve": 0.5},

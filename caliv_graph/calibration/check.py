@@ -118,13 +118,14 @@ def check(
 def unexplained(
     found: Sequence[Contradiction], suspects: Sequence[Suspect]
 ) -> tuple[Contradiction, ...]:
-    """The findings that remain once the first suspect is freed; those that it states are its own.
+    """The findings that remain once the first suspect is freed, without what its sentence says.
 
-    Findings about many parameters at once (outliers, coarse registrations) have no suspect of their
-    own, and remain.
+    A guess that is far off has many causes, which its own sentence names. Findings about many
+    parameters at once (outliers, coarse registrations) have no suspect of their own, and remain.
     """
-    left = {s.input: s.sigmas_left for s in suspects[1:]}
-    left[suspects[0].input] = 0.0
+    left = {s.input: s.sigmas_left for s in suspects}
+    if not suspects[0].input.endswith(".initial"):
+        left[suspects[0].input] = 0.0
 
     def remains(each: Contradiction) -> bool:
         match each:

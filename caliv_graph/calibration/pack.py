@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -12,9 +13,11 @@ from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
 from caliv_graph.calibration.vehicle_parameters import KEYS, NAMES, estimated_parameters
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.conventions import key_target, key_vehicle
 from caliv_graph.errors import SolveError
-from caliv_graph.products import Array, Registration, Solution
+from caliv_graph.products import Array, PoseNoise, Registration, Solution
+from caliv_graph.uncertainty.suspects import DRIFT_M, DRIFT_RAD
 
 
 def packed_solution(
@@ -28,7 +31,6 @@ def packed_solution(
     iterations: int,
     converged: bool,
     time_offsets: Mapping[str, tuple[float, float]],
-    tested: Reduced | None = None,
 ) -> Solution:
     """Packs the result, the whole graph and its linearisation: long for the fields of a record.
 
@@ -43,7 +45,6 @@ def packed_solution(
         iterations: of the loop.
         converged: whether its last step was below its tolerance.
         time_offsets: LiDAR -> offset and sigma, seconds.
-        tested: linearisation for score tests; None: `reduced`.
 
     Raises:
         SolveError: the covariance is not finite.
@@ -83,8 +84,12 @@ def packed_solution(
         graph=graph,
         factor_kinds=tuple(graph.kinds),
         values=state.values,
-        linearised=(tested or reduced).linearised(
-            problem, pose_graph(problem, state.noise, state.motion)
+        linearised=reduced.linearised(
+            problem,
+            pose_graph(problem, state.noise, state.motion),
+            pose_graph(problem, sound_noise(state.noise, state.config.noise), state.motion)
+            if problem.given().any()
+            else None,
         ),
         time_offsets=time_offsets,
         gradient_data=reduced.c,
@@ -93,6 +98,19 @@ def packed_solution(
             NAMES[name]: reduced.information_knowing(KEYS[name]) for name in vehicle
         },
     )
+
+
+def sound_noise(noise: PoseNoise, config: NoiseConfig) -> PoseNoise:
+    """The noise of given poses, their drift at most that of sound ones unless the user states it.
+
+    The fit of the noise takes a drift by decimetres for noise, and nothing would contradict it.
+    """
+    position_m, rotation_rad = noise.drift_position_m, noise.drift_rotation_rad
+    if config.pose_drift_position_m is None:
+        position_m = min(position_m, DRIFT_M)
+    if config.pose_drift_rotation_deg is None:
+        rotation_rad = min(rotation_rad, DRIFT_RAD)
+    return replace(noise, drift_position_m=position_m, drift_rotation_rad=rotation_rad)
 
 
 def _target_in_its_map(state: SolveState, placement: int) -> gtsam.Pose3:

@@ -96,25 +96,25 @@ class Reduced:
         rest = self._g - self._G @ tangent
         return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
 
-    def linearised(self, problem: Problem, poses: CalibrationGraph) -> LinearisedGraph:
+    def linearised(
+        self,
+        problem: Problem,
+        poses: CalibrationGraph,
+        sound_poses: CalibrationGraph | None = None,
+    ) -> LinearisedGraph:
         """The same as numbers, with the guesses' information, for score tests.
 
-        `poses` is the graph of the vehicle's poses alone (`graph.pose_graph`).
+        `poses` is the graph of the vehicle's poses alone (`graph.pose_graph`), `sound_poses` that
+        with the noise of sound poses at most; None: the same.
         """
         H, gradient = self.clouds
         guesses = np.zeros_like(self.system.H)
         of_extrinsics = slice(len(guesses) - len(self._to_axes), None)
         guesses[of_extrinsics, of_extrinsics] = self.in_tangents(problem.guess_information())
-        alone = dense_system(problem, poses, self._values)
-        where = np.concatenate(
-            [
-                self.system.offset(key) + np.arange(size)
-                for key, size in zip(alone.keys, alone.sizes, strict=True)
-            ]
-        )
-        pose_information, pose_gradient = np.zeros_like(guesses), np.zeros(len(guesses))
-        pose_information[np.ix_(where, where)] = alone.H
-        pose_gradient[where] = alone.b
+        pose_information, pose_gradient = self._of_poses(problem, poses)
+        sound = (pose_information, pose_gradient)
+        if sound_poses is not None:
+            sound = self._of_poses(problem, sound_poses)
         return LinearisedGraph(
             information=self.system.H,
             gradient=self.system.b,
@@ -127,8 +127,24 @@ class Reduced:
             starts=self.system.starts,
             pose_information=pose_information,
             pose_gradient=pose_gradient,
+            sound_pose_information=sound[0],
+            sound_pose_gradient=sound[1],
             to_vehicle_axes=self._to_axes,
         )
+
+    def _of_poses(self, problem: Problem, poses: CalibrationGraph) -> tuple[Array, Array]:
+        """(M, M) and (M,) of a graph without clouds, in the coordinates of the system."""
+        alone = dense_system(problem, poses, self._values)
+        where = np.concatenate(
+            [
+                self.system.offset(key) + np.arange(size)
+                for key, size in zip(alone.keys, alone.sizes, strict=True)
+            ]
+        )
+        information, gradient = np.zeros_like(self.system.H), np.zeros_like(self.system.b)
+        information[np.ix_(where, where)] = alone.H
+        gradient[where] = alone.b
+        return information, gradient
 
 
 def reduce_to_extrinsics(

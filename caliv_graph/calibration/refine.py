@@ -6,7 +6,6 @@ orientations of the components eliminated, all clouds coupled) in the place of t
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -164,23 +163,15 @@ class _Loop:
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
-    def _without_bias(
-        self, shapes: _Shapes, lines: CloudLinearisation, most_m: float = math.inf
-    ) -> Reduced:
+    def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic, the biases of the ranges eliminated.
 
-        `most_m` is the largest sigma of the offsets, metres.
+        At most those that LiDARs have: larger ones would hide what is wrong, a clock or a mount.
         """
         sizes = self.state.bias_sizes
-        sizes = replace(sizes, offset_m=min(sizes.offset_m, most_m))
+        sizes = replace(sizes, offset_m=min(sizes.offset_m, RANGE_BIAS_LIMIT_M))
         clouds = without_bias(*shapes.joint(self.state.scale), shapes.biases.directions(sizes))
         return self._reduced(clouds, lines)
-
-    def tested(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
-        """The linearisation for score tests: biases beyond those of LiDARs explain nothing."""
-        if self.state.bias_sizes.offset_m <= RANGE_BIAS_LIMIT_M:
-            return reduced
-        return self._without_bias(shapes, reduced.lines, RANGE_BIAS_LIMIT_M)
 
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
@@ -375,5 +366,4 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
         iterations=iterations,
         converged=converged,
         time_offsets=reduced.time_offsets(problem, cov),
-        tested=loop.tested(shapes, reduced),
     )

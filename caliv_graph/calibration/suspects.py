@@ -26,22 +26,22 @@ from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Soluti
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.consistency import CLOCK_BIAS_S, REGISTRATION_BIAS
-from caliv_graph.uncertainty.suspects import Candidate, Scores, assembled
+from caliv_graph.uncertainty.suspects import (
+    DRIFT_M,
+    DRIFT_RAD,
+    GNSS_DRIFT_M,
+    Candidate,
+    Scores,
+    assembled,
+)
 
 STANCE_RAD = math.radians(0.2)
 """1 sigma of the angle between a vehicle's horizontal plane and the ground it stands on: a frame is
 drawn for the nominal load. Five of them, one degree, are 49 mm of sag over a wheelbase of 2.8 m:
 the whole travel that a load takes out of the springs."""
 
-DRIFT_M = 0.02
-"""Allowance, 1 sigma per half wave: an RTK receiver's error that does not average out in minutes
-(multipath, troposphere) is one to two centimetres."""
-
-DRIFT_RAD = 1e-3
-"""The same of the yaw of given poses: 0.06 degrees, a good GNSS/INS."""
-
-DRIFT_WAVES = 3
-"""Half waves over the drive, of one, two and three: what is faster is not drift."""
+DRIFT_WAVES = 2
+"""Half waves over the drive, of one and two: what is faster is noise to the fit of the noise."""
 
 GUESS_SCALE = np.array([0.1] * 3 + [1.0] * 3)
 """Of a guess and of given poses' frame, rad and m: a direction that is less well determined is left
@@ -99,8 +99,10 @@ def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _M
     columns = np.zeros((size, whole))
     own, own_gradient = np.zeros((whole, whole)), np.zeros(whole)
     given = np.repeat(~np.isin(drives, list(smoothed)), 6)
-    information[np.ix_(given, given)] = graph.pose_information[:size, :size][np.ix_(given, given)]
-    gradient[given] = graph.pose_gradient[:size][given]
+    information[np.ix_(given, given)] = graph.sound_pose_information[:size, :size][
+        np.ix_(given, given)
+    ]
+    gradient[given] = graph.sound_pose_gradient[:size][given]
     poses = list(solution.T_map_vehicle.values())
     for drive, part in parts.items():
         at = np.repeat(drives == drive, 6)
@@ -288,7 +290,7 @@ def _drives(solution: Solution) -> tuple[IntArray, IntArray]:
 def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> list[_Block]:
     """Slow errors of the vehicle's positions, map axes, and of the yaw of given poses.
 
-    Cosines of one to three half waves over each drive. A pose that is too far east by b pulls the
+    Cosines of one and two half waves over each drive. A pose that is too far east by b pulls the
     graph's pose to where it is less b.
     """
     drives, stamps = _drives(solution)
@@ -313,7 +315,7 @@ def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> 
                 columns[6 * i + 3 : 6 * i + 6, at] = wave[j] * R_vehicle_map
                 if given:
                     columns[6 * i : 6 * i + 3, axes * k + 3] = wave[j] * R_vehicle_map[:, 2]
-        sigmas = np.array([DRIFT_M] * 3 + [DRIFT_RAD] * (axes - 3))
+        sigmas = np.array([DRIFT_M if given else GNSS_DRIFT_M] * 3 + [DRIFT_RAD] * (axes - 3))
         scale = np.array([1.0] * 3 + [0.1] * (axes - 3))
         name = f"{'poses' if given else 'gnss'}.drift{_of_several(drive, trajectories)}"
         candidate = Candidate(name, np.tile(sigmas, DRIFT_WAVES), np.tile(scale, DRIFT_WAVES))

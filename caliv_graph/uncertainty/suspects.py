@@ -18,6 +18,17 @@ from scipy.special import gammaincc, gammaln, ndtri_exp
 
 from caliv_graph.products import Array
 
+DRIFT_M = 0.01
+"""Allowance, 1 sigma per half wave over a drive, of given poses: what a good GNSS/INS leaves. The
+Gauss-Markov error that the fit of their noise finds comes on top, up to the same size."""
+
+DRIFT_RAD = 1e-3
+"""The same of their yaw: 0.06 degrees."""
+
+GNSS_DRIFT_M = 0.02
+"""The same of GNSS fixes, whose noise is taken as white: an RTK receiver's error that does not
+average out in minutes (multipath, troposphere) is one to two centimetres."""
+
 FREED = 30.0
 """1 sigma of the weak prior on parameters that are freed beside the tested one, in their scales:
 it only keeps the elimination invertible where two parameters have the same effect."""

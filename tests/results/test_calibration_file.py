@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from caliv_graph.errors import ConfigError, OutputError
-from caliv_graph.products import DataTerm, Direction, Guess, VehicleParameter
+from caliv_graph.products import DataTerm, Direction, Guess, Suspect, VehicleParameter
 from caliv_graph.results.calibration_file import (
     read_calibration,
     read_calibration_file,
@@ -520,3 +520,25 @@ def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> N
         np.testing.assert_allclose(found[name].sigma, expected.sigma, atol=1e-12)
         assert found[name].determined == expected.determined
         assert found[name].limits == expected.limits
+
+
+def test_suspects_are_read_back_and_may_be_those_of_another_writer(tmp_path: Path) -> None:
+    first = Suspect(
+        "gnss.lever_arm",
+        (1.2, 0.3, 0.85),
+        (0.02,) * 3,
+        (0.2, 0.0, 0.0),
+        ("m",) * 3,
+        0.96,
+        41.0,
+        41.0,
+    )
+    path = tmp_path / "calibration.yaml"
+    write_calibration(make_calibration(suspects=(first,)), path)
+    assert read_calibration(path).suspects == (first,)
+    document = yaml.safe_load(path.read_text())
+    assert document["suspects"][0]["input"] == "gnss.lever_arm"
+    keys = {"input", "value", "sigma", "explains", "sigmas"}
+    few = [{key: document["suspects"][0][key] for key in keys}]
+    found = read_calibration(edit(path, set_at("suspects", value=few))).suspects[0]
+    assert (found.input, found.value, found.change) == (first.input, first.value, ())

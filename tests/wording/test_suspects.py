@@ -1,0 +1,63 @@
+"""Sentences about suspects."""
+
+from __future__ import annotations
+
+import pytest
+
+from caliv_graph.products import Suspect
+from caliv_graph.wording.suspects import motion_sentence, ranking_sentence, remedy
+
+ARM = Suspect(
+    "gnss.lever_arm",
+    (1.19, 0.31, 0.84),
+    (0.02, 0.02, 0.3),
+    (0.19, 0.01, -0.06),
+    ("m",) * 3,
+    0.96,
+    41.2,
+    41.2,
+)
+
+
+def suspect(name: str, sigmas: float, left: float) -> Suspect:
+    return Suspect(name, (0.1,), (0.01,), (0.1,), ("s",), 0.5, sigmas, left)
+
+
+def test_the_first_suspect_leads_and_what_remains_follows() -> None:
+    rest = [suspect("lidars.rear.time_offset", 20.0, 4.0), suspect("gnss.time_offset", 12.0, 0.3)]
+    assert ranking_sentence([ARM, *rest]) == (
+        "most likely: gnss.lever_arm, by (0.19, 0.01, -0.06) m, so that it is (1.19, 0.31, 0.84) m "
+        "(sigma (0.02, 0.02, 0.30) m); it explains 96 percent of the contradiction (41 sigma); "
+        "next, with it freed: lidars.rear.time_offset (4 sigma). Measure the antenna in the "
+        "vehicle frame again, or set gnss.lever_arm: null"
+    )
+
+
+def test_a_clock_is_late_or_early_and_has_a_key() -> None:
+    text = ranking_sentence([suspect("lidars.rear.time_offset", 9.0, 9.0)])
+    assert "the stamps are 0.100 +- 0.010 s late" in text
+    assert text.endswith("Correct the clock of lidar 'rear', or set solve.time_offset")
+
+
+def test_nothing_is_said_below_five_sigma() -> None:
+    assert motion_sentence([suspect("gnss.time_offset", 4.9, 4.9)]) == ""
+    assert motion_sentence([]) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("imu.T_vehicle_imu", "rpy_deg: null"),
+        ("ground.vehicle_height", "height of the vehicle frame"),
+        ("lidars.front.initial", "guess of lidar 'front'"),
+        ("lidars.front.mount.halves", "the mount of lidar 'front' or the target moved during"),
+        ("poses.drift", "given poses drift"),
+        ("gnss.drift.1", "GNSS positions drift"),
+        ("twist.scale", "topics.twist"),
+    ],
+)
+def test_every_suspect_has_a_remedy(name: str, said: str) -> None:
+    text = remedy(suspect(name, 9.0, 9.0))
+    assert said in text
+    # A moved mount is named for a mount only.
+    assert ("moved" in text) == (".mount." in name)

@@ -29,6 +29,7 @@ from caliv_graph.report.inspection import (
     summarise_points,
     summarise_targets,
 )
+from caliv_graph.trajectory.physics import known_rotation
 from caliv_graph.wording.physics import gravity_problem
 
 _SAMPLED_CLOUDS = 20
@@ -235,9 +236,11 @@ def _is_used(config: Config | None, topic: str) -> bool:
 
 def _summarise_imu(check: ImuCheck, config: Config | None) -> ImuSummary:
     """An IMU, its axes by the config that uses it; without one as if it stood upright."""
-    R = np.eye(3) if config is None else config.imu.T_vehicle_imu.pose().rotation().matrix()
+    R = np.eye(3) if config is None else known_rotation(config)
+    axes = ""
     # Without gravity in it, a force has no direction.
-    axes = "" if check.gravity_problem else gravity_problem(np.array(check.up_imu), R)
+    if R is not None and not check.gravity_problem:
+        axes = gravity_problem(np.array(check.up_imu), R)
     return ImuSummary(
         specific_force_m_s2=check.specific_force_m_s2,
         angular_rate_rad_s=check.angular_rate_rad_s,

@@ -31,6 +31,9 @@ MIN_SPAN_S = 1.0
 MAX_WINDOWS = 2000
 """Windows at most, evenly chosen: of a drive of hours every few seconds suffice."""
 
+MIN_WINDOWS = 12
+"""Windows that a comparison is made of: three independent samples."""
+
 WORST = 5.0
 """Times the median scatter about its parabola: a window with more has an outlier or a jump."""
 
@@ -78,7 +81,8 @@ def antenna_windows(positions: Positions, begin_ns: int, end_ns: int) -> Windows
     if len(middles) > MAX_WINDOWS:
         middles = middles[np.linspace(0, len(middles) - 1, MAX_WINDOWS).astype(np.int64)]
     stamps = positions.stamps_ns
-    kept, rows, scatter = [], [], []
+    kept: list[int] = []
+    rows, scatter = [], []
     for middle in middles.tolist():
         first, last = np.searchsorted(stamps, [middle - HALF_WINDOW_NS, middle + HALF_WINDOW_NS])
         if last - first < MIN_FIXES:
@@ -86,7 +90,8 @@ def antenna_windows(positions: Positions, begin_ns: int, end_ns: int) -> Windows
         # The acceleration is that of the middle of the fixes.
         middle = int((stamps[first:last] - middle).mean()) + middle
         t = (stamps[first:last] - middle) * 1e-9
-        if t[-1] - t[0] < MIN_SPAN_S:
+        # At the edge of a gap, the next window may have the same fixes.
+        if t[-1] - t[0] < MIN_SPAN_S or (kept and middle <= kept[-1]):
             continue
         A = np.stack([np.ones(len(t)), t, 0.5 * t**2], axis=1)
         found, *_ = np.linalg.lstsq(A, positions.position_map[first:last])

@@ -14,8 +14,9 @@ from caliv_graph.products import Array, Finding
 from caliv_graph.targets.cloud.copies import Copy
 from caliv_graph.targets.ground.guesses import Misfit
 from caliv_graph.trajectory.alignment import level
+from caliv_graph.trajectory.axes import Axes
 from caliv_graph.trajectory.heading import HeadingDisagreement
-from caliv_graph.trajectory.physics import Axes, Gravity, MotionPhysics, Ratio
+from caliv_graph.trajectory.physics import Gravity, MotionPhysics, Ratio, known_rotation
 from caliv_graph.trajectory.tilt import VehicleTilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
 
@@ -189,8 +190,8 @@ def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:
         )
         return
     sigmas = abs(axes.yaw_rad) / axes.sigma_rad
-    if abs(axes.yaw_rad) > MIN_YAW_RAD and sigmas > CONTRADICTION_SIGMAS:
-        R = config.imu.T_vehicle_imu.pose().rotation().matrix()
+    R = known_rotation(config)
+    if R is not None and abs(axes.yaw_rad) > MIN_YAW_RAD and sigmas > CONTRADICTION_SIGMAS:
         value = _degrees(gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ R)
         yield Finding(
             "imu.T_vehicle_imu",
@@ -221,7 +222,8 @@ def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
     """Vehicle axes that are not level over the drive; None if they are."""
     off, sigma = np.abs(tilt.roll_pitch_rad), tilt.sigma_rad
     said = (off > MIN_TILT_RAD) & (off > WARNING_SIGMAS * sigma)
-    if not said.any():
+    R = known_rotation(config)
+    if not said.any() or (R is None and not tilt.given):
         return None
     i = int(np.argmax(np.where(said, off / sigma, 0.0)))
     sigmas = float(off[i] / sigma[i])
@@ -233,9 +235,8 @@ def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
     )
     key, remedy = "topics.pose", "check the frame of the poses"
     value: tuple[float, ...] = ()
-    if not tilt.given:
+    if not tilt.given and R is not None:
         roll, pitch = tilt.roll_pitch_rad
-        R = config.imu.T_vehicle_imu.pose().rotation().matrix()
         value = _degrees(level(np.array([-pitch, roll, 1.0])) @ R)
         key = "imu.T_vehicle_imu"
         remedy = f"imu.T_vehicle_imu rpy_deg about {_rpy(value, 1)} would fit"
@@ -255,10 +256,10 @@ def heading_finding(found: HeadingDisagreement, config: Config) -> Finding | Non
     """A heading that disagrees with the course over ground, in the words of the check after it."""
     if not found.warning:
         return None
-    R = config.imu.T_vehicle_imu.pose().rotation().matrix()
+    R = known_rotation(config)
     return Finding(
         "imu.T_vehicle_imu",
-        _degrees(gtsam.Rot3.Rz(found.yaw_rad).matrix() @ R),
+        () if R is None else _degrees(gtsam.Rot3.Rz(found.yaw_rad).matrix() @ R),
         math.degrees(found.sigma_rad),
         abs(found.yaw_rad) / found.sigma_rad,
         "warning",

@@ -69,7 +69,7 @@ def calibrate(recordings, config, progress, prior):
 def test_the_first_suspect_is_tried_beside_the_first_run(tmp_path: Path) -> None:
     write_drive(tmp_path / "drive")
     config, out = write_config(tmp_path / "config.yaml"), tmp_path / "out"
-    done = run("calibrate", config, "--out", out, "--try-suspects", pipeline=SUSPECT)
+    done = called("calibrate", config, "--out", out, "--try-suspects", pipeline=SUSPECT)
     assert done.returncode == 4, done.stderr  # that of the run that was asked for
     assert "Tried: gnss.lever_arm: [1.2, 0.3, 0.8]" in done.stdout
     assert read_calibration(out / "calibration.yaml").status == "inconsistent"
@@ -77,6 +77,6 @@ def test_the_first_suspect_is_tried_beside_the_first_run(tmp_path: Path) -> None
     effective = yaml.safe_load((out / "suspect" / "config.yaml").read_text())
     assert effective["gnss"]["lever_arm"] == [1.2, 0.3, 0.8]
     # Both results are replaced together.
-    again = run("calibrate", config, "--out", out, "--force", pipeline=SUSPECT)
+    again = called("calibrate", config, "--out", out, "--force", pipeline=SUSPECT)
     assert again.returncode == 4, again.stderr
     assert not (out / "suspect").exists()

@@ -154,3 +154,37 @@ def test_a_config_with_a_wrong_unit_or_sign(
     done = command("calibrate", config, "--out", tmp_path / "out")
 
     check_sound(done, tmp_path / "out", drive / "truth.yaml")
+
+
+@pytest.mark.parametrize(
+    ("sections", "said"),
+    [
+        ({"imu": {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [90, 0, 0]}}}, "gravity is along"),
+        ({"target": [{"min": [90, 90, 0], "max": [95, 95, 3]}]}, "no LiDAR sees the target"),
+        ({"lidars__front__topic": "/lidar/frnt/points"}, "Did you mean '/lidar/front/points'"),
+    ],
+    ids=["IMU on its side", "no target", "no topic"],
+)
+def test_inspect_shows_its_tables_whatever_the_config_says(
+    sections: dict[str, object], said: str, drive: Path, tmp_path: Path
+) -> None:
+    config = write_config(drive, tmp_path / "config.yaml", **sections)
+
+    done = command("inspect", drive / "drive", "--config", config)
+
+    assert done.code == 0
+    assert said in done.err
+    assert "/lidar/front/points" in done.out
+    assert ("as expected" in done.out) == ("imu" not in sections)
+
+
+def test_a_target_that_a_wrong_yaw_hides_is_blamed_on_the_yaw(drive: Path, tmp_path: Path) -> None:
+    turned = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 90]}}
+    config = write_config(drive, tmp_path / "config.yaml", imu=turned)
+
+    done = command("calibrate", config, "--out", tmp_path / "out")
+
+    assert done.code == 2
+    assert "Most likely because of imu.T_vehicle_imu: " in done.err
+    assert "degrees of yaw against the accelerations of the path" in done.err
+    assert "Move or widen" not in done.err

@@ -41,11 +41,14 @@ def inspect(
         inspection = inspect_any(recording, progress)
         warnings: list[str] = []
         if settings is not None:
+            from caliv_graph.calibration.choose import choose_static
             from caliv_graph.targets import extract_targets
             from caliv_graph.trajectory.select import smooth_trajectories
 
             trajectories = smooth_trajectories([recording], settings, [[]])
-            observations = extract_targets([recording], trajectories, settings, progress)
+            observations = extract_targets(
+                [recording], trajectories, settings, progress, choose_static
+            )
             inspection = add_any_targets(inspection, observations)
             warnings += [line for seen in observations for line in seen.warnings]
         warnings = [*recording.warnings(), *warnings]

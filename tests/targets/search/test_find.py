@@ -16,6 +16,7 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import (
     Config,
     ExtractionConfig,
+    GroundConfig,
     LidarConfig,
     PoseConfig,
     PoseSigmaConfig,
@@ -388,9 +389,26 @@ class TestGuessesFarOff:
         assert min(found.scans.values()) >= 5
         config, sentences = realigned(off.config, [found])
         for name, sentence in zip(found.misplaced, sentences, strict=True):
-            assert sentence.startswith(f"lidar '{name}': the objects that it sees stand still only")
+            assert sentence.startswith(f"lidar '{name}': the objects that it sees stand still on")
             T = config.lidars[name].initial.pose().between(drive.truth[name])
             assert abs(T.rotation().yaw()) < math.radians(6.0)
+
+    def test_a_tilt_is_found_by_the_ground(self) -> None:
+        drive = recorded("street")
+        lidars = dict(drive.config.lidars)
+        (x, y, z), (roll, pitch, yaw) = lidars["rear"].initial.xyz, lidars["rear"].initial.rpy_deg
+        initial = PoseConfig(xyz=(x, y, z + 0.5), rpy_deg=(roll - 12.0, pitch + 9.0, yaw))
+        lidars["rear"] = lidars["rear"].model_copy(update={"initial": initial})
+        config = drive.config.model_copy(
+            update={"lidars": lidars, "ground": GroundConfig(vehicle_height=0.0)}
+        )
+        found = replace(drive, config=config).find()
+        assert list(found.misplaced) == ["rear"]
+        assert off_m(found) < 0.5
+        assert min(found.scans.values()) >= 5
+        tilted = found.aligned["rear"].between(drive.truth["rear"])
+        assert np.abs(tilted.rotation().rpy()[:2]) == pytest.approx(np.zeros(2), abs=0.01)
+        assert found.aligned["rear"].z() == pytest.approx(2.0, abs=0.03)
 
     def test_a_guess_as_good_as_its_sigma_is_kept(self) -> None:
         found = found_in("street", 1)

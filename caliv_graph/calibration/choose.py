@@ -21,7 +21,7 @@ from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
 from caliv_graph.products import Array, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.targets.cloud.extract import Choice, TriedCandidate
+from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at

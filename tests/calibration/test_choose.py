@@ -16,7 +16,7 @@ from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, IntArray, TargetCloud, TargetObservation, Trajectory
 from caliv_graph.scenario.drive_models import FigureEightDrive
 from caliv_graph.scenario.drives import make_drive
-from caliv_graph.targets.cloud.extract import TriedCandidate
+from caliv_graph.targets.cloud.choice import TriedCandidate
 from caliv_graph.targets.search import FoundTarget
 from caliv_graph.trajectory.select import GivenTrajectory
 

@@ -13,7 +13,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording, TargetCloud, TargetObservation
-from caliv_graph.targets.cloud.extract import Choose
+from caliv_graph.targets.cloud.choice import Choose
 from caliv_graph.trajectory.select import VehicleTrajectory
 from tests.cli.commands import write_config, write_drive
 from tests.readers.bags import SECOND, START, cloud, fix, imu, odometry, write_bag

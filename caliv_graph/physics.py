@@ -37,8 +37,6 @@ def check_clouds(recordings: Sequence[Recording], config: Config) -> None:
 
 def raw_findings(motions: Mapping[int, MotionData], config: Config) -> tuple[Finding, ...]:
     """What the raw sensors of each drive say against each other and against the config."""
-    if config.imu.T_vehicle_imu.rpy_deg is None:
-        return ()  # it is found from the same data: there is nothing to check
     out: list[Finding] = []
     for motion in motions.values():
         if takes_given_poses(motion, config):
@@ -73,11 +71,10 @@ def smoothed_findings(
     """
     out: list[Finding] = []
     for index, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
-        if config.imu.T_vehicle_imu.rpy_deg is not None:
-            tilt = vehicle_tilt(trajectory, motions[index].name, config)
-            found = tilt_finding(tilt, config)
-            if found is not None:
-                out.append(found)
+        tilt = vehicle_tilt(trajectory, motions[index].name, config)
+        found = tilt_finding(tilt, config)
+        if found is not None:
+            out.append(found)
         if config.ground.use:
             grounds = lidar_grounds(recording, trajectory, config, progress)
             out += guess_findings(recording.name, misfits(grounds, config), config)
@@ -95,8 +92,7 @@ def heading_findings(
     None with a finding of the raw sensors about `T_vehicle_imu`: then the trajectory is no
     evidence.
     """
-    unknown = config.imu.T_vehicle_imu.rpy_deg is None
-    if unknown or any(found.input == "imu.T_vehicle_imu" for found in raw):
+    if any(found.input == "imu.T_vehicle_imu" for found in raw):
         return ()
     out = []
     for index, trajectory in enumerate(trajectories):

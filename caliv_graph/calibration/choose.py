@@ -21,7 +21,7 @@ from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
 from caliv_graph.products import Array, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.targets.cloud.extract import Choice, TriedCandidate
+from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
@@ -100,7 +100,7 @@ def choose_static(
     best = max(apart, key=rank)
     others = [i for i in apart if i != best]
     same = [i for i in others if rank(i)[0]]
-    moving = [i for i in others if math.isfinite(scatter[i]) and i not in same]
+    worse = [i for i in others if math.isfinite(scatter[i]) and i not in same]
     of = candidates[best].found
     if of.doubtful and scatter[best] > MOVES_M and cause_of(found[best], config) is None:
         raise TargetError(_why_none_stands(candidates, scatter))
@@ -112,11 +112,11 @@ def choose_static(
             f"to {scatter[best]:.2f} m. Other static objects fit too: {listed}. Give a target "
             "region to choose"
         )
-    if moving:
-        listed = ", ".join(f"{candidates[i].found} (by {scatter[i]:.2f} m)" for i in moving)
+    if worse:
+        listed = ", ".join(f"{candidates[i].found} (to {scatter[i]:.2f} m)" for i in worse)
         reasons.append(
-            f"objects that are not at one place of the map were left out: {listed}; this one "
-            f"scatters by {scatter[best]:.2f} m"
+            f"chosen because its clouds agree on one place of the map to {scatter[best]:.2f} m; "
+            f"those of other objects agree less: {listed}"
         )
     return Choice(best, tuple(reasons))
 

@@ -114,7 +114,7 @@ def split_halves(
         prepared = prepare([recording], config, {0: motion}, progress)
     except TargetError as e:
         return Repeatability(("", ""), None, reason=str(e))
-    observations = prepared.observations
+    observations, config = prepared.observations, prepared.config
     fewest = config.extraction.min_scans
     names, halves = ("first passes", "later passes"), [split(o, fewest) for o in observations]
     by_passes = None not in halves

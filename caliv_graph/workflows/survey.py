@@ -57,14 +57,19 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     prepared = prepare(recordings, config, motions, progress)
     with threadpool_limits(limits=1):
         found = survey_observations(
-            prepared.observations, prepared.trajectories, prepared.grounds, config, progress
+            prepared.observations,
+            prepared.trajectories,
+            prepared.grounds,
+            prepared.config,
+            progress,
         )
     return replace(
         found,
         names=tuple(recording.name for recording in recordings),
         warnings=(
-            *prepared.warnings,
+            *prepared.contradictions,
             *(f.sentence for f in prepared.findings if f.severity == "contradiction"),
+            *prepared.warnings,
             *found.warnings,
         ),
     )

@@ -13,6 +13,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording, TargetCloud, TargetObservation
+from caliv_graph.targets.cloud.choice import Choose
 from caliv_graph.trajectory.select import VehicleTrajectory
 from tests.cli.commands import write_config, write_drive
 from tests.readers.bags import SECOND, START, cloud, fix, imu, odometry, write_bag
@@ -67,6 +68,7 @@ def test_with_a_config_who_sees_the_target_when(
         trajectories: Sequence[VehicleTrajectory],
         config: Config,
         progress: Progress,
+        choose: Choose,
     ) -> tuple[TargetObservation, ...]:
         assert len(trajectories[0].trajectory.T_map_vehicle) == 3
         cloud = TargetCloud("front", 0, 100_000_000, np.full((60, 3), 4.0), "1.pcd")

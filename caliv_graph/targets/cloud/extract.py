@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from caliv_graph.common.progress import Progress
+from caliv_graph.common.progress import Advance, Progress
 from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
 from caliv_graph.products import IntArray, Recording, TargetCloud, TargetObservation
+from caliv_graph.targets.cloud.choice import Choose, TriedCandidate, first_candidate
 from caliv_graph.targets.cloud.constellation import match_objects, one_object, static_objects
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
 from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor
@@ -30,47 +31,6 @@ REMEDY = (
 SCANS_OF_A_PLACE = 10
 """Scans of each place of a target that is moved while the vehicle stands. All show the same spots
 of it: more would average the noise but not the sampling by the beams."""
-
-
-@dataclass(frozen=True)
-class TriedCandidate:
-    """An object that the search proposes as the target of a drive, and its clouds.
-
-    Attributes:
-        found: what the search knows of it.
-        observations: its placements.
-    """
-
-    found: FoundTarget
-    observations: tuple[TargetObservation, ...]
-
-    @property
-    def lidars(self) -> frozenset[str]:
-        """Names of the LiDARs that see it often enough."""
-        return frozenset(cloud.lidar for o in self.observations for cloud in o.clouds)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Which candidate is the target.
-
-    Attributes:
-        index: of the candidate.
-        reasons: about it and the others, a line each.
-    """
-
-    index: int
-    reasons: tuple[str, ...] = ()
-
-
-Choose = Callable[[Sequence[TriedCandidate], VehicleTrajectory, Config], Choice]
-
-
-def first_candidate(
-    candidates: Sequence[TriedCandidate], trajectory: VehicleTrajectory, config: Config
-) -> Choice:
-    """The one that is seen best, whether or not its clouds agree."""
-    return Choice(0)
 
 
 def extract_targets(
@@ -113,14 +73,7 @@ def extract_targets(
     with progress.stage("reading clouds", total) as advance:
         for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
             extractors = [RegionExtractor(r, config, trajectory) for r in regions[drive]]
-            seen: list[dict[str, list[list[Candidate]]]] = [
-                {name: [] for name in config.lidars} for _ in extractors
-            ]
-            for name in config.lidars:
-                for scan in recording.scans(name, wanted[drive][name]):
-                    for extractor, of_lidar in zip(extractors, seen, strict=True):
-                        of_lidar[name].append(extractor.candidates(scan, drive))
-                    advance()
+            seen = _candidates(recording, drive, wanted[drive], extractors, advance)
             of_drive = f" of {recording.name}" if len(recordings) > 1 else ""
             if searched:
                 placements = _chosen(searched[drive], extractors, seen, config, of_drive, choose)
@@ -128,7 +81,7 @@ def extract_targets(
                 placements = []
                 for index, (extractor, of_lidar) in enumerate(zip(extractors, seen, strict=True)):
                     label = "target" if len(extractors) == 1 else f"target {index + 1}"
-                    placements += _placements(label + of_drive, extractor, of_lidar, config, ())
+                    placements += _placements(label + of_drive, extractor, of_lidar, config)
             observations += [
                 replace(found, placement=len(observations) + n)
                 for n, found in enumerate(placements)
@@ -138,6 +91,25 @@ def extract_targets(
         what, _, remedy = why.rpartition(". ")  # the remedy is the last sentence
         raise TargetError(what, remedy)
     return tuple(observations)
+
+
+def _candidates(
+    recording: Recording,
+    drive: int,
+    wanted: Mapping[str, frozenset[int]],
+    extractors: Sequence[RegionExtractor],
+    advance: Advance,
+) -> list[dict[str, list[list[Candidate]]]]:
+    """Per extractor and LiDAR, the candidates of each of the wanted scans of a drive."""
+    seen: list[dict[str, list[list[Candidate]]]] = [
+        {name: [] for name in wanted} for _ in extractors
+    ]
+    for name, stamps in wanted.items():
+        for scan in recording.scans(name, stamps):
+            for extractor, of_lidar in zip(extractors, seen, strict=True):
+                of_lidar[name].append(extractor.candidates(scan, drive))
+            advance()
+    return seen
 
 
 def _chosen(
@@ -153,7 +125,7 @@ def _chosen(
     proposals = (searched, *searched.others)
     for found, extractor, of_lidar in zip(proposals, extractors, seen, strict=True):
         label = _label(found) + of_drive
-        placements = tuple(_placements(label, extractor, of_lidar, config, ()))
+        placements = tuple(_placements(label, extractor, of_lidar, config))
         tried.append(TriedCandidate(found, placements))
     choice = choose(tried, extractors[0].trajectory, config)
     first, *rest = tried[choice.index].observations
@@ -172,14 +144,13 @@ def _placements(
     extractor: RegionExtractor,
     seen: Mapping[str, Sequence[Sequence[Candidate]]],
     config: Config,
-    hints: Sequence[str],
 ) -> list[TargetObservation]:
     """One observation of a target, or one of each of its places if somebody moved it."""
     flat = {name: [c for scan in scans for c in scan] for name, scans in seen.items()}
     centres = {name: _centres(found) for name, found in flat.items()}
     moved = periods(centres, extractor.trajectory, config.extraction.min_scans)
     if not moved:
-        return _objects(label, extractor, seen, config, hints)
+        return _objects(label, extractor, seen, config)
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -194,12 +165,12 @@ def _placements(
         most = max(most, SCANS_OF_A_PLACE, config.extraction.min_scans)
         extraction = config.extraction.model_copy(update={"max_scans": most})
         fewer = config.model_copy(update={"extraction": extraction})
-        observation = _observation(name, own, clouds, fewer, ())
+        observation = _observation(name, own, clouds, fewer)
         if observation.clouds:
             out.append(observation)
     if not out:
-        return [_observation(label, extractor, [], config, hints)]
-    warnings = [*hints, *_warnings_of_moves(label, extractor, out, len(moved), config)]
+        return [_observation(label, extractor, [], config)]
+    warnings = [*_warnings_of_moves(label, extractor, out, len(moved), config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
 
@@ -209,7 +180,6 @@ def _objects(
     extractor: RegionExtractor,
     seen: Mapping[str, Sequence[Sequence[Candidate]]],
     config: Config,
-    hints: Sequence[str],
 ) -> list[TargetObservation]:
     """One observation of each object in the region that stands still."""
     fewest = config.extraction.min_scans
@@ -222,7 +192,7 @@ def _objects(
                 clouds += extractor.clouds(lidars[name].candidates[0], lidars[name].scans, name)
             else:
                 clouds += extractor.choose(scans, name)
-        return [_observation(label, extractor, clouds, config, hints)]
+        return [_observation(label, extractor, clouds, config)]
     matched = match_objects(tuple(lidars.values()))
     outside_m = extractor.outside_m(np.array([shared.place for shared in matched.objects]))
     # What stands beside the region is not meant; the guesses place all objects wrong together.
@@ -237,14 +207,14 @@ def _objects(
                 objects = lidars[name]
                 clouds += own.clouds(objects.candidates[shared.seen[name]], objects.scans, name)
         if len(meant) == 1:
-            return [_observation(label, own, clouds, config, hints)]
+            return [_observation(label, own, clouds, config)]
         name = f"{label}, object {number} of {len(meant)}"
-        observation = _observation(name, own, clouds, config, ())
+        observation = _observation(name, own, clouds, config)
         if observation.clouds:
             out.append(replace(observation, centre_map=extractor.in_map(shared.place)))
     if not out:
-        return [_observation(label, extractor, [], config, hints)]
-    warnings = [*hints, *_warnings_of_objects(label, extractor, out, matched.ambiguous, config)]
+        return [_observation(label, extractor, [], config)]
+    warnings = [*_warnings_of_objects(label, extractor, out, matched.ambiguous, config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
 
@@ -347,10 +317,9 @@ def _observation(
     extractor: RegionExtractor,
     found: list[TargetCloud],
     config: Config,
-    hints: Sequence[str],
 ) -> TargetObservation:
     """One observation; LiDARs that saw the target in too few scans are left out with a warning."""
-    warnings = list(hints)
+    warnings: list[str] = []
     kept: list[TargetCloud] = []
     seen_ns: dict[str, tuple[int, ...]] = {}
     seeing = sum(t.kept >= config.extraction.min_scans for t in extractor.tallies.values())

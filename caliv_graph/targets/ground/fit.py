@@ -26,7 +26,7 @@ MIN_POINTS = 30
 """Minimum number of points on a plane."""
 
 
-def fit_ground(points: Array, distance: float) -> Array | None:
+def fit_ground(points: Array, distance: float, max_tilt_rad: float = MAX_TILT_RAD) -> Array | None:
     """The near-horizontal plane that most points (N, 3) lie on, metres, z roughly up.
 
     Within `distance` of it. Unit normal n (upwards) and offset d, (4,), with `n . p + d = 0`; None
@@ -44,7 +44,7 @@ def fit_ground(points: Array, distance: float) -> Array | None:
     usable = length > 1e-9
     normals = normals[usable] / length[usable, None]
     normals *= np.where(normals[:, 2] < 0.0, -1.0, 1.0)[:, None]
-    level = normals[:, 2] > math.cos(MAX_TILT_RAD)
+    level = normals[:, 2] > math.cos(max_tilt_rad)
     if not level.any():
         return None
     normals = normals[level]

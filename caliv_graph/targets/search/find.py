@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from caliv_graph.targets.search.align import (
     concentration,
 )
 from caliv_graph.targets.search.history import Alignment, LidarHistory
+from caliv_graph.targets.search.level import levelled
 from caliv_graph.targets.search.objects import WIDE_M, segment_scan
 from caliv_graph.targets.search.tracks import (
     MAX_EXTENT_M,
@@ -43,6 +45,9 @@ PERIOD_S = 1.0
 
 MAX_SCANS = 240
 """Scans of one LiDAR that are read at most, however long the drive is."""
+
+LEVEL_SCANS = 5
+"""Scans whose ground shows a tilt of the guess: the drive has not got to a slope by then."""
 
 STANDS_M = 0.2
 STANDS_RAD = math.radians(2.0)
@@ -171,7 +176,12 @@ def _read_history(
     lidar = config.lidars[name]
     guess = lidar.initial.pose()
     scans, stamps = [], []
-    for scan in recording.scans(name, wanted=set(chosen.tolist())):
+    read = recording.scans(name, wanted=set(chosen.tolist()))
+    first = list(itertools.islice(read, LEVEL_SCANS))
+    if first:
+        R, _ = trajectory.poses_at([scan.stamp_ns for scan in first])
+        guess = levelled([scan.points_lidar for scan in first], R, guess, name, config)
+    for scan in itertools.chain(first, read):
         range_m = np.linalg.norm(scan.points_lidar, axis=1)
         points = deskew(scan, guess, trajectory).points_lidar
         points = points[(range_m >= lidar.min_range) & (range_m <= lidar.max_range)]
@@ -198,6 +208,9 @@ def _target_of_drive(
             alignments, tracks, proposals = tried, other_tracks, others
         else:
             misplaced = {}
+    for history in histories:
+        if not history.guess.equals(config.lidars[history.name].initial.pose(), 0.0):
+            misplaced.setdefault(history.name, alignments[history.name])
     usable = [p for p in proposals if math.isfinite(p.height_m)]
     if not usable:
         raise TargetError(*_why_none(name, histories, tracks, len(proposals)))

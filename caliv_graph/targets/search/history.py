@@ -33,6 +33,7 @@ class LidarHistory:
 
     Attributes:
         name: of the LiDAR.
+        guess: T_vehicle_lidar.
         scans: the objects of each scan.
         objects: all objects of all scans, n of them.
         scan_of: (n,) index of the scan of each.
@@ -57,7 +58,7 @@ class LidarHistory:
         self.scans = tuple(scans)
         self.stride = stride
         self.R_map_vehicle, self.t_map_vehicle = poses
-        self._guess = T_vehicle_lidar
+        self.guess = T_vehicle_lidar
         self._R_guess = T_vehicle_lidar.rotation().matrix()
         self.t_vehicle_lidar = T_vehicle_lidar.translation()
         self.objects: tuple[ScanObject, ...] = tuple(o for s in scans for o in s.objects)
@@ -101,7 +102,7 @@ class LidarHistory:
         """T_vehicle_lidar, the corrected guess."""
         R_yaw = gtsam.Rot3.Yaw(alignment.yaw_rad)
         shift = np.array([*alignment.shift_m, 0.0])
-        return gtsam.Pose3(R_yaw.compose(self._guess.rotation()), self.t_vehicle_lidar + shift)
+        return gtsam.Pose3(R_yaw.compose(self.guess.rotation()), self.t_vehicle_lidar + shift)
 
     def bases(self, alignment: Alignment) -> Array:
         """(n, 3) metres in the map, the foot of each object."""

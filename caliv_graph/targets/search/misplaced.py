@@ -5,10 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.targets.search.find import FoundTarget
+
+SMALLEST_RAD = math.radians(0.5)
+"""Smaller angles are not named."""
 
 
 def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, tuple[str, ...]]:
@@ -18,7 +24,7 @@ def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, 
     """
     lidars, sentences = dict(config.lidars), []
     for found in searched:
-        for name, off in found.misplaced.items():
+        for name in found.misplaced:
             if lidars[name] is not config.lidars[name]:
                 continue
             T = found.aligned[name]
@@ -26,14 +32,24 @@ def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, 
             roll, pitch, yaw = (float(v) for v in np.degrees(T.rotation().rpy()))
             initial = PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
             lidars[name] = lidars[name].model_copy(update={"initial": initial})
-            shift = float(np.linalg.norm(off.shift_m))
-            sentences.append(
-                f"lidar '{name}': the objects that it sees stand still only if its initial guess "
-                f"is off by about {math.degrees(off.yaw_rad):+.0f} degrees in yaw and {shift:.1f} "
-                f"m ({off.shift_m[0]:+.1f} forward, {off.shift_m[1]:+.1f} left): the target was "
-                f"searched, and the graph solved, from there. Check lidars.{name}.initial: signs, "
-                "degrees, T_vehicle_lidar and not its inverse, the topic"
-            )
+            sentences.append(_sentence(name, config.lidars[name].initial.pose(), T))
     if not sentences:
         return config, ()
     return config.model_copy(update={"lidars": lidars}), tuple(sentences)
+
+
+def _sentence(name: str, guess: gtsam.Pose3, found: gtsam.Pose3) -> str:
+    off = vehicle_axes_difference(found, guess)
+    angles = ", ".join(
+        f"{axis} by {math.degrees(angle):+.0f}"
+        for axis, angle in zip(AXES[:3], off[:3].tolist(), strict=True)
+        if abs(angle) >= SMALLEST_RAD
+    )
+    shift = float(np.linalg.norm(off[3:]))
+    return (
+        f"lidar '{name}': the objects that it sees stand still on level ground only if its initial "
+        f"guess is off: {angles or 'no angle'} degrees, and {shift:.1f} m ({off[3]:+.1f} forward, "
+        f"{off[4]:+.1f} left, {off[5]:+.1f} up). The target was searched, and the graph solved, "
+        f"from there. Check lidars.{name}.initial: signs, degrees, T_vehicle_lidar and not its "
+        "inverse, the topic"
+    )

@@ -16,6 +16,7 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import (
     Config,
     ExtractionConfig,
+    GroundConfig,
     LidarConfig,
     PoseConfig,
     PoseSigmaConfig,
@@ -42,6 +43,7 @@ from caliv_graph.simulation.noise import perturbed_extrinsic
 from caliv_graph.targets.cloud.region import RegionExtractor
 from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.targets.search.find import MAX_SCANS, REGION_MARGIN_M
+from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.drives_with_chair import Memory
 
@@ -368,6 +370,51 @@ class TestInvariance:
         before = [yaw_error(c.initial.pose(), n) for n, c in drive.config.lidars.items()]
         after = [yaw_error(found.aligned[n], n) for n in drive.config.lidars]
         assert sum(after) < 0.5 * sum(before)
+
+
+class TestGuessesFarOff:
+    @pytest.mark.parametrize("names", [("rear",), ("front", "rear")])
+    def test_are_found_by_what_then_stands_still(self, names: tuple[str, ...]) -> None:
+        drive = recorded("street")
+        lidars = dict(drive.config.lidars)
+        for name in names:
+            (x, y, z), (roll, pitch, yaw) = lidars[name].initial.xyz, lidars[name].initial.rpy_deg
+            initial = PoseConfig(xyz=(x + 0.6, y - 0.5, z), rpy_deg=(roll, pitch, yaw + 15.0))
+            lidars[name] = lidars[name].model_copy(update={"initial": initial})
+        off = replace(drive, config=drive.config.model_copy(update={"lidars": lidars}))
+        found = off.find()
+        assert set(found.misplaced) == set(names)
+        # The arc leaves 9.16 m per radian of a common yaw to be made up by x.
+        assert off_m(found) < 1.5
+        assert min(found.scans.values()) >= 5
+        config, sentences = realigned(off.config, [found])
+        for name, sentence in zip(found.misplaced, sentences, strict=True):
+            assert sentence.startswith(f"lidar '{name}': the objects that it sees stand still on")
+            T = config.lidars[name].initial.pose().between(drive.truth[name])
+            assert abs(T.rotation().yaw()) < math.radians(6.0)
+
+    def test_a_tilt_is_found_by_the_ground(self) -> None:
+        drive = recorded("street")
+        lidars = dict(drive.config.lidars)
+        (x, y, z), (roll, pitch, yaw) = lidars["rear"].initial.xyz, lidars["rear"].initial.rpy_deg
+        initial = PoseConfig(xyz=(x, y, z + 0.5), rpy_deg=(roll - 12.0, pitch + 9.0, yaw))
+        lidars["rear"] = lidars["rear"].model_copy(update={"initial": initial})
+        config = drive.config.model_copy(
+            update={"lidars": lidars, "ground": GroundConfig(vehicle_height=0.0)}
+        )
+        found = replace(drive, config=config).find()
+        assert list(found.misplaced) == ["rear"]
+        assert off_m(found) < 0.5
+        assert min(found.scans.values()) >= 5
+        tilted = found.aligned["rear"].between(drive.truth["rear"])
+        assert np.abs(tilted.rotation().rpy()[:2]) == pytest.approx(np.zeros(2), abs=0.01)
+        assert found.aligned["rear"].z() == pytest.approx(2.0, abs=0.03)
+
+    def test_a_guess_as_good_as_its_sigma_is_kept(self) -> None:
+        found = found_in("street", 1)
+        assert not found.misplaced
+        config = recorded("street", 1).config
+        assert realigned(config, [found]) == (config, ())
 
 
 class TestNothingFound:

@@ -22,6 +22,8 @@ from caliv_graph.targets.search.align import (
     align,
     align_anywhere,
     concentration,
+    gate_m,
+    tracks_at_places,
 )
 from caliv_graph.targets.search.history import Alignment, LidarHistory
 from caliv_graph.targets.search.level import levelled
@@ -55,6 +57,9 @@ STANDS_RAD = math.radians(2.0)
 
 STANDING_PERIODS = 4
 """While the vehicle stands, every fourth scan is read: other objects move."""
+
+FEWEST_PLACES = 2
+"""Objects that must stand still under a guess far off for it to be taken."""
 
 MOST_TRIED = 4
 """Candidates that are tried at most: each costs a registration of some of its clouds."""
@@ -241,7 +246,11 @@ def _elsewhere(history: LidarHistory, near: Alignment, config: Config) -> Alignm
     if (np.abs([far.yaw_rad, *far.shift_m]) <= GUESS_SIGMAS * prior).all():
         return None
     least = FAR_RATIO * max(concentration(history, near), 0) + FAR_PAIRS
-    return far if concentration(history, far) > least else None
+    if concentration(history, far) <= least:
+        return None
+    # Some yaw and shift make a single walker stand still.
+    places = tracks_at_places(history, history.bases(far)[:, :2], gate_m(history, config))
+    return far if len(places) >= FEWEST_PLACES else None
 
 
 def _ranked(proposals: Sequence[Proposal]) -> list[Proposal]:

@@ -21,7 +21,9 @@ from tests.trajectory.motions import Course, config_for, eight_drive, mounted_as
 
 COURSE = Course(eight_drive(16.0), rough=1.0)
 SENSORS = replace(mounted_askew(), twist_hz=50.0)
-CONFIG = config_for(SENSORS)
+CONFIG = config_for(
+    SENSORS, gnss={"lever_arm": list(SENSORS.lever_arm)}, imu={"rotation_sigma_deg": None}
+)
 WANTED = stamps(16.0, 0.5, 0.3)
 
 

@@ -190,11 +190,14 @@ def first_fix_map(motion: MotionData) -> Array:
 
 
 def config_for(sensors: Sensors, **sections: dict[str, object]) -> Config:
-    """A config that knows the extrinsics."""
+    """A config that knows the extrinsics exactly, unless `sections` say otherwise."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
+    known: dict[str, object] = {} if not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-7}
+    same = sensors.T_vehicle_imu.equals(gtsam.Pose3(), 1e-9)
+    turned: dict[str, object] = {} if same else {"rotation_sigma_deg": 1e-6}
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},
-        "gnss": {"lever_arm": list(sensors.lever_arm)},
+        "gnss": {"lever_arm": list(sensors.lever_arm), **known},
         **sections,
     }
     raw["imu"] = {
@@ -202,6 +205,7 @@ def config_for(sensors: Sensors, **sections: dict[str, object]) -> Config:
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),
         },
+        **turned,
         **sections.get("imu", {}),
     }
     return parse_config(raw, "test", Path())

@@ -100,7 +100,7 @@ def _gravity(found: MotionPhysics, config: Config) -> Finding:
         turned = gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ level(gravity.up_vehicle) @ R
         value = _degrees(turned)
         sentence += f"; with the accelerations of the path {_rpy(value)}"
-    sentence = f"{found.name}: {sentence}. Now it is {_rpy(given.rpy_deg)}"
+    sentence = f"{found.name}: {sentence}. Now it is {_rpy(given.rpy_deg or ())}"
     sigma = MAX_GRAVITY_TILT_RAD / CONTRADICTION_SIGMAS
     return Finding(
         "imu.T_vehicle_imu",

@@ -190,26 +190,23 @@ def first_fix_map(motion: MotionData) -> Array:
     return np.concatenate(first)
 
 
-def config_for(
-    sensors: Sensors, *, measured: bool = False, **sections: Mapping[str, object]
-) -> Config:
-    """A config that knows the extrinsics: exactly, or `measured` with the default sigmas."""
+def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
+    """A config that knows the extrinsics exactly, unless `sections` say otherwise."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
+    known: dict[str, object] = {} if not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-7}
+    same = sensors.T_vehicle_imu.equals(gtsam.Pose3(), 1e-9)
+    turned: dict[str, object] = {} if same else {"rotation_sigma_deg": 1e-6}
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},
+        "gnss": {"lever_arm": list(sensors.lever_arm), **known},
         **sections,
-        "gnss": {
-            "lever_arm": list(sensors.lever_arm),
-            **({} if measured or not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-6}),
-            **sections.get("gnss", {}),
-        },
     }
     raw["imu"] = {
         "T_vehicle_imu": {
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),
         },
-        **({} if measured or not rpy.any() else {"rotation_sigma_deg": 1e-5}),
+        **turned,
         **sections.get("imu", {}),
     }
     return parse_config(raw, "test", Path())

@@ -51,7 +51,7 @@ def nees(motion: MotionData, smoothed: SmoothedTrajectory) -> float:
 
 def test_an_unknown_lever_arm_is_found() -> None:
     motion = record(COURSE, SENSORS, 1)
-    config = config_for(SENSORS, measured=True, gnss={"lever_arm": None})
+    config = config_for(SENSORS, gnss={"lever_arm": None}, imu={"rotation_sigma_deg": None})
 
     smoothed = smooth_trajectory(motion, config, WANTED)
 
@@ -66,7 +66,12 @@ def test_an_unknown_lever_arm_is_found() -> None:
 
 def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
     motion = record(COURSE, SENSORS, 3)
-    rough = smooth_trajectory(motion, config_for(SENSORS, measured=True), WANTED)
+    usual = config_for(
+        SENSORS,
+        gnss={"lever_arm": list(SENSORS.lever_arm)},
+        imu={"rotation_sigma_deg": None},
+    )
+    rough = smooth_trajectory(motion, usual, WANTED)
 
     exact = smooth_trajectory(motion, config_for(SENSORS), WANTED)
 
@@ -89,10 +94,13 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
     R = gtsam.Rot3.RzRyRx(*np.radians(rpy_deg))
     T = gtsam.Pose3(R, np.array([1.2, -0.4, 0.6]))
     sensors = replace(SENSORS, T_vehicle_imu=T)
-    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+    unknown: dict[str, object] = {
+        "T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None},
+        "rotation_sigma_deg": None,
+    }
 
     smoothed = smooth_trajectory(
-        record(COURSE, sensors, 4), config_for(sensors, measured=True, imu=unknown), WANTED
+        record(COURSE, sensors, 4), config_for(sensors, imu=unknown), WANTED
     )
 
     off = gtsam.Rot3.Logmap(smoothed.data.T_vehicle_imu.rotation().compose(R.inverse()))
@@ -104,15 +112,18 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
 
 def test_a_course_needs_gnss() -> None:
     motion = replace(record(COURSE, SENSORS, 5), gnss=None)
-    unknown: dict[str, object] = {"T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None}}
+    unknown: dict[str, object] = {
+        "T_vehicle_imu": {"xyz": [1.2, -0.4, 0.6], "rpy_deg": None},
+        "rotation_sigma_deg": None,
+    }
 
     with pytest.raises(TrajectoryError, match="measure the rotation of the IMU"):
-        smooth_trajectory(motion, config_for(SENSORS, measured=True, imu=unknown), WANTED)
+        smooth_trajectory(motion, config_for(SENSORS, imu=unknown), WANTED)
 
 
 def test_a_vehicle_frame_that_is_the_imu_s_has_no_parameters() -> None:
     motion = record(COURSE, Sensors(), 6)
 
-    smoothed = smooth_trajectory(motion, config_for(Sensors(), measured=True), WANTED)
+    smoothed = smooth_trajectory(motion, config_for(Sensors()), WANTED)
 
     assert smoothed.parameters == ()

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.stats import chi2, kstest, norm
 
-from caliv_graph.products import Array
 from caliv_graph.uncertainty.suspects import Candidate, Scores, assembled, log_tail, ranking
 
 
@@ -16,7 +16,7 @@ def candidate(name: str, size: int = 1, allowance: float = 0.0, scale: float = 1
     return Candidate(name, np.full(size, allowance), np.full(size, scale))
 
 
-def scores(candidates: list[Candidate], information: Array, gradient: Array) -> Scores:
+def scores(candidates: list[Candidate], information: ArrayLike, gradient: ArrayLike) -> Scores:
     return Scores(tuple(candidates), np.asarray(information, float), np.asarray(gradient, float))
 
 

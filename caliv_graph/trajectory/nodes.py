@@ -71,9 +71,11 @@ def carry_to_nodes(data: SmootherInput, nodes: IntArray, dead: DeadReckoning) ->
         positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
     if data.orientation:
         cov, _ = orientation_covariances(data.motion.imu, data.config)
+        cov = cov * data.scales.get("orientation", 1.0) ** 2
         orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
     if data.motion.twist is not None:
         cov, _ = velocity_covariances(data.motion.twist, data.config)
+        cov = cov * data.scales.get("velocity", 1.0) ** 2
         velocities = velocities_at_nodes(
             data.motion.twist, cov, nodes, dead, data.noise, data.T_vehicle_imu
         )

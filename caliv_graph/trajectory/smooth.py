@@ -14,25 +14,37 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
 from caliv_graph.trajectory.initial import first_states
-from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources
+from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.nodes import place_nodes
-from caliv_graph.trajectory.outliers import solve_without_outliers
+from caliv_graph.trajectory.noise import configured_errors
+from caliv_graph.trajectory.outliers import dropped_warnings, solve_without_outliers
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
-from caliv_graph.trajectory.solve import chain_of, covariances_of, solve_from_the_start
+from caliv_graph.trajectory.solve import (
+    chain_of,
+    covariances_of,
+    solve_from_the_start,
+    with_errors,
+)
+from caliv_graph.trajectory.variances import estimated_scales
 
 BIAS_SIGMAS = 5.0
 """Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
 
 
 def smooth_trajectory(
-    motion: MotionData, config: Config, stamps_ns: Sequence[int] | IntArray
+    motion: MotionData,
+    config: Config,
+    stamps_ns: Sequence[int] | IntArray,
+    correlated: Sequence[CorrelatedError] = (),
 ) -> SmoothedTrajectory:
     """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
 
     Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
-    IMU are in `lost_ns` of the result.
+    IMU are in `lost_ns` of the result. `correlated` are errors of sensors that the config does not
+    give.
 
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
@@ -41,11 +53,21 @@ def smooth_trajectory(
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
     states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    errors = errors_in(data, [*configured_errors(config), *correlated])
     robust = solve_without_outliers(data, nodes, states)
+    warnings += [*lines, *robust.warnings]
+    found = robust.estimate.states
+    scales = estimated_scales(robust.data, nodes, found, robust.dropped, errors)
+    if scales:
+        robust = solve_without_outliers(scaled(robust.data, scales), nodes, found)
+        warnings += robust.warnings
     data, estimate, positions = robust.data, robust.estimate, robust.data.positions
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
-    warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
+    chain = chain_of(linear, len(nodes), data.yaw_bias)
+    if errors:
+        estimate, cov_imu, chain = with_errors(estimate, linear, data, nodes, errors)
+    warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov_imu),
         lost_ns=tuple(lost.tolist()),
@@ -60,10 +82,21 @@ def smooth_trajectory(
         origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
-        chain=chain_of(linear, len(nodes), data.yaw_bias),
+        chain=chain,
         inertial=data.inertial,
         factor_kinds=tuple(estimate.graph.kinds),
+        data=data,
+        correlated=tuple(errors),
     )
+
+
+def errors_in(
+    data: SmootherInput, errors: Sequence[CorrelatedError]
+) -> tuple[CorrelatedError, ...]:
+    """The errors of sensors that the drive has, the first of each sensor."""
+    has = {"gnss": data.positions is not None, "orientation": data.orientation}
+    first = {error.kind: error for error in reversed(errors) if has[error.kind]}
+    return tuple(first[kind] for kind in MOVES if kind in first)
 
 
 def _within_span(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -13,6 +14,14 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
 from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.chain_solution import solved
+from caliv_graph.trajectory.correlated import (
+    AXES,
+    WIDTH,
+    CorrelatedError,
+    add_prior,
+    linearised,
+)
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
@@ -213,3 +222,48 @@ def covariances_of(
     if position > MAX_POSITION_SIGMA_M:
         raise TrajectoryError(f"{wanting}position: its sigma is {position:.1f} m. Record {advice}")
     return cov, None if yaw_cov is None else math.sqrt(float(yaw_cov[0, 0, 0]))
+
+
+def with_errors(
+    estimate: Estimate,
+    linear: gtsam.GaussianFactorGraph,
+    data: SmootherInput,
+    nodes: IntArray,
+    errors: Sequence[CorrelatedError],
+) -> tuple[Estimate, Array, Chain]:
+    """The estimate with errors of sensors that are correlated over time, by one linear step.
+
+    An error of decimetres turns the vehicle by milliradians: what is neglected is below a
+    micrometre.
+
+    Args:
+        estimate: without them.
+        linear: its graph, linearised.
+        data: the input.
+        nodes: (n,) stamps.
+        errors: at least one.
+
+    Returns:
+        The estimate; (n, 6, 6) covariances of the IMU's poses; and the information, the errors as
+        the last coordinates of every state.
+    """
+    R = estimate.states.R_map_imu
+    common = [key_yaw_bias()] if data.yaw_bias else []
+    kinds = [error.kind for error in errors]
+    J, r = linearised(linear, estimate.graph.kinds, kinds, R, common)
+    n, width = len(nodes), WIDTH + AXES * len(errors)
+    chain = Chain.zero(n, width, len(common))
+    chain.add(J)
+    add_prior(chain, nodes, errors)
+    found = solved(chain, J.T @ r)
+    step = gtsam.VectorValues()
+    by_node = found.step[: n * width].reshape(n, width)
+    for i, d in enumerate(by_node):
+        step.insert(key_imu(i), d[:6])
+        step.insert(key_velocity(i), d[6:9])
+        step.insert(key_bias(i), d[9:15])
+    for key, value in zip(common, found.step[n * width :], strict=True):
+        step.insert(key, np.array([value]))
+    values = estimate.values.retract(step)
+    moved = Estimate(from_values(values, n, data), estimate.graph, values)
+    return moved, np.asarray(found.cov[:, :6, :6]), chain

@@ -100,7 +100,7 @@ def test_the_covariance_is_that_of_the_distance_at_the_lidar() -> None:
     assert left / there[2, 2] < 0.3
     floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
     added = np.diag(floors**2) + np.outer(plane.beyond, plane.beyond)
-    assert plane.cov_with_floors - plane.cov == pytest.approx(added)
+    assert plane.cov_with(FLOORS) - plane.cov == pytest.approx(added)
     # The ground is level: what it seems to be bent by is noise, and less than the floors.
     assert np.all(np.abs(plane.beyond) < 2.0 * floors)
 
@@ -275,7 +275,7 @@ def test_a_crest_or_a_dip_is_owned_up_to(radius_m: float) -> None:
     assert off + beyond == pytest.approx(np.zeros(3), abs=0.25 * abs(off[2]))
     for plane in planes:
         wrong = errors(plane)
-        assert wrong @ np.linalg.solve(plane.cov_with_floors, wrong) < 6.0
+        assert wrong @ np.linalg.solve(plane.cov_with(FLOORS), wrong) < 6.0
 
 
 @pytest.mark.parametrize("radius_m", [100.0, -100.0, 300.0])

@@ -1,0 +1,91 @@
+"""What an error of a sensor that is correlated over time does to the smoothed poses.
+
+The smoother is a linear estimator near its solution: its poses move with the error by a fixed gain.
+So the covariance of the poses under any such error is known without smoothing again (a consider
+covariance; Schmidt 1966), and its level can be estimated from what the LiDARs see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.conventions import key_yaw_bias
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.chain_solution import inverse_columns
+from caliv_graph.trajectory.correlated import AXES, WIDTH, linearised
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+
+@dataclass(frozen=True)
+class ErrorEffects:
+    """Gain of the smoothed poses on one sensor's error.
+
+    Attributes:
+        kind: of the sensor's factors.
+        nodes_ns: (n,) stamps of the nodes.
+        gain: (6 m, 3, n) right perturbations of m vehicle poses, rotation then translation, by the
+            error at each node, along each axis of the map.
+    """
+
+    kind: str
+    nodes_ns: IntArray
+    gain: Array
+
+
+def error_effects(
+    trajectory: SmoothedTrajectory, stamps_ns: Sequence[int], kinds: Sequence[str]
+) -> tuple[ErrorEffects, ...]:
+    """The effects of each kind of error on the poses at wanted stamps (m,), increasing.
+
+    `trajectory` is without errors that are correlated over time.
+
+    Raises:
+        KeyError: a stamp has no node.
+    """
+    i = trajectory.node_indices(stamps_ns)
+    n, width = len(trajectory.nodes_ns), WIDTH + AXES * len(kinds)
+    common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]
+    linear = trajectory.graph.linearize(trajectory.values)
+    R = trajectory.states.R_map_imu
+    J, _ = linearised(linear, trajectory.factor_kinds, kinds, R, common)
+    both = Chain.zero(n, width, len(common))
+    both.add(J)
+    of_state = slice(0, WIDTH)
+    states = Chain(
+        both.diagonal[:, of_state, of_state],
+        both.coupling[:, of_state, of_state],
+        both.border[:, of_state],
+        both.corner,
+    )
+    wanted = (WIDTH * i[:, None] + np.arange(POSE)).ravel()
+    inverse = inverse_columns(states, wanted)
+    by_state = inverse[: n * WIDTH].reshape(n, WIDTH, len(wanted))
+    Ad = np.asarray(trajectory.T_vehicle_imu.AdjointMap())
+    out = []
+    for number, kind in enumerate(kinds):
+        of_error = slice(WIDTH + AXES * number, WIDTH + AXES * (number + 1))
+        # An error of a sensor acts at its own node: the coupling of neighbours has none.
+        gain = -np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
+        gain -= np.einsum("kp,nak->pan", inverse[n * WIDTH :], both.border[:, of_error])
+        shape = gain.shape
+        turned = Ad @ gain.reshape(len(i), POSE, -1)
+        out.append(ErrorEffects(kind, trajectory.nodes_ns, turned.reshape(shape)))
+    return tuple(out)
+
+
+def smoothed_in_time(rows: Array, nodes_ns: IntArray, time_s: float) -> Array:
+    """(r, n) rows times the correlation matrix of a first-order Gauss-Markov error at n nodes.
+
+    The matrix is `exp(-|t_i - t_j| / time_s)`: a recursion forwards and one backwards.
+    """
+    decay = np.exp(-np.diff(nodes_ns) * 1e-9 / time_s)
+    forward, backward = rows.T.copy(), rows.T.copy()
+    for i, d in enumerate(decay.tolist(), start=1):
+        forward[i] += d * forward[i - 1]
+    for i in range(len(decay) - 1, -1, -1):
+        backward[i] += decay[i] * backward[i + 1]
+    return np.asarray((forward + backward).T - rows)

@@ -117,9 +117,7 @@ def _estimate(
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     warnings = (*rough.warnings, *alike, *_unconverged(solution.registrations))
-    return replace(
-        solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels
-    )
+    return replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
 
 
 def _deskewed(

@@ -7,8 +7,10 @@ errors of the motion sensors do to the poses (`README.md`, "Noise levels").
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -36,6 +38,9 @@ from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 FEWEST_CLOUDS = 16
 """Fewer clouds do not tell noise levels: the usual ones hold."""
+
+MOST_CLOUDS = 36
+"""Clouds that are used, spread evenly over the drives: the cost grows with their cube."""
 
 SEEN = 0.5
 """Least weight of a cloud or a ground observation that is used."""
@@ -71,19 +76,25 @@ class Evidence:
                 (np.einsum("rc,can->ran", self.by_pose[:, columns], of[kind].gain[:, axes]), n)
                 for columns, of in self.effects
                 if kind in of
-                for n in [of[kind].nodes_ns]
+                for n in [of[kind].stamps_ns]
             ]
         out = np.zeros((len(self.by_pose),) * 2)
-        for moved, nodes_ns in self._moved[kind, axes]:
+        for moved, stamps_ns in self._moved[kind, axes]:
             for a in range(len(axes)):
-                out += smoothed_in_time(moved[:, a], nodes_ns, time_s) @ moved[:, a].T
+                out += smoothed_in_time(moved[:, a], stamps_ns, time_s) @ moved[:, a].T
         return out
 
 
 @dataclass
 class _Rows:
-    """Residuals (d,) of one observation; its Jacobians by key; its covariance (d, d) of known size;
-    and by name of a white level what that brings, at sigma 1."""
+    """One observation.
+
+    Attributes:
+        residual: (d,).
+        jacobians: (d, size) by key.
+        known: (d, d) its covariance of known size.
+        white: (d, d) by name of a white level, what that brings at sigma 1.
+    """
 
     residual: Array
     jacobians: Mapping[int, Array]
@@ -102,7 +113,7 @@ def linearised_evidence(
     usable = state.sound & smoothed & (state.weights.values > SEEN)
     if usable.sum() < FEWEST_CLOUDS:
         return None
-    clouds = evenly_over_drives(problem, usable)
+    clouds = evenly_over_drives(problem, usable, MOST_CLOUDS)
     poses = np.unique(problem.cloud_pose[clouds])
     values = with_given_poses(problem, state.values)
     rows = [
@@ -110,7 +121,7 @@ def linearised_evidence(
         *_ground_rows(state, values, poses),
     ]
     starts = np.cumsum([0, *(len(row.residual) for row in rows)])
-    parts = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    parts = [slice(a, b) for a, b in itertools.pairwise(starts.tolist())]
     sizes = {key: J.shape[1] for row in rows for key, J in row.jacobians.items()}
     of_pose = {key_vehicle(i): 6 * n for n, i in enumerate(poses.tolist())}
     others = [key for key in sizes if key not in of_pose]
@@ -145,9 +156,7 @@ def linearised_evidence(
     return Evidence(Observed(residuals, design, ridge, known), by_pose, white, effects)
 
 
-def _effects(
-    trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]
-) -> dict[str, ErrorEffects]:
+def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[str, ErrorEffects]:
     """What errors that are correlated over time do to the poses; none if some are in use."""
     if trajectory.correlated:
         return {}
@@ -202,8 +211,9 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
         centre = ground_centre(problem, o.drive)
         # With a unit covariance, GTSAM's whitening leaves the residual as it is.
         factor = ground_plane_factor(keys, key_ground(o.drive), centre, replace(o, cov=np.eye(3)))
-        linear = factor.linearize(values)
-        blocks = np.split(linear.getA(), 6 * np.arange(1, len(keys) + 1), axis=1)
+        linear: Any = factor.linearize(values)
+        # A copy: GTSAM's array ends with the factor.
+        blocks = np.split(np.array(linear.getA()), 6 * np.arange(1, len(keys) + 1), axis=1)
         known = o.cov - floors + weights.heave_m[n] ** 2 * distance
         out.append(
             _Rows(

@@ -146,7 +146,9 @@ def ground_graph(
             )
             graph.append("standing", factor)
         if config.parallel_sigma_deg is not None:
-            graph.append("parallel", parallel_factor(X, plane, key_parallel(drive), weight, sway_rad))
+            graph.append(
+                "parallel", parallel_factor(X, plane, key_parallel(drive), weight, sway_rad)
+            )
     return graph
 
 

@@ -150,8 +150,8 @@ def standing_factor(
 ) -> gtsam.CustomFactor:
     """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
 
-    Its sigma is the heave of one scan, `heave_m`; the error (`key_error`) is common to the drive. `centre`
-    (2,) metres is where the plane's height is defined; `weight` is on the information.
+    Its sigma is the heave of one scan, `heave_m`; the error (`key_error`) is common to the drive.
+    `centre` (2,) metres is where the plane's height is defined; `weight` is on the information.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:

@@ -320,11 +320,11 @@ def _pose_covariance(
     return np.asarray(known)
 
 
-def evenly_over_drives(problem: Problem, sound: BoolArray) -> IntArray:
-    """At most CLOUDS_USED sound clouds, evenly over the drives, in any order of the LiDARs."""
+def evenly_over_drives(problem: Problem, sound: BoolArray, most: int = CLOUDS_USED) -> IntArray:
+    """At most so many sound clouds, evenly over the drives, in any order of the LiDARs."""
     usable = np.flatnonzero(sound)
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
-    step = max(1, math.ceil(len(usable) / CLOUDS_USED))
+    step = max(1, math.ceil(len(usable) / most))
     return np.sort(usable[::step])
 
 

@@ -112,10 +112,11 @@ def estimated_noise(
     best = _fitted(evidence, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:
-        found = [(kind, _with_slow(evidence, names, best, kind)) for kind in kinds]
-        kind, better = min(found, key=lambda of: of[1].cost)
-        if best.cost - better.cost < EVIDENCE:
+        tried = [(kind, _with_slow(evidence, names, best, kind)) for kind in kinds]
+        found = [(kind, fit) for kind, fit in tried if fit and best.cost - fit.cost > EVIDENCE]
+        if not found:
             break
+        kind, better = min(found, key=lambda of: of[1].cost)
         best = better
         kinds.remove(kind)
     values = dict(zip(names, best.white.tolist(), strict=True))
@@ -196,8 +197,11 @@ def _fitted(
     slow: Sequence[tuple[str, Array]],
     white: Array | None,
 ) -> _Fit:
-    """The most likely levels. `slow` are kinds of errors, and where their search begins: sigmas of
-    the groups, then the time; `white` (k,) likewise."""
+    """The most likely levels of `names` and of correlated errors.
+
+    `slow` are the kinds of these, and where their search begins: sigmas of the groups, then the
+    time. `white` (k,) are the sigmas that the search of the others begins with.
+    """
     parts = [evidence.white[name] for name in names]
     unknowns = [LEVELS[name] for name in names]
     start = [u.median for u in unknowns] if white is None else white.tolist()
@@ -216,15 +220,21 @@ def _fitted(
         for group, sigma in zip(groups, found[at:], strict=False):
             sigmas[list(group)] = sigma
         at += len(groups)
-        errors.append(CorrelatedError(kind, tuple(sigmas.tolist()), float(found[at])))
+        east, north, up = sigmas.tolist()
+        errors.append(CorrelatedError(kind, (east, north, up), float(found[at])))
         at += 1
     return _Fit(found[: len(names)], tuple(errors), value)
 
 
 def _cost(
-    evidence: Evidence, parts: Sequence[Array], kinds: Sequence[str], x: Array
+    evidence: Evidence,
+    parts: Sequence[Array],
+    kinds: Sequence[str],
+    x: Array,
+    *,
+    slopes: bool = True,
 ) -> tuple[float, Array]:
-    """Minus the log-likelihood and its derivative at logarithms x; times by a difference."""
+    """Minus the log-likelihood and its derivative at logarithms x, of times by a difference."""
     slow: list[Array] = []
     sigmas, times = list(range(len(parts))), []
     at = len(parts)
@@ -238,19 +248,20 @@ def _cost(
     value, by_sigma = evidence.observed.cost([*parts, *slow], x[sigmas])
     slope = np.zeros(len(x))
     slope[sigmas] = by_sigma
+    if not slopes:
+        return value, slope
     step = 1e-2
     for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
         first = sum(len(SLOW[k].groups) for k in kinds[:number])
         groups = SLOW[kind].groups
-        # By the chain rule, its covariance changes like a part of unit sigma.
         later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
         changed = [*slow[:first], *later, *slow[first + len(groups) :]]
         slope[index] = (evidence.observed.cost([*parts, *changed], x[sigmas])[0] - value) / step
     return value, slope
 
 
-def _with_slow(evidence: Evidence, names: Sequence[str], best: _Fit, kind: str) -> _Fit:
-    """The best fit with one more correlated error."""
+def _with_slow(evidence: Evidence, names: Sequence[str], best: _Fit, kind: str) -> _Fit | None:
+    """The best fit with one more correlated error; None: it explains nothing at any start."""
     parts = [evidence.white[name] for name in names]
     before = [(error.kind, _start_of(error)) for error in best.errors]
     logarithms = np.log(np.concatenate([best.white, *(values for _, values in before)]))
@@ -261,8 +272,10 @@ def _with_slow(evidence: Evidence, names: Sequence[str], best: _Fit, kind: str) 
         for time_s in START_TIMES_S:
             values = np.array([sigma] * groups + [time_s])
             x = np.concatenate([logarithms, np.log(values)])
-            tried.append((_cost(evidence, parts, kinds, x)[0], values))
-    start = min(tried, key=lambda of: of[0])[1]
+            tried.append((_cost(evidence, parts, kinds, x, slopes=False)[0], values))
+    least, start = min(tried, key=lambda of: of[0])
+    if least > _cost(evidence, parts, kinds[:-1], logarithms, slopes=False)[0]:
+        return None
     return _fitted(evidence, names, [*before, (kind, start)], best.white)
 
 

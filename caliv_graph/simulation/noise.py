@@ -64,9 +64,7 @@ def height_and_heave(
     return height_m, heave_m
 
 
-def gauss_markov(
-    stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator
-) -> Array:
+def gauss_markov(stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator) -> Array:
     """(n, 3) first-order Gauss-Markov errors of unit sigma, stationary from the first stamp on."""
     draws = rng.standard_normal((len(stamps_ns), 3))
     dt_s = np.diff(stamps_ns) / NANOSECONDS_PER_SECOND

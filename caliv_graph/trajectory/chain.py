@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -186,7 +187,8 @@ def jacobian(
     keys = sorted(set(graph.keyVector()))
     order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in keys)])
     keep = columns <= len(order)
-    m = sum(graph.at(i).rows() for i in range(graph.size()))
+    factors: list[Any] = [graph.at(i) for i in range(graph.size())]
+    m = sum(factor.rows() for factor in factors)
     where = rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]
     r = np.zeros(m)
     r[rows[~keep].astype(np.int64) - 1] = -entries[~keep]

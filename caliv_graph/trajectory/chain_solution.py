@@ -50,7 +50,7 @@ def solved(chain: Chain, gradient: Array) -> ChainSolution:
     by_state = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
     alone, to_border = by_state[:, 0], by_state[:, 1:]
     left = chain.corner - border.T @ to_border
-    cov_corner = np.linalg.inv(left) if k else left
+    cov_corner: Array = np.asarray(np.linalg.inv(left)) if k else left
     common = cov_corner @ (-gradient[n * w :] - border.T @ alone)
     own, next_ = _selected_inverse(*_blocks(factor, n, w))
     edge = to_border.reshape(n, w, k)
@@ -120,7 +120,10 @@ def _blocks(factor: Array, n: int, w: int) -> tuple[Array, Array]:
 
 
 def _selected_inverse(L: Array, below: Array) -> tuple[Array, Array]:
-    """Diagonal and next blocks of the inverse of `F F^T`, F of blocks L (i, i), below (i + 1, i)."""
+    """Diagonal and next blocks of the inverse of `F F^T`.
+
+    F has the blocks L (n, w, w) on its diagonal and `below` (n - 1, w, w) under it.
+    """
     inverse = np.linalg.inv(L)
     own = np.swapaxes(inverse, 1, 2) @ inverse
     carry = below @ inverse[:-1]

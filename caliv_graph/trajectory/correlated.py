@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -83,10 +84,10 @@ def with_columns(
     columns: list[Array] = []
     at = 0
     for number, kind in enumerate(kinds):
-        factor = graph.at(number)
+        factor: Any = graph.at(number)
         m = factor.rows()
         if kind in errors:
-            i = next(nodes[key] for key in factor.keys() if key in nodes)
+            i = next(nodes[key] for key in map(int, factor.keys()) if key in nodes)
             first = MOVES[kind].start
             block = J[at : at + m, width * i + first : width * i + first + AXES].toarray()
             place = width * (i + 1) - AXES * (len(errors) - errors.index(kind))
@@ -97,9 +98,8 @@ def with_columns(
     if not data:
         return J
     where = np.concatenate(rows), np.concatenate(columns)
-    return scipy.sparse.csr_array(
-        J + scipy.sparse.csr_array((np.concatenate(data), where), shape=J.shape)
-    )
+    entries = np.asarray(np.concatenate(data), dtype=np.float64)
+    return scipy.sparse.csr_array(J + scipy.sparse.csr_array((entries, where), shape=J.shape))
 
 
 def linearised(

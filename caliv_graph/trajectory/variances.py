@@ -11,13 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
+import scipy.sparse
 from scipy.optimize import minimize
 
 from caliv_graph.conventions import key_yaw_bias
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.trajectory.build import build_graph, to_values
 from caliv_graph.trajectory.chain import Chain
 from caliv_graph.trajectory.chain_solution import ChainSolution, solved
@@ -51,8 +53,8 @@ SCALE_BOUNDS = (0.05, 20.0)
 
 
 LARGEST_RIGHT = 1.1
-"""Estimated scales up to this, and down to its inverse, leave the stated sigmas as they are: a drive
-of a minute tells the noise of a gyroscope to 8 percent, and that of fixes to 2."""
+"""Estimated scales up to this, and down to its inverse, leave the stated sigmas as they are. A
+drive of a minute tells the noise of a gyroscope to 8 percent, and that of fixes to 2."""
 
 NODES = 1200
 """First nodes of the drive that are used: two minutes."""
@@ -143,7 +145,8 @@ class NoiseLikelihood:
         label = np.full(len(r), -1)
         at = 0
         for number, kind in enumerate(kinds):
-            m = graph.at(number).rows()
+            factor: Any = graph.at(number)
+            m = factor.rows()
             for c, name in enumerate(free):
                 of_kind, rows = COMPONENTS[name]
                 if of_kind == kind:
@@ -154,7 +157,7 @@ class NoiseLikelihood:
         self.fixed = self._part(J, r, label < 0)
         self.parts = [self._part(J, r, label == c) for c in index]
 
-    def _part(self, J: Array, r: Array, mine: Array) -> _Part:
+    def _part(self, J: scipy.sparse.csr_array, r: Array, mine: BoolArray) -> _Part:
         rows = np.flatnonzero(mine)
         chain = Chain.zero(len(self.nodes_ns), self.width, self.k)
         chain.add(J[rows])

@@ -112,13 +112,15 @@ def estimated_noise(
     best = _fitted(evidence, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:
-        tried = [(kind, _with_slow(evidence, names, best, kind)) for kind in kinds]
-        found = [(kind, fit) for kind, fit in tried if fit and best.cost - fit.cost > EVIDENCE]
-        if not found:
+        start = _best_start(evidence, names, best, kinds)
+        if start is None:
             break
-        kind, better = min(found, key=lambda of: of[1].cost)
+        before = [(error.kind, _start_of(error)) for error in best.errors]
+        better = _fitted(evidence, names, [*before, start], best.white)
+        if best.cost - better.cost < EVIDENCE:
+            break
         best = better
-        kinds.remove(kind)
+        kinds.remove(start[0])
     values = dict(zip(names, best.white.tolist(), strict=True))
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
@@ -260,23 +262,26 @@ def _cost(
     return value, slope
 
 
-def _with_slow(evidence: Evidence, names: Sequence[str], best: _Fit, kind: str) -> _Fit | None:
-    """The best fit with one more correlated error; None: it explains nothing at any start."""
+def _best_start(
+    evidence: Evidence, names: Sequence[str], best: _Fit, kinds: Sequence[str]
+) -> tuple[str, Array] | None:
+    """Which further error explains most before anything is fitted, and with which sigmas and time.
+
+    None: none of them explains anything.
+    """
     parts = [evidence.white[name] for name in names]
-    before = [(error.kind, _start_of(error)) for error in best.errors]
-    logarithms = np.log(np.concatenate([best.white, *(values for _, values in before)]))
-    kinds = [*(k for k, _ in before), kind]
-    groups = len(SLOW[kind].groups)
-    tried = []
-    for sigma in SLOW[kind].starts:
-        for time_s in START_TIMES_S:
-            values = np.array([sigma] * groups + [time_s])
-            x = np.concatenate([logarithms, np.log(values)])
-            tried.append((_cost(evidence, parts, kinds, x, slopes=False)[0], values))
-    least, start = min(tried, key=lambda of: of[0])
-    if least > _cost(evidence, parts, kinds[:-1], logarithms, slopes=False)[0]:
-        return None
-    return _fitted(evidence, names, [*before, (kind, start)], best.white)
+    before = [error.kind for error in best.errors]
+    logarithms = np.log(np.concatenate([best.white, *map(_start_of, best.errors)]))
+    least, out = _cost(evidence, parts, before, logarithms, slopes=False)[0], None
+    for kind in kinds:
+        for sigma in SLOW[kind].starts:
+            for time_s in START_TIMES_S:
+                values = np.array([sigma] * len(SLOW[kind].groups) + [time_s])
+                x = np.concatenate([logarithms, np.log(values)])
+                cost = _cost(evidence, parts, [*before, kind], x, slopes=False)[0]
+                if cost < least:
+                    least, out = cost, (kind, values)
+    return out
 
 
 def _start_of(error: CorrelatedError) -> Array:

@@ -243,7 +243,7 @@ class NoiseConfig(Section):
         "absent: estimated; 0: none",
     )
     gnss_correlated_vertical_m: NonNegative | None = Field(
-        None, description="metres, the same, up; absent: as horizontal"
+        None, description="metres, the same, up; absent while the other is given: none"
     )
     gnss_correlation_s: Positive | None = Field(
         None, description="seconds, its correlation time; absent: estimated"

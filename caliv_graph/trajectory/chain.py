@@ -18,8 +18,11 @@ import scipy.sparse
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 
+STATE = 15
+"""Rotation, position (right perturbation of the pose), velocity, accelerometer and gyro bias."""
+
 POSE = 6
-"""Coordinates of a pose, the first ones of every state: rotation, position (right perturbation)."""
+"""The first ones of these."""
 
 FACTORS_AT_A_TIME = 100
 """Factors of a graph that are turned into a part of the chain at once."""
@@ -31,8 +34,7 @@ UNDETERMINED = "the motion data do not determine the trajectory"
 class Chain:
     """Information of n states in a row and k coordinates that all of them may share.
 
-    A state has w coordinates: of its pose, then velocity, accelerometer and gyro bias, and what
-    else is estimated beside them.
+    A state has w coordinates: `STATE`, and after them what else is estimated beside it.
 
     Attributes:
         diagonal: (n, w, w).

@@ -17,12 +17,10 @@ import scipy.sparse
 
 from caliv_graph.conventions import key_bias, key_imu, key_velocity
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.chain import Chain, jacobian, places
+from caliv_graph.trajectory.chain import STATE, Chain, jacobian, places
 
 DIMENSIONS = (6, 3, 6)
 """Of the pose, the velocity and the bias of a state."""
-
-WIDTH = sum(DIMENSIONS)
 
 AXES = 3
 """Coordinates of a correlated error."""
@@ -98,8 +96,8 @@ def with_columns(
     if not data:
         return J
     where = np.concatenate(rows), np.concatenate(columns)
-    entries = np.asarray(np.concatenate(data), dtype=np.float64)
-    return scipy.sparse.csr_array(J + scipy.sparse.csr_array((entries, where), shape=J.shape))
+    more = scipy.sparse.coo_array((np.concatenate(data), where), shape=J.shape)
+    return scipy.sparse.csr_array(J + more)
 
 
 def linearised(
@@ -113,7 +111,7 @@ def linearised(
 
     Arguments as in `with_columns`; `common_keys` are of the variables that all states share.
     """
-    n, width = len(R_map_imu), WIDTH + AXES * len(errors)
+    n, width = len(R_map_imu), STATE + AXES * len(errors)
     keys = [(key_imu(i), key_velocity(i), key_bias(i)) for i in range(n)]
     place = places(keys, DIMENSIONS, common_keys, width)
     J, r = jacobian(graph, place, n * width + len(common_keys))

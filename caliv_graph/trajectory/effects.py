@@ -14,9 +14,9 @@ import numpy as np
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.chain import POSE, Chain
+from caliv_graph.trajectory.chain import POSE, STATE, Chain
 from caliv_graph.trajectory.chain_solution import inverse_columns
-from caliv_graph.trajectory.correlated import AXES, WIDTH, linearised
+from caliv_graph.trajectory.correlated import AXES, linearised
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 STEP_NS = 500_000_000
@@ -51,30 +51,30 @@ def error_effects(
         KeyError: a stamp has no node.
     """
     i = trajectory.node_indices(stamps_ns)
-    n, width = len(trajectory.nodes_ns), WIDTH + AXES * len(kinds)
+    n, width = len(trajectory.nodes_ns), STATE + AXES * len(kinds)
     common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]
     linear = trajectory.graph.linearize(trajectory.values)
     R = trajectory.states.R_map_imu
     J, _ = linearised(linear, trajectory.factor_kinds, kinds, R, common)
     both = Chain.zero(n, width, len(common))
     both.add(J)
-    of_state = slice(0, WIDTH)
+    of_state = slice(0, STATE)
     states = Chain(
         both.diagonal[:, of_state, of_state],
         both.coupling[:, of_state, of_state],
         both.border[:, of_state],
         both.corner,
     )
-    wanted = (WIDTH * i[:, None] + np.arange(POSE)).ravel()
+    wanted = (STATE * i[:, None] + np.arange(POSE)).ravel()
     inverse = inverse_columns(states, wanted)
-    by_state = inverse[: n * WIDTH].reshape(n, WIDTH, len(wanted))
+    by_state = inverse[: n * STATE].reshape(n, STATE, len(wanted))
     Ad = np.asarray(trajectory.T_vehicle_imu.AdjointMap())
     out = []
     for number, kind in enumerate(kinds):
-        of_error = slice(WIDTH + AXES * number, WIDTH + AXES * (number + 1))
+        of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
         # An error of a sensor acts at its own node: the coupling of neighbours has none.
         gain = -np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
-        gain -= np.einsum("kp,nak->pan", inverse[n * WIDTH :], both.border[:, of_error])
+        gain -= np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
         shape = gain.shape
         turned = Ad @ gain.reshape(len(i), POSE, -1)
         stamps = trajectory.nodes_ns

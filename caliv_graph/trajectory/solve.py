@@ -13,11 +13,10 @@ from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bia
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
-from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.chain import STATE, Chain
 from caliv_graph.trajectory.chain_solution import solved
 from caliv_graph.trajectory.correlated import (
     AXES,
-    WIDTH,
     CorrelatedError,
     add_prior,
     linearised,
@@ -251,7 +250,7 @@ def with_errors(
     common = [key_yaw_bias()] if data.yaw_bias else []
     kinds = [error.kind for error in errors]
     J, r = linearised(linear, estimate.graph.kinds, kinds, R, common)
-    n, width = len(nodes), WIDTH + AXES * len(errors)
+    n, width = len(nodes), STATE + AXES * len(errors)
     chain = Chain.zero(n, width, len(common))
     chain.add(J)
     add_prior(chain, nodes, errors)

@@ -21,11 +21,10 @@ from scipy.optimize import minimize
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.trajectory.build import build_graph, to_values
-from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.chain import STATE, Chain
 from caliv_graph.trajectory.chain_solution import ChainSolution, solved
 from caliv_graph.trajectory.correlated import (
     AXES,
-    WIDTH,
     CorrelatedError,
     add_prior,
     linearised,
@@ -140,7 +139,7 @@ class NoiseLikelihood:
             free: names of `COMPONENTS` that are estimated.
         """
         self.nodes_ns, self.errors = nodes_ns, tuple(errors)
-        self.width, self.k = WIDTH + AXES * len(errors), len(common_keys)
+        self.width, self.k = STATE + AXES * len(errors), len(common_keys)
         J, r = linearised(graph, kinds, [e.kind for e in errors], R_map_imu, common_keys)
         label = np.full(len(r), -1)
         at = 0

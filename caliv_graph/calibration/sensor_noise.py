@@ -27,9 +27,10 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
-EVIDENCE = 6.0
-"""Gain of the log-likelihood from which an error is taken to be correlated over time. With its
-three parameters, chance gains as much in one of four hundred drives (Wilks)."""
+EVIDENCE = 3.0
+"""Gain of the log-likelihood from which an error is taken to be correlated over time: one for each
+of its parameters (Akaike). Errors as slow as the drive is long gain little more, and move S2V by
+many of its sigmas; chance gains as much in one of twenty drives, at levels that cost little."""
 
 LEVELS: Mapping[str, Unknown] = {
     "registration": Unknown(1.0, LOG_SPREAD, (0.1, 30.0)),
@@ -96,10 +97,20 @@ def estimated_noise(
     Of drives with given poses, whose noise is fitted elsewhere, nothing is used.
     """
     noise = state.config.noise
-    usual = SensorNoise(state.problem.heave_m, ground_floors(noise))
     evidence = linearised_evidence(state, registrations, trajectories)
     if evidence is None:
+        usual = _usual(noise)
         return replace(usual, levels=_levels(usual, noise, ()))
+    return estimated(evidence, noise)
+
+
+def _usual(noise: NoiseConfig) -> SensorNoise:
+    return SensorNoise(noise.heave_m or HEAVE_SIGMA_M, ground_floors(noise))
+
+
+def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
+    """The noise levels that a config leaves open."""
+    usual = _usual(noise)
     given = {
         "heave": noise.heave_m,
         "ground_normal": noise.ground_normal_deg and math.radians(noise.ground_normal_deg),

@@ -73,8 +73,8 @@ def error_effects(
     for number, kind in enumerate(kinds):
         of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
         # An error of a sensor acts at its own node: the coupling of neighbours has none.
-        gain = -np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
-        gain -= np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
+        gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
+        gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
         shape = gain.shape
         turned = Ad @ gain.reshape(len(i), POSE, -1)
         stamps = trajectory.nodes_ns

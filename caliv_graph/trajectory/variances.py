@@ -9,7 +9,7 @@ trajectory absorbs (`README.md`, section 9).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +55,10 @@ LARGEST_RIGHT = 1.1
 """Estimated scales up to this, and down to its inverse, leave the stated sigmas as they are. A
 drive of a minute tells the noise of a gyroscope to 8 percent, and that of fixes to 2."""
 
+EVIDENCE = 9.0
+"""Increase of -2 log L, by holding a scale at 1, from which the stated sigma counts as wrong: 3
+sigma. Beside a slow error of the fixes, the noise of an accelerometer is hardly known."""
+
 NODES = 1200
 """First nodes of the drive that are used: two minutes."""
 
@@ -97,11 +101,7 @@ def estimated_scales(
         errors,
         free_components(data),
     )
-    return {
-        name: scale
-        for name, scale in fit(likelihood).items()
-        if max(scale, 1.0 / scale) > LARGEST_RIGHT
-    }
+    return contradicted(likelihood)
 
 
 @dataclass
@@ -207,24 +207,43 @@ def _expected(part: _Part, found: ChainSolution) -> float:
     return float(total)
 
 
-def fit(likelihood: NoiseLikelihood) -> dict[str, float]:
-    """Scale of each noise level on the stated sigmas, at the maximum of likelihood times prior."""
-    count = len(likelihood.names)
-    if not count:
-        return {}
-    begin = likelihood.at(np.ones(count))[0]
+def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
+    """The scales that the data set against the stated sigmas; all others are 1."""
+    names = set(likelihood.names)
+    scales, best = fit(likelihood, names)
+    away = {name for name, s in scales.items() if max(s, 1.0 / s) > LARGEST_RIGHT}
+    kept = {name for name in away if fit(likelihood, names - {name})[1] - best > EVIDENCE}
+    return fit(likelihood, kept)[0] if kept else {}
+
+
+def fit(likelihood: NoiseLikelihood, free: Set[str]) -> tuple[dict[str, float], float]:
+    """Scales of the `free` noise levels at the maximum of likelihood times prior.
+
+    The others are 1. Returns them, and -2 log of likelihood times prior.
+    """
+    at = [i for i, name in enumerate(likelihood.names) if name in free]
+    logarithms = np.zeros(len(likelihood.names))
+    begin = likelihood.at(np.exp(logarithms))[0]
 
     def cost(x: Array) -> tuple[float, Array]:
-        value, slope = likelihood.at(np.exp(x))
+        logarithms[at] = x
+        value, slope = likelihood.at(np.exp(logarithms))
         # Less the value at the start: the optimiser's tolerance is relative.
-        return value - begin + float(x @ x) / LOG_SPREAD**2, slope + 2.0 * x / LOG_SPREAD**2
+        return (
+            value - begin + float(x @ x) / LOG_SPREAD**2,
+            slope[at] + 2.0 * x / LOG_SPREAD**2,
+        )
 
+    if not at:
+        return {}, begin
     found = minimize(
         cost,
-        np.zeros(count),
+        np.zeros(len(at)),
         jac=True,
         method="L-BFGS-B",
-        bounds=[tuple(np.log(SCALE_BOUNDS))] * count,
+        bounds=[tuple(np.log(SCALE_BOUNDS))] * len(at),
         options={"ftol": 1e-9, "gtol": 0.5, "maxiter": 30},
     )
-    return dict(zip(likelihood.names, np.exp(found.x).tolist(), strict=True))
+    scales = np.exp(np.asarray(found.x)).tolist()
+    names = [likelihood.names[i] for i in at]
+    return dict(zip(names, scales, strict=True)), float(found.fun) + begin

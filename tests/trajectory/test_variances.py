@@ -101,7 +101,7 @@ def test_stated_sigmas_that_hold_are_kept() -> None:
 
 
 def test_stated_sigmas_that_the_data_contradict_are_scaled() -> None:
-    wrong = {"gyroscope": 4.0, "gnss_horizontal": 0.5, "gnss_vertical": 2.0}
+    wrong = {"gnss_horizontal": 0.5, "gnss_vertical": 2.0}
     trajectory = smoothed(recorded(**wrong))
 
     assert trajectory.data is not None

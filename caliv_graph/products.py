@@ -255,6 +255,25 @@ class TargetObservation:
 
 
 @dataclass(frozen=True)
+class NoiseLevel:
+    """A noise level that no message states.
+
+    Attributes:
+        name: 'heave', 'ground_normal', 'gnss_correlated_horizontal', ...
+        sigma: 1 sigma, in `unit`.
+        unit: 'm' or 'rad'.
+        source: where the figure is from.
+        time_s: correlation time; None: white from scan to scan.
+    """
+
+    name: str
+    sigma: float
+    unit: str
+    source: str
+    time_s: float | None = None
+
+
+@dataclass(frozen=True)
 class GroundObservation:
     """The ground in one scan: points p of the lidar frame with `normal . p + distance = 0`.
 
@@ -485,6 +504,7 @@ class Solution:
         warnings: for the user, a line each.
         gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not computed.
         course: the iterations of the joint loop; empty without one (`staged`).
+        sensor_noise: noise levels that no message states, and where their figures are from.
     """
 
     mode: str
@@ -516,6 +536,7 @@ class Solution:
     vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
     information_knowing: Mapping[str, Array] = field(default_factory=dict)
     course: tuple[Iteration, ...] = ()
+    sensor_noise: tuple[NoiseLevel, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
+from caliv_graph.calibration.sensor_noise import estimated_noise, with_floors, with_noise
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.common.progress import Progress
@@ -25,6 +26,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import GroundObservation, Registration, Solution, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
+from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -69,6 +71,11 @@ def _estimate(
     """The stages of `estimate`, timed."""
     limit = config.registration.max_iterations
     rough = rough_solve(problem, observations, grounds, config, progress, limit)
+    with progress.stage("estimating the noise of the sensors", None):
+        noise = estimated_noise(rough.state, rough.registrations, trajectories)
+        trajectories = with_noise(noise, trajectories)
+        grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
+        problem = pose_problem(observations, trajectories, config, noise.heave_m)
     solved = rough.state.problem
     # All clouds from here on: those that the field of view cuts off have predicted poses now.
     problem = replace(problem, offsets=solved.offsets, twists=solved.twists)
@@ -110,7 +117,7 @@ def _estimate(
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     warnings = (*rough.warnings, *alike, *_unconverged(solution.registrations))
-    return replace(solution, stage_times_s=times, warnings=warnings)
+    return replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
 
 
 def _deskewed(

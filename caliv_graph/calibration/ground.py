@@ -16,11 +16,12 @@ import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.ground_factors import (
+    SWAY_SIGMA_RAD,
     ground_plane_factor,
     parallel_factor,
     standing_factor,
 )
-from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
+from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.model import GroundConfig
 from caliv_graph.conventions import key_ground, key_height, key_parallel, key_vehicle
 from caliv_graph.products import Array, GroundObservation, IntArray
@@ -93,7 +94,7 @@ def first_heave(problem: Problem, observation: GroundObservation) -> float:
     """
     if observation.drive not in problem.motion or abs(observation.apart_ns) <= TOGETHER_NS:
         return 0.0
-    return math.sqrt(2.0) * HEAVE_SIGMA_M
+    return math.sqrt(2.0) * problem.heave_m
 
 
 def ground_graph(
@@ -101,11 +102,12 @@ def ground_graph(
     observations: Sequence[GroundObservation],
     config: GroundConfig,
     weights: GroundWeights | None = None,
+    sway_rad: float = SWAY_SIGMA_RAD,
 ) -> CalibrationGraph:
     """All factors of the ground; empty if it is not to be used or was not seen.
 
     Observations of LiDARs and poses that the problem has not are left out. Without `weights` (of
-    `ground_weights`) all have full weight.
+    `ground_weights`) all have full weight. `sway_rad` is 1 sigma of the body's tilt at each pose.
     """
     graph = CalibrationGraph()
     if not config.use:
@@ -121,7 +123,7 @@ def ground_graph(
         if config.parallel_sigma_deg is not None:
             sigma = math.radians(config.parallel_sigma_deg)
             graph.append("ground_tilt", _centred(key_parallel(drive), np.full(2, sigma)))
-    weight_of = weights.planes * _place_weights(problem, observations, taken)
+    weight_of = weights.planes * place_weights(problem, observations, taken)
     weighted = zip(
         observations, taken.tolist(), weight_of.tolist(), weights.heave_m.tolist(), strict=True
     )
@@ -139,14 +141,18 @@ def ground_graph(
         X, plane = key_vehicle(i), key_ground(drive)
         if config.vehicle_height is not None:
             height = config.vehicle_height
-            factor = standing_factor(X, plane, key_height(drive), centres[drive], height, weight)
+            factor = standing_factor(
+                X, plane, key_height(drive), centres[drive], height, weight, problem.heave_m
+            )
             graph.append("standing", factor)
         if config.parallel_sigma_deg is not None:
-            graph.append("parallel", parallel_factor(X, plane, key_parallel(drive), weight))
+            graph.append(
+                "parallel", parallel_factor(X, plane, key_parallel(drive), weight, sway_rad)
+            )
     return graph
 
 
-def _place_weights(
+def place_weights(
     problem: Problem, observations: Sequence[GroundObservation], taken: IntArray
 ) -> Array:
     """(n,) weights for repeated views: a standing vehicle sees the same bumps in every scan."""

@@ -13,8 +13,9 @@ from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, GroundObservation
 
 SWAY_SIGMA_RAD = 1e-3
-"""Sway: tilt of the body on its springs at each stamp from its mean over the drive, per axis. It
-leans by 1.3 mrad in a turn at walking pace (measured on the drive of the CaLiV authors)."""
+"""Sway: tilt of the body on its springs at each stamp from its mean over the drive, per axis, where
+the config does not give it. It leans by 1.3 mrad in a turn at walking pace (measured on the drive
+of the CaLiV authors)."""
 
 
 def plane_normal(g: Array) -> Array:
@@ -145,11 +146,12 @@ def standing_factor(
     centre: Array,
     vehicle_height_m: float,
     weight: float = 1.0,
+    heave_m: float = HEAVE_SIGMA_M,
 ) -> gtsam.CustomFactor:
     """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
 
-    Its sigma is the heave of one scan; the error (`key_error`) is common to the drive. `centre`
-    (2,) metres is where the plane's height is defined; `weight` is on the information.
+    Its sigma is the heave of one scan, `heave_m`; the error (`key_error`) is common to the drive.
+    `centre` (2,) metres is where the plane's height is defined; `weight` is on the information.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -163,12 +165,16 @@ def standing_factor(
             jacobians[2] = -np.ones((1, 1))
         return np.asarray(height - vehicle_height_m - values.atVector(key_error))
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, HEAVE_SIGMA_M / math.sqrt(weight))
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, heave_m / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_error], error)
 
 
 def parallel_factor(
-    key_pose: int, key_plane: int, key_tilt: int, weight: float = 1.0
+    key_pose: int,
+    key_plane: int,
+    key_tilt: int,
+    weight: float = 1.0,
+    sway_rad: float = SWAY_SIGMA_RAD,
 ) -> gtsam.CustomFactor:
     """Role c: `r` = x and y of the plane's normal in the vehicle frame, less the drive's tilt."""
 
@@ -184,5 +190,5 @@ def parallel_factor(
             jacobians[2] = -np.eye(2)
         return np.asarray(n_vehicle[:2] - values.atVector(key_tilt))
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, SWAY_SIGMA_RAD / math.sqrt(weight))
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sway_rad / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_tilt], error)

@@ -22,7 +22,7 @@ from caliv_graph.calibration.ground_factors import (
     plane_normal,
     with_heave,
 )
-from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
+from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_ground
 from caliv_graph.products import Array, GroundObservation, IntArray
 
@@ -147,7 +147,7 @@ def _standing(
         g, centre = values.atVector(key_ground(drive)), ground_centre(problem, drive)
         poses = [problem.T_map_vehicle[i] for i in alike.tolist()]
         height = np.array([[height_over(g, centre, T.translation())[0]] for T in poses])
-        stands[alike] *= _group_weights(height, np.full_like(height, HEAVE_SIGMA_M))
+        stands[alike] *= _group_weights(height, np.full_like(height, problem.heave_m))
         tilt = np.array([(T.rotation().matrix().T @ plane_normal(g))[:2] for T in poses])
         off = np.linalg.norm(tilt - np.median(tilt, axis=0), axis=1)
         stands[alike] *= _falling(off, *TILT_RAD)

@@ -183,7 +183,7 @@ def fit_scale(
     # From the solved to the given poses: the gradient follows.
     y = gradient - H @ r
     K = _pose_covariance(problem, values, every, B, noise)
-    chosen = _spread(problem, np.trace(own_blocks(H), axis1=1, axis2=2) > 0.0)
+    chosen = evenly_over_drives(problem, np.trace(own_blocks(H), axis1=1, axis2=2) > 0.0)
     rows = (6 * chosen[:, None] + np.arange(6)).ravel()
     across = H[rows]
     spread = across @ K @ across.T
@@ -243,7 +243,7 @@ class _RestrictedLikelihood:
         first: PoseNoise,
     ) -> _RestrictedLikelihood:
         """Linearised at `values`; arguments as in `fit_pose_noise`."""
-        chosen = _spread(problem, sound)
+        chosen = evenly_over_drives(problem, sound)
         lines = linearise_clouds(problem, values)
         r, A, B = _stacked(problem, lines, measured, values, chosen)
         known, parts = _pose_parts(problem, values, chosen, B, first)
@@ -319,11 +319,11 @@ def _pose_covariance(
     return np.asarray(known)
 
 
-def _spread(problem: Problem, sound: BoolArray) -> IntArray:
-    """At most CLOUDS_USED sound clouds, evenly over the drives, in any order of the LiDARs."""
+def evenly_over_drives(problem: Problem, sound: BoolArray, most: int = CLOUDS_USED) -> IntArray:
+    """At most so many sound clouds, evenly over the drives, in any order of the LiDARs."""
     usable = np.flatnonzero(sound)
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
-    step = max(1, math.ceil(len(usable) / CLOUDS_USED))
+    step = max(1, math.ceil(len(usable) / most))
     return np.sort(usable[::step])
 
 

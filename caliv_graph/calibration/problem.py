@@ -37,8 +37,9 @@ from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, tw
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 HEAVE_SIGMA_M = 0.005
-"""1 sigma of the heave, the height of the body on its springs, at each stamp. The smoothed
-trajectory does not contain it; given poses do."""
+"""1 sigma of the heave, the height of the body on its springs, at each stamp, where neither config
+nor data give it: that of a car at walking pace on asphalt. The smoothed trajectory does not contain
+it; given poses do."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Problem:
             one.
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
+        heave_m: 1 sigma of the heave at each pose.
     """
 
     lidars: tuple[str, ...]
@@ -93,6 +95,7 @@ class Problem:
     twists: Array | None = None
     stated_cov: Array | None = None
     views: Array | None = None
+    heave_m: float = HEAVE_SIGMA_M
 
     @property
     def clouds(self) -> int:
@@ -232,8 +235,11 @@ def pose_problem(
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
+    heave_m: float | None = None,
 ) -> Problem:
     """Lists LiDARs, poses and clouds that take part: long for the fields of a record.
+
+    `heave_m` is 1 sigma of the heave; None: that of the config, or the usual one.
 
     Raises:
         SolveError: there is no cloud.
@@ -241,6 +247,7 @@ def pose_problem(
     clouds = [(o.placement, c) for o in observations for c in o.clouds]
     if not clouds:
         raise SolveError("no cloud of a target to calibrate with")
+    heave_m = config.noise.heave_m or heave_m or HEAVE_SIGMA_M
     seen = {c.lidar for _, c in clouds}
     lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
     # If the configured reference saw no target, another LiDAR carries E.
@@ -265,7 +272,7 @@ def pose_problem(
         if isinstance(trajectory, SmoothedTrajectory) and d in origins
     }
     of_drive = {d: [stamp for drive, stamp in poses if drive == d] for d in smoothed}
-    terms = {d: motion_term(t, of_drive[d], HEAVE_SIGMA_M) for d, t in smoothed.items()}
+    terms = {d: motion_term(t, of_drive[d], heave_m) for d, t in smoothed.items()}
     of_pose = dict(zip(poses, T_map_vehicle, strict=True))
     return Problem(
         lidars=lidars,
@@ -285,7 +292,7 @@ def pose_problem(
         cloud_placement=np.array([m for m, _ in clouds]),
         placements=len(observations),
         motion={
-            d: with_heave(trajectory.joint_information(of_drive[d])[0])
+            d: with_heave(trajectory.joint_information(of_drive[d])[0], heave_m)
             for d, trajectory in smoothed.items()
         },
         motion_terms={d: term for d, term in terms.items() if term is not None},
@@ -294,6 +301,7 @@ def pose_problem(
         twists=np.concatenate(twists) if twists else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([_views(o, of_pose, config) for o in observations]),
+        heave_m=heave_m,
     )
 
 
@@ -334,10 +342,10 @@ def _stated_covariances(
     return out if np.isfinite(out).any() else None
 
 
-def with_heave(information: Array) -> Array:
+def with_heave(information: Array, heave_m: float) -> Array:
     """Information (6 m, 6 m) on poses with a heave of its own each, along the vehicle's z."""
     cov = np.linalg.inv(information)
     z = np.arange(5, len(cov), 6)
-    cov[z, z] += HEAVE_SIGMA_M**2
+    cov[z, z] += heave_m**2
     with_heave = np.linalg.inv(cov)
     return np.asarray(0.5 * (with_heave + with_heave.T))

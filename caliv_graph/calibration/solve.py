@@ -6,6 +6,7 @@ the data. Then the problem reduced to the extrinsics, for steps and covariances.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -288,7 +289,13 @@ def base_graph(state: SolveState) -> CalibrationGraph:
     return merged(
         pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
-        ground_graph(problem, state.grounds, state.config.ground, state.ground_weights),
+        ground_graph(
+            problem,
+            state.grounds,
+            state.config.ground,
+            state.ground_weights,
+            math.radians(state.config.noise.sway_deg),
+        ),
         prior_graph(problem, sorted(problem.fixed)),
     )
 

@@ -198,6 +198,44 @@ class NoiseConfig(Section):
     )
     gnss_horizontal_m: Positive | None = None
     gnss_vertical_m: Positive | None = None
+    gnss_correlated_horizontal_m: NonNegative | None = Field(
+        None,
+        description="metres, first-order Gauss-Markov error of the fixes, east and north alike; "
+        "absent: estimated; 0: none",
+    )
+    gnss_correlated_vertical_m: NonNegative | None = Field(
+        None, description="metres, the same, up; absent while the other is given: none"
+    )
+    gnss_correlation_s: Positive | None = Field(
+        None, description="seconds, its correlation time; absent: estimated"
+    )
+    orientation_correlated_deg: NonNegative | None = Field(
+        None,
+        description="degrees, first-order Gauss-Markov error of the IMU's orientation, per map "
+        "axis; absent: estimated; 0: none",
+    )
+    orientation_correlation_s: Positive | None = Field(
+        None, description="seconds, its correlation time; absent: estimated"
+    )
+    heave_m: Positive | None = Field(
+        None,
+        description="metres, lift of the body on its springs at each stamp; absent: estimated",
+    )
+    sway_deg: Positive = Field(
+        0.057,
+        description="degrees, tilt of the body at each stamp from its mean over the drive, per "
+        "axis; used with ground.parallel_sigma_deg",
+    )
+    ground_normal_deg: Positive | None = Field(
+        None,
+        description="degrees, tilt of the ground around a LiDAR from the plane of the drive, from "
+        "scan to scan; absent: estimated",
+    )
+    ground_distance_m: Positive | None = Field(
+        None,
+        description="metres, height of the ground below a LiDAR over that plane, from scan to "
+        "scan; absent: estimated",
+    )
     velocity_m_s: Positive | None = None
     orientation_deg: Positive | None = None
 

@@ -22,7 +22,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Calibration, Direction, LidarResult, Solution
+from caliv_graph.products import Calibration, Direction, LidarResult, NoiseLevel, Solution
 from caliv_graph.report.numbers import SHOWN_AXES, fixed, pair_cells, pose_cells, two_digits
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weighted
@@ -264,10 +264,19 @@ def _noise_rows(solution: Solution, record: RunRecord) -> list[tuple[str, str]]:
     rows.append(
         ("registration of the target, factor on its sigmas", f"{solution.registration_scale:.2f}")
     )
+    rows += [_noise_row(level) for level in solution.sensor_noise]
     for name, trajectory in zip(record.drives, record.trajectories, strict=True):
         if isinstance(trajectory, SmoothedTrajectory):
             rows += [(f"{name}: {what}", by) for what, by in trajectory.noise_sources.items()]
     return rows
+
+
+def _noise_row(level: NoiseLevel) -> tuple[str, str]:
+    """A noise level that no message states, and where it is from."""
+    unit = "mm" if level.unit == "m" else "mrad"
+    time = "" if level.time_s is None else f", correlation time {level.time_s:.3g} s"
+    name = level.name.replace("_", " ")
+    return f"{name} (from: {level.source})", f"{1e3 * level.sigma:.2g} {unit}{time}"
 
 
 def _inputs(calibration: Calibration) -> list[tuple[str, str]]:

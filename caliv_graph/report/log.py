@@ -1,8 +1,8 @@
 """log.jsonl: the course and the results of a run, one JSON object per line, for programs.
 
 The first key of a line names its subject: `stage`, `recording`, `trajectory`, `ground`,
-`clouds`, `registration`, `iteration`, `solution`, `residuals`, `down_weighted`, `result` or
-`warning`.
+`clouds`, `registration`, `iteration`, `solution`, `noise`, `residuals`, `down_weighted`, `result`
+or `warning`.
 """
 
 from __future__ import annotations
@@ -97,6 +97,12 @@ def log_documents(
         "held": list(solution.held),
         "seconds": {name: round(s, 4) for name, s in solution.stage_times_s.items()},
     }
+    for level in solution.sensor_noise:
+        yield {"noise": level.name, "sigma": rounded(level.sigma)} | {
+            "unit": level.unit,
+            "time_s": None if level.time_s is None else rounded(level.time_s),
+            "from": level.source,
+        }
     if record is not None:
         for residuals in all_residuals(solution, record):
             yield _residuals(residuals)

@@ -194,6 +194,10 @@ class OrientationModel(Section):
     yaw_bias_deg: Finite = Field(
         0.0, description="degrees, constant error of its heading, positive to the left"
     )
+    correlated_sigma_rad: NonNegative = Field(
+        0.0, description="radians, 1 sigma of a first-order Gauss-Markov error per map axis"
+    )
+    correlation_s: Positive = Field(30.0, description="seconds, its correlation time")
 
 
 class ImuModel(_SampledSection):
@@ -220,6 +224,10 @@ class ImuModel(_SampledSection):
     )
     gyroscope_bias_walk_rad_s2_sqrthz: NonNegative = Field(
         0.0, description="rad/s per sqrt(second), random walk of the bias"
+    )
+    stated_over_true: Positive = Field(
+        1.0,
+        description="sigmas that the messages state for acceleration and rate, over the true ones",
     )
     orientation: OrientationModel = OrientationModel()
 
@@ -248,6 +256,18 @@ class GnssModel(_SampledSection):
         0.0167, description="metres, 1 sigma of white noise, east and north alike"
     )
     vertical_sigma_m: NonNegative = Field(0.02, description="metres, 1 sigma of white noise")
+    stated_over_true: Positive = Field(
+        1.0, description="sigma of white noise that the messages state, over the true one"
+    )
+    correlated_horizontal_sigma_m: NonNegative = Field(
+        0.0,
+        description="metres, 1 sigma of a first-order Gauss-Markov error, east and north alike; "
+        "no message states it",
+    )
+    correlated_vertical_sigma_m: NonNegative = Field(
+        0.0, description="metres, 1 sigma of the same, up"
+    )
+    correlation_s: Positive = Field(10.0, description="seconds, its correlation time")
     outlier_probability: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
         0.0, description="fraction of the fixes that are outliers"
     )

@@ -18,7 +18,7 @@ from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, TwistSa
 from caliv_graph.scenario.drives import Drive, VehicleStates, sample_stamps
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import GnssModel, ImuModel
-from caliv_graph.simulation.noise import Stream, random_stream
+from caliv_graph.simulation.noise import Stream, gauss_markov, random_stream
 
 ANGULAR_ACCELERATION_STEP_NS = 50_000
 """Half step of the difference for the angular acceleration, exact to 1e-7 rad/s^2."""
@@ -116,8 +116,13 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
         errors = orientation.sigma_rad * random_stream(seed, Stream.ORIENTATION).standard_normal(
             (n, 3)
         )
+        rng = random_stream(seed, Stream.ORIENTATION_CORRELATED)
+        slow = orientation.correlated_sigma_rad * gauss_markov(
+            stamps_ns, orientation.correlation_s, rng
+        )
         yaw_bias = Rotation.from_euler("z", math.radians(orientation.yaw_bias_deg))
-        xyzw = (yaw_bias * rotations * Rotation.from_rotvec(errors)).as_quat()
+        turned = Rotation.from_rotvec(slow) * yaw_bias * rotations
+        xyzw = (turned * Rotation.from_rotvec(errors)).as_quat()
     known = scenario.bag.covariances == "stated"
     samples = ImuSamples(
         stamps_ns=_absolute(stamps_ns, scenario),
@@ -129,8 +134,12 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
             if known and orientation.enabled
             else None
         ),
-        angular_velocity_cov=_diagonal(model.gyroscope_sigma_rad_s) if known else None,
-        specific_force_cov=_diagonal(model.accelerometer_sigma_m_s2) if known else None,
+        angular_velocity_cov=(
+            _diagonal(model.stated_over_true * model.gyroscope_sigma_rad_s) if known else None
+        ),
+        specific_force_cov=(
+            _diagonal(model.stated_over_true * model.accelerometer_sigma_m_s2) if known else None
+        ),
     )
     return SimulatedImu(samples, accelerometer_bias, gyroscope_bias)
 
@@ -149,6 +158,9 @@ def simulate_gnss(drive: Drive, scenario: Scenario, z_map: float, seed: int) -> 
     sigma = np.array([model.horizontal_sigma_m, model.horizontal_sigma_m, model.vertical_sigma_m])
     antenna_map = antenna_positions(drive.states(stamps_ns, z_map), model)
     measured = antenna_map + sigma * random_stream(seed, Stream.GNSS).standard_normal((n, 3))
+    slow = np.array([model.correlated_horizontal_sigma_m] * 2 + [model.correlated_vertical_sigma_m])
+    rng = random_stream(seed, Stream.GNSS_CORRELATED)
+    measured += slow * gauss_markov(stamps_ns, model.correlation_s, rng)
     rng = random_stream(seed, Stream.GNSS_OUTLIERS)
     is_outlier = rng.random(n) < model.outlier_probability
     wrong = model.outlier_sigma_m * rng.standard_normal((n, 3))
@@ -171,7 +183,7 @@ def simulate_gnss(drive: Drive, scenario: Scenario, z_map: float, seed: int) -> 
         longitude_deg=np.asarray(longitude, dtype=np.float64),
         altitude_m=np.asarray(altitude, dtype=np.float64),
         cov_enu=(
-            np.tile(np.diag(sigma**2), (int(fixed.sum()), 1, 1))
+            np.tile(np.diag((model.stated_over_true * sigma) ** 2), (int(fixed.sum()), 1, 1))
             if scenario.bag.covariances == "stated"
             else None
         ),

@@ -36,6 +36,8 @@ class Stream(enum.IntEnum):
     VELOCITY = 9
     THINNED_LIDAR = 10
     GROUND_WAVES = 11
+    GNSS_CORRELATED = 12
+    ORIENTATION_CORRELATED = 13
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:
@@ -60,6 +62,18 @@ def height_and_heave(
     height_m = model.height_sigma_m * float(rng.standard_normal())
     heave_m: Array = model.heave_sigma_m * rng.standard_normal(count)
     return height_m, heave_m
+
+
+def gauss_markov(stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator) -> Array:
+    """(n, 3) first-order Gauss-Markov errors of unit sigma, stationary from the first stamp on."""
+    draws = rng.standard_normal((len(stamps_ns), 3))
+    dt_s = np.diff(stamps_ns) / NANOSECONDS_PER_SECOND
+    decay = np.exp(-dt_s / correlation_s)
+    fresh = np.sqrt(1.0 - decay**2)
+    out = draws.copy()
+    for i, (keep, new) in enumerate(zip(decay.tolist(), fresh.tolist(), strict=True), start=1):
+        out[i] = keep * out[i - 1] + new * draws[i]
+    return out
 
 
 def noisy_poses(

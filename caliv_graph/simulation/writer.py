@@ -134,17 +134,17 @@ def _noise_of_sensors(scenario: Scenario) -> dict[str, float]:
         }
     if scenario.bag.covariances == "unknown":
         # Density of white noise: sigma of a sample times the root of the sampling period.
-        root_s = 1.0 / math.sqrt(imu.rate_hz)
+        stated = imu.stated_over_true / math.sqrt(imu.rate_hz)
         if imu.enabled:
             noise |= {
-                "accelerometer_density_m_s2_sqrthz": imu.accelerometer_sigma_m_s2 * root_s,
-                "gyroscope_density_rad_s_sqrthz": imu.gyroscope_sigma_rad_s * root_s,
+                "accelerometer_density_m_s2_sqrthz": stated * imu.accelerometer_sigma_m_s2,
+                "gyroscope_density_rad_s_sqrthz": stated * imu.gyroscope_sigma_rad_s,
             }
         if imu.enabled and imu.orientation.enabled:
             noise["orientation_deg"] = math.degrees(imu.orientation.sigma_rad)
         if gnss.enabled:
-            noise["gnss_horizontal_m"] = gnss.horizontal_sigma_m
-            noise["gnss_vertical_m"] = gnss.vertical_sigma_m
+            noise["gnss_horizontal_m"] = gnss.stated_over_true * gnss.horizontal_sigma_m
+            noise["gnss_vertical_m"] = gnss.stated_over_true * gnss.vertical_sigma_m
         if scenario.velocity.enabled:
             noise["velocity_m_s"] = scenario.velocity.sigma_m_s
     return _positive(noise)

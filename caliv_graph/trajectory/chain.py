@@ -22,6 +22,7 @@ STATE = 15
 """Rotation, position (right perturbation of the pose), velocity, accelerometer and gyro bias."""
 
 POSE = 6
+"""The first ones of these."""
 
 FACTORS_AT_A_TIME = 100
 """Factors of a graph that are turned into a part of the chain at once."""
@@ -33,10 +34,12 @@ UNDETERMINED = "the motion data do not determine the trajectory"
 class Chain:
     """Information of n states in a row and k coordinates that all of them may share.
 
+    A state has w coordinates: `STATE`, and after them what else is estimated beside it.
+
     Attributes:
-        diagonal: (n, 15, 15).
-        coupling: (n - 1, 15, 15) between a state (rows) and the next (columns).
-        border: (n, 15, k) between each state (rows) and the common coordinates.
+        diagonal: (n, w, w).
+        coupling: (n - 1, w, w) between a state (rows) and the next (columns).
+        border: (n, w, k) between each state (rows) and the common coordinates.
         corner: (k, k).
     """
 
@@ -44,6 +47,16 @@ class Chain:
     coupling: Array
     border: Array
     corner: Array
+
+    @staticmethod
+    def zero(n: int, width: int, k: int) -> Chain:
+        """No information on n states of `width` coordinates and k common ones."""
+        return Chain(
+            np.zeros((n, width, width)),
+            np.zeros((max(n - 1, 0), width, width)),
+            np.zeros((n, width, k)),
+            np.zeros((k, k)),
+        )
 
     @staticmethod
     def from_graph(
@@ -57,48 +70,44 @@ class Chain:
 
         Every factor touches one state, two neighbours, or common variables. `state_keys` are the
         keys of each state in the order of its coordinates, `state_dims` their dimensions, which add
-        up to 15. `common_keys` are the common variables, of one dimension each. `columns` (rows of
+        up to w. `common_keys` are the common variables, of one dimension each. `columns` (rows of
         the graph, p) are derivatives of its rows by p more common coordinates, which follow those
         of the keys.
         """
+        width = sum(state_dims)
         extra = 0 if columns is None else columns.shape[1]
-        n, k = len(state_keys), len(common_keys) + extra
-        size = STATE * n + k
-        place = {}
-        for i, keys in enumerate(state_keys):
-            at = STATE * i
-            for key, dim in zip(keys, state_dims, strict=True):
-                place[key] = (at, dim)
-                at += dim
-        for j, key in enumerate(common_keys):
-            place[key] = (STATE * n + j, 1)
-        diagonal = np.zeros((n, STATE, STATE))
-        coupling = np.zeros((max(n - 1, 0), STATE, STATE))
-        border, corner = np.zeros((n, STATE, k)), np.zeros((k, k))
+        n, k = len(state_keys), len(common_keys)
+        place = places(state_keys, state_dims, common_keys, width)
+        out = Chain.zero(n, width, k + extra)
         # In parts: the triplets take ten times the memory of the blocks, gigabytes on a long drive.
         row_from = 0
         for begin in range(0, graph.size(), FACTORS_AT_A_TIME):
             some = gtsam.GaussianFactorGraph()
             for number in range(begin, min(begin + FACTORS_AT_A_TIME, graph.size())):
                 some.push_back(graph.at(number))
-            J = _jacobian(some, place, size)
+            J, _ = jacobian(some, place, width * n + k)
             if columns is not None:
-                J = _with_columns(J, columns[row_from : row_from + J.shape[0]])
+                J = beside(J, columns[row_from : row_from + J.shape[0]])
                 row_from += J.shape[0]
-            H = (J.T @ J).tocoo()
-            row, column = (np.asarray(index, np.int64) for index in H.coords)
-            (a, r), (b, c), value = np.divmod(row, STATE), np.divmod(column, STATE), H.data
-            state, other = row < STATE * n, column < STATE * n
-            if (np.abs(b - a)[state & other] > 1).any():
-                raise ValueError("a factor touches states that are not neighbours")
-            # After summation each entry of a matrix occurs once.
-            on, above = state & other & (b == a), state & other & (b == a + 1)
-            diagonal[a[on], r[on], c[on]] += value[on]
-            coupling[a[above], r[above], c[above]] += value[above]
-            edge, common = state & ~other, ~state & ~other
-            border[a[edge], r[edge], column[edge] - STATE * n] += value[edge]
-            corner[row[common] - STATE * n, column[common] - STATE * n] += value[common]
-        return Chain(diagonal, coupling, border, corner)
+            out.add(J)
+        return out
+
+    def add(self, J: scipy.sparse.csr_array) -> None:
+        """Adds the information of a whitened Jacobian, columns as in `places`, in place."""
+        n, width = self.diagonal.shape[:2]
+        H = (J.T @ J).tocoo()
+        row, column = (np.asarray(index, np.int64) for index in H.coords)
+        (a, r), (b, c), value = np.divmod(row, width), np.divmod(column, width), H.data
+        state, other = row < width * n, column < width * n
+        if (np.abs(b - a)[state & other] > 1).any():
+            raise ValueError("a factor touches states that are not neighbours")
+        # After summation each entry of a matrix occurs once.
+        on, above = state & other & (b == a), state & other & (b == a + 1)
+        self.diagonal[a[on], r[on], c[on]] += value[on]
+        self.coupling[a[above], r[above], c[above]] += value[above]
+        edge, common = state & ~other, ~state & ~other
+        self.border[a[edge], r[edge], column[edge] - width * n] += value[edge]
+        self.corner[row[common] - width * n, column[common] - width * n] += value[common]
 
     def only(self, wanted: IntArray) -> Chain:
         """The chain of the states of ascending indices `wanted` (m,), all others eliminated."""
@@ -106,7 +115,7 @@ class Chain:
         n, k = len(self.diagonal), self.corner.shape[0]
         diagonal, border = self.diagonal.copy(), self.border.copy()
         corner = self.corner.copy()
-        coupling = np.zeros((max(len(wanted) - 1, 0), STATE, STATE))
+        coupling = np.zeros((max(len(wanted) - 1, 0), *self.diagonal.shape[1:]))
         last = -1  # the last kept state
         link: Array | None = None  # its coupling with state i
         kept = 0
@@ -140,15 +149,16 @@ class Chain:
         fixed, and the others are eliminated too. (6 m + p, 6 m + p), p the number of `kept`.
         """
         chain = self.only(wanted)
-        m, rest, k = len(wanted), STATE - POSE, chain.corner.shape[0]
-        pose, other = slice(0, POSE), slice(POSE, STATE)
+        width = self.diagonal.shape[1]
+        m, rest, k = len(wanted), width - POSE, chain.corner.shape[0]
+        pose, other = slice(0, POSE), slice(POSE, width)
         poses = _tridiagonal(chain.diagonal[:, pose, pose], chain.coupling[:, pose, pose])
         cross = _tridiagonal(
             chain.diagonal[:, pose, other],
             chain.coupling[:, pose, other],
             np.swapaxes(chain.coupling[:, other, pose], 1, 2),
         )
-        banded = _banded(chain.diagonal[:, other, other], chain.coupling[:, other, other])
+        banded = banded_of(chain.diagonal[:, other, other], chain.coupling[:, other, other])
         border_other = chain.border[:, other].reshape(m * rest, k)
         border_pose = chain.border[:, pose].reshape(m * POSE, k)
         right = np.hstack([cross.T.toarray(), border_other])
@@ -175,29 +185,48 @@ class Chain:
         return np.asarray(0.5 * (information + information.T))
 
 
-def _jacobian(
+def places(
+    state_keys: Sequence[Sequence[int]],
+    state_dims: Sequence[int],
+    common_keys: Sequence[int],
+    width: int,
+) -> dict[int, tuple[int, int]]:
+    """First column and dimension of each key: states of `width` in a row, then common variables."""
+    out = {}
+    for i, keys in enumerate(state_keys):
+        at = width * i
+        for key, dim in zip(keys, state_dims, strict=True):
+            out[key] = (at, dim)
+            at += dim
+    for j, key in enumerate(common_keys):
+        out[key] = (width * len(state_keys) + j, 1)
+    return out
+
+
+def jacobian(
     graph: gtsam.GaussianFactorGraph, place: Mapping[int, tuple[int, int]], size: int
-) -> scipy.sparse.csr_array:
-    """The Jacobian of a linear graph, its columns where `place` (first, how many) has each key."""
+) -> tuple[scipy.sparse.csr_array, Array]:
+    """The Jacobian (m, `size`) of a whitened linear graph and minus its right-hand side (m,).
+
+    Columns are where `place` (first, how many) has each key; the graph is `J d + r`.
+    """
     rows, columns, entries = np.asarray(graph.sparseJacobian_())
     # GTSAM's columns are in ascending order of the keys; the last one is the right-hand side.
     keys = sorted(set(graph.keyVector()))
     order = np.concatenate([np.arange(a, a + d) for a, d in (place[k] for k in keys)])
     keep = columns <= len(order)
+    factors: list[Any] = [graph.at(i) for i in range(graph.size())]
+    m = sum(factor.rows() for factor in factors)
     where = rows[keep].astype(np.int64) - 1, order[columns[keep].astype(np.int64) - 1]
-    # The triplets leave out zeros, so that their last row is not always that of the graph.
-    factors: list[Any] = [graph.at(number) for number in range(graph.size())]
-    count = sum(factor.rows() for factor in factors)
-    return scipy.sparse.csr_array((entries[keep], where), shape=(count, size))
+    # The triplets leave out zeros: rows are counted by the factors.
+    r = np.zeros(m)
+    r[rows[~keep].astype(np.int64) - 1] = -entries[~keep]
+    return scipy.sparse.csr_array((entries[keep], where), shape=(m, size)), r
 
 
-def _with_columns(J: scipy.sparse.csr_array, columns: Array) -> scipy.sparse.csr_array:
-    """J (r, c), its last columns, which are empty, filled with `columns` (r, p)."""
-    row, column = np.nonzero(columns)
-    where = row, column + J.shape[1] - columns.shape[1]
-    return scipy.sparse.csr_array(
-        J + scipy.sparse.csr_array((columns[row, column], where), shape=J.shape)
-    )
+def beside(J: scipy.sparse.csr_array, columns: Array) -> scipy.sparse.csr_array:
+    """J (r, c) with more columns (r, p) after its own."""
+    return scipy.sparse.csr_array(scipy.sparse.hstack([J, columns], format="csr"))
 
 
 def inverse_of(A: Array) -> Array:
@@ -238,7 +267,7 @@ def _tridiagonal(
     )
 
 
-def _banded(diagonal: Array, above: Array) -> Array:
+def banded_of(diagonal: Array, above: Array) -> Array:
     """Lower banded storage of a symmetric block-tridiagonal matrix, as scipy wants it."""
     n, r, _ = diagonal.shape
     out = np.zeros((2 * r, n * r))

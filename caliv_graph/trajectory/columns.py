@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -13,9 +12,8 @@ import numpy as np
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States
-from caliv_graph.trajectory.solve import chain_of
+from caliv_graph.trajectory.parameters import InputParameter
+from caliv_graph.trajectory.smoothed import States
 
 
 def parameter_columns(
@@ -81,31 +79,3 @@ def whitened(factor: Any, values: gtsam.Values, change: Array) -> Array:
     noise = factor.noiseModel()
     residual = noise.unweightedWhiten(factor.unwhitenedError(values))
     return np.asarray(noise.unweightedWhiten(change) * math.sqrt(noise.weight(residual)))
-
-
-def with_parameters(
-    smoothed: SmoothedTrajectory, parameters: Sequence[InputParameter]
-) -> SmoothedTrajectory:
-    """The trajectory with more parameters in its chain, without a prior: none is estimated.
-
-    `joint` of the result can be asked for their information and gradient. Those that the chain has
-    already stay as they are.
-    """
-    known = {p.parameter.name for p in smoothed.parameters}
-    more = tuple(UncertainParameter(p) for p in parameters if p.name not in known)
-    if not more:
-        return smoothed
-    every = (*smoothed.parameters, *more)
-    graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
-    columns = parameter_columns(
-        smoothed.data,
-        smoothed.nodes_ns,
-        smoothed.states,
-        graph,
-        smoothed.values,
-        smoothed.gnss_dropped,
-        [p.parameter for p in every],
-    )
-    linear = smoothed.graph.linearize(smoothed.values)
-    chain = chain_of(linear, len(smoothed.nodes_ns), smoothed.data.yaw_bias, columns)
-    return replace(smoothed, chain=chain, parameters=every)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -47,6 +48,8 @@ class SmootherInput:
         gravity_m_s2: along -z of the map.
         rotation_sigmas: (3,) of the rotation of `T_vehicle_imu` about the vehicle's axes, radians;
             None: it is exact, or still to be guessed (`mounting.py`).
+        scales: name of `variances.COMPONENTS` -> factor on the stated sigmas that is in use, of
+            those that the data contradict.
     """
 
     name: str
@@ -60,6 +63,7 @@ class SmootherInput:
     lever_arm: Array
     gravity_m_s2: float
     rotation_sigmas: Array | None = None
+    scales: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def arm_imu(self) -> Array:
@@ -166,6 +170,22 @@ def has_orientation(imu: ImuSamples, inertial: Inertial, name: str) -> bool:
     return True
 
 
+def scaled(data: SmootherInput, scales: Mapping[str, float]) -> SmootherInput:
+    """The input with some stated sigmas multiplied (`variances.COMPONENTS`)."""
+    noise, positions = data.noise, data.positions
+    if positions is not None:
+        horizontal, vertical = (scales.get(f"gnss_{s}", 1.0) for s in ("horizontal", "vertical"))
+        axes = np.array([horizontal, horizontal, vertical])
+        positions = replace(positions, cov_map=positions.cov_map * np.outer(axes, axes))
+    noise = replace(
+        noise,
+        gyro_density=noise.gyro_density * scales.get("gyroscope", 1.0) ** 2,
+        force_density=noise.force_density * scales.get("accelerometer", 1.0) ** 2,
+    )
+    every = {name: data.scales.get(name, 1.0) * scale for name, scale in scales.items()}
+    return replace(data, noise=noise, positions=positions, scales={**data.scales, **every})
+
+
 def noise_sources(data: SmootherInput) -> dict[str, str]:
     """Sensor in use -> where its noise figures are from."""
     out = dict(data.noise.sources)
@@ -176,4 +196,8 @@ def noise_sources(data: SmootherInput) -> dict[str, str]:
         out["gnss"] = data.positions.source
     if data.motion.twist is not None:
         out["velocity"] = velocity_covariances(data.motion.twist, data.config)[1]
+    for name, scale in data.scales.items():
+        sensor, _, part = name.partition("_")
+        what = f", {part}" if part else ""
+        out[sensor] = f"{out[sensor]}{what} times {scale:.2f} by the residuals"
     return out

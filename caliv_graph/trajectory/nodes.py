@@ -78,9 +78,11 @@ def carry_to_nodes(
         positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
     if data.orientation and "orientation" in kinds:
         cov, _ = orientation_covariances(data.motion.imu, data.config)
+        cov = cov * data.scales.get("orientation", 1.0) ** 2
         orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
     if data.motion.twist is not None and "velocity" in kinds:
         cov, _ = velocity_covariances(data.motion.twist, data.config)
+        cov = cov * data.scales.get("velocity", 1.0) ** 2
         velocities = velocities_at_nodes(
             data.motion.twist, cov, nodes, dead, data.noise, data.T_vehicle_imu
         )

@@ -13,6 +13,7 @@ import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, TwistSamples
+from caliv_graph.trajectory.correlated import CorrelatedError
 
 # Table I of the CaLiV paper, 1 sigma per sample.
 PAPER_FORCE_M_S2 = 0.05
@@ -31,6 +32,13 @@ MIN_POSE_ROTATION_RAD = 2e-5
 MIN_POSE_POSITION_M = 2e-4
 """Smallest sigmas taken from a message of a given pose: below what any cloud of a target resolves.
 Some drivers state 1e-9 instead of an unknown covariance."""
+
+TYPICAL_CORRELATION_S = 30.0
+"""Correlation time of the errors of a receiver with corrections (the troposphere and multipath of a
+moving antenna) and of an AHRS, where neither config nor data give one."""
+
+MIN_CORRELATED_M = 1e-4
+"""1 sigma that stands for no error: below what any sensor resolves."""
 
 
 @dataclass(frozen=True)
@@ -200,3 +208,21 @@ def velocity_covariances(twist: TwistSamples, config: Config) -> tuple[Array, st
     return _per_message(
         len(twist.stamps_ns), configured, twist.velocity_cov, PAPER_VELOCITY_M_S**2 * np.eye(3)
     )
+
+
+def configured_errors(config: Config) -> tuple[CorrelatedError, ...]:
+    """The correlated errors that the config gives, with a typical correlation time if it has none.
+
+    An error of zero is none.
+    """
+    noise, out = config.noise, []
+    horizontal, vertical = noise.gnss_correlated_horizontal_m, noise.gnss_correlated_vertical_m
+    if horizontal or vertical:
+        sigmas = [v if v else MIN_CORRELATED_M for v in (horizontal or 0.0, vertical or 0.0)]
+        time_s = noise.gnss_correlation_s or TYPICAL_CORRELATION_S
+        out.append(CorrelatedError("gnss", (sigmas[0], sigmas[0], sigmas[1]), time_s))
+    if noise.orientation_correlated_deg:
+        sigma = math.radians(noise.orientation_correlated_deg)
+        time_s = noise.orientation_correlation_s or TYPICAL_CORRELATION_S
+        out.append(CorrelatedError("orientation", (sigma, sigma, sigma), time_s))
+    return tuple(out)

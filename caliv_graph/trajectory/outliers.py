@@ -72,13 +72,18 @@ def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States)
         states = estimate.states
     if solved_with != kernel:
         estimate = solve(data, nodes, states, dropped, kernel)
-    if len(dropped):
-        assert data.positions is not None
-        warnings.append(
-            f"{data.name}: {len(dropped)} of {len(data.positions.stamps_ns)} GNSS fixes disagree "
-            "with the motion, dropped"
-        )
     return Robust(data, estimate, dropped, tuple(warnings))
+
+
+def dropped_warnings(robust: Robust) -> list[str]:
+    """A line if fixes were dropped."""
+    positions, count = robust.data.positions, len(robust.dropped)
+    if positions is None or not count:
+        return []
+    return [
+        f"{robust.data.name}: {count} of {len(positions.stamps_ns)} GNSS fixes disagree with the "
+        "motion, dropped"
+    ]
 
 
 def _with_fitting_noise(

@@ -15,12 +15,15 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
+from caliv_graph.trajectory.correlated_step import step_with_errors
 from caliv_graph.trajectory.initial import first_states
-from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources
+from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
-from caliv_graph.trajectory.outliers import solve_without_outliers
+from caliv_graph.trajectory.noise import configured_errors
+from caliv_graph.trajectory.outliers import dropped_warnings, solve_without_outliers
 from caliv_graph.trajectory.parameters import UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
 from caliv_graph.trajectory.solve import (
@@ -31,23 +34,29 @@ from caliv_graph.trajectory.solve import (
     solve_from_the_start,
 )
 from caliv_graph.trajectory.uncertain import (
+    Settled,
     are_wide,
     settle,
     uncertain_parameters,
     vehicle_covariances,
 )
+from caliv_graph.trajectory.variances import estimated_scales
 
 BIAS_SIGMAS = 5.0
 """Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
 
 
 def smooth_trajectory(
-    motion: MotionData, config: Config, stamps_ns: Sequence[int] | IntArray
+    motion: MotionData,
+    config: Config,
+    stamps_ns: Sequence[int] | IntArray,
+    correlated: Sequence[CorrelatedError] = (),
 ) -> SmoothedTrajectory:
     """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
 
     Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
-    IMU are in `lost_ns` of the result.
+    IMU are in `lost_ns` of the result. `correlated` are errors of sensors that the config does not
+    give.
 
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
@@ -61,19 +70,31 @@ def smooth_trajectory(
     parameters = uncertain_parameters(data)
     if are_wide(parameters):
         data, states, parameters = _roughly_settled(data, nodes, states, parameters)
+    errors = errors_in(data, [*configured_errors(config), *correlated])
     robust = solve_without_outliers(data, nodes, states)
+    warnings += [*lines, *robust.warnings]
+    found = robust.estimate.states
+    scales = estimated_scales(robust.data, nodes, found, robust.dropped, errors)
+    if scales:
+        robust = solve_without_outliers(scaled(robust.data, scales), nodes, found)
+        warnings += robust.warnings
     data, estimate, positions = robust.data, robust.estimate, robust.data.positions
-    columns: Array | None = None
+    settled = Settled(data, estimate)
     if parameters:
         kernel = data.config.robust.kernel
         settled = settle(data, nodes, estimate, robust.dropped, kernel, parameters)
         data, estimate, parameters = settled.data, settled.estimate, settled.parameters
-        columns = settled.columns
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
     Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
     cov = vehicle_covariances(settled, cov_imu) if parameters else Ad @ cov_imu @ Ad.T
-    warnings += [*lines, *robust.warnings, *_bias_warnings(data, estimate.states)]
+    chain = chain_of(linear, len(nodes), data.yaw_bias, settled.columns)
+    found_errors = np.zeros((len(nodes), 0))
+    if errors:
+        step = step_with_errors(settled, nodes, robust.dropped, errors)
+        settled, cov, chain, found_errors = step.settled, step.cov, step.chain, step.errors
+        data, estimate, parameters = settled.data, settled.estimate, settled.parameters
+    warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov),
         lost_ns=tuple(lost.tolist()),
@@ -88,13 +109,24 @@ def smooth_trajectory(
         origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
-        chain=chain_of(linear, len(nodes), data.yaw_bias, columns),
+        chain=chain,
         inertial=data.inertial,
         data=data,
         gnss_dropped=robust.dropped,
         factor_kinds=tuple(estimate.graph.kinds),
         parameters=parameters,
+        correlated=tuple(errors),
+        errors=found_errors,
     )
+
+
+def errors_in(
+    data: SmootherInput, errors: Sequence[CorrelatedError]
+) -> tuple[CorrelatedError, ...]:
+    """The errors of sensors that the drive has, the first of each sensor."""
+    has = {"gnss": data.positions is not None, "orientation": data.orientation}
+    first = {error.kind: error for error in reversed(errors) if has[error.kind]}
+    return tuple(first[kind] for kind in MOVES if kind in first)
 
 
 def _within_span(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -15,6 +15,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
+from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
@@ -43,6 +44,18 @@ class States:
     force_bias: Array
     gyro_bias: Array
     yaw_bias_rad: float = 0.0
+
+
+def first_nodes(states: States, n: int) -> States:
+    """The estimate of the first n nodes."""
+    return replace(
+        states,
+        R_map_imu=states.R_map_imu[:n],
+        p_map_imu=states.p_map_imu[:n],
+        velocity_map=states.velocity_map[:n],
+        force_bias=states.force_bias[:n],
+        gyro_bias=states.gyro_bias[:n],
+    )
 
 
 def poses_of_vehicle(
@@ -127,6 +140,9 @@ class SmoothedTrajectory:
         gnss_dropped: (k,) indices of the fixes that the graph is without.
         factor_kinds: of each factor of the graph, in order (`build.TrajectoryGraph`).
         parameters: of the input, in the chain after the yaw bias (`parameters.py`).
+        correlated: errors of sensors that are correlated over time. States and chain contain them,
+            the chain as the last coordinates of every state; the graph does not.
+        errors: (n, 3 e) their estimates at the nodes, metres or radians, map axes.
     """
 
     trajectory: Trajectory
@@ -148,6 +164,8 @@ class SmoothedTrajectory:
     gnss_dropped: IntArray = field(repr=False)
     factor_kinds: tuple[str, ...] = field(default=(), repr=False)
     parameters: tuple[UncertainParameter, ...] = ()
+    correlated: tuple[CorrelatedError, ...] = ()
+    errors: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -224,7 +242,12 @@ class SmoothedTrajectory:
         sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
         return sigmas[:, :3], sigmas[:, 3:]
 
-    def _node_indices(self, stamps_ns: Sequence[int] | IntArray) -> IntArray:
+    def node_indices(self, stamps_ns: Sequence[int] | IntArray) -> IntArray:
+        """(m,) nodes at wanted stamps (m,), increasing.
+
+        Raises:
+            KeyError: a stamp has no node.
+        """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         right = np.clip(np.searchsorted(self.nodes_ns, stamps), 1, len(self.nodes_ns) - 1)
         left_nearer = stamps - self.nodes_ns[right - 1] < self.nodes_ns[right] - stamps
@@ -262,7 +285,7 @@ class SmoothedTrajectory:
         Raises:
             KeyError: a stamp has no node, or the chain does not have a parameter (`columns`).
         """
-        i = self._node_indices(stamps_ns)
+        i = self.node_indices(stamps_ns)
         m, names = len(i), [p.parameter.name for p in self.parameters]
         missing = sorted(set(parameters) - set(names))
         if missing:

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from caliv_graph.products import Array, ImuSamples, TwistSamples
-from caliv_graph.trajectory.columns import with_parameters
 from caliv_graph.trajectory.imu import interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.with_parameters import with_parameters
 
 ARM_M = 0.01
 """Allowance, 1 sigma, of a lever arm without a sigma: the error of an RTK receiver that does not

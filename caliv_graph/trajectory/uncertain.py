@@ -7,7 +7,7 @@ linear graph (`README.md`, section 13). After a step the input is moved and the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
@@ -50,15 +50,16 @@ class Settled:
         data: the input with its parameters as estimated.
         estimate: of the states, with that input.
         parameters: with the offsets from their priors' means.
-        columns: (rows, p) derivatives of the estimate's whitened residuals by the parameters.
+        columns: (rows, p) derivatives of the estimate's whitened residuals by the parameters; None:
+            there are none.
         cov: (p, p) of the parameters, priors included.
     """
 
     data: SmootherInput
     estimate: Estimate
-    parameters: tuple[UncertainParameter, ...]
-    columns: Array
-    cov: Array
+    parameters: tuple[UncertainParameter, ...] = ()
+    columns: Array | None = None
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
@@ -124,7 +125,7 @@ def settle(
         enough = STEP_SIGMAS if tolerance == ERROR_TOLERANCE else ROUGH_STEP_SIGMAS
         if (np.abs(step) < enough * np.sqrt(np.diag(cov))).all() or number == MAX_STEPS:
             break
-        data, parameters = _moved(data, parameters, step)
+        data, parameters = moved(data, parameters, step)
         # The states move with the parameters: an antenna that is a metre off leaves its fixes with
         # small robust weights.
         states = from_values(estimate.values.retract(solution), len(nodes), data)
@@ -132,7 +133,7 @@ def settle(
     return Settled(data, estimate, parameters, columns, cov)
 
 
-def _moved(
+def moved(
     data: SmootherInput, parameters: Sequence[UncertainParameter], step: Array
 ) -> tuple[SmootherInput, tuple[UncertainParameter, ...]]:
     """The input and the offsets after a step of all parameters."""
@@ -193,6 +194,7 @@ def vehicle_covariances(settled: Settled, cov_imu: Array) -> Array:
     data, n = settled.data, len(cov_imu)
     sigmas = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters])
     estimate = settled.estimate
+    assert settled.columns is not None
     linear = _with_variable(estimate.graph.factors.linearize(estimate.values), settled.columns)
     # The states follow a parameter linearly, whatever moves it: here another mean of its prior.
     moves, states = [], []

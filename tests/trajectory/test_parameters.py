@@ -11,10 +11,11 @@ import pytest
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array
-from caliv_graph.trajectory.columns import whitened, with_parameters
+from caliv_graph.trajectory.columns import whitened
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.with_parameters import with_parameters
 from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
 
 COURSE = Course(eight_drive(12.0), rough=1.0)

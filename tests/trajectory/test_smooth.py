@@ -508,14 +508,15 @@ def test_noise_is_taken_from_messages_and_config_and_said() -> None:
     config = config_for(Sensors(), noise={"gnss_horizontal_m": 0.0167, "gnss_vertical_m": 0.02})
     configured = smooth_trajectory(told, config, wanted)
     assert table.noise_sources["gnss"] == "the paper's table"
-    assert messages.noise_sources["gnss"] == "messages"
+    # A metre for fixes that are good to 17 mm: the residuals contradict it.
+    assert messages.noise_sources["gnss"].startswith("messages, horizontal times 0.0")
     assert configured.noise_sources["gnss"] == "config"
     for smoothed in (table, messages, configured):
         assert smoothed.trajectory.cov is not None
     assert messages.trajectory.cov is not None
     assert table.trajectory.cov is not None
     assert configured.trajectory.cov is not None
-    assert messages.trajectory.cov[40, 5, 5] > 20.0 * table.trajectory.cov[40, 5, 5]
+    assert messages.trajectory.cov[40, 5, 5] > 1.5 * table.trajectory.cov[40, 5, 5]
     np.testing.assert_allclose(configured.trajectory.cov, table.trajectory.cov, rtol=0.02)
 
 

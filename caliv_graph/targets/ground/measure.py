@@ -19,7 +19,7 @@ from caliv_graph.products import (
     Recording,
     TargetObservation,
 )
-from caliv_graph.targets.ground.planes import fit_plane, near_points, response
+from caliv_graph.targets.ground.planes import fit_plane, ground_floors, near_points, response
 from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -38,6 +38,7 @@ class GroundMeter:
     def __init__(self, config: Config, trajectory: VehicleTrajectory, drive: int) -> None:
         """Binds the initial guesses to the trajectory of a drive."""
         self._sigma_range_m = config.noise.lidar_range_m
+        self._floors = ground_floors(config.noise)
         self._trajectory = trajectory
         self._drive = drive
         self._guess: Mapping[str, gtsam.Pose3] = {
@@ -89,7 +90,7 @@ class GroundMeter:
             normal_lidar=plane.normal_lidar,
             distance_m=plane.distance_m,
             axes_lidar=plane.axes_lidar,
-            cov=plane.cov_with_floors,
+            cov=plane.cov_with(self._floors),
             centre_lidar=plane.centre_lidar,
             points=plane.points,
             R_vehicle_lidar=None if by_extrinsic is None else guess.rotation().matrix(),

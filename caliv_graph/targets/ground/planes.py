@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.targets.ground.fit import fit_ground, height_above
@@ -18,8 +19,8 @@ from caliv_graph.targets.ground.fit import fit_ground, height_above
 NORMAL_FLOOR_RAD = 0.5e-3
 DISTANCE_FLOOR_M = 2e-3
 """Sigmas added to what the noise of the points leaves (thousands of points leave 0.02 mrad and
-0.1 mm). Asphalt is no plane: its waves are longer than the patch and do not average out within a
-scan."""
+0.1 mm), where neither config nor data give them. Asphalt is no plane: its waves are longer than the
+patch and do not average out within a scan."""
 
 RADII_M = (15.0, 10.0)
 """The ground is fitted this far around the LiDAR; if it is no plane there, nearer."""
@@ -119,14 +120,19 @@ class GroundPlane:
     scatter_m: float
     radius_m: float
 
-    @property
-    def cov_with_floors(self) -> Array:
-        """(3, 3) covariance as the ground under the wheels: `cov`, the floors, and `beyond`.
+    def cov_with(self, floors: Array) -> Array:
+        """(3, 3) covariance as the ground under the wheels: `cov`, the floors (3,), and `beyond`.
 
         The points that are seen begin 5 m ahead of the wheels.
         """
-        floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
         return np.asarray(self.cov + np.diag(floors**2) + np.outer(self.beyond, self.beyond))
+
+
+def ground_floors(noise: NoiseConfig) -> Array:
+    """(3,) 1 sigma of (a, b, distance) by the waves of the ground: of the config, or the usual."""
+    normal_deg, distance_m = noise.ground_normal_deg, noise.ground_distance_m
+    normal = NORMAL_FLOOR_RAD if normal_deg is None else math.radians(normal_deg)
+    return np.array([normal, normal, DISTANCE_FLOOR_M if distance_m is None else distance_m])
 
 
 def near_points(points: Array, up: Array) -> IntArray:

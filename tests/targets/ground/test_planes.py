@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.config.model import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.simulation import load_scenario, simulate_drive
@@ -19,6 +20,7 @@ from caliv_graph.targets.ground.planes import (
     DISTANCE_FLOOR_M,
     NORMAL_FLOOR_RAD,
     GroundPlane,
+    ground_floors,
     near_points,
 )
 from tests.samples import pose
@@ -98,9 +100,9 @@ def test_the_covariance_is_that_of_the_distance_at_the_lidar() -> None:
     assert correlation / plane.cov[2, 2] > 0.8
     left = there[2, :2] @ np.linalg.solve(there[:2, :2], there[2, :2])
     assert left / there[2, 2] < 0.3
-    floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
+    floors = ground_floors(NoiseConfig())
     added = np.diag(floors**2) + np.outer(plane.beyond, plane.beyond)
-    assert plane.cov_with_floors - plane.cov == pytest.approx(added)
+    assert plane.cov_with(floors) - plane.cov == pytest.approx(added)
     # The ground is level: what it seems to be bent by is noise, and less than the floors.
     assert np.all(np.abs(plane.beyond) < 2.0 * floors)
 
@@ -275,7 +277,7 @@ def test_a_crest_or_a_dip_is_owned_up_to(radius_m: float) -> None:
     assert off + beyond == pytest.approx(np.zeros(3), abs=0.25 * abs(off[2]))
     for plane in planes:
         wrong = errors(plane)
-        assert wrong @ np.linalg.solve(plane.cov_with_floors, wrong) < 6.0
+        assert wrong @ np.linalg.solve(plane.cov_with(ground_floors(NoiseConfig())), wrong) < 6.0
 
 
 @pytest.mark.parametrize("radius_m", [100.0, -100.0, 300.0])

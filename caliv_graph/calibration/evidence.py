@@ -1,0 +1,226 @@
+"""What the LiDARs see along smoothed trajectories, as residuals with errors of known shape.
+
+Residuals of registered clouds and of ground planes at the smoothed poses. Extrinsics, targets and
+planes are the parameters; the errors are those of the registration, of heave and ground, and what
+errors of the motion sensors do to the poses (`README.md`, "Noise levels").
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.calibration.graph import with_given_poses
+from caliv_graph.calibration.ground import (
+    PLANE_SIGMAS,
+    ground_centre,
+    place_weights,
+    taken_poses,
+)
+from caliv_graph.calibration.ground_factors import ground_plane_factor
+from caliv_graph.calibration.linear import linearise_clouds
+from caliv_graph.calibration.noise import evenly_over_drives
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.solve import SolveState, measured_poses, of_single_clouds
+from caliv_graph.calibration.variance_components import Observed
+from caliv_graph.conventions import key_ground, key_vehicle
+from caliv_graph.products import Array, IntArray, Registration
+from caliv_graph.targets.ground.planes import ground_floors
+from caliv_graph.trajectory.effects import ErrorEffects, error_effects, smoothed_in_time
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+FEWEST_CLOUDS = 16
+"""Fewer clouds do not tell noise levels: the usual ones hold."""
+
+MOST_CLOUDS = 36
+"""Clouds that are used, spread evenly over the drives: the cost grows with their cube."""
+
+SEEN = 0.5
+"""Least weight of a cloud or a ground observation that is used."""
+
+WEAK = 1e-2
+"""Information on targets and time offsets, per rad^2, m^2 and s^2."""
+
+
+@dataclass
+class Evidence:
+    """What the LiDARs see, linearised at the smoothed poses.
+
+    Attributes:
+        observed: residuals of clouds and ground planes; `known`: of poses, points and heave
+            between scans.
+        by_pose: (N, 6 p) derivatives by right perturbations of p poses.
+        white: name of `LEVELS` -> (N, N) covariance at sigma 1.
+        effects: per drive, the columns of its poses in `by_pose`, and what errors do to them.
+    """
+
+    observed: Observed
+    by_pose: Array
+    white: dict[str, Array]
+    effects: list[tuple[IntArray, dict[str, ErrorEffects]]] = field(default_factory=list)
+    _moved: dict[tuple[str, tuple[int, ...]], list[tuple[Array, IntArray]]] = field(
+        default_factory=dict
+    )
+
+    def slow(self, kind: str, axes: tuple[int, ...], time_s: float) -> Array:
+        """(N, N) covariance by an error of unit sigma along some map axes."""
+        if (kind, axes) not in self._moved:
+            self._moved[kind, axes] = [
+                (np.einsum("rc,can->ran", self.by_pose[:, columns], of[kind].gain[:, axes]), n)
+                for columns, of in self.effects
+                if kind in of
+                for n in [of[kind].stamps_ns]
+            ]
+        out = np.zeros((len(self.by_pose),) * 2)
+        for moved, stamps_ns in self._moved[kind, axes]:
+            for a in range(len(axes)):
+                out += smoothed_in_time(moved[:, a], stamps_ns, time_s) @ moved[:, a].T
+        return out
+
+
+@dataclass
+class _Rows:
+    """One observation.
+
+    Attributes:
+        residual: (d,).
+        jacobians: (d, size) by key.
+        known: (d, d) its covariance of known size.
+        white: (d, d) by name of a white level, what that brings at sigma 1.
+    """
+
+    residual: Array
+    jacobians: Mapping[int, Array]
+    known: Array
+    white: Mapping[str, Array]
+
+
+def linearised_evidence(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    trajectories: Sequence[VehicleTrajectory],
+) -> Evidence | None:
+    """The residuals of smoothed drives at the smoothed poses; None: too few clouds."""
+    problem = state.problem
+    smoothed = ~problem.given()[problem.cloud_pose]
+    usable = state.sound & smoothed & (state.weights.values > SEEN)
+    if usable.sum() < FEWEST_CLOUDS:
+        return None
+    clouds = evenly_over_drives(problem, usable, MOST_CLOUDS)
+    poses = np.unique(problem.cloud_pose[clouds])
+    values = with_given_poses(problem, state.values)
+    rows = [
+        *_cloud_rows(problem, registrations, values, clouds),
+        *_ground_rows(state, values, poses),
+    ]
+    starts = np.cumsum([0, *(len(row.residual) for row in rows)])
+    parts = [slice(a, b) for a, b in itertools.pairwise(starts.tolist())]
+    sizes = {key: J.shape[1] for row in rows for key, J in row.jacobians.items()}
+    of_pose = {key_vehicle(i): 6 * n for n, i in enumerate(poses.tolist())}
+    others = [key for key in sizes if key not in of_pose]
+    columns = np.cumsum([0, *(sizes[key] for key in others)]).tolist()
+    at = dict(zip(others, columns, strict=False))
+    design, by_pose = np.zeros((starts[-1], columns[-1])), np.zeros((starts[-1], 6 * len(poses)))
+    for row, part in zip(rows, parts, strict=True):
+        for key, J in row.jacobians.items():
+            if key in of_pose:
+                by_pose[part, of_pose[key] : of_pose[key] + 6] = J
+            else:
+                design[part, at[key] : at[key] + J.shape[1]] = J
+    lift = by_pose[:, 5::6]
+    white = {"heave": lift @ lift.T}
+    for name in dict.fromkeys(name for row in rows for name in row.white):
+        white[name] = scipy.linalg.block_diag(
+            *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
+        )
+    known = scipy.linalg.block_diag(*(row.known for row in rows))
+    effects = []
+    for drive in sorted({problem.poses[i][0] for i in poses.tolist()}):
+        trajectory = trajectories[drive]
+        assert isinstance(trajectory, SmoothedTrajectory)
+        mine = [n for n, i in enumerate(poses.tolist()) if problem.poses[i][0] == drive]
+        stamps = [problem.poses[poses[n]][1] for n in mine]
+        own = (6 * np.array(mine)[:, None] + np.arange(6)).ravel()
+        J = by_pose[:, own]
+        known = known + J @ np.linalg.solve(trajectory.joint_information(stamps)[0], J.T)
+        effects.append((own, _effects(trajectory, stamps)))
+    ridge = np.concatenate([_weak(problem, key, sizes[key]) for key in others])
+    residuals = np.concatenate([row.residual for row in rows])
+    return Evidence(Observed(residuals, design, ridge, known), by_pose, white, effects)
+
+
+def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[str, ErrorEffects]:
+    """What errors that are correlated over time do to the poses; none if some are in use."""
+    if trajectory.correlated:
+        return {}
+    kinds = [kind for kind in ("gnss", "orientation") if kind in trajectory.factor_kinds]
+    return {of.kind: of for of in error_effects(trajectory, stamps_ns, kinds)}
+
+
+def _weak(problem: Problem, key: int, size: int) -> Array:
+    """(size,) weak information on a parameter, so that undetermined directions stay finite."""
+    if key in problem.extrinsic_keys():
+        sigmas = np.max([problem.prior_sigmas[name] for name in problem.lidars], axis=0)
+        return np.asarray(sigmas**-2.0)
+    drives = {key_ground(drive) for drive in problem.drives().tolist()}
+    return PLANE_SIGMAS**-2.0 if key in drives else np.full(size, WEAK)
+
+
+def _cloud_rows(
+    problem: Problem,
+    registrations: Sequence[Registration],
+    values: gtsam.Values,
+    clouds: IntArray,
+) -> list[_Rows]:
+    """Registered clouds: the covariance of each is that of its registration."""
+    measured, information = measured_poses(registrations)
+    covariances = np.linalg.inv(of_single_clouds(information, registrations)[clouds])
+    lines = linearise_clouds(problem, values)
+    return [
+        _Rows(
+            gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse())),
+            dict(zip(lines.keys[j], lines.jacobians[j], strict=True)),
+            np.zeros((6, 6)),
+            {"registration": cov},
+        )
+        for j, cov in zip(clouds.tolist(), covariances, strict=True)
+    ]
+
+
+def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> list[_Rows]:
+    """Ground planes seen from some poses, those in use; not twice the same place."""
+    problem, weights = state.problem, state.ground_weights
+    if weights is None:
+        return []
+    floors = np.diag(ground_floors(state.config.noise) ** 2)
+    taken = taken_poses(problem, state.grounds)
+    weight = weights.planes * place_weights(problem, state.grounds, taken)
+    normal, distance = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+    out = []
+    for n, o in enumerate(state.grounds):
+        if taken[n] not in poses or weight[n] < SEEN:
+            continue
+        keys = (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar))
+        centre = ground_centre(problem, o.drive)
+        # With a unit covariance, GTSAM's whitening leaves the residual as it is.
+        factor = ground_plane_factor(keys, key_ground(o.drive), centre, replace(o, cov=np.eye(3)))
+        linear: Any = factor.linearize(values)
+        # A copy: GTSAM's array ends with the factor.
+        blocks = np.split(np.array(linear.getA()), 6 * np.arange(1, len(keys) + 1), axis=1)
+        known = o.cov - floors + weights.heave_m[n] ** 2 * distance
+        out.append(
+            _Rows(
+                -np.asarray(linear.getb()),
+                dict(zip(linear.keys(), blocks, strict=True)),
+                known,
+                {"ground_normal": normal, "ground_distance": distance},
+            )
+        )
+    return out

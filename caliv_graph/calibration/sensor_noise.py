@@ -1,0 +1,310 @@
+"""Noise that no message states, estimated from what the LiDARs see along smoothed trajectories.
+
+Heave of the body, waves of the ground, and errors of fixes and orientations that are correlated
+over time: variance components of the residuals of clouds and ground planes at the smoothed poses,
+extrinsics, targets and planes integrated out (`README.md`, "Noise levels").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.calibration.evidence import Evidence, linearised_evidence
+from caliv_graph.calibration.noise import LOG_SPREAD
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M
+from caliv_graph.calibration.solve import SolveState
+from caliv_graph.calibration.variance_components import Unknown, maximise
+from caliv_graph.config.model import NoiseConfig
+from caliv_graph.products import Array, GroundObservation, NoiseLevel, Registration
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
+from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+EVIDENCE = 3.0
+"""Gain of the log-likelihood from which an error is taken to be correlated over time: one for each
+of its parameters (Akaike). Errors as slow as the drive is long gain little more, and move S2V by
+many of its sigmas; chance gains as much in one of twenty drives, at levels that cost little."""
+
+LEVELS: Mapping[str, Unknown] = {
+    "registration": Unknown(1.0, LOG_SPREAD, (0.1, 30.0)),
+    "heave": Unknown(HEAVE_SIGMA_M, LOG_SPREAD, (1e-4, 0.2)),
+    "ground_normal": Unknown(NORMAL_FLOOR_RAD, LOG_SPREAD, (1e-5, 0.05)),
+    "ground_distance": Unknown(DISTANCE_FLOOR_M, LOG_SPREAD, (1e-4, 0.2)),
+}
+"""White errors, a sigma each: of the registration as a factor, else in metres and radians. The
+usual figures are weak priors, a factor of ten."""
+
+TIME = Unknown(TYPICAL_CORRELATION_S, math.log(3.0), (2.0, 300.0))
+"""Correlation time in seconds: below, the error is as good as white; above, it is constant over a
+drive, which extrinsics and target take up."""
+
+
+@dataclass(frozen=True)
+class Slow:
+    """A correlated error that is looked for.
+
+    Attributes:
+        groups: map axes that share a sigma.
+        sigma: of each group.
+        starts: sigmas that the search begins with, all with each of `START_TIMES_S`.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    sigma: Unknown
+    starts: tuple[float, ...]
+
+
+SLOW: Mapping[str, Slow] = {
+    "gnss": Slow(((0, 1), (2,)), Unknown(5e-3, LOG_SPREAD, (1e-4, 30.0)), (5e-3, 0.02)),
+    "orientation": Slow(((0, 1, 2),), Unknown(1e-3, LOG_SPREAD, (1e-5, 0.5)), (5e-4, 2e-3)),
+}
+"""By kind of factor; the prior is that of a receiver with corrections, and of an AHRS."""
+
+START_TIMES_S = (8.0, 40.0)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise levels that hold for all drives.
+
+    Attributes:
+        heave_m: 1 sigma of the heave.
+        floors: (3,) 1 sigma of (a, b, distance) of a ground plane by the waves of the ground.
+        correlated: errors of sensors that are correlated over time.
+        levels: for the report.
+    """
+
+    heave_m: float
+    floors: Array
+    correlated: tuple[CorrelatedError, ...] = ()
+    levels: tuple[NoiseLevel, ...] = ()
+
+
+def estimated_noise(
+    state: SolveState,
+    registrations: Sequence[Registration],
+    trajectories: Sequence[VehicleTrajectory],
+) -> SensorNoise:
+    """Noise levels that the config leaves open, from a rough solve.
+
+    Of drives with given poses, whose noise is fitted elsewhere, nothing is used.
+    """
+    noise = state.config.noise
+    evidence = linearised_evidence(state, registrations, trajectories)
+    if evidence is None:
+        usual = _usual(noise)
+        return replace(usual, levels=_levels(usual, noise, ()))
+    return estimated(evidence, noise)
+
+
+def _usual(noise: NoiseConfig) -> SensorNoise:
+    return SensorNoise(noise.heave_m or HEAVE_SIGMA_M, ground_floors(noise))
+
+
+def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
+    """The noise levels that a config leaves open."""
+    usual = _usual(noise)
+    given = {
+        "heave": noise.heave_m,
+        "ground_normal": noise.ground_normal_deg and math.radians(noise.ground_normal_deg),
+        "ground_distance": noise.ground_distance_m,
+    }
+    names = [name for name in evidence.white if given.get(name) is None]
+    for name, sigma in given.items():
+        if sigma is not None and name in evidence.white:
+            evidence.observed.known[:] += sigma**2 * evidence.white[name]
+    best = _fitted(evidence, names, (), None)
+    kinds = _looked_for(noise, evidence)
+    while kinds:
+        start = _best_start(evidence, names, best, kinds)
+        if start is None:
+            break
+        before = [(error.kind, _start_of(error)) for error in best.errors]
+        better = _fitted(evidence, names, [*before, start], best.white)
+        if best.cost - better.cost < EVIDENCE:
+            break
+        best = better
+        kinds.remove(start[0])
+    values = dict(zip(names, best.white.tolist(), strict=True))
+    normal = values.get("ground_normal", usual.floors[0])
+    floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
+    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, best.errors)
+    return replace(fitted, levels=_levels(fitted, noise, names))
+
+
+def with_noise(
+    noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
+) -> list[VehicleTrajectory]:
+    """The trajectories, smoothed again where a sensor's error was found to be correlated."""
+    out: list[VehicleTrajectory] = []
+    for t in trajectories:
+        if noise.correlated and isinstance(t, SmoothedTrajectory) and t.data is not None:
+            stamps = t.trajectory.stamps_ns
+            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated)
+        out.append(t)
+    return out
+
+
+def with_floors(
+    observations: Sequence[GroundObservation], before: Array, after: Array
+) -> tuple[GroundObservation, ...]:
+    """Ground observations with other sigmas (3,) of the ground's waves."""
+    change = np.diag(after**2 - before**2)
+    return tuple(replace(o, cov=o.cov + change) for o in observations)
+
+
+def _levels(
+    noise: SensorNoise, config: NoiseConfig, estimated: Sequence[str]
+) -> tuple[NoiseLevel, ...]:
+    """The figures in use and where they are from."""
+    given = {
+        "heave": config.heave_m,
+        "ground_normal": config.ground_normal_deg,
+        "ground_distance": config.ground_distance_m,
+    }
+
+    def source(name: str) -> str:
+        if given[name] is not None:
+            return "config"
+        return "residuals of the LiDARs" if name in estimated else "the usual figure"
+
+    figures = (
+        ("heave", noise.heave_m, "m"),
+        ("ground_normal", float(noise.floors[0]), "rad"),
+        ("ground_distance", float(noise.floors[2]), "m"),
+    )
+    out = [NoiseLevel(name, value, unit, source(name)) for name, value, unit in figures]
+    for error in noise.correlated:
+        unit = "m" if error.kind == "gnss" else "rad"
+        parts = {"horizontal": error.sigmas[0], "vertical": error.sigmas[2]}
+        if error.kind == "orientation":
+            parts = {"": error.sigmas[0]}
+        for part, sigma in parts.items():
+            name = "_".join(filter(None, (error.kind, "correlated", part)))
+            out.append(NoiseLevel(name, sigma, unit, "residuals of the LiDARs", error.time_s))
+    return tuple(out)
+
+
+# ------------------------------------------------------------------ likelihood
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Sigmas (k,) of the white levels, correlated errors, minus the log-posterior."""
+
+    white: Array
+    errors: tuple[CorrelatedError, ...]
+    cost: float
+
+
+def _fitted(
+    evidence: Evidence,
+    names: Sequence[str],
+    slow: Sequence[tuple[str, Array]],
+    white: Array | None,
+) -> _Fit:
+    """The most likely levels of `names` and of correlated errors.
+
+    `slow` are the kinds of these, and where their search begins: sigmas of the groups, then the
+    time. `white` (k,) are the sigmas that the search of the others begins with.
+    """
+    parts = [evidence.white[name] for name in names]
+    unknowns = [LEVELS[name] for name in names]
+    start = [u.median for u in unknowns] if white is None else white.tolist()
+    for kind, values in slow:
+        unknowns += [SLOW[kind].sigma] * len(SLOW[kind].groups) + [TIME]
+        start += values.tolist()
+
+    def cost(x: Array) -> tuple[float, Array]:
+        return _cost(evidence, parts, [kind for kind, _ in slow], x)
+
+    found, value = maximise(cost, unknowns, np.array(start))
+    errors, at = [], len(names)
+    for kind, _ in slow:
+        groups = SLOW[kind].groups
+        sigmas = np.zeros(3)
+        for group, sigma in zip(groups, found[at:], strict=False):
+            sigmas[list(group)] = sigma
+        at += len(groups)
+        east, north, up = sigmas.tolist()
+        errors.append(CorrelatedError(kind, (east, north, up), float(found[at])))
+        at += 1
+    return _Fit(found[: len(names)], tuple(errors), value)
+
+
+def _cost(
+    evidence: Evidence,
+    parts: Sequence[Array],
+    kinds: Sequence[str],
+    x: Array,
+    *,
+    slopes: bool = True,
+) -> tuple[float, Array]:
+    """Minus the log-likelihood and its derivative at logarithms x, of times by a difference."""
+    slow: list[Array] = []
+    sigmas, times = list(range(len(parts))), []
+    at = len(parts)
+    for kind in kinds:
+        groups = SLOW[kind].groups
+        times.append(at + len(groups))
+        time_s = math.exp(x[times[-1]])
+        slow += [evidence.slow(kind, group, time_s) for group in groups]
+        sigmas += range(at, at + len(groups))
+        at = times[-1] + 1
+    value, by_sigma = evidence.observed.cost([*parts, *slow], x[sigmas])
+    slope = np.zeros(len(x))
+    slope[sigmas] = by_sigma
+    if not slopes:
+        return value, slope
+    step = 1e-2
+    for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
+        first = sum(len(SLOW[k].groups) for k in kinds[:number])
+        groups = SLOW[kind].groups
+        later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
+        changed = [*slow[:first], *later, *slow[first + len(groups) :]]
+        slope[index] = (evidence.observed.cost([*parts, *changed], x[sigmas])[0] - value) / step
+    return value, slope
+
+
+def _best_start(
+    evidence: Evidence, names: Sequence[str], best: _Fit, kinds: Sequence[str]
+) -> tuple[str, Array] | None:
+    """Which further error explains most before anything is fitted, and with which sigmas and time.
+
+    None: none of them explains anything.
+    """
+    parts = [evidence.white[name] for name in names]
+    before = [error.kind for error in best.errors]
+    logarithms = np.log(np.concatenate([best.white, *map(_start_of, best.errors)]))
+    least, out = _cost(evidence, parts, before, logarithms, slopes=False)[0], None
+    for kind in kinds:
+        for sigma in SLOW[kind].starts:
+            for time_s in START_TIMES_S:
+                values = np.array([sigma] * len(SLOW[kind].groups) + [time_s])
+                x = np.concatenate([logarithms, np.log(values)])
+                cost = _cost(evidence, parts, [*before, kind], x, slopes=False)[0]
+                if cost < least:
+                    least, out = cost, (kind, values)
+    return out
+
+
+def _start_of(error: CorrelatedError) -> Array:
+    """Sigmas of its groups, and its time."""
+    return np.array([*(error.sigmas[g[0]] for g in SLOW[error.kind].groups), error.time_s])
+
+
+def _looked_for(noise: NoiseConfig, evidence: Evidence) -> list[str]:
+    """Kinds of correlated errors that the config leaves open and a drive has."""
+    configured = {
+        "gnss": (noise.gnss_correlated_horizontal_m, noise.gnss_correlated_vertical_m),
+        "orientation": (noise.orientation_correlated_deg,),
+    }
+    has = {kind for _, of in evidence.effects for kind in of}
+    return [k for k, values in configured.items() if k in has and all(v is None for v in values)]

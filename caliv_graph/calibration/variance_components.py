@@ -1,0 +1,99 @@
+"""Restricted maximum likelihood of variances that add up in one covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.optimize import minimize
+
+from caliv_graph.products import Array
+
+MAX_STEPS = 40
+"""Of the optimiser; about fifteen do."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Residuals that depend on parameters and on errors of known shape.
+
+    Attributes:
+        residuals: (N,).
+        design: (N, p) derivatives by the parameters, which are integrated out.
+        ridge: (p,) weak information on these.
+        known: (N, N) covariance of errors of known size.
+    """
+
+    residuals: Array
+    design: Array
+    ridge: Array
+    known: Array
+
+    def cost(self, parts: Sequence[Array], logarithms: Array) -> tuple[float, Array]:
+        """Minus the log-likelihood, and its derivative by the logarithms (k,) of the sigmas.
+
+        `parts` (N, N) are the covariances at sigma 1. Patterson & Thompson (1971).
+        """
+        variances = np.exp(2.0 * logarithms)
+        V = self.known + sum(v * part for v, part in zip(variances, parts, strict=True))
+        try:
+            L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            return 1e12, np.zeros(len(logarithms))
+        inverse = scipy.linalg.cho_solve((L, True), np.eye(len(V)), check_finite=False)
+        weighted = inverse @ self.design
+        LN = scipy.linalg.cholesky(self.design.T @ weighted + np.diag(self.ridge), lower=True)
+        half = scipy.linalg.solve_triangular(LN, weighted.T, lower=True)
+        P = inverse - half.T @ half
+        y = P @ self.residuals
+        value = np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * self.residuals @ y
+        slope = [
+            v * (np.sum(P * part) - y @ part @ y) for v, part in zip(variances, parts, strict=True)
+        ]
+        return float(value), np.array(slope)
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A positive quantity to estimate: its log-normal prior and its bounds.
+
+    Attributes:
+        median: of the prior.
+        spread: 1 sigma of its logarithm.
+        bounds: of the estimate.
+    """
+
+    median: float
+    spread: float
+    bounds: tuple[float, float]
+
+
+def maximise(
+    cost: Callable[[Array], tuple[float, Array]], unknowns: Sequence[Unknown], start: Array
+) -> tuple[Array, float]:
+    """The most likely values (k,) under their priors, and minus the logarithm of both there.
+
+    `cost` gives minus the log-likelihood and its derivative at logarithms (k,); `start` (k,) are
+    values.
+    """
+    centre = np.log([u.median for u in unknowns])
+    spread = np.array([u.spread for u in unknowns])
+    first = cost(np.log(start))[0]
+
+    def penalised(x: Array) -> tuple[float, Array]:
+        value, slope = cost(x)
+        surprise = (x - centre) / spread
+        # Less the value at the start: the optimiser's tolerance is relative.
+        return value - first + 0.5 * float(surprise @ surprise), slope + surprise / spread
+
+    found = minimize(
+        penalised,
+        np.log(start),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[tuple(np.log(u.bounds)) for u in unknowns],
+        options={"ftol": 1e-7, "gtol": 0.05, "maxiter": MAX_STEPS},
+    )
+    return np.exp(np.asarray(found.x)), float(found.fun) + first

@@ -1,0 +1,135 @@
+"""The solution of a chain: estimate, determinant, and covariance next to the diagonal.
+
+From one banded Cholesky factor: the inverse of a chain is needed only where the chain has entries
+(Takahashi et al. 1973), for gradients of a likelihood and for marginal covariances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.chain import UNDETERMINED, Chain, banded_of
+
+
+@dataclass(frozen=True)
+class ChainSolution:
+    """Of `information d = -gradient`, for n states of w coordinates and k common ones.
+
+    Attributes:
+        step: (n w + k,) d.
+        log_determinant: of the information.
+        cov: (n, w, w) covariance of each state.
+        cov_next: (n - 1, w, w) between a state (rows) and the next (columns).
+        cov_border: (n, w, k) between each state and the common coordinates.
+        cov_corner: (k, k) of the common coordinates.
+    """
+
+    step: Array
+    log_determinant: float
+    cov: Array
+    cov_next: Array
+    cov_border: Array
+    cov_corner: Array
+
+
+def solved(chain: Chain, gradient: Array) -> ChainSolution:
+    """Solves a chain for a gradient (n w + k,).
+
+    Raises:
+        TrajectoryError: the chain is singular.
+    """
+    n, w = chain.diagonal.shape[:2]
+    k = len(chain.corner)
+    size, factor, border = _factorised(chain)
+    right = np.column_stack([-gradient[: n * w] / size.ravel(), border])
+    by_state = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
+    alone, to_border = by_state[:, 0], by_state[:, 1:]
+    left = chain.corner - border.T @ to_border
+    cov_corner: Array = np.asarray(np.linalg.inv(left)) if k else left
+    common = cov_corner @ (-gradient[n * w :] - border.T @ alone)
+    own, next_ = _selected_inverse(*_blocks(factor, n, w))
+    edge = to_border.reshape(n, w, k)
+    own = own + edge @ cov_corner @ np.swapaxes(edge, 1, 2)
+    next_ = next_ + edge[:-1] @ cov_corner @ np.swapaxes(edge[1:], 1, 2)
+    log_determinant = 2.0 * (np.log(factor[0]).sum() + np.log(size).sum())
+    if k:
+        log_determinant += np.linalg.slogdet(left)[1]
+    return ChainSolution(
+        step=np.concatenate([(alone - to_border @ common) / size.ravel(), common]),
+        log_determinant=float(log_determinant),
+        cov=own / (size[:, :, None] * size[:, None]),
+        cov_next=next_ / (size[:-1, :, None] * size[1:, None]),
+        cov_border=-(edge @ cov_corner) / size[:, :, None],
+        cov_corner=cov_corner,
+    )
+
+
+def inverse_columns(chain: Chain, coordinates: IntArray) -> Array:
+    """(n w + k, m) columns of the inverse of a chain's information.
+
+    `coordinates` (m,) are of states, each i w + j.
+
+    Raises:
+        TrajectoryError: the chain is singular.
+    """
+    n, w = chain.diagonal.shape[:2]
+    k = len(chain.corner)
+    size, factor, border = _factorised(chain)
+    right = np.zeros((n * w, len(coordinates) + k))
+    right[coordinates, np.arange(len(coordinates))] = 1.0 / size.ravel()[coordinates]
+    right[:, len(coordinates) :] = border
+    by_state = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
+    alone, to_border = np.split(by_state, [len(coordinates)], axis=1)
+    common = -np.linalg.solve(chain.corner - border.T @ to_border, border.T @ alone)
+    return np.vstack([(alone - to_border @ common) / size.reshape(-1, 1), common])
+
+
+def _factorised(chain: Chain) -> tuple[Array, Array, Array]:
+    """Scale (n, w) to a unit diagonal, banded Cholesky factor, and border (n w, k), both scaled."""
+    n, w = chain.diagonal.shape[:2]
+    # Variances of rad and of m/s^2 differ by ten orders of magnitude.
+    size = np.sqrt(np.diagonal(chain.diagonal, axis1=1, axis2=2))
+    if not (size > 0.0).all():
+        raise TrajectoryError(UNDETERMINED)
+    diagonal = chain.diagonal / (size[:, :, None] * size[:, None])
+    coupling = chain.coupling / (size[:-1, :, None] * size[1:, None])
+    border = (chain.border / size[:, :, None]).reshape(n * w, len(chain.corner))
+    try:
+        factor = scipy.linalg.cholesky_banded(
+            banded_of(diagonal, coupling), lower=True, check_finite=False
+        )
+    except np.linalg.LinAlgError:
+        raise TrajectoryError(UNDETERMINED) from None
+    return size, factor, border
+
+
+def _blocks(factor: Array, n: int, w: int) -> tuple[Array, Array]:
+    """(n, w, w) diagonal and (n - 1, w, w) lower blocks of a banded Cholesky factor."""
+    diagonal, below = np.zeros((n, w, w)), np.zeros((max(n - 1, 0), w, w))
+    for column in range(w):
+        for row in range(column, w):
+            diagonal[:, row, column] = factor[row - column, column::w]
+        for row in range(w):
+            below[:, row, column] = factor[w + row - column, column : (n - 1) * w : w]
+    return diagonal, below
+
+
+def _selected_inverse(L: Array, below: Array) -> tuple[Array, Array]:
+    """Diagonal and next blocks of the inverse of `F F^T`.
+
+    F has the blocks L (n, w, w) on its diagonal and `below` (n - 1, w, w) under it.
+    """
+    inverse = np.linalg.inv(L)
+    own = np.swapaxes(inverse, 1, 2) @ inverse
+    carry = below @ inverse[:-1]
+    next_ = np.empty_like(below)
+    for i in range(len(L) - 2, -1, -1):
+        across = own[i + 1] @ carry[i]
+        next_[i] = -across.T
+        own[i] += carry[i].T @ across
+    return own, next_

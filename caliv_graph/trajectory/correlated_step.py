@@ -1,0 +1,163 @@
+"""The estimate with errors of sensors that are correlated over time (`README.md`, section 9).
+
+One linear step from the estimate without them. An error of decimetres turns the vehicle by
+milliradians: what is neglected is below a micrometre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import scipy.sparse
+
+from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.build import build_graph, from_values
+from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
+from caliv_graph.trajectory.chain_solution import solved
+from caliv_graph.trajectory.columns import parameter_columns
+from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised
+from caliv_graph.trajectory.solve import Estimate
+from caliv_graph.trajectory.uncertain import Settled, moved
+
+
+@dataclass(frozen=True)
+class WithErrors:
+    """An estimate with correlated errors.
+
+    Attributes:
+        settled: states and parameters.
+        errors: (n, 3 e) of the sensors at the nodes, map axes, metres or radians.
+        cov: (n, 6, 6) covariances of the vehicle's poses at the nodes, parameters included.
+        chain: the information, as `chain_with_errors` has it.
+    """
+
+    settled: Settled
+    errors: Array
+    cov: Array
+    chain: Chain
+
+
+def step_with_errors(
+    settled: Settled, nodes: IntArray, dropped: IntArray, errors: Sequence[CorrelatedError]
+) -> WithErrors:
+    """The estimate moved by one step of states, parameters and correlated errors together.
+
+    Args:
+        settled: without the errors.
+        nodes: (n,) stamps.
+        dropped: (k,) indices of fixes that are left out.
+        errors: at least one.
+
+    Raises:
+        TrajectoryError: the graph is singular.
+    """
+    data, estimate, n = settled.data, settled.estimate, len(nodes)
+    linear = estimate.graph.factors.linearize(estimate.values)
+    none = np.zeros((n, AXES * len(errors)))
+    start = chain_with_errors(settled, linear, nodes, errors, none)
+    # The last common coordinate is the right-hand side.
+    gradient = -np.concatenate([start.border[:, :, -1].ravel(), start.corner[:-1, -1]])
+    chain = Chain(
+        start.diagonal, start.coupling, start.border[:, :, :-1], start.corner[:-1, :-1].copy()
+    )
+    first = 1 if data.yaw_bias else 0
+    if settled.parameters:
+        at = np.arange(first, len(chain.corner))
+        weight = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters]) ** -2
+        chain.corner[at, at] += weight
+        offset = np.concatenate([np.asarray(p.offset) for p in settled.parameters])
+        gradient[len(gradient) - len(at) :] += weight * offset
+    found = solved(chain, gradient)
+    width = STATE + AXES * len(errors)
+    by_node, common = found.step[: n * width].reshape(n, width), found.step[n * width :]
+    step = gtsam.VectorValues()
+    for i, d in enumerate(by_node):
+        step.insert(key_imu(i), d[:6])
+        step.insert(key_velocity(i), d[6:9])
+        step.insert(key_bias(i), d[9:STATE])
+    if first:
+        step.insert(key_yaw_bias(), common[:1])
+    parameters = settled.parameters
+    if parameters:
+        data, parameters = moved(data, parameters, common[first:])
+    values = estimate.values.retract(step)
+    states = from_values(values, n, data)
+    graph = build_graph(data, nodes, states, dropped, data.config.robust.kernel)
+    columns = None
+    if parameters:
+        of = [p.parameter for p in parameters]
+        columns = parameter_columns(data, nodes, states, graph, values, dropped, of)
+    after = Settled(
+        data, Estimate(states, graph, values), parameters, columns, found.cov_corner[first:, first:]
+    )
+    linear = graph.factors.linearize(values)
+    estimated = by_node[:, STATE:]
+    return WithErrors(
+        settled=after,
+        errors=estimated,
+        cov=_of_vehicle(after, found.cov[:, :POSE, :POSE], found.cov_border[:, :POSE, first:]),
+        chain=chain_with_errors(after, linear, nodes, errors, estimated),
+    )
+
+
+def _of_vehicle(settled: Settled, cov_imu: Array, cross: Array) -> Array:
+    """(n, 6, 6) covariances of the vehicle's poses.
+
+    `cov_imu` (n, 6, 6) is that of the IMU's poses, `cross` (n, 6, p) theirs with the parameters. X
+    = I T_vehicle_imu^-1: the vehicle also moves where a parameter is that transform.
+    """
+    data = settled.data
+    total = cov_imu
+    if settled.parameters:
+        moves = np.hstack([p.parameter.imu_moves(data) for p in settled.parameters])
+        mixed = cross @ moves.T
+        total = total - mixed - np.swapaxes(mixed, 1, 2) + moves @ settled.cov @ moves.T
+    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+    return np.asarray(Ad @ total @ Ad.T)
+
+
+def chain_with_errors(
+    settled: Settled,
+    linear: gtsam.GaussianFactorGraph,
+    nodes: IntArray,
+    errors: Sequence[CorrelatedError],
+    estimated: Array,
+) -> Chain:
+    """The information about an estimate, the errors as the last coordinates of every state.
+
+    Common coordinates are those of `solve.chain_of`: the yaw bias if there is one, the parameters,
+    and the right-hand side, the priors of the errors included.
+
+    Args:
+        settled: the estimate and the columns of its parameters.
+        linear: its graph, linearised.
+        nodes: (n,) stamps.
+        errors: at least one.
+        estimated: (n, 3 e) their estimates.
+    """
+    estimate, n = settled.estimate, len(nodes)
+    common = [key_yaw_bias()] if settled.data.yaw_bias else []
+    names = [error.kind for error in errors]
+    R = estimate.states.R_map_imu
+    J, residuals = linearised(linear, estimate.graph.kinds, names, R, common)
+    width = STATE + AXES * len(errors)
+    of_errors = np.zeros((n, width))
+    of_errors[:, STATE:] = estimated
+    residuals = residuals + J[:, : n * width] @ of_errors.ravel()
+    columns = np.zeros((len(residuals), 0)) if settled.columns is None else settled.columns
+    J = beside(J, np.column_stack([columns, -residuals]))
+    chain = Chain.zero(n, width, J.shape[1] - n * width)
+    chain.add(scipy.sparse.csr_array(J))
+    prior = Chain.zero(n, width, 0)
+    add_prior(prior, nodes, errors)
+    pull = np.einsum("nij,nj->ni", prior.diagonal, of_errors)
+    pull[:-1] += np.einsum("nij,nj->ni", prior.coupling, of_errors[1:])
+    pull[1:] += np.einsum("nji,nj->ni", prior.coupling, of_errors[:-1])
+    chain.border[:, :, -1] -= pull
+    chain.diagonal += prior.diagonal
+    chain.coupling += prior.coupling
+    return chain

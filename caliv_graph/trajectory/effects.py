@@ -1,0 +1,99 @@
+"""What an error of a sensor that is correlated over time does to the smoothed poses.
+
+The smoother is a linear estimator near its solution: its poses move with the error by a fixed gain.
+So the covariance of the poses under any such error is known without smoothing again (a consider
+covariance; Schmidt 1966), and its level can be estimated from what the LiDARs see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.conventions import key_yaw_bias
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.chain import POSE, STATE, Chain
+from caliv_graph.trajectory.chain_solution import inverse_columns
+from caliv_graph.trajectory.correlated import AXES, linearised
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+STEP_NS = 500_000_000
+"""The error is taken to be constant over this: a quarter of the shortest correlation time that is
+looked for, and five times fewer numbers than with a step at every node."""
+
+
+@dataclass(frozen=True)
+class ErrorEffects:
+    """Gain of the smoothed poses on one sensor's error.
+
+    Attributes:
+        kind: of the sensor's factors.
+        stamps_ns: (n,) middles of the steps over which the error is taken to be constant.
+        gain: (6 m, 3, n) right perturbations of m vehicle poses, rotation then translation, by the
+            error in each step, along each axis of the map.
+    """
+
+    kind: str
+    stamps_ns: IntArray
+    gain: Array
+
+
+def error_effects(
+    trajectory: SmoothedTrajectory, stamps_ns: Sequence[int], kinds: Sequence[str]
+) -> tuple[ErrorEffects, ...]:
+    """The effects of each kind of error on the poses at wanted stamps (m,), increasing.
+
+    `trajectory` is without errors that are correlated over time.
+
+    Raises:
+        KeyError: a stamp has no node.
+    """
+    i = trajectory.node_indices(stamps_ns)
+    n, width = len(trajectory.nodes_ns), STATE + AXES * len(kinds)
+    common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]
+    linear = trajectory.graph.linearize(trajectory.values)
+    R = trajectory.states.R_map_imu
+    J, _ = linearised(linear, trajectory.factor_kinds, kinds, R, common)
+    both = Chain.zero(n, width, len(common))
+    both.add(J)
+    of_state = slice(0, STATE)
+    states = Chain(
+        both.diagonal[:, of_state, of_state],
+        both.coupling[:, of_state, of_state],
+        both.border[:, of_state],
+        both.corner,
+    )
+    wanted = (STATE * i[:, None] + np.arange(POSE)).ravel()
+    inverse = inverse_columns(states, wanted)
+    by_state = inverse[: n * STATE].reshape(n, STATE, len(wanted))
+    Ad = np.asarray(trajectory.T_vehicle_imu.AdjointMap())
+    out = []
+    for number, kind in enumerate(kinds):
+        of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
+        # An error of a sensor acts at its own node: the coupling of neighbours has none.
+        gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
+        gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
+        shape = gain.shape
+        turned = Ad @ gain.reshape(len(i), POSE, -1)
+        stamps = trajectory.nodes_ns
+        step = (stamps - stamps[0]) // STEP_NS
+        first = np.flatnonzero(np.diff(step, prepend=-1))
+        middle = stamps[0] + step[first] * STEP_NS + STEP_NS // 2
+        out.append(ErrorEffects(kind, middle, np.add.reduceat(turned.reshape(shape), first, 2)))
+    return tuple(out)
+
+
+def smoothed_in_time(rows: Array, stamps_ns: IntArray, time_s: float) -> Array:
+    """(r, n) rows times the correlation matrix of a first-order Gauss-Markov error at n stamps.
+
+    The matrix is `exp(-|t_i - t_j| / time_s)`: a recursion forwards and one backwards.
+    """
+    decay = np.exp(-np.diff(stamps_ns) * 1e-9 / time_s)
+    forward, backward = rows.T.copy(), rows.T.copy()
+    for i, d in enumerate(decay.tolist(), start=1):
+        forward[i] += d * forward[i - 1]
+    for i in range(len(decay) - 1, -1, -1):
+        backward[i] += decay[i] * backward[i + 1]
+    return np.asarray((forward + backward).T - rows)

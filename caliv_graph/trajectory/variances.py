@@ -1,0 +1,251 @@
+"""The noise of the sensors, estimated from how they contradict each other.
+
+Restricted maximum likelihood on the linearised graph: minus twice its logarithm is chi-square at
+the optimum, the log-determinant of the information, and that of the noise. What the trajectory
+takes up of the noise is in the second term, so that no residual counts as precision which the
+trajectory absorbs (`README.md`, section 9).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+import scipy.sparse
+from scipy.optimize import minimize
+
+from caliv_graph.conventions import key_yaw_bias
+from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.trajectory.build import build_graph, to_values
+from caliv_graph.trajectory.chain import STATE, Chain
+from caliv_graph.trajectory.chain_solution import ChainSolution, solved
+from caliv_graph.trajectory.correlated import (
+    AXES,
+    CorrelatedError,
+    add_prior,
+    linearised,
+)
+from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.smoothed import States, first_nodes
+
+COMPONENTS: Mapping[str, tuple[str, slice]] = {
+    "gnss_horizontal": ("gnss", slice(0, 2)),
+    "gnss_vertical": ("gnss", slice(2, 3)),
+    # GTSAM whitens from above: the rotation by itself, then position and velocity given it.
+    "gyroscope": ("imu", slice(0, 3)),
+    "accelerometer": ("imu", slice(3, 9)),
+    "orientation": ("orientation", slice(0, 3)),
+    "velocity": ("velocity", slice(0, 3)),
+}
+"""Name of a noise level -> kind of its factors, and rows of their residual."""
+
+LOG_SPREAD = math.log(3.0)
+"""1 sigma of the log-normal prior of a scale about 1: a factor of three. The hundreds of
+measurements of a drive outweigh it."""
+
+SCALE_BOUNDS = (0.05, 20.0)
+"""Of a scale on stated sigmas."""
+
+
+LARGEST_RIGHT = 1.1
+"""Estimated scales up to this, and down to its inverse, leave the stated sigmas as they are. A
+drive of a minute tells the noise of a gyroscope to 8 percent, and that of fixes to 2."""
+
+EVIDENCE = 9.0
+"""Increase of -2 log L, by holding a scale at 1, from which the stated sigma counts as wrong: 3
+sigma. Beside a slow error of the fixes, the noise of an accelerometer is hardly known."""
+
+NODES = 1200
+"""First nodes of the drive that are used: two minutes."""
+
+
+def free_components(data: SmootherInput) -> list[str]:
+    """Names of the noise levels that the config does not give."""
+    noise = data.config.noise
+    configured = {
+        "gnss_horizontal": noise.gnss_horizontal_m,
+        "gnss_vertical": noise.gnss_vertical_m,
+        "gyroscope": noise.gyroscope_density_rad_s_sqrthz,
+        "accelerometer": noise.accelerometer_density_m_s2_sqrthz,
+        "orientation": noise.orientation_deg,
+        "velocity": noise.velocity_m_s,
+    }
+    return [name for name, value in configured.items() if value is None]
+
+
+def estimated_scales(
+    data: SmootherInput,
+    nodes: IntArray,
+    states: States,
+    dropped: IntArray,
+    errors: Sequence[CorrelatedError],
+) -> dict[str, float]:
+    """Scales on the stated sigmas that the data contradict; empty: none.
+
+    `states` is the estimate at the nodes, `dropped` the fixes that are left out, `errors` those
+    that are correlated over time.
+    """
+    if data.config.robust.kernel == "none":
+        return {}  # everything is believed, jumps of the fixes too
+    nodes = nodes[:NODES]
+    part = first_nodes(states, len(nodes))
+    graph = build_graph(data, nodes, part, dropped, "none")
+    likelihood = NoiseLikelihood(
+        graph.factors.linearize(to_values(part, data)),
+        graph.kinds,
+        [key_yaw_bias()] if data.yaw_bias else [],
+        nodes,
+        part.R_map_imu,
+        errors,
+        free_components(data),
+    )
+    return contradicted(likelihood)
+
+
+@dataclass
+class _Part:
+    """Information, gradient and squared residuals of one noise level at scale 1."""
+
+    chain: Chain
+    gradient: Array
+    square: float
+    rows: int
+
+
+class NoiseLikelihood:
+    """The restricted likelihood of noise levels of a linearised trajectory."""
+
+    def __init__(
+        self,
+        graph: gtsam.GaussianFactorGraph,
+        kinds: Sequence[str],
+        common_keys: Sequence[int],
+        nodes_ns: IntArray,
+        R_map_imu: Array,
+        errors: Sequence[CorrelatedError],
+        free: Sequence[str],
+    ) -> None:
+        """Sorts the rows of a graph by noise level.
+
+        Args:
+            graph: whitened by the stated noise, without robust weights, over n nodes.
+            kinds: of its factors.
+            common_keys: of the variables that all nodes share.
+            nodes_ns: (n,) stamps.
+            R_map_imu: (n, 3, 3) at which it was linearised.
+            errors: correlated over time.
+            free: names of `COMPONENTS` that are estimated.
+        """
+        self.nodes_ns, self.errors = nodes_ns, tuple(errors)
+        self.width, self.k = STATE + AXES * len(errors), len(common_keys)
+        J, r = linearised(graph, kinds, [e.kind for e in errors], R_map_imu, common_keys)
+        label = np.full(len(r), -1)
+        at = 0
+        for number, kind in enumerate(kinds):
+            factor: Any = graph.at(number)
+            m = factor.rows()
+            for c, name in enumerate(free):
+                of_kind, rows = COMPONENTS[name]
+                if of_kind == kind:
+                    label[at + rows.start : at + rows.stop] = c
+            at += m
+        self.names = [name for c, name in enumerate(free) if (label == c).any()]
+        index = [c for c, name in enumerate(free) if name in self.names]
+        self.fixed = self._part(J, r, label < 0)
+        self.parts = [self._part(J, r, label == c) for c in index]
+
+    def _part(self, J: scipy.sparse.csr_array, r: Array, mine: BoolArray) -> _Part:
+        rows = np.flatnonzero(mine)
+        chain = Chain.zero(len(self.nodes_ns), self.width, self.k)
+        chain.add(J[rows])
+        return _Part(chain, J[rows].T @ r[rows], float(r[rows] @ r[rows]), len(rows))
+
+    def at(self, scales: Array) -> tuple[float, Array]:
+        """-2 log L at scales (m,) of `names`, and its derivatives by their logarithms."""
+        weights = scales**-2.0
+        total = _sum([self.fixed, *self.parts], [1.0, *weights])
+        add_prior(total.chain, self.nodes_ns, self.errors)
+        found = solved(total.chain, total.gradient)
+        cost = total.square + float(total.gradient @ found.step) + found.log_determinant
+        slope = np.zeros(len(scales))
+        for c, (part, weight) in enumerate(zip(self.parts, weights, strict=True)):
+            cost += 2.0 * part.rows * math.log(scales[c])
+            slope[c] = 2.0 * part.rows - 2.0 * weight * _expected(part, found)
+        return cost, slope
+
+
+def _sum(parts: Sequence[_Part], weights: Sequence[float]) -> _Part:
+    """The weighted sum of some parts."""
+
+    def total(of: str) -> Array:
+        return np.asarray(
+            sum(w * getattr(p.chain, of) for p, w in zip(parts, weights, strict=True))
+        )
+
+    return _Part(
+        Chain(total("diagonal"), total("coupling"), total("border"), total("corner")),
+        np.asarray(sum(w * p.gradient for p, w in zip(parts, weights, strict=True))),
+        sum(w * p.square for p, w in zip(parts, weights, strict=True)),
+        0,
+    )
+
+
+def _expected(part: _Part, found: ChainSolution) -> float:
+    """Expected squared residual of the rows of a part, the trajectory's uncertainty included."""
+    chain, d = part.chain, found.step
+    n, w = chain.diagonal.shape[:2]
+    x, common = d[: n * w].reshape(n, w), d[n * w :]
+    second = found.cov + x[:, :, None] * x[:, None]
+    across = found.cov_next + x[:-1, :, None] * x[1:, None]
+    total = part.square + 2.0 * part.gradient @ d
+    total += np.sum(chain.diagonal * second) + 2.0 * np.sum(chain.coupling * across)
+    if len(common):
+        total += 2.0 * np.sum(chain.border * (found.cov_border + x[:, :, None] * common))
+        total += np.sum(chain.corner * (found.cov_corner + np.outer(common, common)))
+    return float(total)
+
+
+def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
+    """The scales that the data set against the stated sigmas; all others are 1."""
+    names = set(likelihood.names)
+    scales, best = fit(likelihood, names)
+    away = {name for name, s in scales.items() if max(s, 1.0 / s) > LARGEST_RIGHT}
+    kept = {name for name in away if fit(likelihood, names - {name})[1] - best > EVIDENCE}
+    return fit(likelihood, kept)[0] if kept else {}
+
+
+def fit(likelihood: NoiseLikelihood, free: Set[str]) -> tuple[dict[str, float], float]:
+    """Scales of the `free` noise levels at the maximum of likelihood times prior.
+
+    The others are 1. Returns them, and -2 log of likelihood times prior.
+    """
+    at = [i for i, name in enumerate(likelihood.names) if name in free]
+    logarithms = np.zeros(len(likelihood.names))
+    begin = likelihood.at(np.exp(logarithms))[0]
+
+    def cost(x: Array) -> tuple[float, Array]:
+        logarithms[at] = x
+        value, slope = likelihood.at(np.exp(logarithms))
+        # Less the value at the start: the optimiser's tolerance is relative.
+        return (
+            value - begin + float(x @ x) / LOG_SPREAD**2,
+            slope[at] + 2.0 * x / LOG_SPREAD**2,
+        )
+
+    if not at:
+        return {}, begin
+    found = minimize(
+        cost,
+        np.zeros(len(at)),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[tuple(np.log(SCALE_BOUNDS))] * len(at),
+        options={"ftol": 1e-9, "gtol": 0.5, "maxiter": 30},
+    )
+    scales = np.exp(np.asarray(found.x)).tolist()
+    names = [likelihood.names[i] for i in at]
+    return dict(zip(names, scales, strict=True)), float(found.fun) + begin

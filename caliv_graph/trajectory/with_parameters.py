@@ -1,0 +1,49 @@
+"""More parameters of the input in the chain of a trajectory (`README.md`, section 13)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from caliv_graph.trajectory.build import TrajectoryGraph
+from caliv_graph.trajectory.columns import parameter_columns
+from caliv_graph.trajectory.correlated_step import chain_with_errors
+from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.solve import Estimate, chain_of
+from caliv_graph.trajectory.uncertain import Settled
+
+
+def with_parameters(
+    smoothed: SmoothedTrajectory, parameters: Sequence[InputParameter]
+) -> SmoothedTrajectory:
+    """The trajectory with more parameters in its chain, without a prior: none is estimated.
+
+    `joint` of the result can be asked for their information and gradient. Those that the chain has
+    already stay as they are.
+    """
+    known = {p.parameter.name for p in smoothed.parameters}
+    more = tuple(UncertainParameter(p) for p in parameters if p.name not in known)
+    if not more:
+        return smoothed
+    every = (*smoothed.parameters, *more)
+    graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
+    columns = parameter_columns(
+        smoothed.data,
+        smoothed.nodes_ns,
+        smoothed.states,
+        graph,
+        smoothed.values,
+        smoothed.gnss_dropped,
+        [p.parameter for p in every],
+    )
+    linear = smoothed.graph.linearize(smoothed.values)
+    if smoothed.correlated:
+        estimate = Estimate(smoothed.states, graph, smoothed.values)
+        settled = Settled(smoothed.data, estimate, every, columns)
+        chain = chain_with_errors(
+            settled, linear, smoothed.nodes_ns, smoothed.correlated, smoothed.errors
+        )
+    else:
+        chain = chain_of(linear, len(smoothed.nodes_ns), smoothed.data.yaw_bias, columns)
+    return replace(smoothed, chain=chain, parameters=every)

@@ -1,0 +1,131 @@
+"""Noise levels from the residuals of the LiDARs along smoothed trajectories."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from caliv_graph.calibration.evidence import Evidence
+from caliv_graph.calibration.sensor_noise import LEVELS, SLOW, estimated, with_floors
+from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
+from caliv_graph.config.model import NoiseConfig
+from caliv_graph.products import Array, GroundObservation
+from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
+
+POSES = 16
+STEPS = 48
+STAMPS = np.arange(STEPS) * 500_000_000
+
+
+def gain() -> Array:
+    """(6 POSES, 3, STEPS): positions follow the errors of the fixes, averaged over two seconds."""
+    out = np.zeros((POSES, 6, 3, STEPS))
+    for i in range(POSES):
+        near = np.exp(-0.5 * ((np.arange(STEPS) - 3.0 * i) / 2.0) ** 2)
+        out[i, 3:] = np.eye(3)[:, :, None] * near / near.sum()
+    return out.reshape(6 * POSES, 3, STEPS)
+
+
+def evidence(seed: int, heave_m: float, error: CorrelatedError | None) -> Evidence:
+    """Two observations of every pose, of 2 mm and 0.3 mrad; an unknown shift of them all."""
+    rng = np.random.default_rng(seed)
+    n = 6 * POSES
+    by_pose = np.vstack([np.eye(n), np.eye(n)])
+    registration = np.diag(np.tile([0.3e-3] * 3 + [2e-3] * 3, 2 * POSES) ** 2)
+    known = by_pose @ np.diag(np.tile([0.2e-3] * 3 + [1e-3] * 3, POSES) ** 2) @ by_pose.T
+    lift = by_pose[:, 5::6]
+    effects = ErrorEffects("gnss", STAMPS, gain())
+    cov = known + registration + heave_m**2 * lift @ lift.T
+    if error is not None:
+        for axis, sigma in enumerate(error.sigmas):
+            moved = by_pose @ effects.gain[:, axis]
+            cov += sigma**2 * smoothed_in_time(moved, STAMPS, error.time_s) @ moved.T
+    residuals = np.linalg.cholesky(cov) @ rng.standard_normal(2 * n)
+    design = np.tile(np.eye(6), (2 * POSES, 1))
+    observed = Observed(residuals, design, np.full(6, 1e-2), known)
+    white = {"heave": lift @ lift.T, "registration": registration}
+    return Evidence(observed, by_pose, white, [(np.arange(n), {"gnss": effects})])
+
+
+def test_the_slope_of_the_likelihood_is_right() -> None:
+    made = evidence(0, 5e-3, None)
+    parts = [*made.white.values(), made.slow("gnss", (0, 1), 8.0)]
+    x = np.log([4e-3, 1.2, 6e-3])
+    _, slope = made.observed.cost(parts, x)
+
+    for i in range(3):
+        more, less = (made.observed.cost(parts, x + s * np.eye(3)[i])[0] for s in (1e-4, -1e-4))
+        assert slope[i] == pytest.approx((more - less) / 2e-4, rel=1e-4, abs=1e-4)
+
+
+def test_variances_are_found_and_parameters_do_not_count_as_precision() -> None:
+    rng = np.random.default_rng(3)
+    design = rng.standard_normal((60, 20))
+    residuals = design @ rng.standard_normal(20) + 0.1 * rng.standard_normal(60)
+    observed = Observed(residuals, design, np.full(20, 1e-6), 1e-12 * np.eye(60))
+    unknown = Unknown(1.0, math.log(10.0), (1e-4, 1e4))
+
+    (sigma,), _ = maximise(lambda x: observed.cost([np.eye(60)], x), [unknown], np.ones(1))
+
+    orthogonal = np.linalg.qr(design, mode="complete")[0][:, 20:]
+    assert sigma == pytest.approx(np.sqrt(np.mean((orthogonal.T @ residuals) ** 2)), rel=0.03)
+
+
+@pytest.mark.parametrize("heave_m", [2.5e-3, 10e-3])
+def test_heave_is_found_and_no_error_where_there_is_none(heave_m: float) -> None:
+    found = estimated(evidence(1, heave_m, None), NoiseConfig())
+
+    assert found.heave_m == pytest.approx(heave_m, rel=0.35)
+    assert found.correlated == ()
+    sources = {level.name: level.source for level in found.levels}
+    assert sources["heave"] == "residuals of the LiDARs"
+    assert sources["ground_normal"] == "the usual figure"
+
+
+def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
+    true = CorrelatedError("gnss", (0.02, 0.02, 0.015), 10.0)
+
+    found = estimated(evidence(2, 5e-3, true), NoiseConfig())
+
+    (error,) = found.correlated
+    assert error.kind == "gnss"
+    assert error.sigmas == pytest.approx(true.sigmas, rel=0.9)
+    assert error.time_s == pytest.approx(10.0, rel=1.0)
+    assert found.heave_m == pytest.approx(5e-3, rel=0.35)
+    names = {level.name: level for level in found.levels}
+    assert names["gnss_correlated_horizontal"].time_s == error.time_s
+
+
+def test_levels_of_the_config_are_kept() -> None:
+    true = CorrelatedError("gnss", (0.02, 0.02, 0.015), 10.0)
+    config = NoiseConfig(heave_m=0.004, gnss_correlated_horizontal_m=0.0)
+
+    found = estimated(evidence(2, 5e-3, true), config)
+
+    assert found.heave_m == 0.004
+    assert found.correlated == ()
+    assert {level.source for level in found.levels if level.name == "heave"} == {"config"}
+
+
+def test_every_axis_of_an_error_has_a_sigma() -> None:
+    for slow in SLOW.values():
+        assert sorted(axis for group in slow.groups for axis in group) == [0, 1, 2]
+    assert all(
+        low < level.median < high for level in LEVELS.values() for low, high in [level.bounds]
+    )
+
+
+def test_floors_are_replaced() -> None:
+    observation = GroundObservation(
+        "front", 0, 0, np.array([0.0, 0.0, 1.0]), 2.0, np.eye(2, 3), np.eye(3), np.zeros(3), 100
+    )
+    before, after = np.array([1e-3, 1e-3, 2e-3]), np.array([2e-3, 2e-3, 1e-3])
+
+    (changed,) = with_floors([observation], before, after)
+
+    expected = replace(observation).cov + np.diag(after**2 - before**2)
+    assert changed.cov == pytest.approx(expected)

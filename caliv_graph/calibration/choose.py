@@ -103,7 +103,7 @@ def choose_static(
     worse = [i for i in others if math.isfinite(scatter[i]) and i not in same]
     of = candidates[best].found
     if of.doubtful and scatter[best] > MOVES_M and cause_of(found[best], config) is None:
-        raise TargetError(_why_none_stands(candidates, scatter))
+        raise TargetError(*_why_none_stands(candidates, scatter))
     reasons = []
     if same:
         listed = ", ".join(f"{candidates[i].found} (to {scatter[i]:.2f} m)" for i in same)
@@ -185,7 +185,9 @@ def _late(
     return first if max(map(abs, first.late_s.values())) > LATE_S else None
 
 
-def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[float]) -> str:
+def _why_none_stands(
+    candidates: Sequence[TriedCandidate], scatter: Sequence[float]
+) -> tuple[str, str]:
     listed = ", ".join(
         f"{candidate.found} (its clouds scatter by {of:.2f} m)"
         for candidate, of in zip(candidates, scatter, strict=True)
@@ -193,8 +195,9 @@ def _why_none_stands(candidates: Sequence[TriedCandidate], scatter: Sequence[flo
     )
     return (
         f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
-        "guess of one LiDAR explains it: the objects move, or the poses are wrong. Check the "
-        "trajectory with 'caliv-graph inspect', and drive past a chair that nobody stands beside"
+        "guess of one LiDAR explains it: the objects move, or the poses are wrong",
+        "Check the trajectory with 'caliv-graph inspect', and drive past a chair that nobody "
+        "stands beside",
     )
 
 

@@ -19,6 +19,7 @@ from caliv_graph.products import Array, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
+from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
 ParameterValue = Array | gtsam.Rot3
 
@@ -32,8 +33,7 @@ USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
 }
-"""A parameter that nobody measured is determined if the drive knows it better than the usual guess
-of a mount."""
+"""A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,11 @@ def estimated_parameters(
         variance = np.diag(own)
         # What the drive knows is what the result knows beyond the prior.
         by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
-        limit = np.minimum(prior.sigmas, USUAL_SIGMAS[name])
+        limit = UNDETERMINED_RATIO * np.minimum(prior.sigmas, USUAL_SIGMAS[name])
         determined = by_drive > limit**-2.0
         # Of what nobody knows the linearised graph knows too much: the noise of the poses' tilt
         # looks like one that would tell the height of the antenna (`README.md`, section 17).
-        unknown = ~determined & (prior.sigmas > USUAL_SIGMAS[name])
+        unknown = ~determined & (prior.sigmas > USUAL_SIGMAS[name]) & (name == LEVER_ARM.name)
         sigma = np.where(unknown, prior.sigmas, np.sqrt(variance))
         x, y, z = determined.tolist()
         out[name] = VehicleParameter(np.asarray(value), sigma, (x, y, z))

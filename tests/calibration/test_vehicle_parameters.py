@@ -11,6 +11,7 @@ import pytest
 
 from caliv_graph.calibration.graph import initial_values, motion_graph
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, pose_problem
+from caliv_graph.calibration.vehicle_parameters import ParameterPrior, estimated_parameters
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm
 from caliv_graph.products import Array, TargetCloud, TargetObservation
@@ -146,3 +147,33 @@ def test_the_factor_predicts_the_poses_of_a_moved_parameter(name: str) -> None:
     scale = np.abs(expected).max()
     assert scale > 1e-4
     np.testing.assert_allclose(seen, expected, atol=0.05 * scale)
+
+
+@pytest.mark.parametrize(
+    ("prior_m", "sigma_m", "determined", "reported_m"),
+    [
+        (0.01, 0.004, True, 0.004),  # the data alone: 4.4 mm
+        (0.01, 0.008, False, 0.008),  # 13 mm
+        (2.0, 0.02, True, 0.02),
+        (2.0, 0.5, False, 2.0),  # worse than a usual guess: nothing that a tilt's noise would not
+    ],
+)
+def test_verdicts_on_a_lever_arm(
+    prior_m: float, sigma_m: float, determined: bool, reported_m: float
+) -> None:
+    class Solved:
+        """A solved problem in which the lever arm has one sigma."""
+
+        def covariance_of(self, key: int, cov: Array) -> Array:
+            return np.eye(3) * sigma_m**2
+
+    values = gtsam.Values()
+    values.insert(key_lever_arm(), np.array([1.0, 2.0, 3.0]))
+    prior = ParameterPrior(np.zeros(3), np.eye(3) * prior_m**2, np.full(3, prior_m))
+
+    found = estimated_parameters({"gnss.lever_arm": prior}, values, Solved(), np.zeros((6, 6)))
+
+    arm = found["gnss.lever_arm"]
+    assert arm.value.tolist() == [1.0, 2.0, 3.0]
+    assert arm.determined == (determined,) * 3
+    assert arm.sigma == pytest.approx([reported_m] * 3)

@@ -147,7 +147,7 @@ def _step(
     """The values after one damped step; unchanged if the damped system is singular."""
     if damping == 0.0:
         try:
-            return values.retract(_solved(linear, ordering))
+            return values.retract(linear.optimize(ordering))
         except RuntimeError:  # GTSAM's report of a singular system
             damping = MIN_DAMPING
     damped = linear.clone()
@@ -160,20 +160,9 @@ def _step(
         damped.add(gtsam.JacobianFactor(key_velocity(i), root * np.eye(3), np.zeros(3), unit3))
         damped.add(gtsam.JacobianFactor(key_bias(i), bias, np.zeros(6), unit6))
     try:
-        return values.retract(_solved(damped, ordering))
+        return values.retract(damped.optimize(ordering))
     except RuntimeError:
         return values
-
-
-def _solved(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
-    """The solution of a linear graph, by QR where GTSAM's Cholesky takes it for singular.
-
-    It does where fixes that are a metre off have small robust weights beside the IMU's factors.
-    """
-    try:
-        return linear.optimize(ordering)
-    except RuntimeError:
-        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR).optimize()
 
 
 def chain_of(

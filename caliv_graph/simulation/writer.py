@@ -33,6 +33,10 @@ BAG_FOLDER = "drive"
 TRAJECTORY_PERIOD_NS = NANOSECONDS_PER_SECOND // 100
 """Period of the true poses written beside a bag, in addition to those at cloud stamps."""
 
+EXACT_M, EXACT_DEG = 1e-4, 1e-3
+"""Sigmas of lever arm and IMU rotation in the written config: the values are those that were
+simulated, and no error of theirs is drawn."""
+
 TOPIC_IMU = "/imu/data"
 TOPIC_GNSS = "/gnss/fix"
 TOPIC_TWIST = "/vehicle/twist"
@@ -160,9 +164,13 @@ def _motion_sections(scenario: Scenario) -> dict[str, Any]:
         sections["imu"] = {
             "T_vehicle_imu": {"xyz": list(mounting.xyz), "rpy_deg": list(mounting.rpy_deg)}
         }
+        if any(mounting.rpy_deg) or any(mounting.xyz):
+            sections["imu"]["rotation_sigma_deg"] = EXACT_DEG
     if scenario.gnss.enabled:
         topics["gnss"] = TOPIC_GNSS
         sections["gnss"] = {"lever_arm": list(scenario.gnss.lever_arm)}
+        if any(scenario.gnss.lever_arm):
+            sections["gnss"]["lever_arm_sigma"] = EXACT_M
     if scenario.velocity.enabled:
         topics["twist"] = TOPIC_TWIST
     return {"topics": topics, **sections}

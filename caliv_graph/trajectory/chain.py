@@ -226,7 +226,7 @@ def jacobian(
 
 def beside(J: scipy.sparse.csr_array, columns: Array) -> scipy.sparse.csr_array:
     """J (r, c) with more columns (r, p) after its own."""
-    return scipy.sparse.csr_array(scipy.sparse.hstack([J, columns], format="csr"))
+    return scipy.sparse.csr_array(scipy.sparse.hstack([J, scipy.sparse.csr_array(columns)]))
 
 
 def inverse_of(A: Array) -> Array:

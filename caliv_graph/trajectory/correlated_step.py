@@ -7,7 +7,7 @@ milliradians: what is neglected is below a micrometre.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -158,6 +158,8 @@ def chain_with_errors(
     pull[:-1] += np.einsum("nij,nj->ni", prior.coupling, of_errors[1:])
     pull[1:] += np.einsum("nji,nj->ni", prior.coupling, of_errors[:-1])
     chain.border[:, :, -1] -= pull
-    chain.diagonal += prior.diagonal
-    chain.coupling += prior.coupling
-    return chain
+    return replace(
+        chain,
+        diagonal=chain.diagonal + prior.diagonal,
+        coupling=chain.coupling + prior.coupling,
+    )

@@ -15,7 +15,9 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
+from caliv_graph.trajectory.imu import exp_so3
 from caliv_graph.trajectory.noise import stated
+from caliv_graph.trajectory.parameters import IMU_ROTATION
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -76,6 +78,7 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
     at = np.linspace(begin, end, count).astype(np.int64)
     R, _ = trajectory.poses_at(at)
+    R = R @ _as_configured(trajectory)
     up = R[:, 2, :]  # e_z of the map in vehicle axes
     heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     before, after = np.maximum(at - CLIMB_WINDOW_NS, begin), np.minimum(at + CLIMB_WINDOW_NS, end)
@@ -122,6 +125,18 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
         sigma_rad=np.sqrt(np.array([cov[1, 1], cov[0, 0]]) + body**2),
         given=not isinstance(trajectory, SmoothedTrajectory),
     )
+
+
+def _as_configured(trajectory: VehicleTrajectory) -> Array:
+    """(3, 3) from the vehicle frame by the configured T_vehicle_imu to that by the estimated one.
+
+    A rotation of the IMU with a sigma gives way to velocities, and hides a part of its error.
+    """
+    uncertain = trajectory.parameters if isinstance(trajectory, SmoothedTrajectory) else ()
+    for each in uncertain:
+        if each.parameter is IMU_ROTATION and each.offset is not None:
+            return np.asarray(exp_so3(each.offset[None])[0])
+    return np.eye(3)
 
 
 def _attitude_cov(trajectory: VehicleTrajectory) -> Array:

@@ -21,8 +21,9 @@ from scipy.optimize import minimize
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.trajectory.build import build_graph, to_values
-from caliv_graph.trajectory.chain import STATE, Chain
+from caliv_graph.trajectory.chain import STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import ChainSolution, solved
+from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import (
     AXES,
     CorrelatedError,
@@ -30,6 +31,7 @@ from caliv_graph.trajectory.correlated import (
     linearised,
 )
 from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
 from caliv_graph.trajectory.smoothed import States, first_nodes
 
 COMPONENTS: Mapping[str, tuple[str, slice]] = {
@@ -58,6 +60,9 @@ drive of a minute tells the noise of a gyroscope to 8 percent, and that of fixes
 EVIDENCE = 9.0
 """Increase of -2 log L, by holding a scale at 1, from which the stated sigma counts as wrong: 3
 sigma. Beside a slow error of the fixes, the noise of an accelerometer is hardly known."""
+
+UNKNOWN_SIGMA = 3.0
+"""Prior of a lever arm (m) and of the IMU's rotation (rad) that are free: larger than any error."""
 
 NODES = 1200
 """First nodes of the drive that are used: two minutes."""
@@ -94,14 +99,19 @@ def estimated_scales(
     nodes = nodes[:NODES]
     part = first_nodes(states, len(nodes))
     graph = build_graph(data, nodes, part, dropped, "none")
+    values = to_values(part, data)
+    # Free, whatever sigma they have: a lever arm that was typed wrong is no noise.
+    typed = [IMU_ROTATION] if data.positions is None else [LEVER_ARM, IMU_ROTATION]
+    columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)
     likelihood = NoiseLikelihood(
-        graph.factors.linearize(to_values(part, data)),
+        graph.factors.linearize(values),
         graph.kinds,
         [key_yaw_bias()] if data.yaw_bias else [],
         nodes,
         part.R_map_imu,
         errors,
         free_components(data),
+        columns,
     )
     return contradicted(likelihood)
 
@@ -128,6 +138,7 @@ class NoiseLikelihood:
         R_map_imu: Array,
         errors: Sequence[CorrelatedError],
         free: Sequence[str],
+        columns: Array | None = None,
     ) -> None:
         """Sorts the rows of a graph by noise level.
 
@@ -139,10 +150,16 @@ class NoiseLikelihood:
             R_map_imu: (n, 3, 3) at which it was linearised.
             errors: correlated over time.
             free: names of `COMPONENTS` that are estimated.
+            columns: (rows, p) derivatives of the residuals by parameters that are free, in units of
+                which `UNKNOWN_SIGMA` is a prior without weight.
         """
         self.nodes_ns, self.errors = nodes_ns, tuple(errors)
-        self.width, self.k = STATE + AXES * len(errors), len(common_keys)
         J, r = linearised(graph, kinds, [e.kind for e in errors], R_map_imu, common_keys)
+        self.parameters = 0 if columns is None else columns.shape[1]
+        if columns is not None:
+            J = beside(J, columns)
+        self.width = STATE + AXES * len(errors)
+        self.k = len(common_keys) + self.parameters
         label = np.full(len(r), -1)
         at = 0
         for number, kind in enumerate(kinds):
@@ -169,6 +186,8 @@ class NoiseLikelihood:
         weights = scales**-2.0
         total = _sum([self.fixed, *self.parts], [1.0, *weights])
         add_prior(total.chain, self.nodes_ns, self.errors)
+        at = np.arange(self.k - self.parameters, self.k)
+        total.chain.corner[at, at] += UNKNOWN_SIGMA**-2.0
         found = solved(total.chain, total.gradient)
         cost = total.square + float(total.gradient @ found.step) + found.log_determinant
         slope = np.zeros(len(scales))

@@ -11,6 +11,7 @@ import pytest
 from caliv_graph.conventions import key_bias, key_imu, key_velocity
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.build import build_graph
+from caliv_graph.trajectory.chain import STATE
 from caliv_graph.trajectory.chain_solution import inverse_columns, solved
 from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
 from caliv_graph.trajectory.effects import STEP_NS, error_effects, smoothed_in_time
@@ -18,7 +19,7 @@ from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.variances import COMPONENTS, NoiseLikelihood
 from tests.trajectory.motions import Course, Sensors, arc_drive, config_for, record, stamps
-from tests.trajectory.test_chain import STATE, random_chain
+from tests.trajectory.test_chain import random_chain
 
 COURSE = Course(arc_drive(8.0))
 WANTED = stamps(7.0, 2.0)[2:]
@@ -102,7 +103,7 @@ def test_stated_sigmas_that_hold_are_kept() -> None:
 
 def test_stated_sigmas_that_the_data_contradict_are_scaled() -> None:
     wrong = {"gnss_horizontal": 0.5, "gnss_vertical": 2.0}
-    trajectory = smoothed(recorded(**wrong))
+    trajectory = smoothed(recorded(gnss_horizontal=0.5, gnss_vertical=2.0))
 
     assert trajectory.data is not None
     found = trajectory.data.scales
@@ -201,5 +202,6 @@ def test_correlated_errors_of_the_config_are_used() -> None:
 
     (error,) = trajectory.correlated
     assert (error.kind, error.sigmas[:2], error.time_s) == ("gnss", (0.03, 0.03), 20.0)
+    assert trajectory.trajectory.cov is not None
     position = np.sqrt(np.diagonal(trajectory.trajectory.cov, axis1=1, axis2=2))[:, 3:5]
     assert np.median(position) == pytest.approx(0.03, rel=0.2)

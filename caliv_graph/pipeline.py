@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
 from caliv_graph.calibration.choose import choose_static, displaced
-from caliv_graph.calibration.estimate import estimate
+from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
@@ -240,12 +240,12 @@ def _calibrate(
     guessed = config if prior is None else starting_from(config, prior, digests)
 
     prepared = prepare(recordings, guessed, motions, progress)
-    solution = estimate(
+    solution, trajectories = estimate_with_noise(
         prepared.observations, prepared.trajectories, prepared.config, progress, prepared.grounds
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(
-        calibration, solution, recordings, prepared.trajectories, motions, prepared.config
+        calibration, solution, recordings, trajectories, motions, prepared.config
     )
     calibration = contradicted(calibration, prepared.findings)
     if prepared.contradictions:
@@ -256,7 +256,7 @@ def _calibrate(
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)
     record = RunRecord(
         drives=tuple(Path(recording.name).absolute().name for recording in recordings),
-        trajectories=prepared.trajectories,
+        trajectories=trajectories,
         grounds=prepared.grounds,
         scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
     )

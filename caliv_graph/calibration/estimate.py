@@ -50,6 +50,17 @@ def estimate(
     Raises:
         RegistrationError, SolveError: it could not be done.
     """
+    return estimate_with_noise(observations, trajectories, config, progress, grounds)[0]
+
+
+def estimate_with_noise(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+    grounds: Sequence[GroundObservation] = (),
+) -> tuple[Solution, tuple[VehicleTrajectory, ...]]:
+    """`estimate`, and the trajectories with the noise of the sensors that it was solved with."""
     used = usable(observations)
     problem = pose_problem(used, trajectories, config)
     if config.solve.mode == "staged":
@@ -67,8 +78,8 @@ def _estimate(
     grounds: tuple[GroundObservation, ...],
     config: Config,
     progress: Progress,
-) -> Solution:
-    """The stages of `estimate`, timed."""
+) -> tuple[Solution, tuple[VehicleTrajectory, ...]]:
+    """The stages of `estimate_with_noise`, timed."""
     limit = config.registration.max_iterations
     rough = rough_solve(problem, observations, grounds, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
@@ -117,7 +128,8 @@ def _estimate(
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     warnings = (*rough.warnings, *alike, *_unconverged(solution.registrations))
-    return replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+    solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+    return solution, tuple(trajectories)
 
 
 def _deskewed(

@@ -16,7 +16,6 @@ import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.ground_factors import (
-    SWAY_SIGMA_RAD,
     ground_plane_factor,
     parallel_factor,
     standing_factor,
@@ -102,7 +101,7 @@ def ground_graph(
     observations: Sequence[GroundObservation],
     config: GroundConfig,
     weights: GroundWeights | None = None,
-    sway_rad: float = SWAY_SIGMA_RAD,
+    sway_rad: float | None = None,
 ) -> CalibrationGraph:
     """All factors of the ground; empty if it is not to be used or was not seen.
 

@@ -146,11 +146,12 @@ def standing_factor(
     centre: Array,
     vehicle_height_m: float,
     weight: float = 1.0,
-    heave_m: float = HEAVE_SIGMA_M,
+    heave_m: float | None = None,
 ) -> gtsam.CustomFactor:
     """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
 
-    Its sigma is the heave of one scan, `heave_m`; the error (`key_error`) is common to the drive.
+    Its sigma is the heave of one scan, `heave_m` (None: the usual one); the error (`key_error`) is
+    common to the drive.
     `centre` (2,) metres is where the plane's height is defined; `weight` is on the information.
     """
 
@@ -165,7 +166,8 @@ def standing_factor(
             jacobians[2] = -np.ones((1, 1))
         return np.asarray(height - vehicle_height_m - values.atVector(key_error))
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, heave_m / math.sqrt(weight))
+    sigma_m = HEAVE_SIGMA_M if heave_m is None else heave_m
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_m / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_error], error)
 
 
@@ -174,9 +176,12 @@ def parallel_factor(
     key_plane: int,
     key_tilt: int,
     weight: float = 1.0,
-    sway_rad: float = SWAY_SIGMA_RAD,
+    sway_rad: float | None = None,
 ) -> gtsam.CustomFactor:
-    """Role c: `r` = x and y of the plane's normal in the vehicle frame, less the drive's tilt."""
+    """Role c: `r` = x and y of the plane's normal in the vehicle frame, less the drive's tilt.
+
+    Its sigma is the sway of one scan, `sway_rad` (None: the usual one).
+    """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         R_vehicle_map = values.atPose3(key_pose).rotation().matrix().T
@@ -190,5 +195,6 @@ def parallel_factor(
             jacobians[2] = -np.eye(2)
         return np.asarray(n_vehicle[:2] - values.atVector(key_tilt))
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, sway_rad / math.sqrt(weight))
+    sigma_rad = SWAY_SIGMA_RAD if sway_rad is None else sway_rad
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_tilt], error)

@@ -319,8 +319,12 @@ def _pose_covariance(
     return np.asarray(known)
 
 
-def evenly_over_drives(problem: Problem, sound: BoolArray, most: int = CLOUDS_USED) -> IntArray:
-    """At most so many sound clouds, evenly over the drives, in any order of the LiDARs."""
+def evenly_over_drives(problem: Problem, sound: BoolArray, most: int | None = None) -> IntArray:
+    """At most so many sound clouds, evenly over the drives, in any order of the LiDARs.
+
+    `most` None: `CLOUDS_USED`.
+    """
+    most = CLOUDS_USED if most is None else most
     usable = np.flatnonzero(sound)
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
     step = max(1, math.ceil(len(usable) / most))

@@ -42,6 +42,11 @@ nor data give it: that of a car at walking pace on asphalt. The smoothed traject
 it; given poses do."""
 
 
+def usual_heave_m() -> float:
+    """1 sigma of the heave of a vehicle of which nothing else is known."""
+    return HEAVE_SIGMA_M
+
+
 @dataclass(frozen=True)
 class Problem:
     """The bookkeeping of one calibration; arrays over clouds are in order of placement, cloud.
@@ -95,7 +100,7 @@ class Problem:
     twists: Array | None = None
     stated_cov: Array | None = None
     views: Array | None = None
-    heave_m: float = HEAVE_SIGMA_M
+    heave_m: float = field(default_factory=usual_heave_m)
 
     @property
     def clouds(self) -> int:

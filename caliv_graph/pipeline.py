@@ -245,7 +245,7 @@ def _calibrate(
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(
-        calibration, solution, recordings, trajectories, motions, prepared.config
+        calibration, solution, recordings, prepared.trajectories, motions, prepared.config
     )
     calibration = contradicted(calibration, prepared.findings)
     if prepared.contradictions:

@@ -148,7 +148,9 @@ def without_bias(H: Array, gradient: Array, directions: Array) -> tuple[Array, A
     return H - seen @ scipy.linalg.cho_solve(factor, seen.T), gradient - seen @ pull
 
 
-def fit_bias_sizes(reduced: Reduced, biases: RangeBiases, prior: Array) -> BiasSizes:
+def fit_bias_sizes(
+    reduced: Reduced, biases: RangeBiases, prior: Array, offset_m: float | None = None
+) -> BiasSizes:
     """The sigmas of the biases: root mean squares of their posterior.
 
     By the restricted likelihood: extrinsics, poses, targets and shape are integrated out, so that a
@@ -158,17 +160,19 @@ def fit_bias_sizes(reduced: Reduced, biases: RangeBiases, prior: Array) -> BiasS
         reduced: the linearised problem with the clouds' quadratic, no bias eliminated.
         biases: of the same clouds.
         prior: (6n, 6n) information of the guesses, tangents of the graph's extrinsics.
+        offset_m: 1 sigma of the offsets, if the user knows it.
     """
+    offsets_m = OFFSETS_M if offset_m is None else np.array([offset_m])
     information, pull = _information(reduced, np.hstack([biases.offsets, biases.smooth]), prior)
     smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)
     count = biases.offsets.shape[1]
-    cost = np.zeros((len(OFFSETS_M), len(smooths)))
-    for i, offset_m in enumerate(OFFSETS_M):
+    cost = np.zeros((len(offsets_m), len(smooths)))
+    for i, each_m in enumerate(offsets_m):
         for k, smooth in enumerate(smooths):
             sigma = np.full(len(pull), smooth)
-            sigma[:count] = offset_m
+            sigma[:count] = each_m
             cost[i, k] = _cost(sigma[:, None] * information * sigma, sigma * pull)
-    cost += 0.5 * (np.log(OFFSETS_M / TYPICAL_OFFSET_M) / LOG_SPREAD)[:, None] ** 2
+    cost += 0.5 * (np.log(offsets_m / TYPICAL_OFFSET_M) / LOG_SPREAD)[:, None] ** 2
     if biases.smooth.shape[1]:
         cost += 0.5 * (np.log(smooths / TYPICAL_SMOOTH) / LOG_SPREAD) ** 2
     weights = np.exp(cost.min() - cost)
@@ -176,9 +180,9 @@ def fit_bias_sizes(reduced: Reduced, biases: RangeBiases, prior: Array) -> BiasS
     of_offsets = weights.sum(axis=1)
     least = int(np.searchsorted(np.cumsum(of_offsets), 1.0 - SURE))
     return BiasSizes(
-        offset_m=float(np.sqrt(of_offsets @ OFFSETS_M**2)),
+        offset_m=float(np.sqrt(of_offsets @ offsets_m**2)),
         smooth=float(np.sqrt(weights.sum(axis=0) @ smooths**2)),
-        least_m=float(OFFSETS_M[least]),
+        least_m=float(offsets_m[least]) if offset_m is None else 0.0,
     )
 
 

@@ -156,7 +156,10 @@ class _Loop:
         """Estimates the sigmas of the biases at a linearisation, and applies them to that."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
         self.state.bias_sizes = fit_bias_sizes(
-            reduced, shapes.biases, reduced.in_tangents(self.prior)
+            reduced,
+            shapes.biases,
+            reduced.in_tangents(self.prior),
+            self.state.config.noise.lidar_range_bias_m,
         )
         return self._without_bias(shapes, lines)
 

@@ -169,6 +169,11 @@ class NoiseConfig(Section):
     """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
 
     lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
+    lidar_range_bias_m: Positive | None = Field(
+        None,
+        description="metres, how much all ranges of a LiDAR on one target are off, 1 sigma; "
+        "absent: integrated over, with the few millimetres of data sheets as the prior",
+    )
     pose_position_m: Positive | None = Field(
         None,
         description="metres, white error of each given pose; absent: its message, or fitted",

@@ -64,8 +64,8 @@ sigma. Beside a slow error of the fixes, the noise of an accelerometer is hardly
 UNKNOWN_SIGMA = 3.0
 """Prior of a lever arm (m) and of the IMU's rotation (rad) that are free: larger than any error."""
 
-NODES = 1200
-"""First nodes of the drive that are used: two minutes."""
+NODES = 600
+"""First nodes of the drive that are used: a minute, which tells the noise to some percent."""
 
 
 def free_components(data: SmootherInput) -> list[str]:

@@ -266,6 +266,10 @@ def test_offsets_that_the_place_of_a_target_makes_up_for_say_nothing() -> None:
     # The root mean square of a log-normal distribution, but for its tail beyond 30 mm.
     assert found.offset_m == pytest.approx(TYPICAL_OFFSET_M * np.exp(LOG_SPREAD**2), rel=0.2)
     assert found.least_m < 0.5e-3
+    # Who knows his LiDARs is believed.
+    known = fit_bias_sizes(reduced, RangeBiases(common, np.zeros((24, 0))), prior, 0.001)
+    assert known.offset_m == pytest.approx(0.001)
+    assert known.least_m == 0.0
 
 
 def test_turned_faces_are_told_from_offsets() -> None:

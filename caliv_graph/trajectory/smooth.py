@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
+import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
-from caliv_graph.trajectory.correlated_step import step_with_errors
+from caliv_graph.trajectory.correlated_step import WithErrors, step_with_errors
 from caliv_graph.trajectory.initial import first_states
 from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
 from caliv_graph.trajectory.measurements import nearest_node
@@ -83,20 +84,14 @@ def smooth_trajectory(
     if parameters:
         kernel = data.config.robust.kernel
         settled = settle(data, nodes, estimate, robust.dropped, kernel, parameters)
-        data, estimate, parameters = settled.data, settled.estimate, settled.parameters
+        data, estimate = settled.data, settled.estimate
     linear = estimate.graph.factors.linearize(estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
-    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
-    cov = vehicle_covariances(settled, cov_imu) if parameters else Ad @ cov_imu @ Ad.T
-    chain = chain_of(linear, len(nodes), data.yaw_bias, settled.columns)
-    found_errors = np.zeros((len(nodes), 0))
-    if errors:
-        step = step_with_errors(settled, nodes, robust.dropped, errors)
-        settled, cov, chain, found_errors = step.settled, step.cov, step.chain, step.errors
-        data, estimate, parameters = settled.data, settled.estimate, settled.parameters
+    last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)
+    data, estimate = last.settled.data, last.settled.estimate
     warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
-        trajectory=_at_wanted(data, wanted, nodes, estimate.states, cov),
+        trajectory=_at_wanted(data, wanted, nodes, estimate.states, last.cov),
         lost_ns=tuple(lost.tolist()),
         warnings=tuple(warnings),
         noise_sources=noise_sources(data),
@@ -109,15 +104,39 @@ def smooth_trajectory(
         origin_deg_m=None if positions is None else positions.origin_deg_m,
         graph=estimate.graph.factors,
         values=estimate.values,
-        chain=chain,
+        chain=last.chain,
         inertial=data.inertial,
         data=data,
         gnss_dropped=robust.dropped,
         factor_kinds=tuple(estimate.graph.kinds),
-        parameters=parameters,
+        parameters=last.settled.parameters,
         correlated=tuple(errors),
-        errors=found_errors,
+        errors=last.errors,
     )
+
+
+def _last_step(
+    settled: Settled,
+    linear: gtsam.GaussianFactorGraph,
+    cov_imu: Array,
+    nodes: IntArray,
+    dropped: IntArray,
+    errors: Sequence[CorrelatedError],
+) -> WithErrors:
+    """The estimate with its covariance and chain, after a step with correlated errors if any.
+
+    `linear` is the settled graph, `cov_imu` (n, 6, 6) its covariances where parameters are known.
+    """
+    if errors:
+        return step_with_errors(settled, nodes, dropped, errors)
+    data = settled.data
+    if settled.parameters:
+        cov = vehicle_covariances(settled, cov_imu)
+    else:
+        Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+        cov = Ad @ cov_imu @ Ad.T
+    chain = chain_of(linear, len(nodes), data.yaw_bias, settled.columns)
+    return WithErrors(settled, np.zeros((len(nodes), 0)), cov, chain)
 
 
 def errors_in(

@@ -127,3 +127,32 @@ def test_a_vehicle_frame_that_is_the_imu_s_has_no_parameters() -> None:
     smoothed = smooth_trajectory(motion, config_for(Sensors()), WANTED)
 
     assert smoothed.parameters == ()
+
+
+def test_a_rough_lever_arm_and_a_slow_error_of_the_fixes_are_in_one_gaussian() -> None:
+    motion = record(COURSE, SENSORS, 3)
+    slow = {
+        "gnss_correlated_horizontal_m": 0.03,
+        "gnss_correlated_vertical_m": 0.03,
+        "gnss_correlation_s": 10.0,
+    }
+    usual = config_for(
+        SENSORS,
+        gnss={"lever_arm": list(SENSORS.lever_arm)},
+        imu={"rotation_sigma_deg": None},
+        noise=slow,
+    )
+
+    smoothed = smooth_trajectory(motion, usual, WANTED)
+
+    joint = smoothed.joint(WANTED)
+    cov = np.linalg.inv(joint.information)
+    blocks = [cov[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(WANTED))]
+    # The step that estimates the errors has the one, the graph linearised after it the other.
+    assert smoothed.trajectory.cov is not None
+    np.testing.assert_allclose(
+        smoothed.trajectory.cov, blocks, atol=1e-3 * float(np.abs(blocks).max())
+    )
+    assert np.abs(joint.gradient / np.sqrt(np.diag(joint.information))).max() < 0.02
+    sigma = np.sqrt(np.diagonal(smoothed.trajectory.cov, axis1=1, axis2=2))
+    assert (sigma[:, 3:] > 0.025).all()

@@ -117,16 +117,19 @@ def with_cause(error: CalivError, findings: Sequence[Finding]) -> CalivError:
     return type(error)(f"{what}. Most likely because of {found.input}: {found.sentence}")
 
 
-def contradicted(calibration: Calibration, findings: Sequence[Finding]) -> Calibration:
-    """The calibration, inconsistent if there are contradictions among the findings."""
-    sentences = tuple(f.sentence for f in findings if f.severity != "warning")
-    if not sentences:
+def contradicted(
+    calibration: Calibration, before: Sequence[str], after: Sequence[str]
+) -> Calibration:
+    """The calibration, inconsistent if there are sentences before or after its own ones."""
+    if not (before or after):
         return calibration
-    return replace(
-        calibration,
-        status="inconsistent",
-        contradictions=(*calibration.contradictions, *sentences),
-    )
+    sentences = (*before, *calibration.contradictions, *after)
+    return replace(calibration, status="inconsistent", contradictions=sentences)
+
+
+def contradictions_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The sentences of those that are contradictions."""
+    return tuple(f.sentence for f in findings if f.severity != "warning")
 
 
 def warnings_of(findings: Sequence[Finding]) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -22,6 +22,7 @@ from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.physics import (
     check_clouds,
     contradicted,
+    contradictions_of,
     heading_findings,
     raise_fatal,
     raw_findings,
@@ -90,15 +91,15 @@ def prepare(
     check_clouds(recordings, config)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
-    findings = causes = raw
+    findings = raw
     rough: Sequence[VehicleTrajectory] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
-        causes = (*findings, *heading_findings(rough, motions, config, raw))
         config, misplaced, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
+        causes = (*findings, *heading_findings(rough, motions, config, raw))
         if isinstance(error, TargetError) and not causes:
             said = _doubts_about_motion(rough, motions, config)
             if said:
@@ -247,10 +248,9 @@ def _calibrate(
     calibration, doubts = check(
         calibration, solution, recordings, prepared.trajectories, motions, prepared.config
     )
-    calibration = contradicted(calibration, prepared.findings)
-    if prepared.contradictions:
-        found = (*prepared.contradictions, *calibration.contradictions)
-        calibration = replace(calibration, status="inconsistent", contradictions=found)
+    calibration = contradicted(
+        calibration, prepared.contradictions, contradictions_of(prepared.findings)
+    )
     calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)

@@ -7,7 +7,13 @@ from typing import Literal
 import pytest
 
 from caliv_graph.errors import TargetError, TrajectoryError
-from caliv_graph.physics import contradicted, raise_fatal, warnings_of, with_cause
+from caliv_graph.physics import (
+    contradicted,
+    contradictions_of,
+    raise_fatal,
+    warnings_of,
+    with_cause,
+)
 from caliv_graph.products import Finding
 from tests.samples import make_calibration
 
@@ -41,9 +47,13 @@ def test_only_fatal_findings_stop() -> None:
 
 def test_contradictions_make_a_calibration_inconsistent_and_warnings_do_not() -> None:
     calibration = make_calibration("front", "rear")
-    assert contradicted(calibration, [finding(4.0, "warning")]) is calibration
+    assert (
+        contradicted(calibration, (), contradictions_of([finding(4.0, "warning")])) is calibration
+    )
 
-    found = contradicted(calibration, [finding(6.0), finding(4.0, "warning")])
+    found = contradicted(
+        calibration, (), contradictions_of([finding(6.0), finding(4.0, "warning")])
+    )
 
     assert found.status == "inconsistent"
     assert found.contradictions == (*calibration.contradictions, "it is off by 6 sigma")

@@ -18,6 +18,7 @@ from caliv_graph.calibration.rough import RoughSolve, rough_solve
 from caliv_graph.calibration.solve import reduced_registered
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.physics import contradictions_of
 from caliv_graph.pipeline import prepare
 from caliv_graph.products import Array, GroundObservation, Recording, TargetObservation
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -68,7 +69,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
         names=tuple(recording.name for recording in recordings),
         warnings=(
             *prepared.contradictions,
-            *(f.sentence for f in prepared.findings if f.severity == "contradiction"),
+            *contradictions_of(prepared.findings),
             *prepared.warnings,
             *found.warnings,
         ),

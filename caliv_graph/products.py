@@ -311,6 +311,70 @@ class GroundObservation:
 
 
 @dataclass(frozen=True)
+class Strip:
+    """A strip of surface, flat over at most 2 m.
+
+    Attributes:
+        drive: index of the drive.
+        surface: number of the surface (a wall) that it is a part of, within the drive.
+        centre_map: (3,) metres.
+        normal_map: (3,) unit, towards the side it was seen from.
+        scans: LiDAR -> number of scans that see it.
+        residuals_m: LiDAR -> weighted mean distance of its points from the strip.
+        scatter_m: standard deviation of its points along the normal, at the estimate.
+        before_m: the same at the initial guesses.
+        weight: robust weight of the strip, 1 full and 0 dropped.
+    """
+
+    drive: int
+    surface: int
+    centre_map: Array
+    normal_map: Array
+    scans: Mapping[str, int]
+    residuals_m: Mapping[str, float]
+    scatter_m: float
+    before_m: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class StructureTerm:
+    """What the structure of one drive says; its planes and all other poses are eliminated.
+
+    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are, in this order, right
+    perturbations of the vehicle's poses (rotation then translation, rad and m), of the parameters
+    of the vehicle (three each: metres of the lever arm; right perturbation of R_vehicle_imu), of
+    the time offsets (s), and right perturbations of T_vehicle_lidar (lidar frame). Motion data,
+    guesses and priors are not in it.
+
+    Attributes:
+        drive: index of the drive.
+        stamps_ns: (m,) of the poses, those of the scans that see a target.
+        T_map_vehicle: m poses at which it was linearised, the drive's map.
+        parameters: name -> value at which it was linearised (`lever_arm` (3,), a rotation).
+        time_offsets_s: LiDAR -> the same, of the LiDARs whose offset is free.
+        T_vehicle_lidar: LiDAR -> the same, of the LiDARs that see structure.
+        information: (6 m + 3 k + o + 6 n,) squared.
+        gradient: (6 m + 3 k + o + 6 n,).
+        strips: the strips, for the report.
+        offset_m: 1 sigma of the offset of a strip in a scan, estimated.
+        warnings: for the user, a line each.
+    """
+
+    drive: int
+    stamps_ns: IntArray
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+    parameters: Mapping[str, Array | gtsam.Rot3]
+    time_offsets_s: Mapping[str, float]
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+    information: Array
+    gradient: Array
+    strips: tuple[Strip, ...]
+    offset_m: float
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Finding:
     """A value that the user gave and that the raw data contradict, found without a solved graph.
 

@@ -48,16 +48,11 @@ def deskewed(
     Raises:
         TrajectoryError: as `deskew`, when the first is asked for.
     """
-    if scan.point_times_s is None or not len(scan.points_lidar):
+    times_s = checked_times(scan)
+    if times_s is None:
         yield from (scan.points_lidar for _ in T_vehicle_lidar)
         return
-    if not np.isfinite(scan.point_times_s).all() or np.abs(scan.point_times_s).max() > MAX_OFFSET_S:
-        raise TrajectoryError(
-            f"{scan.source}: per-point times from {scan.point_times_s.min():g} s to "
-            f"{scan.point_times_s.max():g} s about the stamp: no sweep takes a second. Check its "
-            "time field with 'caliv-graph inspect'"
-        )
-    offsets_ns: IntArray = np.round(1e9 * scan.point_times_s).astype(np.int64)
+    offsets_ns: IntArray = np.round(1e9 * times_s).astype(np.int64)
     first, last = int(offsets_ns.min()), int(offsets_ns.max())
     if last == first == 0:
         yield from (scan.points_lidar for _ in T_vehicle_lidar)
@@ -80,6 +75,23 @@ def deskewed(
         R_knots = back @ R_lidar[:-1]
         t_knots = (t_lidar[:-1] - t_lidar[-1]) @ back.T
         yield _moved(scan.points_lidar, offsets_ns, knots, R_knots, t_knots)
+
+
+def checked_times(scan: LidarScan) -> Array | None:
+    """Times of a scan's points (N,), seconds after the stamp; None without times or points.
+
+    Raises:
+        TrajectoryError: the times are unusable.
+    """
+    times_s = scan.point_times_s
+    if times_s is None or not len(times_s):
+        return None
+    if not np.isfinite(times_s).all() or np.abs(times_s).max() > MAX_OFFSET_S:
+        raise TrajectoryError(
+            f"{scan.source}: per-point times from {times_s.min():g} s to {times_s.max():g} s about "
+            "the stamp: no sweep takes a second. Check its time field with 'caliv-graph inspect'"
+        )
+    return times_s
 
 
 def _moved(points: Array, offsets_ns: IntArray, knots: IntArray, R: Array, t: Array) -> Array:

@@ -1,0 +1,359 @@
+"""Flat patches of one scan: points are grouped by direction, fitted, tested and reduced.
+
+Points are grouped by the *direction of their beam*, not by their place. The noise of a range moves
+a point along its beam and never into another group. Cells in space would cut the noise of a wall
+that lies along their border, and bias both halves.
+
+Cells are those of a cube around the LiDAR, halved until they span about `PATCH_M` at the range they
+see. A cell with too few points, or with one or two lines of them (the rings of a LiDAR of few
+channels), is judged again together with its neighbours, up to `MAX_PATCH_M`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.products import Array, BoolArray, IntArray
+
+PATCH_M = 0.5
+"""Width of a patch across the beams: below the cells of 1 to 2 m over which real walls are uneven,
+and wide enough for tens of points."""
+
+MAX_PATCH_M = 2.0
+"""Greatest length of a patch. Walls are not flat beyond this (bumps of 5 mm per 1 to 2 m)."""
+
+ROOT_CELLS = 12
+"""Coarsest cells along the edge of a face of the cube: 7.5 degrees, 0.5 m at 4 m."""
+
+FINEST = 5
+"""Halvings of the coarsest cells at most: 0.23 degrees, 0.5 m at 120 m."""
+
+MERGES = 2
+"""How often undecided cells are joined with their neighbours: up to four times `PATCH_M`."""
+
+SLOT_S = 0.01
+"""Points of a patch are from one slot of this length. Within 5 ms of their mean time, an extrinsic
+that is 3 degrees off moves a point by 1 mm at 0.3 rad/s and 15 m; the mean itself is exact."""
+
+MIN_POINTS = 12
+"""Of a patch: a plane takes three, and its tests need as many again for each axis."""
+
+ROUGHNESS_M = 0.01
+"""Scatter of plaster, brick and cladding about a plane of 0.5 m, 1 sigma, beside the range noise.
+Hedges have 30 mm and more."""
+
+MAX_SCATTER = 1.5
+"""Largest scatter in units of the expected one. 12 points scatter so much by chance in 1 of 100
+patches; a step of 0.1 m under a patch makes 25 mm."""
+
+MIN_WIDTH = 4.0
+"""Smallest width in units of the scatter, both standard deviations: the narrower direction is then
+clearly in the surface."""
+
+MAX_TILT_RAD = 0.03
+"""Greatest uncertainty of the normal that the points leave: 2 degrees."""
+
+MIN_SPREAD = 0.25
+"""Pearson's kurtosis - skewness^2 - 1 of the places along an axis is zero for points on two lines,
+0.5 on three, 0.8 for evenly spread ones. Two lines always lie on some plane, so they prove none."""
+
+MAX_BEND_M = 0.005
+"""Greatest root mean square of bend and steps (second and third order) beyond what noise makes: a
+corner or a reveal of 3 cm within the patch makes more."""
+
+MIN_INCIDENCE_COS = math.cos(math.radians(75.0))
+"""Smallest cosine between beam and normal: the footprint of a flatter beam is long, and its range
+biased."""
+
+MAX_POINTS = 50_000
+"""Points of a scan that are used; of denser clouds an even part. Patches of 0.5 m keep enough."""
+
+MAX_PATCHES = 1500
+"""Patches that are kept of a scan; of more an even part over all directions."""
+
+GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of the golden ratio are evenly spread and have no period that a pattern of channels
+could share."""
+
+
+@dataclass(frozen=True)
+class ScanPatches:
+    """Patches of one scan, as in `DrivePatches`.
+
+    Attributes:
+        time_s: (n,) seconds after the stamp.
+        moments: (n, 4, 4) metres, lidar frame at the patch's own time.
+        normal_lidar: (n, 3) unit, towards the LiDAR.
+        scatter_m: (n,) standard deviation along the normal.
+        undecided: points in groups that are too few or too thin to be judged.
+        uneven: points in groups that are not flat.
+        grazing: points in flat groups under a flat angle or too long.
+    """
+
+    time_s: Array
+    moments: Array
+    normal_lidar: Array
+    scatter_m: Array
+    undecided: int = 0
+    uneven: int = 0
+    grazing: int = 0
+
+    def part(self, keep: BoolArray | IntArray) -> ScanPatches:
+        """Some of the patches; the counts stay."""
+        return ScanPatches(
+            self.time_s[keep],
+            self.moments[keep],
+            self.normal_lidar[keep],
+            self.scatter_m[keep],
+            self.undecided,
+            self.uneven,
+            self.grazing,
+        )
+
+
+@dataclass(frozen=True)
+class SweepMotion:
+    """Motion of a LiDAR during a scan: constant twist in each slot.
+
+    Attributes:
+        first_s: start of the first slot, seconds after the stamp.
+        turn: (k, 3) rad/s, lidar frame, of each slot of `SLOT_S`.
+        velocity: (k, 3) m/s, lidar frame.
+    """
+
+    first_s: float
+    turn: Array
+    velocity: Array
+
+
+def planar_patches(
+    points: Array,
+    sigma_range_m: float,
+    times_s: Array | None = None,
+    motion: SweepMotion | None = None,
+) -> ScanPatches:
+    """The flat patches of a scan.
+
+    Args:
+        points: (N, 3) metres, lidar frame, as measured, without the origin.
+        sigma_range_m: noise along the beam, 1 sigma.
+        times_s: (N,) seconds after the stamp; None: all at the stamp.
+        motion: of the LiDAR, over the span of these times; given with them.
+    """
+    points, times_s = _even_part(points, times_s)
+    cell, level = _cells(points)
+    slot = np.zeros(len(points), dtype=np.int64)
+    if times_s is not None and motion is not None:
+        slot = np.clip(((times_s - motion.first_s) / SLOT_S).astype(np.int64), 0, None)
+        slot = np.minimum(slot, len(motion.turn) - 1)
+    left = np.arange(len(points))
+    found: list[ScanPatches] = []
+    uneven = grazing = 0
+    for _ in range(MERGES + 1):
+        groups = _grouped(cell[left], level[left], slot[left])
+        left = left[groups.order]
+        at, times = points[left], None if times_s is None else times_s[left]
+        patches, judged = _judged(groups, at, times, motion, slot[left], sigma_range_m)
+        found.append(patches)
+        uneven += patches.uneven
+        grazing += patches.grazing
+        left = left[~judged]
+        left = left[level[left] > 0]
+        level[left] -= 1
+        if not len(left):
+            break
+    return _joined(found, len(points), uneven, grazing)
+
+
+def _even_part(points: Array, times_s: Array | None) -> tuple[Array, Array | None]:
+    """At most `MAX_POINTS` points, the same of the same cloud."""
+    if len(points) <= MAX_POINTS:
+        return points, times_s
+    keep = np.modf(np.arange(len(points)) * GOLDEN)[0] < MAX_POINTS / len(points)
+    return points[keep], None if times_s is None else times_s[keep]
+
+
+def _cells(points: Array) -> tuple[IntArray, IntArray]:
+    """Index of the finest cell of each point (N,), and halvings of the coarsest one (N,)."""
+    size = np.abs(points)
+    axis = np.argmax(size, axis=1)
+    rows = np.arange(len(points))
+    along = points[rows, axis]
+    face = 2 * axis + (along < 0.0)
+    width = ROOT_CELLS << FINEST
+    place = []
+    for step in (1, 2):
+        angle = np.arctan(points[rows, (axis + step) % 3] / np.abs(along))
+        part = (angle * (2.0 / math.pi) + 0.5) * width
+        place.append(np.clip(part.astype(np.int64), 0, width - 1))
+    root = (face * ROOT_CELLS + (place[0] >> FINEST)) * ROOT_CELLS + (place[1] >> FINEST)
+    # The level is common to a whole coarse cell, so that it does not depend on a point's noise.
+    number = 6 * ROOT_CELLS**2
+    count = np.maximum(np.bincount(root, minlength=number), 1)
+    log_range = 0.5 * np.log2(np.einsum("ni,ni->n", points, points))
+    mean = np.bincount(root, log_range, number) / count
+    level = np.round(mean + math.log2(0.5 * math.pi / ROOT_CELLS / PATCH_M))
+    level = np.clip(level, 0, FINEST).astype(np.int64)
+    return (face * width + place[0]) * width + place[1], level[root]
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Points sorted by group: `order` (n,), first place of each group, number of each, group of."""
+
+    order: IntArray
+    first: IntArray
+    count: IntArray
+    member: IntArray
+
+
+def _grouped(cell: IntArray, level: IntArray, slot: IntArray) -> _Groups:
+    """Groups points of the same cell at their level and of the same slot of time."""
+    width = ROOT_CELLS << FINEST
+    rest, b = np.divmod(cell, width)
+    shift = FINEST - level
+    b >>= shift
+    a = (rest % width) >> shift
+    face = rest // width
+    # The level is a part of the key only through the coarse cell, which has one.
+    key = (((slot * 6 + face) * (FINEST + 1) + level) * width + a) * width + b
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    starts = np.ones(len(key), dtype=bool)
+    starts[1:] = key[1:] != key[:-1]
+    first = np.flatnonzero(starts)
+    return _Groups(order, first, np.diff(np.append(first, len(key))), np.cumsum(starts) - 1)
+
+
+def _judged(
+    groups: _Groups,
+    points: Array,
+    times_s: Array | None,
+    motion: SweepMotion | None,
+    slot: IntArray,
+    sigma_range_m: float,
+) -> tuple[ScanPatches, BoolArray]:
+    """Patches among the groups; and for each point whether its group is decided, flat or not."""
+    enough = groups.count >= MIN_POINTS
+    chosen = enough[groups.member]
+    group = (np.cumsum(enough) - 1)[groups.member[chosen]]
+    count = groups.count[enough].astype(np.float64)
+    first = np.concatenate([[0], np.cumsum(groups.count[enough])[:-1]]).astype(np.int64)
+    p = points[chosen].T.copy()
+    time_s = np.zeros(len(count))
+    if not len(count):
+        empty = ScanPatches(time_s, np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0))
+        return empty, np.zeros(len(points), dtype=bool)
+    if times_s is not None and motion is not None:
+        t = times_s[chosen]
+        time_s = np.add.reduceat(t, first) / count
+        k = slot[chosen]
+        p += (t - time_s[group]) * (np.cross(motion.turn[k].T, p, axis=0) + motion.velocity[k].T)
+    moments = _moments(p, first, count)
+    centre = moments[:, :3, 3] / count[:, None]
+    cov = moments[:, :3, :3] / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    values, axes = np.linalg.eigh(cov)
+    width = np.sqrt(np.maximum(values, 0.0))
+    normal = axes[:, :, 0]
+    normal = np.where((np.einsum("ni,ni->n", normal, centre) > 0.0)[:, None], -normal, normal)
+    range_m = np.sqrt(np.einsum("ni,ni->n", centre, centre))
+    cosine = -np.einsum("ni,ni->n", normal, centre) / range_m
+    expected = np.hypot(sigma_range_m * cosine, ROUGHNESS_M)
+    # Three degrees of freedom went into the plane.
+    scatter = width[:, 0] * np.sqrt(count / (count - 3.0))
+    flat = scatter < MAX_SCATTER * expected
+    # A thick group may become flat when it is seen as a part of nothing else: it is decided.
+    tilt = np.maximum(scatter, sigma_range_m * cosine) / (width[:, 1] * np.sqrt(count) + 1e-12)
+    broad = (width[:, 1] > MIN_WIDTH * np.maximum(scatter, 1e-6)) & (tilt < MAX_TILT_RAD)
+    spread, bend = _shape(p, group, first, count, centre, axes, width)
+    broad &= spread > MIN_SPREAD
+    uneven = bend > MAX_BEND_M + 2.0 * scatter / np.sqrt(count)
+    seen = (cosine > MIN_INCIDENCE_COS) & (math.sqrt(12.0) * width[:, 2] < MAX_PATCH_M)
+    good = flat & broad & ~uneven & seen
+    decided = ~flat | broad
+    judged = np.zeros(len(points), dtype=bool)
+    judged[chosen] = decided[group]
+    patches = ScanPatches(
+        time_s=time_s[good],
+        moments=moments[good],
+        normal_lidar=normal[good],
+        scatter_m=scatter[good],
+        uneven=int(count[decided & (~flat | uneven)].sum()),
+        grazing=int(count[flat & broad & ~uneven & ~seen].sum()),
+    )
+    return patches, judged
+
+
+def _moments(p: Array, first: IntArray, count: Array) -> Array:
+    """(n, 4, 4) sums of h h^T over groups of points p (3, N) that start at `first` (n,)."""
+    x, y, z = p
+    sums = np.add.reduceat(np.stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z]), first, 1)
+    out = np.empty((len(first), 4, 4))
+    out[:, :3, 3] = out[:, 3, :3] = sums[:3].T
+    for k, (i, j) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+        out[:, i, j] = out[:, j, i] = sums[3 + k]
+    out[:, 3, 3] = count
+    return out
+
+
+def _shape(
+    p: Array,
+    group: IntArray,
+    first: IntArray,
+    count: Array,
+    centre: Array,
+    axes: Array,
+    width: Array,
+) -> tuple[Array, Array]:
+    """How evenly groups are spread along their worse axis, and how bent they are in metres; (n,).
+
+    The bend is the root mean square of the residuals' parts of second and third order.
+    """
+    off = p - centre.T[:, group]
+    scaled = axes / np.maximum(width, 1e-9)[:, None, :]
+    v, u = (np.einsum("in,in->n", scaled[:, :, k].T[:, group], off) for k in (1, 2))
+    r = np.einsum("in,in->n", axes[:, :, 0].T[:, group], off)
+    uu, vv = u * u, v * v
+    powers = np.stack([uu * u, vv * v, uu * uu, vv * vv, uu * v, u * vv, uu * vv])
+    u3, v3, u4, v4, uuv, uvv, uuvv = np.add.reduceat(powers, first, 1) / count
+    spread = np.minimum(u4 - u3**2, v4 - v3**2) - 1.0
+    by_r = np.stack([r * uu, r * u * v, r * vv, r * uu * u, r * vv * v])
+    ruu, ruv, rvv, ru3, rv3 = np.add.reduceat(by_r, first, 1) / count
+    # Residuals have no constant and no linear part, so that only the terms' own remainder counts.
+    bend = (
+        ruu**2 / np.maximum(u4 - u3**2 - 1.0, MIN_SPREAD)
+        + ruv**2 / np.maximum(uuvv - uuv**2 - uvv**2, MIN_SPREAD)
+        + rvv**2 / np.maximum(v4 - v3**2 - 1.0, MIN_SPREAD)
+    )
+    sixth = np.add.reduceat(np.stack([uu * uu * uu, vv * vv * vv]), first, 1) / count
+    bend += ru3**2 / np.maximum(sixth[0] - u3**2 - u4**2, MIN_SPREAD)
+    bend += rv3**2 / np.maximum(sixth[1] - v3**2 - v4**2, MIN_SPREAD)
+    return spread, np.sqrt(bend)
+
+
+def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) -> ScanPatches:
+    """All patches of a scan, at most `MAX_PATCHES`, and what became of its points."""
+    joined = ScanPatches(
+        time_s=np.concatenate([f.time_s for f in found]),
+        moments=np.concatenate([f.moments for f in found]),
+        normal_lidar=np.concatenate([f.normal_lidar for f in found]),
+        scatter_m=np.concatenate([f.scatter_m for f in found]),
+        uneven=uneven,
+        grazing=grazing,
+    )
+    used = int(joined.moments[:, 3, 3].sum())
+    joined = ScanPatches(
+        joined.time_s,
+        joined.moments,
+        joined.normal_lidar,
+        joined.scatter_m,
+        points - used - uneven - grazing,
+        uneven,
+        grazing,
+    )
+    if len(joined.time_s) <= MAX_PATCHES:
+        return joined
+    return joined.part(np.linspace(0, len(joined.time_s) - 1, MAX_PATCHES).astype(np.int64))

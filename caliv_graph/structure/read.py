@@ -1,0 +1,201 @@
+"""Reads the scans of a drive, a few along its way, and reduces each to flat patches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
+from caliv_graph.targets.cloud.views import evenly_spread
+from caliv_graph.trajectory.deskew import checked_times
+from caliv_graph.trajectory.imu import log_so3
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+MAX_SCANS = 150
+"""Scans of a LiDAR that are read of a drive. More scans of one place share the errors of its
+surface (an offset of its own per strip and scan, not per point), and the poses between are tied by
+the IMU; time and memory do not grow with the drive."""
+
+MIN_SCANS = 20
+"""Scans that are read however little the vehicle moves, if there are as many: their noise averages
+out."""
+
+MIN_STEP_M = 0.1
+"""Least motion between two scans that are read: nearer ones hit the same spots of a wall, 0.2
+degrees of beams at 30 m being 0.1 m apart."""
+
+LEVER_M = 10.0
+"""A rotation counts as the motion that it gives a point at this range, typical of walls."""
+
+REST_M_S = 0.1
+"""Time counts as motion at this speed: a vehicle that stands gives a scan a second at most."""
+
+INSTANTS = 2000
+"""Instants at most among which those of the scans are chosen."""
+
+INSTANT_NS = 100_000_000
+"""Time between these at least: the period of common LiDARs."""
+
+LEVEL_COS = float(np.cos(np.radians(25.0)))
+"""Cosine between a patch's normal and up above which it is level: 10 degrees of error of the guess,
+7 of the ground, and 2 of the patch's own normal."""
+
+
+def read_patches(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+    keep_level: bool = False,
+) -> tuple[DrivePatches, ...]:
+    """The patches of every drive, those of the ground only with `keep_level`.
+
+    Raises:
+        RecordingError: a cloud could not be read.
+        TrajectoryError: times of points are invalid.
+    """
+    names = tuple(config.lidars)
+    wanted = [
+        chosen_scans([recording.scan_stamps_ns(name) for name in names], trajectory)
+        for recording, trajectory in zip(recordings, trajectories, strict=True)
+    ]
+    found: list[DrivePatches] = []
+    total = sum(len(stamps) for of_drive in wanted for stamps in of_drive)
+    with progress.stage("reading walls and other surfaces", total) as advance:
+        for drive, recording in enumerate(recordings):
+            scans: list[tuple[int, int, ScanPatches]] = []
+            for k, name in enumerate(names):
+                guess = config.lidars[name].initial.pose()
+                stamps = frozenset(wanted[drive][k].tolist())
+                for scan in recording.scans(name, stamps) if stamps else ():
+                    patches = scan_patches(
+                        scan, guess, trajectories[drive], config.noise.lidar_range_m, keep_level
+                    )
+                    scans.append((k, scan.stamp_ns, patches))
+                    advance()
+            found.append(_together(drive, names, scans))
+    return tuple(found)
+
+
+def chosen_scans(
+    stamps_ns: Sequence[Sequence[int] | IntArray], trajectory: VehicleTrajectory
+) -> list[IntArray]:
+    """Stamps of the scans to read, per LiDAR, of all its stamps: evenly over the motion.
+
+    All LiDARs are read at the same instants, each at its own stamps nearest to them.
+    """
+    begin, end = trajectory.span_ns
+    within = []
+    for of_lidar in stamps_ns:
+        all_ns = np.asarray(of_lidar, dtype=np.int64)
+        within.append(all_ns[(all_ns >= begin) & (all_ns <= end)])
+    ends = [t for s in within if len(s) for t in (s[0], s[-1])]
+    if not ends:
+        return within
+    first, last = int(min(ends)), int(max(ends))
+    count = min((last - first) // INSTANT_NS + 1, INSTANTS)
+    instants: IntArray = first + np.arange(count, dtype=np.int64) * (last - first) // max(
+        count - 1, 1
+    )
+    motion = _motion(instants, trajectory)
+    most = int(np.clip(motion.sum() / MIN_STEP_M, MIN_SCANS, MAX_SCANS))
+    instants = instants[evenly_spread(motion, most)]
+    return [_nearest(instants, s) for s in within]
+
+
+def _motion(instants_ns: IntArray, trajectory: VehicleTrajectory) -> Array:
+    """Motion about each of the instants (n,), metres: half of that to either neighbour."""
+    if len(instants_ns) < 2:
+        return np.ones(len(instants_ns))
+    R, t = trajectory.poses_at(instants_ns)
+    turned = np.linalg.norm(log_so3(R[:-1].transpose(0, 2, 1) @ R[1:]), axis=1)
+    moved = np.linalg.norm(np.diff(t, axis=0), axis=1)
+    seconds = np.diff(instants_ns) / NANOSECONDS_PER_SECOND
+    steps = moved + LEVER_M * turned + REST_M_S * seconds
+    return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
+
+
+def _nearest(instants_ns: IntArray, stamps_ns: IntArray) -> IntArray:
+    """The stamps nearest to instants, each once: a slow LiDAR has none within milliseconds."""
+    if not len(stamps_ns):
+        return stamps_ns
+    after = np.clip(np.searchsorted(stamps_ns, instants_ns), 0, len(stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = instants_ns - stamps_ns[before] < stamps_ns[after] - instants_ns
+    return np.unique(stamps_ns[np.where(earlier, before, after)])
+
+
+def scan_patches(
+    scan: LidarScan,
+    T_vehicle_lidar: gtsam.Pose3,
+    trajectory: VehicleTrajectory,
+    sigma_range_m: float,
+    keep_level: bool = False,
+) -> ScanPatches:
+    """The patches of one scan as it was read, which the guess is good enough for.
+
+    Raises:
+        TrajectoryError: the stamp is outside the trajectory's span, or times are invalid.
+    """
+    R_map_vehicle, _ = trajectory.poses_at([scan.stamp_ns])
+    times_s = checked_times(scan)
+    motion = None
+    if times_s is not None:
+        motion = _sweep_motion(scan.stamp_ns, times_s, T_vehicle_lidar, trajectory)
+    patches = planar_patches(scan.points_lidar, sigma_range_m, times_s, motion)
+    begin, end = trajectory.span_ns
+    at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND)
+    keep: BoolArray = (at >= begin) & (at <= end)
+    if not keep_level:
+        up_lidar = (R_map_vehicle[0] @ T_vehicle_lidar.rotation().matrix())[2]
+        keep &= np.abs(patches.normal_lidar @ up_lidar) < LEVEL_COS
+    return patches.part(keep)
+
+
+def _sweep_motion(
+    stamp_ns: int, times_s: Array, T_vehicle_lidar: gtsam.Pose3, trajectory: VehicleTrajectory
+) -> SweepMotion:
+    """Twists of a LiDAR over the times of its points; none before and after the trajectory."""
+    first_s = float(times_s.min())
+    count = int((times_s.max() - first_s) / SLOT_S) + 1
+    knots = np.round((first_s + SLOT_S * np.arange(count + 1)) * NANOSECONDS_PER_SECOND)
+    begin, end = trajectory.span_ns
+    at = np.clip(stamp_ns + knots.astype(np.int64), begin, end)
+    R, t = trajectory.poses_at(at)
+    R_extrinsic, t_extrinsic = stack([T_vehicle_lidar])
+    t = t + R @ t_extrinsic[0]
+    R = R @ R_extrinsic[0]
+    back = R[:-1].transpose(0, 2, 1)
+    seconds = np.maximum(np.diff(at), 1)[:, None] / NANOSECONDS_PER_SECOND
+    return SweepMotion(
+        first_s=first_s,
+        turn=log_so3(back @ R[1:]) / seconds,
+        velocity=np.einsum("kij,kj->ki", back, np.diff(t, axis=0)) / seconds,
+    )
+
+
+def _together(
+    drive: int, names: tuple[str, ...], scans: Sequence[tuple[int, int, ScanPatches]]
+) -> DrivePatches:
+    """The patches of all scans (LiDAR, stamp, patches) of a drive."""
+    parts = [patches for _, _, patches in scans]
+    number = [len(p.time_s) for p in parts]
+    return DrivePatches(
+        drive=drive,
+        lidars=names,
+        stamps_ns=np.array([stamp for _, stamp, _ in scans], dtype=np.int64),
+        scan_lidar=np.array([k for k, _, _ in scans], dtype=np.int64),
+        scan=np.repeat(np.arange(len(scans), dtype=np.int64), number),
+        time_s=np.concatenate([np.zeros(0), *(p.time_s for p in parts)]),
+        moments=np.concatenate([np.zeros((0, 4, 4)), *(p.moments for p in parts)]),
+        normal_lidar=np.concatenate([np.zeros((0, 3)), *(p.normal_lidar for p in parts)]),
+        scatter_m=np.concatenate([np.zeros(0), *(p.scatter_m for p in parts)]),
+    )

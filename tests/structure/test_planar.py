@@ -1,0 +1,209 @@
+"""Flat patches of a scan: what is kept, what is not, and that nothing is biased."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from caliv_graph.products import Array
+from caliv_graph.structure.planar import (
+    MAX_PATCHES,
+    MIN_POINTS,
+    ScanPatches,
+    SweepMotion,
+    planar_patches,
+)
+
+SIGMA_M = 0.01
+
+
+def beams(elevations_deg: Array, azimuths_deg: Array) -> Array:
+    elevation, azimuth = np.meshgrid(np.radians(elevations_deg), np.radians(azimuths_deg))
+    flat = np.cos(elevation)
+    return np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1
+    ).reshape(-1, 3)
+
+
+DENSE = beams(np.arange(-12.5, 12.5, 0.25), np.arange(-45.0, 45.0, 0.25))
+
+
+def on_plane(rays: Array, normal: Array, distance_m: float) -> Array:
+    """(N,) ranges to the plane `normal . p = distance`; infinite behind."""
+    at = distance_m / (rays @ normal)
+    return np.where(at > 0.0, at, np.inf)
+
+
+def noisy(rays: Array, ranges: Array, seed: int = 0) -> Array:
+    seen = ranges < 60.0
+    ranges = ranges + np.random.default_rng(seed).normal(0.0, SIGMA_M, len(ranges))
+    return np.asarray(rays[seen] * ranges[seen, None])
+
+
+def points_of(patches: ScanPatches) -> Array:
+    return np.asarray(patches.moments[:, 3, 3])
+
+
+def centres(patches: ScanPatches) -> Array:
+    return np.asarray(patches.moments[:, :3, 3] / patches.moments[:, 3, 3, None])
+
+
+def test_the_moments_are_the_sums_over_the_points() -> None:
+    # All within one cell of 3.75 degrees.
+    rays = beams(np.arange(0.2, 3.4, 0.25), np.arange(0.2, 3.4, 0.25))
+    points = noisy(rays, on_plane(rays, np.array([1.0, 0.0, 0.0]), 9.0))
+    patches = planar_patches(points, SIGMA_M)
+    h = np.column_stack([points, np.ones(len(points))])
+    np.testing.assert_allclose(patches.moments, [h.T @ h], rtol=1e-12)
+    np.testing.assert_allclose(patches.normal_lidar, [[-1.0, 0.0, 0.0]], atol=0.02)
+    residual = (points - points.mean(axis=0)) @ patches.normal_lidar[0]
+    assert patches.scatter_m[0] ** 2 == pytest.approx(residual @ residual / (len(points) - 3))
+    assert patches.time_s.tolist() == [0.0]
+
+
+def test_a_wall_becomes_unbiased_patches() -> None:
+    normal = np.array([0.8, 0.5, 0.1])
+    normal /= np.linalg.norm(normal)
+    points = noisy(DENSE, on_plane(DENSE, normal, 15.0))
+    patches = planar_patches(points, SIGMA_M)
+    assert points_of(patches).sum() > 0.95 * (len(points) - patches.grazing)
+    assert patches.uneven == 0
+    assert points_of(patches).min() >= MIN_POINTS
+    off = centres(patches) @ normal - 15.0
+    expected = SIGMA_M / np.sqrt(points_of(patches))
+    assert np.sqrt(np.mean((off / expected) ** 2)) < 1.1
+    assert abs(np.average(off, weights=points_of(patches))) < 3.0 * SIGMA_M / len(points) ** 0.5
+    np.testing.assert_allclose(patches.normal_lidar @ normal, -1.0, atol=3e-3)
+    assert 300 < len(patches.time_s) < MAX_PATCHES
+    assert (
+        patches.undecided + patches.uneven + patches.grazing
+        == len(points) - points_of(patches).sum()
+    )
+
+
+def test_no_patch_is_a_mean_of_the_two_walls_of_a_corner() -> None:
+    normals = np.array([[0.9, 0.436, 0.0], [0.7, -0.714, 0.0]])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    ranges = np.minimum(*(on_plane(DENSE, n, 11.0) for n in normals))
+    patches = planar_patches(noisy(DENSE, ranges), SIGMA_M)
+    angle = np.arccos(np.clip(np.abs(patches.normal_lidar @ normals.T), 0.0, 1.0)).min(axis=1)
+    assert len(angle) > 300
+    assert angle.max() < 0.12
+    off = np.abs(centres(patches) @ normals.T - 11.0).min(axis=1)
+    assert off.max() < 0.012
+
+
+@pytest.mark.parametrize("step_m", [0.05, 0.2, 3.0])
+def test_no_patch_spans_a_step(step_m: float) -> None:
+    # 8.2 degrees is inside a cell. The rear part is hidden behind the front one's edge.
+    left = np.arctan2(DENSE[:, 1], DENSE[:, 0]) > np.radians(8.2)
+    normal = np.array([1.0, 0.0, 0.0])
+    ranges = np.where(left, on_plane(DENSE, normal, 10.0), on_plane(DENSE, normal, 10.0 + step_m))
+    patches = planar_patches(noisy(DENSE, ranges), SIGMA_M)
+    x = centres(patches)[:, 0]
+    assert len(x) > 300
+    off = np.minimum(np.abs(x - 10.0), np.abs(x - 10.0 - step_m))
+    assert off.max() < 0.012
+    assert np.abs(patches.normal_lidar[:, 0]).min() > 0.99
+
+
+def test_curved_and_rough_surfaces_are_left_out() -> None:
+    rays = beams(np.arange(-3.5, 3.5, 0.1), np.arange(-3.5, 3.5, 0.1))
+    b = rays @ np.array([8.0, 0.0, 0.0])
+    with np.errstate(invalid="ignore"):
+        ball = b - np.sqrt(b * b - 64.0 + 0.5**2)
+    ball = np.where(np.isfinite(ball), ball, np.inf)
+    patches = planar_patches(noisy(rays, ball), SIGMA_M)
+    assert points_of(patches).sum() < 0.1 * np.isfinite(ball).sum()
+    hedge = on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 9.0)
+    hedge += np.random.default_rng(1).normal(0.0, 0.05, len(hedge))
+    patches = planar_patches(noisy(DENSE, hedge), SIGMA_M)
+    assert points_of(patches).sum() < 0.01 * len(DENSE)
+    assert patches.uneven > 0.9 * len(DENSE)
+
+
+def test_beams_that_graze_a_wall_are_left_out() -> None:
+    normal = np.array([np.sin(np.radians(3.0)), np.cos(np.radians(3.0)), 0.0])
+    patches = planar_patches(noisy(DENSE, on_plane(DENSE, normal, 2.0)), SIGMA_M)
+    towards = centres(patches) / np.linalg.norm(centres(patches), axis=1)[:, None]
+    cosine = -np.einsum("ni,ni->n", towards, patches.normal_lidar)
+    assert cosine.min() > np.cos(np.radians(75.0))
+    assert patches.grazing > 0
+
+
+def test_two_rings_prove_no_plane_and_sixteen_do() -> None:
+    azimuths = np.arange(-45.0, 45.0, 0.2)
+    normal = np.array([0.9, 0.3, 0.0])
+    normal /= np.linalg.norm(normal)
+    two = beams(np.array([-1.0, 1.0]), azimuths)
+    assert not len(planar_patches(noisy(two, on_plane(two, normal, 10.0)), SIGMA_M).time_s)
+    # A ring on a wall and one on the ground before it lie on a plane, which is neither.
+    rings = beams(np.linspace(-15.0, 15.0, 16), azimuths)
+    ranges = np.minimum(on_plane(rings, normal, 12.0), on_plane(rings, np.array([0, 0, -1.0]), 1.6))
+    patches = planar_patches(noisy(rings, ranges), SIGMA_M)
+    assert len(patches.time_s) > 20
+    upright = np.abs(patches.normal_lidar[:, 2]) < 0.3
+    assert upright.sum() > 20
+    np.testing.assert_allclose(-patches.normal_lidar[upright] @ normal, 1.0, atol=5e-3)
+    np.testing.assert_allclose(centres(patches)[upright] @ normal, 12.0, atol=0.012)
+
+
+def test_the_cells_favour_no_axis() -> None:
+    normal = np.array([0.8, 0.5, 0.3])
+    normal /= np.linalg.norm(normal)
+    points = noisy(DENSE, on_plane(DENSE, normal, 9.0))
+    here, there = planar_patches(points, SIGMA_M), planar_patches(points[:, [1, 2, 0]], SIGMA_M)
+    assert len(here.time_s) == len(there.time_s)
+    back = there.moments[:, [2, 0, 1, 3]][:, :, [2, 0, 1, 3]]
+    order, other = (np.lexsort(m[:, :3, 3].T.round(6)) for m in (here.moments, back))
+    np.testing.assert_allclose(back[other], here.moments[order], rtol=1e-9, atol=1e-9)
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    points = noisy(DENSE, on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 9.0))
+    mixed = np.random.default_rng(2).permutation(len(points))
+    here, there = planar_patches(points, SIGMA_M), planar_patches(points[mixed], SIGMA_M)
+    np.testing.assert_allclose(there.moments, here.moments, rtol=1e-9, atol=1e-9)
+
+
+def test_points_of_a_sweep_are_moved_to_their_patchs_time() -> None:
+    # Rows one after the other within 0.1 s, so that times differ within a patch.
+    turn, velocity = np.array([0.05, -0.1, 0.6]), np.array([3.0, 0.4, -0.2])
+    times = np.repeat(np.linspace(0.0, 0.1, 100), len(DENSE) // 100 + 1)[: len(DENSE)]
+    normal = np.array([0.95, 0.2, 0.1])
+    normal /= np.linalg.norm(normal)
+
+    def plane_at(t: Array) -> tuple[Array, Array]:
+        # Normal and distance of a fixed wall in the frame of a body with this twist, to 1e-5.
+        n = normal - t[:, None] * np.cross(turn, normal)
+        n += 0.5 * t[:, None] ** 2 * np.cross(turn, np.cross(turn, normal))
+        return n, 9.0 - t * (n @ velocity) - 0.5 * t**2 * (np.cross(turn, velocity) @ normal)
+
+    n, d = plane_at(times)
+    points = DENSE * (d / np.einsum("ni,ni->n", DENSE, n))[:, None]
+    motion = SweepMotion(0.0, np.tile(turn, (11, 1)), np.tile(velocity, (11, 1)))
+    patches = planar_patches(points, SIGMA_M, times, motion)
+    n, d = plane_at(patches.time_s)
+    off = np.einsum("ni,ni->n", centres(patches), n) - d
+    assert len(off) > 100
+    assert np.abs(off).max() < 2e-4
+    assert patches.scatter_m.max() < 2e-4
+    still = planar_patches(points, SIGMA_M)
+    assert still.scatter_m.max() > 5e-3 or len(still.time_s) < len(patches.time_s)
+
+
+def test_a_dense_cloud_costs_no_more_than_a_bounded_one() -> None:
+    rays = beams(np.arange(-45.0, 45.0, 0.1), np.arange(-45.0, 45.0, 0.22))
+    assert len(rays) > 300_000
+    points = noisy(rays, on_plane(rays, np.array([1.0, 0.0, 0.0]), 25.0))
+    patches = planar_patches(points, SIGMA_M)
+    assert 1000 < len(patches.time_s) <= MAX_PATCHES
+    assert np.ptp(centres(patches)[:, 1]) > 40.0
+
+
+def test_nothing_comes_of_nothing() -> None:
+    for points in (np.zeros((0, 3)), np.array([[5.0, 0.0, 0.0]])):
+        patches = planar_patches(points, SIGMA_M)
+        assert len(patches.time_s) == 0
+        assert patches.moments.shape == (0, 4, 4)
+        assert patches.undecided == len(points)

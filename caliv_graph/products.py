@@ -538,7 +538,7 @@ class Solution:
 
     Attributes:
         mode: staged, joint or auto.
-        lidars: LiDARs in the graph: they saw a target, or are fixed.
+        lidars: LiDARs in the graph: they saw a target or structure, or are fixed.
         reference: name of the reference LiDAR.
         T_vehicle_lidar: estimate per LiDAR.
         T_map_vehicle: estimated vehicle pose per (drive, stamp_ns).
@@ -569,6 +569,7 @@ class Solution:
         gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not computed.
         course: the iterations of the joint loop; empty without one (`staged`).
         sensor_noise: noise levels that no message states, and where their figures are from.
+        structure: the structure of each drive that has any.
     """
 
     mode: str
@@ -601,6 +602,7 @@ class Solution:
     information_knowing: Mapping[str, Array] = field(default_factory=dict)
     course: tuple[Iteration, ...] = ()
     sensor_noise: tuple[NoiseLevel, ...] = ()
+    structure: tuple[StructureTerm, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import gtsam
@@ -39,6 +39,7 @@ FactorKind = Literal[
     "ground_plane",
     "standing",
     "parallel",
+    "structure",
 ]
 
 
@@ -165,8 +166,16 @@ def cloud_graph(
     return graph
 
 
-def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.Values:
-    """The guesses, the given poses, and the target frames that fit the median cloud."""
+def initial_values(
+    problem: Problem,
+    measured: Sequence[gtsam.Pose3],
+    start: Mapping[str, gtsam.Pose3] | None = None,
+) -> gtsam.Values:
+    """The guesses, the given poses, and the target frames that fit the median cloud.
+
+    `start` are extrinsics that are nearer than the guesses.
+    """
+    extrinsics = {**problem.guesses, **(start or {})}
     values = gtsam.Values()
     for i, T in enumerate(problem.T_map_vehicle):
         values.insert(key_vehicle(i), T)
@@ -176,17 +185,17 @@ def initial_values(problem: Problem, measured: Sequence[gtsam.Pose3]) -> gtsam.V
         values.insert(key, np.zeros(1))
     for key, value in problem.parameter_values().items():
         values.insert(key, value)
-    E = problem.guesses[problem.reference]
+    E = extrinsics[problem.reference]
     values.insert(key_extrinsic(), E)
     for name in problem.lidars:
         for key in problem.extrinsic_keys_of(name)[1:]:
-            values.insert(key, E.between(problem.guesses[name]))
+            values.insert(key, E.between(extrinsics[name]))
     for m in range(problem.placements):
         candidates = []
         for j in np.flatnonzero(problem.cloud_placement == m).tolist():
             X = problem.T_map_vehicle[problem.cloud_pose[j]]
-            guess = problem.guesses[problem.lidars[problem.cloud_lidar[j]]]
-            candidates.append(measured[j].compose(X.compose(guess).inverse()))
+            extrinsic = extrinsics[problem.lidars[problem.cloud_lidar[j]]]
+            candidates.append(measured[j].compose(X.compose(extrinsic).inverse()))
         values.insert(key_target(m), _median_pose(candidates))
     return values
 

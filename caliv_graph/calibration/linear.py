@@ -196,7 +196,8 @@ def cloud_rows(system: DenseSystem, lines: CloudLinearisation) -> scipy.sparse.c
 
     Left perturbations of the predicted T_target_lidar by right perturbations of the variables.
     """
-    rows, columns, entries = [], [], []
+    nothing = np.zeros(0, dtype=np.int64)
+    rows, columns, entries = [nothing], [nothing], [np.zeros(0)]
     for j, (keys, jacobians) in enumerate(zip(lines.keys, lines.jacobians, strict=True)):
         for key, jacobian in zip(keys, jacobians, strict=True):
             row, column = np.indices(jacobian.shape)

@@ -57,7 +57,7 @@ def packed_solution(
     graph = merged(guessed_graph(state), clouds)
     roots = np.linalg.cholesky(information)
     whitened = np.einsum("jba,jb->ja", roots, cloud_residuals(reduced.lines, measured))
-    cuts = np.cumsum([len(r.T_target_lidar) for r in registrations])[:-1]
+    placements = problem.clouds_of_placements()
     vehicle = estimated_parameters(problem.parameters, state.values, reduced, cov)
     return Solution(
         mode=state.config.solve.mode,
@@ -70,8 +70,8 @@ def packed_solution(
         },
         T_target_map=tuple(_target_in_its_map(state, m) for m in range(problem.placements)),
         registrations=tuple(registrations),
-        cloud_weights=tuple(np.split(weights, cuts)),
-        residuals=tuple(np.split(whitened, cuts)),
+        cloud_weights=tuple(weights[own] for own in placements),
+        residuals=tuple(whitened[own] for own in placements),
         pose_noise=state.noise if problem.given().any() else None,
         registration_scale=state.scale,
         range_bias_m=state.bias_sizes.least_m,
@@ -97,6 +97,7 @@ def packed_solution(
         information_knowing={
             NAMES[name]: reduced.information_knowing(KEYS[name]) for name in vehicle
         },
+        structure=state.structure,
     )
 
 

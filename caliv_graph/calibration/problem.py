@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 
 from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS, TRUSTED_SIGMAS
+from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
     MotionTerm,
@@ -241,23 +242,32 @@ def pose_problem(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
     heave_m: float | None = None,
+    others: Collection[str] = (),
+    kept_ns: Mapping[int, Sequence[int] | IntArray] | None = None,
 ) -> Problem:
     """Lists LiDARs, poses and clouds that take part: long for the fields of a record.
 
-    `heave_m` is 1 sigma of the heave; None: that of the config, or the usual one.
+    Args:
+        observations: clouds of each target placement.
+        trajectories: one per drive.
+        config: LiDARs, noise.
+        heave_m: 1 sigma of the heave; None: that of the config, or the usual one.
+        others: names of LiDARs that take part without having seen a target.
+        kept_ns: per drive, stamps of further poses; they have nodes.
 
     Raises:
-        SolveError: there is no cloud.
+        SolveError: there is neither a cloud nor another pose.
     """
     clouds = [(o.placement, c) for o in observations for c in o.clouds]
-    if not clouds:
-        raise SolveError("no cloud of a target to calibrate with")
+    further = {(d, int(stamp)) for d, stamps in (kept_ns or {}).items() for stamp in stamps}
     heave_m = config.noise.heave_m or heave_m or HEAVE_SIGMA_M
-    seen = {c.lidar for _, c in clouds}
+    seen = {c.lidar for _, c in clouds} | set(others)
     lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
-    # If the configured reference saw no target, another LiDAR carries E.
+    poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds} | further))
+    if not (poses and lidars):
+        raise SolveError("no cloud of a target to calibrate with")
+    # If the configured reference saw nothing, another LiDAR carries E.
     reference = config.reference if config.reference in lidars else lidars[0]
-    poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds}))
     index = {pose: i for i, pose in enumerate(poses)}
     T_map_vehicle: list[gtsam.Pose3] = []
     twists: list[Array] = []
@@ -292,12 +302,12 @@ def pose_problem(
             moved_map(T, -origins[d]) for (d, _), T in zip(poses, T_map_vehicle, strict=True)
         ),
         origins_map=origins,
-        cloud_lidar=np.array([lidars.index(c.lidar) for _, c in clouds]),
-        cloud_pose=np.array([index[c.drive, c.stamp_ns] for _, c in clouds]),
-        cloud_placement=np.array([m for m, _ in clouds]),
+        cloud_lidar=np.array([lidars.index(c.lidar) for _, c in clouds], np.int64),
+        cloud_pose=np.array([index[c.drive, c.stamp_ns] for _, c in clouds], np.int64),
+        cloud_placement=np.array([m for m, _ in clouds], np.int64),
         placements=len(observations),
         motion={
-            d: with_heave(trajectory.joint_information(of_drive[d])[0], heave_m)
+            d: poses_with_heave(trajectory.joint_information(of_drive[d])[0], heave_m)
             for d, trajectory in smoothed.items()
         },
         motion_terms={d: term for d, term in terms.items() if term is not None},
@@ -305,7 +315,7 @@ def pose_problem(
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
-        views=np.concatenate([_views(o, of_pose, config) for o in observations]),
+        views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
     )
 
@@ -345,12 +355,3 @@ def _stated_covariances(
             if cov is not None:
                 out[drives == d] = cov
     return out if np.isfinite(out).any() else None
-
-
-def with_heave(information: Array, heave_m: float) -> Array:
-    """Information (6 m, 6 m) on poses with a heave of its own each, along the vehicle's z."""
-    cov = np.linalg.inv(information)
-    z = np.arange(5, len(cov), 6)
-    cov[z, z] += heave_m**2
-    with_heave = np.linalg.inv(cov)
-    return np.asarray(0.5 * (with_heave + with_heave.T))

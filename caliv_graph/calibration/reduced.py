@@ -122,8 +122,8 @@ class Reduced:
             cloud_jacobian=cloud_rows(self.system, self.lines),
             cloud_information=H,
             cloud_gradient=gradient,
-            by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]),
-            by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]),
+            by_vehicle=np.array([moves[1] for moves in self.lines.jacobians]).reshape(-1, 6, 6),
+            by_extrinsic=np.array([moves[-1] for moves in self.lines.jacobians]).reshape(-1, 6, 6),
             starts=self.system.starts,
             pose_information=pose_information,
             pose_gradient=pose_gradient,
@@ -159,7 +159,7 @@ def reduce_to_extrinsics(
     Args:
         problem: LiDARs, poses and clouds.
         values: where to linearise.
-        graph: everything but the clouds and the guesses.
+        graph: everything but the clouds and the guesses; it may be all.
         clouds: (6 J, 6 J) and (6 J,) their quadratic in left perturbations of their poses.
         lines: how these move with the variables.
 

@@ -32,7 +32,8 @@ from caliv_graph.calibration.solve import (
     WEIGHT_TOLERANCE,
     SolveState,
     base_graph,
-    offset_from_guesses,
+    covariance_of_mode,
+    step_of_mode,
 )
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, Iteration, Solution
@@ -45,11 +46,6 @@ from caliv_graph.registration.register import (
 )
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry, refit
 from caliv_graph.uncertainty.consistency import RANGE_BIAS_LIMIT_M
-from caliv_graph.uncertainty.observability import (
-    covariance_with_prior_in_null_space,
-    spectrum,
-    step_with_prior_in_null_space,
-)
 
 SHAPES_BEGUN_AGAIN = 8
 """Iteration of the joint loop after which normals and mixture are made anew: annealing is at its
@@ -203,14 +199,9 @@ class _Loop:
 
     def _step(self, reduced: Reduced, number: int) -> tuple[Array, int | None]:
         """The step (6n,) of the extrinsics; and in mode `auto` the undetermined directions."""
-        offset = offset_from_guesses(self.state)
-        if self.state.config.solve.mode != "auto":
-            return reduced.step_with(self.prior, offset), None
-        split = spectrum(reduced.D, self.prior, self.undetermined)
-        lost = int(split.undetermined.sum())
+        step, lost = step_of_mode(self.state, reduced, self.undetermined)
         if number >= DECIDED_AFTER:
             self.undetermined = lost
-        step = step_with_prior_in_null_space(reduced.D, reduced.c, self.prior, offset, split)
         return step, lost
 
     def _squares(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
@@ -339,11 +330,7 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     begun = time.perf_counter()
     loop.jackknife = loop.left_out(reduced)
     reduced = loop.scaled(shapes, reduced)
-    if state.config.solve.mode == "auto":
-        split = spectrum(reduced.D, loop.prior, loop.undetermined)
-        cov = covariance_with_prior_in_null_space(loop.prior, split)
-    else:
-        cov = np.asarray(np.linalg.inv(reduced.D + loop.prior), np.float64)
+    cov = covariance_of_mode(state, reduced, loop.undetermined)
     pull, information = _single_clouds(state, shapes)
     # The robust weights of the clouds are kept apart from their information.
     weighted = shapes.single[0]

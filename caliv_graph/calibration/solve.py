@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -41,10 +41,23 @@ from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
+from caliv_graph.calibration.structure import structure_graph
 from caliv_graph.config.model import Config, RobustConfig
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array, BoolArray, GroundObservation, PoseNoise, Registration
+from caliv_graph.products import (
+    Array,
+    BoolArray,
+    GroundObservation,
+    PoseNoise,
+    Registration,
+    StructureTerm,
+)
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry
+from caliv_graph.uncertainty.observability import (
+    covariance_with_prior_in_null_space,
+    spectrum,
+    step_with_prior_in_null_space,
+)
 
 REWEIGHTINGS = 12
 """Rounds of reweighting at most; graduated non-convexity needs more and may take four times
@@ -83,6 +96,9 @@ class SolveState:
     graph_seconds: float = 0.0
     bias_sizes: BiasSizes = UNKNOWN
     """1 sigma of the biases of the ranges; before the joint loop none are looked for."""
+    structure: tuple[StructureTerm, ...] = ()
+    structure_factors: CalibrationGraph = field(default_factory=CalibrationGraph)
+    """Of `structure`; like those of `motion` they take time to build."""
 
 
 def solve_registered(
@@ -91,11 +107,13 @@ def solve_registered(
     grounds: tuple[GroundObservation, ...],
     config: Config,
     turns: tuple[Symmetry | None, ...] = (),
+    structure: tuple[StructureTerm, ...] = (),
+    start: Mapping[str, gtsam.Pose3] | None = None,
 ) -> SolveState:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
 
     `registrations` are of the problem's placements, in order; `turns` the continuous symmetry of
-    each placement's target, empty for none.
+    each placement's target, empty for none; `start` extrinsics that are nearer than the guesses.
 
     Raises:
         SolveError: the graph is singular.
@@ -105,7 +123,7 @@ def solve_registered(
     state = SolveState(
         problem=problem,
         config=config,
-        values=initial_values(problem, measured),
+        values=initial_values(problem, measured, start),
         noise=first_pose_noise(config.noise),
         scale=TYPICAL_SCALE,
         weights=RobustWeights(config.robust, problem.clouds),
@@ -113,6 +131,8 @@ def solve_registered(
         sound=np.ones(problem.clouds, dtype=bool),
         grounds=grounds,
         turns=turns,
+        structure=structure,
+        structure_factors=structure_graph(problem, structure, start),
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and
@@ -171,10 +191,13 @@ def with_determined_offsets(
     `state` and `registrations` are those of `solve_registered`. Returns the problem; and LiDAR -> 1
     sigma in seconds of each offset that was free.
     """
-    problem = state.problem
-    if not problem.offsets:
-        return problem, {}
-    reduced = reduced_registered(state, registrations)
+    if not state.problem.offsets:
+        return state.problem, {}
+    return keep_determined_offsets(state.problem, reduced_registered(state, registrations))
+
+
+def keep_determined_offsets(problem: Problem, reduced: Reduced) -> tuple[Problem, dict[str, float]]:
+    """`with_determined_offsets` of a problem that is reduced to the extrinsics."""
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
     sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
     kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_DETERMINED_S)
@@ -259,7 +282,7 @@ def measured_poses(
             ridge = 1e-9 * np.trace(blocks, axis1=1, axis2=2)
             blocks = blocks + ridge[:, None, None] * np.eye(6)
         information.append(blocks)
-    return poses, np.concatenate(information)
+    return poses, np.concatenate([np.zeros((0, 6, 6)), *information])
 
 
 def of_single_clouds(information: Array, registrations: Sequence[Registration]) -> Array:
@@ -275,7 +298,7 @@ def cloud_residuals(lines: CloudLinearisation, measured: Sequence[gtsam.Pose3]) 
             gtsam.Pose3.Logmap(Z.compose(measured[j].inverse()))
             for j, Z in enumerate(lines.predicted)
         ]
-    )
+    ).reshape(-1, 6)
 
 
 def explained_parts(registrations: Sequence[Registration]) -> Array:
@@ -284,7 +307,7 @@ def explained_parts(registrations: Sequence[Registration]) -> Array:
 
 
 def base_graph(state: SolveState) -> CalibrationGraph:
-    """The graph without clouds and guesses: poses, ground, trusted extrinsics."""
+    """The graph without clouds and guesses: poses, ground, structure, trusted extrinsics."""
     problem = state.problem
     return merged(
         pose_graph(problem, state.noise, state.motion),
@@ -296,6 +319,7 @@ def base_graph(state: SolveState) -> CalibrationGraph:
             state.ground_weights,
             math.radians(state.config.noise.sway_deg),
         ),
+        state.structure_factors,
         prior_graph(problem, sorted(problem.fixed)),
     )
 
@@ -304,6 +328,30 @@ def guessed_graph(state: SolveState) -> CalibrationGraph:
     """`base_graph`, and the guesses of the extrinsics that are estimated."""
     estimated = [n for n in state.problem.lidars if n not in state.problem.fixed]
     return merged(base_graph(state), prior_graph(state.problem, estimated))
+
+
+def step_of_mode(
+    state: SolveState, reduced: Reduced, undetermined: int | None
+) -> tuple[Array, int | None]:
+    """The step (6 n,) of the extrinsics by `joint` or `auto`; and for `auto` the directions lost.
+
+    `undetermined` is the number of undetermined directions once it is fixed.
+    """
+    prior, offset = state.problem.guess_information(), offset_from_guesses(state)
+    if state.config.solve.mode != "auto":
+        return reduced.step_with(prior, offset), None
+    split = spectrum(reduced.D, prior, undetermined)
+    step = step_with_prior_in_null_space(reduced.D, reduced.c, prior, offset, split)
+    return step, int(split.undetermined.sum())
+
+
+def covariance_of_mode(state: SolveState, reduced: Reduced, undetermined: int | None) -> Array:
+    """(6 n, 6 n) covariance of the extrinsics, vehicle axes, by `joint` or `auto`."""
+    prior = state.problem.guess_information()
+    if state.config.solve.mode != "auto":
+        return np.asarray(np.linalg.inv(reduced.D + prior), np.float64)
+    split = spectrum(reduced.D, prior, undetermined)
+    return covariance_with_prior_in_null_space(prior, split)
 
 
 def offset_from_guesses(state: SolveState) -> Array:

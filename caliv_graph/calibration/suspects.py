@@ -16,8 +16,9 @@ import numpy as np
 import scipy.linalg
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
+from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
-from caliv_graph.calibration.problem import HEAVE_SIGMA_M, with_heave
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.conventions import key_ground
 from caliv_graph.errors import SolveError
@@ -108,7 +109,7 @@ def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _M
     heave_m = levels.get("heave", HEAVE_SIGMA_M)
     for drive, part in parts.items():
         at = np.repeat(drives == drive, 6)
-        W = with_heave(part.information, heave_m)
+        W = poses_with_heave(part.information, heave_m)
         mine = np.flatnonzero(drives == drive).tolist()
         off = [
             gtsam.Pose3.Logmap(T.between(poses[i]))

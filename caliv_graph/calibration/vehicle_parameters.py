@@ -6,7 +6,7 @@ The motion data of a drive are a Gaussian on its poses and on them (`README.md`,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import gtsam
@@ -14,8 +14,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.calibration.heave import with_heave
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm
-from caliv_graph.products import Array, VehicleParameter
+from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
@@ -72,11 +73,26 @@ def motion_term(
     trajectory: SmoothedTrajectory, stamps_ns: Sequence[int], heave_m: float
 ) -> MotionTerm | None:
     """The term of one drive's wanted poses; None if none of its parameters is uncertain."""
-    names = [name for name in KEYS if name in _uncertain(trajectory)]
-    if not names:
+    if not _uncertain(trajectory):
         return None
+    joint, values = motion_gaussian(trajectory, stamps_ns, heave_m)
+    return MotionTerm(joint.information, joint.gradient, _constant(joint), values)
+
+
+def motion_gaussian(
+    trajectory: SmoothedTrajectory, stamps_ns: Sequence[int] | IntArray, heave_m: float
+) -> tuple[JointInformation, dict[str, ParameterValue]]:
+    """The joint Gaussian of one drive's wanted poses, heave included, and uncertain parameters.
+
+    A rotation of the IMU is a right perturbation in it. Also the parameters' values, by name.
+    """
+    names = [name for name in KEYS if name in _uncertain(trajectory)]
     joint = _in_tangents(trajectory, trajectory.joint(stamps_ns, names))
-    return _with_heave(joint, {name: _value(trajectory, name) for name in names}, heave_m)
+    information, gradient = with_heave(
+        joint.information, joint.gradient, len(joint.T_map_vehicle), heave_m
+    )
+    joint = replace(joint, information=information, gradient=gradient)
+    return joint, {name: _value(trajectory, name) for name in names}
 
 
 def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, ParameterPrior]:
@@ -161,31 +177,12 @@ def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> Joi
     return JointInformation(information, gradient, joint.T_map_vehicle, joint.parameters)
 
 
-def _with_heave(
-    joint: JointInformation, values: Mapping[str, ParameterValue], heave_m: float
-) -> MotionTerm:
-    """Adds a heave of its own to each pose, along the vehicle's z; the parameters' share stays.
-
-    Given the parameters the poses are Gaussian: the heave adds to that covariance.
-    """
+def _constant(joint: JointInformation) -> float:
+    """At least twice what the quadratic falls below zero."""
     size = POSE * len(joint.T_map_vehicle)
-    A, B, C = (
-        joint.information[:size, :size],
-        joint.information[:size, size:],
-        joint.information[size:, size:],
-    )
-    a, c = joint.gradient[:size], joint.gradient[size:]
-    cov = np.linalg.inv(A)
-    follows, moved = cov @ B, cov @ a
-    own, pull = C - B.T @ follows, c - B.T @ moved  # the parameters' marginal
-    z = np.arange(5, size, POSE)
-    cov[z, z] += heave_m**2
-    A_heave = np.linalg.inv(cov)
-    B_heave, a_heave = A_heave @ follows, A_heave @ moved
-    information = np.block([[A_heave, B_heave], [B_heave.T, own + follows.T @ B_heave]])
-    return MotionTerm(
-        information=np.asarray(0.5 * (information + information.T)),
-        gradient=np.concatenate([a_heave, pull + follows.T @ a_heave]),
-        constant=float(a_heave @ moved + pull @ np.linalg.pinv(own, 1e-12, hermitian=True) @ pull),
-        values=values,
-    )
+    B, a = joint.information[:size, size:], joint.gradient[:size]
+    known = np.linalg.solve(joint.information[:size, :size], np.column_stack([B, a]))
+    own = joint.information[size:, size:] - B.T @ known[:, :-1]  # the parameters' marginal
+    pull = joint.gradient[size:] - B.T @ known[:, -1]
+    inverse = np.linalg.pinv(0.5 * (own + own.T), 1e-12, hermitian=True)
+    return float(a @ known[:, -1] + pull @ inverse @ pull)

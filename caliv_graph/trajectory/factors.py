@@ -17,8 +17,8 @@ from caliv_graph.products import Array
 
 NoiseModel = gtsam.noiseModel.Base
 
-POSE_SIZE, VECTOR_SIZE = 6, 3
-"""Coordinates of a pose; of a rotation or a vector in space."""
+POSE_SIZE, ROTATION_SIZE = 6, 3
+"""Coordinates of the tangent of a pose, and of a rotation."""
 
 
 def position_factor(
@@ -117,6 +117,13 @@ def orientation_factor(
     return gtsam.PoseRotationPrior3D(key_imu, R_map_imu, noise)
 
 
+def tangent_size(value: gtsam.Pose3 | gtsam.Rot3 | Array) -> int:
+    """Coordinates of the tangent of a pose, a rotation or a vector."""
+    if isinstance(value, gtsam.Pose3):
+        return POSE_SIZE
+    return ROTATION_SIZE if isinstance(value, gtsam.Rot3) else len(value)
+
+
 def marginal_factor(
     keys: Sequence[int],
     information: Array,
@@ -127,10 +134,10 @@ def marginal_factor(
     """A Gaussian on several variables at once as one native factor of a nonlinear graph.
 
     `information` is their joint one, square, of right perturbations (of poses rotation then
-    translation) about `means`, poses, rotations and vectors of 3. With a `gradient`, one number
-    per coordinate, twice the error is `d^T information d - 2 gradient^T d + constant`.
+    translation) about `means`, poses, rotations and vectors. With a `gradient`, one number per
+    coordinate, twice the error is `d^T information d - 2 gradient^T d + constant`.
     """
-    sizes = [POSE_SIZE if isinstance(mean, gtsam.Pose3) else VECTOR_SIZE for mean in means]
+    sizes = [tangent_size(mean) for mean in means]
     starts = np.cumsum([0, *sizes]).tolist()
     parts = [slice(a, b) for a, b in itertools.pairwise(starts)]
     linear = np.zeros(starts[-1]) if gradient is None else gradient

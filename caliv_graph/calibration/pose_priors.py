@@ -1,0 +1,132 @@
+"""What the motion data say of many poses of each drive: the prior that structure is solved under.
+
+The same Gaussians as the graph's own factors of the poses (`graph.pose_graph`), at more stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.calibration.vehicle_parameters import (
+    ParameterPrior,
+    ParameterValue,
+    motion_gaussian,
+    parameter_priors,
+)
+from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import unstack
+from caliv_graph.products import Array, IntArray, PoseNoise
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.trajectory.chain import inverse_of
+from caliv_graph.trajectory.noise import given_pose_covariances
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+
+def pose_priors(
+    trajectories: Sequence[VehicleTrajectory],
+    stamps_ns: Mapping[int, IntArray],
+    heave_m: float,
+    noise: PoseNoise,
+    config: Config,
+) -> dict[int, PosePrior]:
+    """The prior of the poses of some drives.
+
+    Args:
+        trajectories: one per drive.
+        stamps_ns: drive -> (m,) stamps, strictly increasing; a smoothed trajectory has nodes there.
+        heave_m: 1 sigma of the heave; given poses contain it.
+        noise: of given poses.
+        config: for the covariances that messages state.
+
+    Raises:
+        KeyError: a stamp has no node.
+    """
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    priors = parameter_priors(smoothed)
+    out = {}
+    for drive, stamps in stamps_ns.items():
+        trajectory = trajectories[drive]
+        if isinstance(trajectory, SmoothedTrajectory):
+            out[drive] = _smoothed(trajectory, stamps, heave_m, priors)
+        elif isinstance(trajectory, GivenTrajectory):
+            out[drive] = _given(trajectory, stamps, noise, config)
+    return out
+
+
+def _smoothed(
+    trajectory: SmoothedTrajectory,
+    stamps_ns: IntArray,
+    heave_m: float,
+    priors: Mapping[str, ParameterPrior],
+) -> PosePrior:
+    joint, values = motion_gaussian(trajectory, stamps_ns, heave_m)
+    covs = [priors[name].cov for name in values]
+    offsets = [_offset(priors[name], value) for name, value in values.items()]
+    nothing = np.zeros((0, 0))
+    return PosePrior(
+        stamps_ns=np.asarray(stamps_ns, np.int64),
+        T_map_vehicle=joint.T_map_vehicle,
+        parameters=values,
+        information=joint.information,
+        gradient=joint.gradient,
+        parameter_information=(
+            np.asarray(scipy.linalg.block_diag(*np.linalg.inv(covs))) if covs else nothing
+        ),
+        parameter_offset=np.concatenate([np.zeros(0), *offsets]),
+    )
+
+
+def _offset(prior: ParameterPrior, value: ParameterValue) -> Array:
+    """(3,) the value less the mean of its prior."""
+    mean = prior.mean
+    if isinstance(value, gtsam.Rot3) or isinstance(mean, gtsam.Rot3):
+        assert isinstance(value, gtsam.Rot3)
+        assert isinstance(mean, gtsam.Rot3)
+        return np.asarray(gtsam.Rot3.Logmap(mean.between(value)))
+    return value - mean
+
+
+def _given(
+    trajectory: GivenTrajectory, stamps_ns: IntArray, noise: PoseNoise, config: Config
+) -> PosePrior:
+    """White and Gauss-Markov errors of given poses: rotation in vehicle, position in map axes."""
+    stamps = np.asarray(stamps_ns, np.int64)
+    R, t = trajectory.poses_at(stamps)
+    m = len(stamps)
+    times = (stamps - stamps[0]) / NANOSECONDS_PER_SECOND
+    slow = np.exp(-np.abs(times[:, None] - times) / noise.drift_time_s)
+    cov = np.zeros((m, 6, m, 6))
+    drift, white = (
+        np.array([rotation] * 3 + [position] * 3) ** 2
+        for rotation, position in (
+            (noise.drift_rotation_rad, noise.drift_position_m),
+            (noise.white_rotation_rad, noise.white_position_m),
+        )
+    )
+    axes, each = np.arange(6), np.arange(m)
+    cov[:, axes, :, axes] = drift[:, None, None] * slow
+    own = np.tile(np.diag(white), (m, 1, 1))
+    stated = given_pose_covariances(trajectory.error_covariances(stamps), config)
+    if stated is not None:
+        known = np.isfinite(stated).all(axis=(1, 2))
+        own[known] = stated[known]
+    cov[each, :, each, :] += own
+    information = inverse_of(cov.reshape(6 * m, 6 * m)).reshape(m, 6, m, 6)
+    # A right perturbation moves the position by R dt.
+    information[:, 3:] = np.einsum("iba,ibjk->iajk", R, information[:, 3:])
+    information[..., 3:] = np.einsum("jba,ikjb->ikja", R, information[..., 3:])
+    return PosePrior(
+        stamps_ns=stamps,
+        T_map_vehicle=unstack(R, t),
+        parameters={},
+        information=information.reshape(6 * m, 6 * m),
+        gradient=np.zeros(6 * m),
+        parameter_information=np.zeros((0, 0)),
+        parameter_offset=np.zeros(0),
+    )

@@ -1,0 +1,143 @@
+"""Structure in the calibration graph: one native factor per drive (`README.md`, section 18)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.problem import Problem, moved_map
+from caliv_graph.calibration.vehicle_parameters import KEYS
+from caliv_graph.conventions import key_extrinsic, key_offset, key_vehicle
+from caliv_graph.products import Array, StructureTerm
+from caliv_graph.trajectory.factors import marginal_factor, tangent_size
+
+RIDGE = 1e-9
+"""Relative ridge under which the constant of a term is computed: a term is semidefinite."""
+
+
+def structure_graph(
+    problem: Problem,
+    terms: Sequence[StructureTerm],
+    start: Mapping[str, gtsam.Pose3] | None = None,
+) -> CalibrationGraph:
+    """What the structure of each drive says of poses, parameters, time offsets and extrinsics.
+
+    A parameter or an offset that the problem has not is held: a parameter at its value in the
+    term, an offset at zero. `start` are extrinsics near the solution: E is linearised there where
+    the reference has no structure; None: the guesses.
+
+    Raises:
+        ValueError: the problem does not have a pose or a LiDAR of a term.
+    """
+    graph = CalibrationGraph()
+    guess = (start or {}).get(problem.reference, problem.guesses[problem.reference])
+    for term in terms:
+        graph.append("structure", _factor(problem, term, guess))
+    return graph
+
+
+def lidars_with_structure(terms: Sequence[StructureTerm]) -> frozenset[str]:
+    """Names of the LiDARs of some terms."""
+    return frozenset(name for term in terms for name in term.T_vehicle_lidar)
+
+
+def _factor(
+    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3
+) -> gtsam.LinearContainerFactor:
+    """A term as a factor of the graph's variables, linearised where the term was."""
+    point = _linearisation_point(problem, term, T_vehicle_ref)
+    columns = _columns(point)
+    by_graph = np.zeros((len(term.gradient), sum(tangent_size(value) for value in point.values())))
+    held = np.zeros(len(term.gradient))
+    row = 0
+    for i in _pose_indices(problem, term):
+        by_graph[row : row + 6, columns[key_vehicle(i)]] = np.eye(6)
+        row += 6
+    for name in term.parameters:
+        if KEYS[name] in point:
+            by_graph[row : row + 3, columns[KEYS[name]]] = np.eye(3)
+        row += 3
+    for name, offset_s in term.time_offsets_s.items():
+        if name in problem.offsets:
+            by_graph[row, columns[key_offset(problem.lidars.index(name))]] = 1.0
+        else:
+            held[row] = -offset_s
+        row += 1
+    # T_a = E S_a, hence d(T_a) = Ad(S_a^-1) d(E) + d(S_a).
+    for name in term.T_vehicle_lidar:
+        rows = slice(row, row + 6)
+        _, *others = problem.extrinsic_keys_of(name)
+        by_graph[rows, columns[key_extrinsic()]] = np.eye(6)
+        for key in others:
+            S = point[key]
+            assert isinstance(S, gtsam.Pose3)
+            by_graph[rows, columns[key_extrinsic()]] = S.inverse().AdjointMap()
+            by_graph[rows, columns[key]] = np.eye(6)
+        row += 6
+    information = by_graph.T @ term.information @ by_graph
+    information = 0.5 * (information + information.T)
+    gradient = by_graph.T @ (term.gradient - term.information @ held)
+    return marginal_factor(
+        list(point),
+        information,
+        list(point.values()),
+        gradient,
+        _constant(information, gradient),
+    )
+
+
+def _linearisation_point(
+    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3
+) -> dict[int, gtsam.Pose3 | gtsam.Rot3 | Array]:
+    """The graph's variables of a term, where the term was linearised; E, S_a last."""
+    missing = [name for name in term.T_vehicle_lidar if name not in problem.lidars]
+    if missing:
+        raise ValueError(f"lidar '{missing[0]}' has structure, but is not in the problem")
+    origin = problem.origins_map[term.drive]
+    point: dict[int, gtsam.Pose3 | gtsam.Rot3 | Array] = {
+        key_vehicle(i): moved_map(T, -origin)
+        for i, T in zip(_pose_indices(problem, term), term.T_map_vehicle, strict=True)
+    }
+    variables = problem.parameter_values()
+    point |= {KEYS[name]: v for name, v in term.parameters.items() if KEYS[name] in variables}
+    point |= {
+        key_offset(problem.lidars.index(name)): np.array([offset_s])
+        for name, offset_s in term.time_offsets_s.items()
+        if name in problem.offsets
+    }
+    E = term.T_vehicle_lidar.get(problem.reference, T_vehicle_ref)
+    point[key_extrinsic()] = E
+    for name, T in term.T_vehicle_lidar.items():
+        for key in problem.extrinsic_keys_of(name)[1:]:
+            point[key] = E.between(T)
+    return point
+
+
+def _pose_indices(problem: Problem, term: StructureTerm) -> list[int]:
+    """Indices of the poses of a term among those of the problem."""
+    index = {pose: i for i, pose in enumerate(problem.poses)}
+    poses = [(term.drive, int(stamp)) for stamp in term.stamps_ns]
+    missing = [stamp for drive, stamp in poses if (drive, stamp) not in index]
+    if missing:
+        raise ValueError(f"the pose at {missing[0]} ns has structure, but is not in the problem")
+    return [index[pose] for pose in poses]
+
+
+def _columns(point: Mapping[int, gtsam.Pose3 | gtsam.Rot3 | Array]) -> dict[int, slice]:
+    """Where the coordinates of each variable are."""
+    out, start = {}, 0
+    for key, value in point.items():
+        out[key] = slice(start, start + tangent_size(value))
+        start += tangent_size(value)
+    return out
+
+
+def _constant(information: Array, gradient: Array) -> float:
+    """Twice what the quadratic falls below zero: with it, the factor's error is positive."""
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    scaled = information * np.outer(unit, unit) + RIDGE * np.eye(len(unit))
+    pull = unit * gradient
+    return max(float(pull @ np.linalg.solve(scaled, pull)), 0.0)

@@ -1,0 +1,41 @@
+"""What the motion data say of the vehicle's poses: the prior under which structure is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+
+from caliv_graph.products import Array, IntArray
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """What the motion data of one drive say of m poses and of k parameters of the vehicle.
+
+    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are right perturbations of
+    the poses (rotation then translation, rad and m), then of the parameters, three each: metres of
+    the lever arm; right perturbation of R_vehicle_imu. Heave of the body, a sigma of its own at
+    each pose, is part of the poses; the priors of the parameters are apart.
+
+    Attributes:
+        stamps_ns: (m,) of the poses, strictly increasing.
+        T_map_vehicle: m poses at which d is zero, the drive's map.
+        parameters: name of the input (`gnss.lever_arm`, `imu.T_vehicle_imu`) -> the value at which
+            d is zero: (3,) metres, or R_vehicle_imu. Empty: none is uncertain, or it was given
+            poses.
+        information: (6 m + 3 k, 6 m + 3 k), positive definite with `parameter_information` added.
+        gradient: (6 m + 3 k,).
+        parameter_information: (3 k, 3 k) of the priors of the parameters, one for all drives.
+        parameter_offset: (3 k,) the present values less the means of these priors: the priors add
+            `parameter_information` and `-parameter_information parameter_offset`.
+    """
+
+    stamps_ns: IntArray
+    T_map_vehicle: tuple[gtsam.Pose3, ...]
+    parameters: Mapping[str, Array | gtsam.Rot3]
+    information: Array
+    gradient: Array
+    parameter_information: Array
+    parameter_offset: Array

@@ -427,6 +427,7 @@ class ThinnedRecording(SimulatedRecording):
                 self._caster,
                 None,
                 random_stream(self.seed, Stream.LIDAR, index),
+                self.truth.range_bias_m[name],
             )
             for index, (name, model) in enumerate(self.scenario.lidars.items())
         }

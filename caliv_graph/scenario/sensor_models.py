@@ -100,6 +100,18 @@ class LidarModel(Section):
     range_sigma_m: NonNegative = Field(
         0.01, description="metres, 1 sigma of white noise along the beam"
     )
+    range_bias_m: Finite = Field(
+        0.0, description="metres, constant error of all ranges; positive: they are too long"
+    )
+    range_bias_sigma_m: NonNegative = Field(
+        0.0,
+        description="metres, 1 sigma of a constant error that is drawn once per drive and added",
+    )
+    incidence_bias_m: Finite = Field(
+        0.0,
+        description="metres, error b (1 / cos(incidence) - 1) of a range: b at 60 degrees, "
+        "constant beyond 80 degrees; a long footprint widens the echo",
+    )
     min_range_m: NonNegative = Field(1.0, description="metres; nearer returns are not reported")
     max_range_m: Positive = Field(500.0, description="metres; farther returns are not reported")
     time_offset_s: Finite = Field(

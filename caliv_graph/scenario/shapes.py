@@ -1,7 +1,8 @@
 """Triangle meshes, made in code, of what a scenario can place.
 
-Every solid is closed and has thickness. A backrest with a single skin would let two LiDARs on its
-two sides agree on a surface that a real chair does not have.
+Every solid is closed and has thickness; leaves of hedges and bushes are single triangles. A
+backrest with a single skin would let two LiDARs on its two sides agree on a surface that a real
+chair does not have.
 """
 
 from __future__ import annotations
@@ -30,20 +31,27 @@ from caliv_graph.scenario.street_shapes import (
     stroller,
     thin_chair,
 )
+from caliv_graph.scenario.surroundings import bush, car, hedge, kerb, wall
 from caliv_graph.scenario.terrain import Terrain
 from caliv_graph.scenario.world_models import (
     BicycleModel,
     BinModel,
     BoxesModel,
     BoxModel,
+    BushModel,
+    CarModel,
     ChairModel,
     ConesModel,
     CylinderModel,
+    GroundModel,
+    HedgeModel,
+    KerbModel,
     ObjectModel,
     PoleModel,
     StrollerModel,
     TableModel,
     ThinChairModel,
+    WallModel,
 )
 
 DRUM_SIDES = 360
@@ -124,19 +132,27 @@ def person() -> Mesh:
     )
 
 
-def ground(half_size_m: float, terrain: Terrain | None = None) -> Mesh:
-    """Ground around the origin, a square at z = 0 with ramps on it, facing up.
+def ground(model: GroundModel, terrain: Terrain | None = None) -> Mesh:
+    """Ground around the origin, a square at z = 0 with ramps or bumps on it, facing up.
 
     It is the only mesh without thickness.
     """
-    if terrain is None:
+    half_size_m = model.half_size_m
+    if terrain is None and model.bumps_sigma_m == 0.0:
         side_m = 2.0 * half_size_m
         square = rectangle((0.0, 0.0, 0.0), (side_m, side_m), (0, 1))
         return Mesh(square.reshape(-1, 3), grid_quads(np.arange(4).reshape(2, 2)))
-    x, y = np.meshgrid(*terrain.grid_lines(half_size_m), indexing="ij")
-    xy = np.column_stack([x.ravel(), y.ravel()])
-    vertices = np.column_stack([xy, terrain.heights(xy)[0]])
-    return Mesh(vertices, grid_quads(np.arange(len(xy)).reshape(x.shape)))
+    if terrain is None:
+        cells = math.ceil(2.0 * half_size_m / model.bumps_cell_m)
+        line = np.linspace(-half_size_m, half_size_m, cells + 1)
+        x, y = np.meshgrid(line, line, indexing="ij")
+        draws = np.random.default_rng(model.bumps_seed).standard_normal(x.size)
+        heights = model.bumps_sigma_m * draws
+    else:
+        x, y = np.meshgrid(*terrain.grid_lines(half_size_m), indexing="ij")
+        heights = terrain.heights(np.column_stack([x.ravel(), y.ravel()]))[0]
+    vertices = np.column_stack([x.ravel(), y.ravel(), heights])
+    return Mesh(vertices, grid_quads(np.arange(x.size).reshape(x.shape)))
 
 
 def object_mesh(model: ObjectModel) -> Mesh:
@@ -164,4 +180,14 @@ def object_mesh(model: ObjectModel) -> Mesh:
             return cylinder((0.0, 0.0, 0.0), top, model.radius_m, model.radius_m, sides)
         case TableModel():
             return table(model.size_m, model.top_m, model.leg_m)
+        case WallModel():
+            return wall(model)
+        case KerbModel():
+            return kerb(model.length_m, model.height_m, model.width_m)
+        case CarModel():
+            return car()
+        case HedgeModel():
+            return hedge(model)
+        case BushModel():
+            return bush(model)
     assert_never(model)

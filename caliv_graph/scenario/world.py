@@ -11,6 +11,7 @@ import numpy as np
 from caliv_graph.products import Array
 from caliv_graph.scenario.shapes import ground, object_mesh, person
 from caliv_graph.scenario.solids import Mesh, box, join
+from caliv_graph.scenario.surroundings import car
 from caliv_graph.scenario.terrain import Terrain, make_terrain
 from caliv_graph.scenario.world_models import BodyBoxModel, WalkerModel, WorldModel
 
@@ -23,10 +24,10 @@ CARRIER_M = 0.45
 
 @dataclass(frozen=True)
 class Walker:
-    """A person who walks back and forth.
+    """A person who walks back and forth, or a car.
 
     Attributes:
-        mesh: in the walker's frame: origin on the ground, x axis in the direction of walking.
+        mesh: in the walker's frame: origin on the ground, x axis in the direction of motion.
         model: path and speed.
         ground_z_map: height of the level ground in metres.
         terrain: the ramps on it.
@@ -106,7 +107,7 @@ class World:
         meshes: static meshes in the map: the ground first, then the objects.
         targets: names of the objects that serve as targets.
         ground_z_map: height of the level ground in metres.
-        walkers: people who walk, and objects that are carried.
+        walkers: people who walk, cars that drive, and objects that are carried.
         vehicle: the vehicle's body in the vehicle frame; None: it has none.
     """
 
@@ -151,9 +152,10 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
     z = model.ground.height_m
     terrain = make_terrain(model.ground)
     T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))
-    meshes = {GROUND: ground(model.ground.half_size_m, terrain).moved(T_map_ground)}
+    meshes = {GROUND: ground(model.ground, terrain).moved(T_map_ground)}
     walkers: dict[str, Walker | Carried] = {
-        name: Walker(person(), who, z, terrain) for name, who in model.walkers.items()
+        name: Walker(car() if who.shape == "car" else person(), who, z, terrain)
+        for name, who in model.walkers.items()
     }
     for name, placed in model.objects.items():
         stands = [placed, *placed.moves]

@@ -33,11 +33,25 @@ class RampModel(Section):
 
 
 class GroundModel(Section):
-    """Flat ground, a square about the map's origin, with ramps on it."""
+    """Flat ground, a square about the map's origin, with ramps on it.
+
+    Bumps are what the LiDARs see. The vehicle does not follow them.
+    """
 
     height_m: Finite = Field(0.0, description="metres, its z in the map")
     half_size_m: Positive = Field(200.0, description="metres from the origin to each edge")
     ramps: tuple[RampModel, ...] = Field((), description="absent: flat all over")
+    bumps_sigma_m: NonNegative = Field(
+        0.0, description="metres, 1 sigma of its height at the corners of its cells; 0: flat"
+    )
+    bumps_cell_m: Positive = Field(2.0, description="metres, side of a cell")
+    bumps_seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of its bumps")
+
+    @model_validator(mode="after")
+    def _bumps_or_ramps(self) -> GroundModel:
+        if self.ramps and self.bumps_sigma_m > 0.0:
+            raise ValueError("ground: it has ramps or bumps (bumps_sigma_m above 0), not both")
+        return self
 
 
 class MoveModel(Section):
@@ -156,6 +170,107 @@ class TableModel(_ObjectSection):
         return self
 
 
+class RevealsModel(Section):
+    """Windows in both faces of a wall, in one row, set back from the face."""
+
+    size_m: tuple[Positive, Positive] = Field((1.2, 1.4), description="metres, width and height")
+    spacing_m: Positive = Field(3.0, description="metres between the middles of two windows")
+    sill_m: Positive = Field(0.9, description="metres from the ground to their lower edge")
+    depth_m: tuple[Positive, Positive] = Field(
+        (0.05, 0.2), description="metres, least and largest depth; drawn for each window"
+    )
+
+    @model_validator(mode="after")
+    def _apart(self) -> RevealsModel:
+        if self.spacing_m <= self.size_m[0]:
+            raise ValueError(
+                f"spacing_m ({self.spacing_m} m) must exceed the width of {self.size_m[0]} m"
+            )
+        if self.depth_m[0] > self.depth_m[1]:
+            raise ValueError(f"depth_m: {self.depth_m[0]} m must not exceed {self.depth_m[1]} m")
+        return self
+
+
+class WallModel(_ObjectSection):
+    """A wall along its x axis. Neither face is flat: both have bumps of their own.
+
+    A bump is an offset of the face at the corner of a cell. Between corners it is interpolated.
+    """
+
+    shape: Literal["wall"] = "wall"
+    length_m: Positive = Field(description="metres along its x")
+    height_m: Positive = Field(3.0, description="metres")
+    thickness_m: Positive = Field(0.3, description="metres along its y")
+    bumps_sigma_m: NonNegative = Field(
+        0.005, description="metres, 1 sigma of a face's offset at the corners of its cells; 0: flat"
+    )
+    bumps_cell_m: tuple[Positive, Positive] = Field(
+        (1.0, 2.0), description="metres, least and largest side of a cell; drawn for each row"
+    )
+    reveals: RevealsModel | None = Field(None, description="windows; absent: none")
+    seed: Annotated[int, Field(ge=0)] = Field(
+        0, description="seed of its bumps and of the depths of its windows"
+    )
+
+    @model_validator(mode="after")
+    def _holds_its_windows(self) -> WallModel:
+        if self.bumps_cell_m[0] > self.bumps_cell_m[1]:
+            low, high = self.bumps_cell_m
+            raise ValueError(f"bumps_cell_m: {low} m must not exceed {high} m")
+        deep_m = 0.0 if self.reveals is None else self.reveals.depth_m[1]
+        # Six sigma on either side: the faces never meet.
+        if self.thickness_m <= 2.0 * deep_m + 12.0 * self.bumps_sigma_m:
+            raise ValueError(
+                f"thickness_m ({self.thickness_m} m) must exceed twice the depth of a window "
+                f"({deep_m} m) and six bumps_sigma_m ({self.bumps_sigma_m} m)"
+            )
+        if self.reveals is not None:
+            top_m = self.reveals.sill_m + self.reveals.size_m[1]
+            if top_m >= self.height_m or self.reveals.size_m[0] >= self.length_m:
+                raise ValueError(
+                    f"a wall of {self.length_m} m x {self.height_m} m is too small for windows of "
+                    f"{self.reveals.size_m[0]} m up to a height of {top_m} m"
+                )
+        return self
+
+
+class KerbModel(_ObjectSection):
+    """A kerbstone along its x axis; its sides lean by 10 mm."""
+
+    shape: Literal["kerb"] = "kerb"
+    length_m: Positive = Field(description="metres along its x")
+    height_m: Positive = Field(0.12, description="metres")
+    width_m: Positive = Field(0.15, description="metres along its y")
+
+
+class CarModel(_ObjectSection):
+    """A parked car, 4.3 m long, 1.8 m wide, 1.45 m high. Its sides are slightly curved."""
+
+    shape: Literal["car"] = "car"
+
+
+class _FoliageSection(_ObjectSection):
+    leaf_m: Positive = Field(0.12, description="metres, side of a leaf, a triangle")
+    penetration_m: Positive = Field(
+        0.2, description="metres, mean depth to which a beam enters before it hits a leaf"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of its leaves")
+
+
+class HedgeModel(_FoliageSection):
+    """A hedge: a box full of leaves, whose surface is uneven by the depth that beams enter."""
+
+    shape: Literal["hedge"] = "hedge"
+    size_m: PositiveTriple = Field((6.0, 0.8, 1.6), description="metres along its x, y, z")
+
+
+class BushModel(_FoliageSection):
+    """A bush: an ellipsoid full of leaves, on the ground."""
+
+    shape: Literal["bush"] = "bush"
+    size_m: PositiveTriple = Field((1.5, 1.5, 1.4), description="metres along its x, y, z")
+
+
 ObjectModel = Annotated[
     ChairModel
     | ThinChairModel
@@ -167,14 +282,23 @@ ObjectModel = Annotated[
     | BoxModel
     | PoleModel
     | CylinderModel
-    | TableModel,
+    | TableModel
+    | WallModel
+    | KerbModel
+    | CarModel
+    | HedgeModel
+    | BushModel,
     Field(discriminator="shape"),
 ]
 
 
 class WalkerModel(Section):
-    """A person, 1.75 m tall, who walks back and forth along a line."""
+    """A person, 1.75 m tall, who walks back and forth along a line, or a car that drives so.
 
+    A car turns at the ends within no time.
+    """
+
+    shape: Literal["person", "car"] = Field("person", description="what moves")
     from_xy_m: Pair = Field(description="metres, one end of the line in the map")
     to_xy_m: Pair = Field(description="metres, the other end")
     speed_m_s: Positive = Field(1.3, description="metres per second")
@@ -191,7 +315,9 @@ class WorldModel(Section):
 
     ground: GroundModel = GroundModel()
     objects: dict[str, ObjectModel] = Field({}, description="objects, by name")
-    walkers: dict[str, WalkerModel] = Field({}, description="people who walk, by name")
+    walkers: dict[str, WalkerModel] = Field(
+        {}, description="people who walk and cars that drive, by name"
+    )
     targets: tuple[str, ...] = Field(
         (), description="names of the objects that serve as calibration targets"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ from caliv_graph.scenario.world import GROUND, World
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SingleArray = npt.NDArray[np.float32]
+
+LEAST_COSINE = math.cos(math.radians(80.0))
+"""Cosine of the incidence beyond which its range error stays constant; it would become infinite."""
 
 
 def beam_directions(model: LidarModel) -> Array:
@@ -105,11 +109,14 @@ class SimulatedLidar:
         caster: RayCaster,
         crop: CropModel | None,
         rng: np.random.Generator,
+        range_bias_m: float = 0.0,
     ) -> None:
+        """`range_bias_m` is the error of all ranges on this drive; the model's is not added."""
         self.T_vehicle_lidar = model.mounting.pose()
         self._model = model
         self._caster = caster
         self._rng = rng
+        self._range_bias_m = range_bias_m
         # A separate stream: the range noise is the same with and without edge effects.
         self._edge_rng = rng.spawn(1)[0]
         directions = beam_directions(model)
@@ -273,7 +280,9 @@ class SimulatedLidar:
         on_vehicle = vehicle_m < distance_m
         distance_m[on_vehicle] = vehicle_m[on_vehicle]
         objects[on_vehicle] = self._vehicle_index
-        measured_m = distance_m + noise_m
+        # The body of the vehicle is hit squarely.
+        cosine = np.where(on_vehicle, 1.0, _cosine(directions_map, normals_map))
+        measured_m = distance_m + noise_m + self._bias_m(cosine)
         # Infinite where nothing was hit.
         reported = (measured_m >= self._model.min_range_m) & (measured_m <= self._model.max_range_m)
         return LidarReturns(
@@ -282,12 +291,24 @@ class SimulatedLidar:
             beams=beams[reported],
         )
 
+    def _bias_m(self, cosine: Array) -> Array:
+        """(n,) systematic error of ranges in metres, given the cosine of the incidence."""
+        along = 1.0 / np.maximum(cosine, LEAST_COSINE) - 1.0
+        bias_m: Array = self._range_bias_m + self._model.incidence_bias_m * along
+        return bias_m
+
     def _draw_noise(self) -> Array:
         return self._model.range_sigma_m * self._rng.standard_normal(len(self._directions_lidar))
 
     def _draw_edges(self) -> tuple[SingleArray, SingleArray]:
         """(beams, 2) normal and (beams, 3) uniform draws."""
         return _edge_draws(self._edge_rng, len(self._directions_lidar))
+
+
+def _cosine(directions: Array, normals: Array) -> Array:
+    """(n,) cosine of the angle between beams and normals (n, 3) of length 1 on either side."""
+    cosine: Array = np.abs(np.einsum("ni,ni->n", directions, normals))
+    return cosine
 
 
 def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Array) -> Array:

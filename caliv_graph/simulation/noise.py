@@ -18,7 +18,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
-from caliv_graph.scenario.sensor_models import PoseNoiseModel
+from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel
 
 
 class Stream(enum.IntEnum):
@@ -38,6 +38,7 @@ class Stream(enum.IntEnum):
     GROUND_WAVES = 11
     GNSS_CORRELATED = 12
     ORIENTATION_CORRELATED = 13
+    RANGE_BIAS = 14
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:
@@ -62,6 +63,11 @@ def height_and_heave(
     height_m = model.height_sigma_m * float(rng.standard_normal())
     heave_m: Array = model.heave_sigma_m * rng.standard_normal(count)
     return height_m, heave_m
+
+
+def drawn_range_bias_m(model: LidarModel, rng: np.random.Generator) -> float:
+    """The constant error of all ranges of a LiDAR on one drive, in metres."""
+    return model.range_bias_m + model.range_bias_sigma_m * float(rng.standard_normal())
 
 
 def gauss_markov(stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator) -> Array:

@@ -28,6 +28,7 @@ from caliv_graph.simulation.motion import (
 )
 from caliv_graph.simulation.noise import (
     Stream,
+    drawn_range_bias_m,
     height_and_heave,
     perturbed_extrinsic,
     random_stream,
@@ -56,6 +57,7 @@ class SimulatedTruth:
             the ground's height plus this drive's height error.
         heave_m: (n,) lift of the vehicle while clouds are taken, metres, one value per
             `HEAVE_PERIOD_NS` of their stamps. The poses of this class exclude it.
+        range_bias_m: constant error of the ranges per LiDAR, metres.
     """
 
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
@@ -66,6 +68,7 @@ class SimulatedTruth:
     drive: Drive
     level_z_map: float
     heave_m: Array
+    range_bias_m: Mapping[str, float]
 
     def states(self, stamps_ns: IntArray) -> VehicleStates:
         """Pose, velocity, acceleration and angular velocity at any stamps of the recording."""
@@ -130,6 +133,10 @@ class SimulatedRecording:
             drive=drive,
             level_z_map=self.world.ground_z_map + height_m,
             heave_m=heave_m,
+            range_bias_m={
+                name: drawn_range_bias_m(model, random_stream(seed, Stream.RANGE_BIAS, index))
+                for index, (name, model) in enumerate(scenario.lidars.items())
+            },
         )
         self.guesses: dict[str, PoseConfig] = {
             name: perturbed_extrinsic(
@@ -226,6 +233,7 @@ class SimulatedRecording:
             self._caster,
             self.scenario.crop,
             random_stream(self.seed, Stream.LIDAR, index),
+            self.truth.range_bias_m[lidar],
         )
         for frame, stamp_ns in enumerate(self._frame_stamps(lidar).tolist()):
             absolute_ns = stamp_ns + self.truth.start_ns

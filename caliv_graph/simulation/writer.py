@@ -92,6 +92,14 @@ def _target_regions(recording: SimulatedRecording, has_bag: bool) -> list[dict[s
     return regions
 
 
+def _target_section(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
+    """The config's `target`; without it the program searches for one."""
+    scenario = recording.scenario
+    if scenario.config_target == "search" or not scenario.world.targets:
+        return {}
+    return {"target": _target_regions(recording, has_bag)}
+
+
 def _first_antenna_position(recording: SimulatedRecording) -> Array:
     """(3,) true position of the antenna in the map at the first fix; zero without a fix."""
     gnss = recording.motion().gnss
@@ -206,12 +214,12 @@ def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
     if scenario.suspension.height_sigma_m > 0.0:
         ground["sigma"] = scenario.suspension.height_sigma_m
     data = {"format": "rosbag", "path": BAG_FOLDER}
-    content = {
+    return {
         "data": data if has_bag else {"format": "caliv", "path": CALIV_FOLDER},
         **(_motion_sections(scenario) if has_bag else {}),
         "lidars": lidars,
         "reference": scenario.reference,
-        "target": _target_regions(recording, has_bag),
+        **_target_section(recording, has_bag),
         "ground": ground,
         "noise": (
             _noise_of_sensors(scenario)
@@ -219,9 +227,6 @@ def config_of(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
             else _noise_of_poses(scenario, recording.truth.drive.duration_s)
         ),
     }
-    if scenario.config_target == "search" or not recording.world.targets:
-        del content["target"]
-    return content
 
 
 def write_config(path: Path, recording: SimulatedRecording, has_bag: bool) -> None:

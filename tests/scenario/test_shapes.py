@@ -209,7 +209,7 @@ def test_moved_mesh_is_mapped_by_the_pose() -> None:
 
 
 def test_ground_looks_up() -> None:
-    mesh = ground(25.0)
+    mesh = ground(GroundModel(half_size_m=25.0))
     a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     assert (normals[:, 2] > 0.0).all()
@@ -369,7 +369,7 @@ def test_mesh_of_the_ground_is_the_function() -> None:
 
 
 def test_ground_with_a_ramp_ends_where_it_should_and_is_not_huge() -> None:
-    mesh = ground(100.0, Terrain((RAMP,)))
+    mesh = ground(GroundModel(half_size_m=100.0), Terrain((RAMP,)))
     np.testing.assert_allclose(mesh.vertices[:, :2].min(axis=0), [-100.0, -100.0])
     np.testing.assert_allclose(mesh.vertices[:, :2].max(axis=0), [100.0, 100.0])
     assert len(mesh.vertices) < 50_000

@@ -1,0 +1,160 @@
+"""Noise of structure: what the residuals say of beams, sightings and strips."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.sightings import BEAM_RAD, ROUGHNESS_M, Sightings
+from caliv_graph.structure.system import Geometry, Layout, Nuisances, solved
+
+FIRST_SIGHTING_M = 0.01
+"""1 sigma of the offset of a strip from scan to scan before it is estimated: on the safe side, as
+rough extrinsics are still in it."""
+
+LEAST_M = 2e-4
+"""Smallest sigma of an offset: what no LiDAR resolves."""
+
+OWN_STRIP = 10.0
+"""Number of sightings that the common sigma counts as when the sigma of one strip is estimated."""
+
+SPREADS = (3.0, 6.0)
+"""Offset of a sighting in sigmas up to which it has full weight, and from which it has none."""
+
+
+PROBES = 20
+"""Random vectors for the trace: it is then good to a few percent."""
+
+MOST_FITTED = 0.9
+"""Largest share of the offsets' variance that is taken as fitted."""
+
+
+def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
+    """(L,) noise along the beam of each LiDAR, from the scatter of patches about their planes.
+
+    The median: patches of leaves scatter more. At least a third of what is stated.
+    """
+    centres = patches.centres_lidar
+    distance = np.linalg.norm(centres, axis=1)
+    cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar)) / distance
+    points = np.maximum(patches.points, 4.0)
+    variance = patches.scatter_m**2 * points / (points - 3.0)
+    variance = variance - ROUGHNESS_M**2 - (BEAM_RAD * distance) ** 2 * (1.0 - cos**2)
+    out = np.full(len(patches.lidars), stated_m)
+    for i in range(len(out)):
+        own = (patches.scan_lidar[patches.scan] == i) & (points >= 8.0) & (cos > 0.5)
+        if own.sum() >= 50:
+            found = float(np.median(variance[own] / cos[own] ** 2))
+            out[i] = np.sqrt(max(found, (stated_m / 3.0) ** 2))
+    return out
+
+
+def robust_weights(offsets_m: Array, sightings: Sightings, nuisances: Nuisances) -> Array:
+    """(Q,) weights by the offset of each sighting: full, falling to none between `SPREADS`."""
+    variance = _variances(sightings, nuisances.sighting[sightings.strip]) + nuisances.shared**2
+    t = np.abs(offsets_m) / np.sqrt(variance)
+    low, high = SPREADS
+    return np.clip((high - t) / (high - low), 0.0, 1.0)
+
+
+def _variances(sightings: Sightings, sigma_m: Array) -> Array:
+    """(Q,) variance of the offset of each sighting."""
+    return np.asarray(1.0 / sightings.moments[:, 3, 3] + sigma_m**2)
+
+
+def fitted_noise(
+    geometry: Geometry,
+    sightings: Sightings,
+    group: IntArray,
+    factor: tuple[Array, Array],
+    layout: Layout,
+    nuisances: Nuisances,
+    errors: Array,
+) -> Nuisances:
+    """Noise levels from the residuals at an estimate (REML: what was fitted is counted).
+
+    Args:
+        geometry: residuals at the estimate.
+        sightings: Q of them.
+        group: (Q,) a number for scan and surface of each.
+        factor: of the system that the estimate solves.
+        layout: its coordinates.
+        nuisances: the levels that it was solved with.
+        errors: (`layout.errors`,) estimated errors of the LiDARs.
+    """
+    offsets = geometry.offsets_m(sightings)
+    sigma = nuisances.sighting[sightings.strip]
+    fitted = _fitted_share(geometry, sightings, factor, layout, sigma)
+    free = 1.0 - min(fitted, MOST_FITTED)
+    point = 1.0 / sightings.moments[:, 3, 3]
+    total_sigma = _common_sigma(offsets, point, free)
+    limit = 3.0 * np.sqrt(point + total_sigma**2)
+    shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
+    shared = float(np.clip(shared, LEAST_M**2, 0.9 * total_sigma**2 + LEAST_M**2))
+    common = math.sqrt(max(total_sigma**2 - shared, LEAST_M**2))
+    square = np.clip(offsets, -limit, limit) ** 2 / free - point - shared
+    total = np.bincount(sightings.strip, square, layout.strips)
+    count = np.bincount(sightings.strip, minlength=layout.strips)
+    own = (OWN_STRIP * common**2 + total) / (OWN_STRIP + count)
+    return replace(
+        nuisances,
+        sighting=np.sqrt(np.maximum(own, LEAST_M**2)),
+        shared=math.sqrt(shared),
+        strip=_strip_sigma(factor, layout, nuisances.strip, errors),
+    )
+
+
+def _fitted_share(
+    geometry: Geometry,
+    sightings: Sightings,
+    factor: tuple[Array, Array],
+    layout: Layout,
+    sigma: Array,
+) -> float:
+    """Share of the offsets' variance that the estimate takes up: `tr(J H^-1 J^T W) / Q`.
+
+    By random signs (Hutchinson): the exact trace costs as much as all else together.
+    """
+    J = geometry.offset_rows(sightings, layout.size)
+    root = 1.0 / np.sqrt(_variances(sightings, sigma))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
+    seen = J.T @ (root[:, None] * signs)
+    return float((seen * solved(factor, seen)).sum() / PROBES / sightings.count)
+
+
+def _common_sigma(offsets: Array, point: Array, free: float) -> float:
+    """1 sigma of the offsets beside the noise of points: the sum of squares is as expected."""
+    low, high = math.log(LEAST_M), math.log(1.0)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        t = offsets**2 / (point + math.exp(2.0 * middle))
+        # Outliers count as three sigmas.
+        low, high = (middle, high) if np.minimum(t, 9.0).mean() > free else (low, middle)
+    return math.exp(0.5 * (low + high))
+
+
+def _shared_variance(offsets: Array, group: IntArray) -> float:
+    """Mean product of two offsets of a group, m^2; 0 where no group has two."""
+    _, number, count = np.unique(group, return_inverse=True, return_counts=True)
+    total = np.bincount(number.ravel(), offsets)
+    pairs = float((count * (count - 1.0)).sum())
+    return float((total**2).sum() - (offsets**2).sum()) / pairs if pairs else 0.0
+
+
+def _strip_sigma(
+    factor: tuple[Array, Array], layout: Layout, before: float, errors: Array
+) -> float:
+    """1 sigma of how far LiDARs see a strip apart: one fixed-point step of its likelihood."""
+    first = layout.error + layout.lidars * (2 + layout.surfaces)
+    some = np.zeros((layout.size, layout.size - first))
+    some[first:] = np.eye(layout.size - first)
+    variance = np.diagonal(solved(factor, some)[first:])
+    known = np.maximum(1.0 - variance / before**2, 0.0).sum()
+    if known < 1.0:
+        return before
+    found = float((errors[first - layout.error :] ** 2).sum() / known)
+    return float(np.clip(math.sqrt(found), LEAST_M, 0.05))

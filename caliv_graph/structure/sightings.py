@@ -1,0 +1,136 @@
+"""Sightings: what one scan of one LiDAR says of one strip, as weighted moments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.geometry.se3 import tangent_axes
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.strips import Strips
+
+ROUGHNESS_M = 0.003
+"""1 sigma of the surface about its plane from point to point: plaster, joints of bricks."""
+
+BEAM_RAD = 3e-4
+"""1 sigma of the direction of a beam: a tenth of the usual divergence of 3 mrad."""
+
+TILT_LENGTH_M = 1.0
+"""Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
+fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Q sightings, each of one strip in one scan.
+
+    Attributes:
+        scan: (Q,) index of the scan.
+        strip: (Q,) index of the strip.
+        moments: (Q, 4, 4) sum of w h h^T, h = (p, 1), p in the lidar frame at the scan's stamp, w
+            in 1/m^2.
+        cos_incidence: (Q,) cosine of the angle between beam and normal.
+    """
+
+    scan: IntArray
+    strip: IntArray
+    moments: Array
+    cos_incidence: Array
+
+    @property
+    def count(self) -> int:
+        """Q."""
+        return len(self.scan)
+
+    @property
+    def centroids_lidar(self) -> Array:
+        """(Q, 3) weighted mean of the points."""
+        return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
+
+    def only(self, keep: Array) -> Sightings:
+        """Those of a mask or of indices."""
+        return replace(
+            self,
+            scan=self.scan[keep],
+            strip=self.strip[keep],
+            moments=self.moments[keep],
+            cos_incidence=self.cos_incidence[keep],
+        )
+
+
+def moved_moments(moments: Array, R: Array, t: Array) -> Array:
+    """Moments (N, 4, 4) of points moved by `R p + t`, (N, 3, 3) and (N, 3)."""
+    L = np.zeros_like(moments)
+    L[:, :3, :3], L[:, :3, 3], L[:, 3, 3] = R, t, 1.0
+    return np.asarray(L @ moments @ np.swapaxes(L, 1, 2))
+
+
+def point_weights(
+    centres_lidar: Array, normals_lidar: Array, range_sigma_m: Array | float
+) -> Array:
+    """(N,) weight of a point's distance from its plane, 1/m^2.
+
+    Noise along the beam counts by the cosine of the incidence, that across it by the sine.
+    """
+    distance = np.linalg.norm(centres_lidar, axis=1)
+    cos = np.abs(np.einsum("ni,ni->n", centres_lidar, normals_lidar)) / distance
+    across = (BEAM_RAD * distance) ** 2 * (1.0 - cos**2)
+    return np.asarray(1.0 / ((range_sigma_m * cos) ** 2 + across + ROUGHNESS_M**2))
+
+
+def sightings_of(
+    patches: DrivePatches,
+    moments_at_stamp: Array,
+    normals_at_stamp: Array,
+    strips: Strips,
+    range_sigma_m: Array,
+) -> Sightings:
+    """Adds up the patches of each strip in each scan.
+
+    Args:
+        patches: all patches.
+        moments_at_stamp: (N, 4, 4) moments in the lidar frame at the scan's stamp.
+        normals_at_stamp: (N, 3) normals of their strips in that frame, of patches on a strip.
+        strips: which patch is on which.
+        range_sigma_m: (L,) noise along the beam of each LiDAR.
+    """
+    own = np.flatnonzero(strips.of_patch >= 0)
+    key = patches.scan[own] * max(strips.count, 1) + strips.of_patch[own]
+    order = np.argsort(key, kind="stable")
+    own, key = own[order], key[order]
+    if not len(own):
+        none = np.zeros(0, np.int64)
+        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros(0))
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
+    sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
+    weight = point_weights(centres, normals_at_stamp[own], sigma)
+    moments = np.add.reduceat(weight[:, None, None] * moments_at_stamp[own], starts)
+    centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
+    cos = np.abs(np.einsum("qi,qi->q", centroid, normals_at_stamp[own[starts]]))
+    return Sightings(
+        scan=patches.scan[own[starts]],
+        strip=strips.of_patch[own[starts]],
+        moments=moments,
+        cos_incidence=cos / np.linalg.norm(centroid, axis=1),
+    )
+
+
+def without_own_error(sightings: Sightings, normals_lidar: Array, sigma_m: Array) -> Array:
+    """Moments (Q, 4, 4) with an error of each sighting eliminated: an offset and two tilts.
+
+    `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`: however many points it has, a sighting knows its strip
+    no better than `sigma_m` (Q,) at its middle. `normals_lidar` (Q, 3) at the scan's stamp.
+    """
+    S, centroid = sightings.moments, sightings.centroids_lidar
+    axes = tangent_axes(normals_lidar) / TILT_LENGTH_M
+    N = np.zeros((len(S), 4, 3))
+    N[:, 3, 0] = 1.0
+    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
+    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
+    SN = S @ N
+    inner = np.swapaxes(N, 1, 2) @ SN + np.eye(3) * sigma_m[:, None, None] ** -2.0
+    out = S - SN @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))

@@ -1,0 +1,323 @@
+"""The solve of structure: strips, sightings, weights and noise go round until nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.noise import (
+    FIRST_SIGHTING_M,
+    fitted_noise,
+    range_sigmas,
+    robust_weights,
+)
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
+from caliv_graph.structure.strips import Strips, find_strips
+from caliv_graph.structure.system import (
+    Geometry,
+    Layout,
+    Nuisances,
+    Rows,
+    State,
+    System,
+    factor_of,
+    geometry_of,
+    lidar_poses,
+    solved,
+    stepped,
+    system_of,
+    whitened,
+)
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+GATES_M = (0.3, 0.15, 0.08, 0.06, 0.06)
+"""Distance of a patch from its strip at most, from round to round: from the error of guesses
+aligned roughly to a few sigmas of patches and bumps."""
+
+LAST_STEPS = 5
+"""Steps after the last round of strips at most."""
+
+SMALL_SIGMAS = 0.02
+"""Step in standard deviations of the extrinsics at which the solve has converged."""
+
+BIAS_M = 0.005
+SURFACE_BIAS_M = 0.003
+INCIDENCE_BIAS_M = 0.003
+"""1 sigma of the biases of ranges: of a LiDAR, of it on a surface, and per unit of
+1 / cos(incidence): the accuracy that data sheets state, 1 to 3 cm at most, 3 to 5 mm typically."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What the solve of one drive is given.
+
+    Attributes:
+        patches: of the drive.
+        prior: what the motion data say of the poses.
+        pose_of_scan: (S,) index of the pose of each scan.
+        relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
+            time.
+        twists: (M, 6) velocity at each pose; None: no time offset is free.
+        offsets: indices of the LiDARs with a free time offset.
+        guesses: n guesses of T_vehicle_lidar.
+        guess_information: (6 n, 6 n) of them, vehicle axes.
+        range_sigma_m: noise along the beam as stated.
+    """
+
+    patches: DrivePatches
+    prior: PosePrior
+    pose_of_scan: IntArray
+    relative: Array
+    twists: Array | None
+    offsets: tuple[int, ...]
+    guesses: tuple[gtsam.Pose3, ...]
+    guess_information: Array
+    range_sigma_m: float
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The outcome: estimate, strips, and the system at the estimate."""
+
+    problem: Problem
+    state: State
+    strips: Strips
+    sightings: Sightings
+    weights: Array
+    nuisances: Nuisances
+    layout: Layout
+    geometry: Geometry
+    rows: Rows
+    system: System
+    converged: bool
+
+
+def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
+    """(N, 4, 4) T of the vehicle at each patch's time in the vehicle frame at the scan's stamp."""
+    stamps = patches.stamps_ns[patches.scan]
+    begin, end = trajectory.span_ns
+    own = np.clip(stamps + np.round(1e9 * patches.time_s).astype(np.int64), begin, end)
+    # Thousands of patches share a time to a millisecond.
+    times, inverse = np.unique(own // 200_000, return_inverse=True)
+    R, t = trajectory.poses_at(np.clip(times * 200_000, begin, end))
+    R, t = R[inverse.ravel()], t[inverse.ravel()]
+    R_s, t_s = trajectory.poses_at(patches.stamps_ns)
+    R_s, t_s = R_s[patches.scan], t_s[patches.scan]
+    out = np.zeros((len(stamps), 4, 4))
+    out[:, :3, :3] = np.swapaxes(R_s, 1, 2) @ R
+    out[:, :3, 3] = np.einsum("nji,nj->ni", R_s, t - t_s)
+    out[:, 3, 3] = 1.0
+    still = patches.time_s == 0.0
+    out[still] = np.eye(4)
+    return out
+
+
+def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
+    """Solves one drive from rough extrinsics; None if there is no structure.
+
+    Args:
+        problem: the drive.
+        start: T_vehicle_lidar to begin with, per LiDAR.
+
+    Raises:
+        SolveError: the system is singular.
+    """
+    patches, prior = problem.patches, problem.prior
+    R, t = stack(prior.T_map_vehicle)
+    n = len(patches.lidars)
+    state = State(
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        moved=np.zeros(len(prior.gradient)),
+        T_vehicle_lidar=tuple(start[name] for name in patches.lidars),
+        offsets_s=np.zeros(n),
+        centres_map=np.zeros((0, 3)),
+        normals_map=np.zeros((0, 3)),
+        errors=np.zeros(0),
+    )
+    range_sigma = range_sigmas(patches, problem.range_sigma_m)
+    found: Solved | None = None
+    sigma_m = strip_m = shared_m = FIRST_SIGHTING_M
+    for gate in GATES_M:
+        found = _round(problem, state, range_sigma, gate, sigma_m, strip_m, shared_m)
+        if found is None:
+            return None
+        found = _settled(found, steps=2)
+        sigma_m = float(np.median(found.nuisances.sighting))
+        strip_m, shared_m = found.nuisances.strip, found.nuisances.shared
+        state = found.state
+    return None if found is None else _settled(found, steps=LAST_STEPS)
+
+
+def _round(
+    problem: Problem,
+    state: State,
+    range_sigma: Array,
+    gate_m: float,
+    sigma_m: float,
+    strip_m: float,
+    shared_m: float,
+) -> Solved | None:
+    """New strips and sightings at an estimate."""
+    patches = problem.patches
+    lidar = patches.scan_lidar[patches.scan]
+    pose = problem.pose_of_scan[patches.scan]
+    at_stamp, normals = _at_stamp(problem, state, lidar)
+    R, t = lidar_poses(state, lidar, pose, problem.twists)
+    moments_map = moved_moments(at_stamp, R, t)
+    normals_map = np.einsum("nij,nj->ni", R, normals)
+    strips = find_strips(moments_map, normals_map, patches.scan, gate_m)
+    if not strips.count:
+        return None
+    own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
+    of_strip = np.einsum("nji,nj->ni", R, strips.normals_map[own])
+    sightings = sightings_of(patches, at_stamp, of_strip, strips, range_sigma)
+    layout = Layout(
+        poses=len(problem.prior.stamps_ns),
+        parameters=len(problem.prior.parameter_information),
+        offsets=problem.offsets,
+        lidars=len(patches.lidars),
+        strips=strips.count,
+        surfaces=int(strips.surface.max()) + 1,
+    )
+    errors = np.zeros(layout.errors)
+    # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.
+    errors[: 2 * layout.lidars] = state.errors[: 2 * layout.lidars] if len(state.errors) else 0.0
+    state = replace(
+        state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
+    )
+    nuisances = Nuisances(
+        bias=BIAS_M,
+        incidence=INCIDENCE_BIAS_M,
+        surface=SURFACE_BIAS_M,
+        strip=strip_m,
+        sighting=np.full(strips.count, sigma_m),
+        shared=shared_m,
+    )
+    weights = np.ones(sightings.count)
+    geometry = _geometry(problem, state, strips, sightings, layout)
+    rows, system = _whitened(
+        problem, state, geometry, strips, sightings, weights, nuisances, layout
+    )
+    return Solved(
+        problem, state, strips, sightings, weights, nuisances, layout, geometry, rows, system, False
+    )
+
+
+def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array]:
+    """Moments and normals of all patches in the lidar frame at their scans' stamps."""
+    patches = problem.patches
+    if not patches.time_s.any():
+        return patches.moments, patches.normal_lidar
+    T = np.array([T.matrix() for T in state.T_vehicle_lidar])
+    inverse = np.array([T.inverse().matrix() for T in state.T_vehicle_lidar])
+    moved = inverse[lidar] @ problem.relative @ T[lidar]
+    R, t = moved[:, :3, :3], moved[:, :3, 3]
+    normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
+    return moved_moments(patches.moments, R, t), normals
+
+
+def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
+    """(Q,) a number for scan and surface of each sighting."""
+    surface = strips.surface[sightings.strip]
+    return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
+
+
+def _geometry(
+    problem: Problem, state: State, strips: Strips, sightings: Sightings, layout: Layout
+) -> Geometry:
+    scan = sightings.scan
+    return geometry_of(
+        state,
+        sightings,
+        layout,
+        problem.patches.scan_lidar[scan],
+        problem.pose_of_scan[scan],
+        strips.surface[sightings.strip],
+        problem.twists,
+    )
+
+
+def _whitened(
+    problem: Problem,
+    state: State,
+    geometry: Geometry,
+    strips: Strips,
+    sightings: Sightings,
+    weights: Array,
+    nuisances: Nuisances,
+    layout: Layout,
+) -> tuple[Rows, System]:
+    group = groups_of(sightings, strips)
+    rows = whitened(geometry, sightings, group, nuisances, weights, layout.size)
+    return rows, system_of(rows, state, layout, problem.prior, nuisances)
+
+
+def _settled(found: Solved, steps: int) -> Solved:
+    """Gauss-Newton steps; after each one the noise levels and the robust weights."""
+    problem, layout, sightings = found.problem, found.layout, found.sightings
+    converged = False
+    for number in range(steps):
+        H, b = with_guesses(problem, found.state, found.system)
+        factor = factor_of(H)
+        d = solved(factor, b)
+        state = stepped(found.state, layout, d)
+        geometry = _geometry(problem, state, found.strips, sightings, layout)
+        nuisances = fitted_noise(
+            geometry,
+            sightings,
+            groups_of(sightings, found.strips),
+            factor,
+            layout,
+            found.nuisances,
+            state.errors,
+        )
+        weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
+        rows, system = _whitened(
+            problem, state, geometry, found.strips, sightings, weights, nuisances, layout
+        )
+        own = slice(layout.extrinsic, layout.plane)
+        converged = number > 0 and float(d[own] @ H[own, own] @ d[own]) < SMALL_SIGMAS**2
+        found = replace(
+            found,
+            state=state,
+            weights=weights,
+            nuisances=nuisances,
+            geometry=geometry,
+            rows=rows,
+            system=system,
+            converged=converged,
+        )
+        if converged:
+            break
+    return found
+
+
+def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
+    """The system's H and b with the guesses: they hold what structure does not determine."""
+    layout = system.layout
+    H, b = system.H.copy(), system.b.copy()
+    own = slice(layout.extrinsic, layout.plane)
+    axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
+    away = np.zeros(6 * layout.lidars)
+    pairs = zip(state.T_vehicle_lidar, problem.guesses, strict=True)
+    for i, (T, guess) in enumerate(pairs):
+        part = slice(6 * i, 6 * i + 6)
+        axes[part, part] = right_to_vehicle_axes(T)
+        away[part] = vehicle_axes_difference(T, guess)
+    H[own, own] += axes.T @ problem.guess_information @ axes
+    b[own] -= axes.T @ problem.guess_information @ away
+    for i in range(layout.offset, layout.extrinsic):
+        H[i, i] += OFFSET_SIGMA_S**-2.0
+    return H, b
+
+
+OFFSET_SIGMA_S = 0.05
+"""1 sigma of a time offset: half a revolution at 10 Hz."""

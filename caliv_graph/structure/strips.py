@@ -1,0 +1,157 @@
+"""Strips: pieces of surface that are taken to be flat, and the patches on each of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from caliv_graph.products import Array, BoolArray, IntArray
+
+CELL_M = 2.0
+"""Edge of the cells of the map that strips are found in: walls are not flat beyond 2 m."""
+
+MAX_ANGLE_RAD = math.radians(25.0)
+"""Largest angle between the normal of a patch and that of its strip. A patch of 16 rings, 0.5 m
+wide, knows its normal to some 10 degrees."""
+
+STRIPS_OF_A_CELL = 4
+"""Most strips of a cell: the two faces of each of two walls that meet."""
+
+MIN_SCANS = 6
+"""Fewest scans that see a strip. What fewer see may have been moving."""
+
+SURFACE_ANGLE_RAD = math.radians(12.0)
+SURFACE_STEP_M = 0.3
+SURFACE_GAP_M = 3.0
+"""Neighbouring strips are one surface up to this angle, step across it and gap along it: a wall
+with its reveals, painted alike."""
+
+
+@dataclass(frozen=True)
+class Strips:
+    """K strips of one drive.
+
+    Attributes:
+        centres_map: (K, 3) metres.
+        normals_map: (K, 3) unit vectors, towards the side that was seen.
+        surface: (K,) number of the surface that each is a part of.
+        of_patch: (N,) strip of each patch; -1: none.
+    """
+
+    centres_map: Array
+    normals_map: Array
+    surface: IntArray
+    of_patch: IntArray
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return len(self.centres_map)
+
+
+def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: float) -> Strips:
+    """Groups patches into strips.
+
+    Patches of a cell of the map that face the same side and lie on one plane are a strip.
+
+    Args:
+        moments_map: (N, 4, 4) moments of the patches, map.
+        normals_map: (N, 3) their normals.
+        scan: (N,) scan of each.
+        gate_m: largest distance of a patch from its strip.
+    """
+    of_patch = np.full(len(scan), -1, dtype=np.int64)
+    centres: list[Array] = []
+    normals: list[Array] = []
+    points = moments_map[:, 3, 3]
+    positions = moments_map[:, :3, 3] / points[:, None]
+    for members in _cells(positions):
+        for strip in _strips_of(members, moments_map, positions, normals_map, scan, gate_m):
+            own, centre, normal = strip
+            of_patch[own] = len(centres)
+            centres.append(centre)
+            normals.append(normal)
+    if not centres:
+        return Strips(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), of_patch)
+    return Strips(
+        np.array(centres),
+        np.array(normals),
+        _surfaces(np.array(centres), np.array(normals)),
+        of_patch,
+    )
+
+
+def _cells(positions: Array) -> list[IntArray]:
+    """Indices of the patches of each cell of the map, cells in a fixed order."""
+    if not len(positions):
+        return []
+    cell = np.floor(positions / CELL_M).astype(np.int64)
+    _, inverse = np.unique(cell, axis=0, return_inverse=True)
+    inverse = inverse.ravel()
+    order = np.argsort(inverse, kind="stable")
+    ends = np.flatnonzero(np.diff(inverse[order])) + 1
+    return list(np.split(order, ends))
+
+
+def _strips_of(
+    members: IntArray,
+    moments: Array,
+    positions: Array,
+    normals: Array,
+    scan: IntArray,
+    gate_m: float,
+) -> list[tuple[IntArray, Array, Array]]:
+    """Strips of the patches of a cell: their patches, centre and normal."""
+    out: list[tuple[IntArray, Array, Array]] = []
+    left = members
+    for _ in range(STRIPS_OF_A_CELL):
+        if len(left) < MIN_SCANS:
+            break
+        seed = left[np.argmax(moments[left, 3, 3])]
+        centre, normal = positions[seed], normals[seed]
+        own = left[:0]
+        for _ in range(3):
+            own = left[_on_plane(positions[left], normals[left], centre, normal, gate_m)]
+            if len(own) < MIN_SCANS:
+                break
+            centre, normal = plane_of_moments(moments[own].sum(axis=0), normals[own].mean(axis=0))
+        taken = np.isin(left, own)
+        taken[left == seed] = True
+        if len(own) >= MIN_SCANS and len(np.unique(scan[own])) >= MIN_SCANS:
+            out.append((own, centre, normal))
+        left = left[~taken]
+    return out
+
+
+def _on_plane(
+    positions: Array, normals: Array, centre: Array, normal: Array, gate_m: float
+) -> BoolArray:
+    near = np.abs((positions - centre) @ normal) < gate_m
+    return np.asarray(near & (normals @ normal > math.cos(MAX_ANGLE_RAD)))
+
+
+def plane_of_moments(moments: Array, towards: Array) -> tuple[Array, Array]:
+    """Centre (3,) and unit normal (3,) of the plane of moments (4, 4), facing `towards` (3,)."""
+    centre = moments[:3, 3] / moments[3, 3]
+    spread = moments[:3, :3] - moments[3, 3] * np.outer(centre, centre)
+    normal = np.linalg.eigh(spread)[1][:, 0]
+    return centre, normal if normal @ towards > 0.0 else -normal
+
+
+def _surfaces(centres: Array, normals: Array) -> IntArray:
+    """(K,) number of the surface of each strip: neighbours in one plane are of one."""
+    pairs = cKDTree(centres).query_pairs(SURFACE_GAP_M, output_type="ndarray")
+    a, b = pairs.T
+    between = centres[b] - centres[a]
+    same = np.einsum("ki,ki->k", normals[a], normals[b]) > math.cos(SURFACE_ANGLE_RAD)
+    for one in (a, b):
+        same &= np.abs(np.einsum("ki,ki->k", between, normals[one])) < SURFACE_STEP_M
+    k = len(centres)
+    links = coo_array((np.ones(int(same.sum())), (a[same], b[same])), shape=(k, k))
+    _, number = connected_components(links, directed=False)
+    return np.asarray(number, dtype=np.int64)

@@ -1,0 +1,410 @@
+"""The linearised system of structure: poses, extrinsics, planes, and what errs with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from caliv_graph.errors import SolveError
+from caliv_graph.geometry.se3 import skew, stack, tangent_axes
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.sightings import Sightings, without_own_error
+from caliv_graph.trajectory.imu import exp_so3
+
+RIDGE = 1e-12
+"""Relative ridge under which the system is solved."""
+
+TILT_PRIOR_RAD = 0.5
+PLACE_PRIOR_M = 10.0
+"""Prior of a plane: a single ring of beams does not determine its tilt."""
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """1 sigma of errors of the LiDARs that are estimated beside all else, metres.
+
+    Attributes:
+        bias: bias of the ranges of a LiDAR.
+        incidence: growth of that bias with 1 / cos(incidence).
+        surface: bias of a LiDAR on a surface: colour, gloss.
+        strip: how far a LiDAR sees a strip from where others do: bumps, other beams.
+        sighting: (K,) offset of each strip from scan to scan.
+        shared: offset of a surface from scan to scan, which its strips share: incidence, and how
+            the beams fall, change along a wall slowly.
+    """
+
+    bias: float
+    incidence: float
+    surface: float
+    strip: float
+    sighting: Array
+    shared: float
+
+
+@dataclass(frozen=True)
+class State:
+    """An estimate; M poses, n LiDARs, K strips.
+
+    Attributes:
+        R_map_vehicle: (M, 3, 3).
+        t_map_vehicle: (M, 3) metres.
+        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior.
+        T_vehicle_lidar: n poses.
+        offsets_s: (n,) time offsets; zero where they are not free.
+        centres_map: (K, 3) points of the planes.
+        normals_map: (K, 3).
+        errors: the LiDARs' errors, in the order of `Layout`.
+    """
+
+    R_map_vehicle: Array
+    t_map_vehicle: Array
+    moved: Array
+    T_vehicle_lidar: tuple[gtsam.Pose3, ...]
+    offsets_s: Array
+    centres_map: Array
+    normals_map: Array
+    errors: Array
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each variable is among the D coordinates of the system.
+
+    In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), planes
+    (two tilts, offset), and the errors of the LiDARs: bias and its growth with incidence, bias on
+    each surface, offset on each strip, by LiDAR.
+    """
+
+    poses: int
+    parameters: int
+    offsets: tuple[int, ...]
+    lidars: int
+    strips: int
+    surfaces: int
+
+    @property
+    def offset(self) -> int:
+        """First time offset."""
+        return 6 * self.poses + self.parameters
+
+    @property
+    def extrinsic(self) -> int:
+        """First coordinate of the extrinsics."""
+        return self.offset + len(self.offsets)
+
+    @property
+    def plane(self) -> int:
+        """First coordinate of the planes."""
+        return self.extrinsic + 6 * self.lidars
+
+    @property
+    def error(self) -> int:
+        """First coordinate of the LiDARs' errors."""
+        return self.plane + 3 * self.strips
+
+    @property
+    def errors(self) -> int:
+        """Number of these."""
+        return self.lidars * (2 + self.surfaces + self.strips)
+
+    @property
+    def size(self) -> int:
+        """D."""
+        return self.error + self.errors
+
+    def error_sigmas(self, nuisances: Nuisances) -> Array:
+        """(`errors`,) prior sigma of each."""
+        of_lidar = np.array([nuisances.bias, nuisances.incidence])
+        return np.concatenate(
+            [
+                np.tile(of_lidar, self.lidars),
+                np.full(self.lidars * self.surfaces, nuisances.surface),
+                np.full(self.lidars * self.strips, nuisances.strip),
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Residuals of all sightings as linear functions of h = (p, 1), and their derivatives.
+
+    Attributes:
+        plain: (Q, 4) the residual, metres.
+        by: (Q, C, 4) its derivatives.
+        columns: (Q, C) coordinates of these.
+        normals_lidar: (Q, 3) normals of the strips in the lidar frame at the scan's stamp.
+    """
+
+    plain: Array
+    by: Array
+    columns: IntArray
+    normals_lidar: Array
+
+    def offsets_m(self, sightings: Sightings) -> Array:
+        """(Q,) distance of the middle of each sighting from its plane."""
+        return np.asarray(np.einsum("qi,qi->q", self.plain, _middles(sightings)))
+
+    def offset_rows(self, sightings: Sightings, size: int) -> scipy.sparse.csr_array:
+        """(Q, `size`) derivatives of `offsets_m`."""
+        data = np.einsum("qci,qi->qc", self.by, _middles(sightings))
+        row = np.broadcast_to(np.arange(len(data))[:, None], data.shape)
+        return scipy.sparse.csr_array(
+            (data.ravel(), (row.ravel(), self.columns.ravel())), shape=(len(data), size)
+        )
+
+
+def _middles(sightings: Sightings) -> Array:
+    centroid = sightings.centroids_lidar
+    return np.concatenate([centroid, np.ones((len(centroid), 1))], axis=1)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened residuals of all sightings.
+
+    Attributes:
+        J: (4 Q, D).
+        r: (4 Q,).
+        shared: (4 Q, G) derivatives by the offset of each surface in each scan, 1 sigma each.
+    """
+
+    J: scipy.sparse.csr_array
+    r: Array
+    shared: scipy.sparse.csr_array
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        """H (D, D) and b (D,), the shared offsets eliminated."""
+        B = self.shared
+        V = (self.J.T @ B).tocsr()
+        inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
+        H = self.J.T @ self.J - V @ (scipy.sparse.diags_array(inner) @ V.T)
+        b = -(self.J.T @ self.r) + V @ (inner * (B.T @ self.r))
+        return np.asarray(H.toarray()), np.asarray(b)
+
+
+def whitened(
+    geometry: Geometry,
+    sightings: Sightings,
+    group: IntArray,
+    nuisances: Nuisances,
+    weights: Array,
+    size: int,
+) -> Rows:
+    """Residuals by the noise of points and sightings, the latter eliminated.
+
+    `group` (Q,) numbers scan and surface of each, `weights` (Q,) are robust, `size` is D.
+    """
+    sigma_m = nuisances.sighting[sightings.strip]
+    S = without_own_error(sightings, geometry.normals_lidar, sigma_m) * weights[:, None, None]
+    values, vectors = np.linalg.eigh(S)
+    C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    data = np.swapaxes(geometry.by @ C, 1, 2)
+    q = sightings.count
+    row = np.broadcast_to(np.arange(4 * q).reshape(q, 4, 1), data.shape)
+    column = np.broadcast_to(geometry.columns[:, None, :], data.shape)
+    J = scipy.sparse.csr_array((data.ravel(), (row.ravel(), column.ravel())), shape=(4 * q, size))
+    groups, number = np.unique(group, return_inverse=True)
+    by_offset = nuisances.shared * C[:, 3]
+    own = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
+    shared = scipy.sparse.csr_array(
+        (by_offset.ravel(), (np.arange(4 * q), own.ravel())), shape=(4 * q, len(groups))
+    )
+    return Rows(J, np.einsum("qi,qij->qj", geometry.plain, C).ravel(), shared)
+
+
+def lidar_poses(
+    state: State, lidar: IntArray, pose: IntArray, twists: Array | None
+) -> tuple[Array, Array]:
+    """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included."""
+    R_e, t_e = stack(state.T_vehicle_lidar)
+    R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
+    if twists is not None and state.offsets_s.any():
+        late = [gtsam.Pose3.Expmap(v) for v in -state.offsets_s[lidar][:, None] * twists[pose]]
+        R_d, t_d = stack(late)
+        R_v, t_v = R_v @ R_d, t_v + np.einsum("qij,qj->qi", R_v, t_d)
+    return R_v @ R_e[lidar], t_v + np.einsum("qij,qj->qi", R_v, t_e[lidar])
+
+
+def geometry_of(
+    state: State,
+    sightings: Sightings,
+    layout: Layout,
+    lidar: IntArray,
+    pose: IntArray,
+    surface: IntArray,
+    twists: Array | None,
+) -> Geometry:
+    """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
+
+    Args:
+        state: where they are linearised.
+        sightings: Q of them.
+        layout: the coordinates.
+        lidar: (Q,) index of the LiDAR of each.
+        pose: (Q,) index of the pose of each.
+        surface: (Q,) index of the surface of each.
+        twists: (M, 6) velocity at each pose, right perturbation per second; None: no offset is
+            free.
+    """
+    q = sightings.count
+    strip = sightings.strip
+    R, t = lidar_poses(state, lidar, pose, twists)
+    centre, normal = state.centres_map[strip], state.normals_map[strip]
+    m = np.einsum("qji,qj->qi", R, normal)
+    cos = sightings.cos_incidence
+    errors = _errors_of(state, layout, lidar, surface, strip, cos)
+
+    plain = np.zeros((q, 4))
+    plain[:, :3] = m
+    plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre) + errors
+
+    by_extrinsic = np.zeros((q, 6, 4))
+    by_extrinsic[:, :3, :3] = -skew(m)
+    by_extrinsic[:, 3:, 3] = m
+    back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
+    by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
+    B = tangent_axes(normal)
+    by_plane = np.zeros((q, 3, 4))
+    by_plane[:, :2, :3] = B @ R
+    by_plane[:, :2, 3] = np.einsum("qki,qi->qk", B, t - centre)
+    by_plane[:, 2, 3] = -1.0
+    by_error = np.zeros((q, 4, 4))
+    by_error[:, 0, 3] = cos
+    by_error[:, 1, 3] = 1.0 - cos
+    by_error[:, 2, 3] = cos
+    by_error[:, 3, 3] = 1.0
+    parts = [by_pose, by_extrinsic, by_plane, by_error]
+    columns = [
+        6 * pose[:, None] + np.arange(6),
+        layout.extrinsic + 6 * lidar[:, None] + np.arange(6),
+        layout.plane + 3 * strip[:, None] + np.arange(3),
+        _error_columns(layout, lidar, surface, strip),
+    ]
+    if twists is not None and layout.offsets:
+        by_offset = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+        place = np.full(layout.lidars, -1)
+        place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
+        by_offset[place[lidar] < 0] = 0.0
+        parts.append(by_offset)
+        columns.append(np.maximum(place[lidar], 0)[:, None])
+    return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:
+    """(Q, 4) columns of the four errors of each sighting."""
+    first = layout.error
+    of_surface = first + 2 * layout.lidars + layout.surfaces * lidar + surface
+    of_strip = first + layout.lidars * (2 + layout.surfaces) + layout.strips * lidar + strip
+    return np.stack([first + 2 * lidar, first + 2 * lidar + 1, of_surface, of_strip], axis=1)
+
+
+def _errors_of(
+    state: State, layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray, cos: Array
+) -> Array:
+    """(Q,) what the LiDARs' errors add to the residual of each sighting, metres."""
+    at = _error_columns(layout, lidar, surface, strip) - layout.error
+    e = state.errors[at]
+    return np.asarray(cos * (e[:, 0] + e[:, 2]) + (1.0 - cos) * e[:, 1] + e[:, 3])
+
+
+@dataclass(frozen=True)
+class System:
+    """A quadratic `d^T H d / 2 - b^T d` on all coordinates.
+
+    Attributes:
+        H: (D, D) with all priors but those of the extrinsics.
+        b: (D,).
+        H_prior: (P, P) of it what the motion data say, P poses and parameters, without the
+            parameters' own priors.
+        b_prior: (P,).
+    """
+
+    layout: Layout
+    H: Array
+    b: Array
+    H_prior: Array
+    b_prior: Array
+
+
+def system_of(
+    rows: Rows, state: State, layout: Layout, prior: PosePrior, nuisances: Nuisances
+) -> System:
+    """The normal equations of structure and motion data."""
+    H, b = rows.normal_equations()
+    size = 6 * layout.poses + layout.parameters
+    b_prior = prior.gradient - prior.information @ state.moved
+    H[:size, :size] += prior.information
+    b[:size] += b_prior
+    if layout.parameters:
+        own = slice(6 * layout.poses, size)
+        H[own, own] += prior.parameter_information
+        b[own] -= prior.parameter_information @ (prior.parameter_offset + state.moved[own])
+    planes = np.arange(layout.plane, layout.error)
+    H[planes, planes] += np.tile(
+        [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
+    )
+    errors = np.arange(layout.error, layout.size)
+    weight = layout.error_sigmas(nuisances) ** -2.0
+    H[errors, errors] += weight
+    b[errors] -= weight * state.errors
+    return System(layout, H, b, prior.information, b_prior)
+
+
+def factor_of(H: Array) -> tuple[Array, Array]:
+    """Scale (D,) and lower Cholesky factor of H scaled to a unit diagonal.
+
+    Raises:
+        SolveError: it is singular.
+    """
+    scale = np.sqrt(np.diagonal(H))
+    if not (scale > 0.0).all():
+        raise SolveError("structure: a variable has no information")
+    scaled = H / np.outer(scale, scale)
+    scaled[np.arange(len(H)), np.arange(len(H))] += RIDGE
+    try:
+        factor = scipy.linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        raise SolveError("structure: the system is singular") from None
+    return scale, np.asarray(factor)
+
+
+def solved(factor: tuple[Array, Array], right: Array) -> Array:
+    """H^-1 right, from `factor_of(H)`."""
+    scale, L = factor
+    shaped = scale if right.ndim == 1 else scale[:, None]
+    return np.asarray(
+        scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
+    )
+
+
+def stepped(state: State, layout: Layout, d: Array) -> State:
+    """The estimate after a step (D,)."""
+    m = layout.poses
+    xi = d[: 6 * m].reshape(m, 6)
+    moved = [gtsam.Pose3.Expmap(v) for v in xi]
+    R_d, t_d = stack(moved)
+    tangents = d[layout.extrinsic : layout.plane].reshape(-1, 6)
+    planes = d[layout.plane : layout.error].reshape(-1, 3)
+    B = tangent_axes(state.normals_map)
+    turn = np.cross(state.normals_map, np.einsum("kj,kji->ki", planes[:, :2], B))
+    normals = np.einsum("kij,kj->ki", exp_so3(turn), state.normals_map)
+    offsets = state.offsets_s.copy()
+    offsets[list(layout.offsets)] += d[layout.offset : layout.extrinsic]
+    return replace(
+        state,
+        R_map_vehicle=state.R_map_vehicle @ R_d,
+        t_map_vehicle=state.t_map_vehicle + np.einsum("mij,mj->mi", state.R_map_vehicle, t_d),
+        moved=state.moved + d[: 6 * m + layout.parameters],
+        T_vehicle_lidar=tuple(
+            T.retract(v) for T, v in zip(state.T_vehicle_lidar, tangents, strict=True)
+        ),
+        offsets_s=offsets,
+        centres_map=state.centres_map + planes[:, 2:] * state.normals_map,
+        normals_map=normals,
+        errors=state.errors + d[layout.error :],
+    )

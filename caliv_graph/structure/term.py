@@ -1,0 +1,173 @@
+"""What structure says of extrinsics and poses: everything else eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.geometry.se3 import unstack
+from caliv_graph.products import Array, IntArray, Strip, StructureTerm
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.solve import Problem, Solved, relative_motions, solve_structure
+from caliv_graph.structure.system import factor_of, solved
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+
+
+def structure_terms(
+    patches: Sequence[DrivePatches],
+    priors: Sequence[PosePrior],
+    kept_ns: Sequence[IntArray],
+    trajectories: Sequence[VehicleTrajectory],
+    start: Mapping[str, gtsam.Pose3],
+    config: Config,
+    free_offsets: frozenset[str] = frozenset(),
+) -> tuple[StructureTerm, ...]:
+    """The term of each drive that has structure.
+
+    Args:
+        patches: of each drive.
+        priors: per drive what the motion data say of the poses at the stamps of its patches' scans
+            and at those that are kept.
+        kept_ns: per drive the stamps of the poses that the terms are to be on, ascending.
+        trajectories: of each drive, for the motion within sweeps.
+        start: rough T_vehicle_lidar.
+        config: guesses and noise.
+        free_offsets: LiDARs whose time offset is estimated.
+
+    Raises:
+        SolveError: a system is singular.
+    """
+    out = []
+    for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
+        if not len(own.scan):
+            continue
+        problem = problem_of(own, prior, trajectory, config, free_offsets)
+        found = solve_structure(problem, start)
+        if found is not None:
+            out.append(term_of(found, np.searchsorted(prior.stamps_ns, kept)))
+    return tuple(out)
+
+
+def problem_of(
+    patches: DrivePatches,
+    prior: PosePrior,
+    trajectory: VehicleTrajectory,
+    config: Config,
+    free_offsets: frozenset[str] = frozenset(),
+) -> Problem:
+    """What the solve of one drive is given."""
+    offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)
+    stamps = prior.stamps_ns.tolist()
+    lidars = [config.lidars[name] for name in patches.lidars]
+    return Problem(
+        patches=patches,
+        prior=prior,
+        pose_of_scan=np.searchsorted(prior.stamps_ns, patches.stamps_ns),
+        relative=relative_motions(patches, trajectory),
+        twists=twists_at(trajectory, stamps) if offsets else None,
+        offsets=offsets,
+        guesses=tuple(lidar.initial.pose() for lidar in lidars),
+        guess_information=np.diag(np.concatenate([c.sigma.sigmas() for c in lidars]) ** -2.0),
+        range_sigma_m=config.noise.lidar_range_m,
+    )
+
+
+def term_of(found: Solved, kept: IntArray) -> StructureTerm:
+    """The quadratic on the poses `kept` (m,), parameters, time offsets and extrinsics.
+
+    The marginal of motion data and structure together, less that of the motion data alone, which
+    are in the calibration's graph already.
+    """
+    layout, system, prior = found.layout, found.system, found.problem.prior
+    poses = (6 * kept[:, None] + np.arange(6)).ravel()
+    parameters = np.arange(6 * layout.poses, layout.offset)
+    of_motion = np.concatenate([poses, parameters])
+    keep = np.concatenate([of_motion, np.arange(layout.offset, layout.plane)])
+    H, b = system.H.copy(), system.b.copy()
+    if layout.parameters:
+        # The graph of the calibration has the priors of the parameters.
+        own = np.ix_(parameters, parameters)
+        H[own] -= prior.parameter_information
+        moved = prior.parameter_offset + found.state.moved[parameters]
+        b[parameters] += prior.parameter_information @ moved
+    information, gradient = _marginal(H, b, keep)
+    motion, motion_gradient = _marginal(system.H_prior, system.b_prior, of_motion)
+    own_part = slice(0, len(of_motion))
+    information[own_part, own_part] -= motion
+    gradient[own_part] -= motion_gradient
+    state, names = found.state, found.problem.patches.lidars
+    T_map_vehicle = unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept])
+    offsets = {names[i]: float(state.offsets_s[i]) for i in layout.offsets}
+    return StructureTerm(
+        drive=found.problem.patches.drive,
+        stamps_ns=prior.stamps_ns[kept],
+        T_map_vehicle=T_map_vehicle,
+        parameters=_parameters(found),
+        time_offsets_s=offsets,
+        T_vehicle_lidar=dict(zip(names, state.T_vehicle_lidar, strict=True)),
+        information=information,
+        gradient=gradient,
+        strips=strips_of(found),
+        offset_m=float(np.median(found.nuisances.sighting)),
+    )
+
+
+def _marginal(H: Array, b: Array, keep: IntArray) -> tuple[Array, Array]:
+    """The quadratic with all coordinates but `keep` eliminated."""
+    rest = np.ones(len(H), dtype=bool)
+    rest[keep] = False
+    inside = H[np.ix_(keep, keep)]
+    if not rest.any():
+        return inside.copy(), b[keep].copy()
+    cross = H[np.ix_(rest, keep)]
+    both = solved(factor_of(H[np.ix_(rest, rest)]), np.column_stack([cross, b[rest]]))
+    information = inside - cross.T @ both[:, :-1]
+    return 0.5 * (information + information.T), b[keep] - cross.T @ both[:, -1]
+
+
+def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:
+    """Parameters of the vehicle at the estimate."""
+    out: dict[str, Array | gtsam.Rot3] = {}
+    at = 6 * found.layout.poses
+    for name, value in found.problem.prior.parameters.items():
+        d = found.state.moved[at : at + 3]
+        at += 3
+        out[name] = value.retract(d) if isinstance(value, gtsam.Rot3) else value + d
+    return out
+
+
+def strips_of(found: Solved) -> tuple[Strip, ...]:
+    """The strips at the estimate, for the report."""
+    patches, strips, sightings = found.problem.patches, found.strips, found.sightings
+    offsets = found.geometry.offsets_m(sightings)
+    lidar = patches.scan_lidar[sightings.scan]
+    weight = found.weights * sightings.moments[:, 3, 3]
+    out = []
+    order = np.argsort(sightings.strip, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(sightings.strip, minlength=strips.count))[:-1])
+    for k, own in enumerate(parts):
+        scans, residuals = {}, {}
+        for i, name in enumerate(patches.lidars):
+            of_lidar = own[lidar[own] == i]
+            total = float(weight[of_lidar].sum())
+            if total > 0.0:
+                scans[name] = len(of_lidar)
+                residuals[name] = float(offsets[of_lidar] @ weight[of_lidar]) / total
+        out.append(
+            Strip(
+                drive=patches.drive,
+                surface=int(strips.surface[k]),
+                centre_map=found.state.centres_map[k],
+                normal_map=found.state.normals_map[k],
+                scans=scans,
+                residuals_m=residuals,
+                scatter_m=float(found.nuisances.sighting[k]),
+                before_m=float("nan"),
+                weight=float(found.weights[own].mean()) if len(own) else 0.0,
+            )
+        )
+    return tuple(out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.sightings import BEAM_RAD, ROUGHNESS_M, Sightings
-from caliv_graph.structure.system import Geometry, Layout, Nuisances, solved
+from caliv_graph.structure.system import Geometry, Layout, Nuisances
 
 FIRST_SIGHTING_M = 0.01
 """1 sigma of the offset of a strip from scan to scan before it is estimated: on the safe side, as
@@ -70,7 +71,7 @@ def fitted_noise(
     geometry: Geometry,
     sightings: Sightings,
     group: IntArray,
-    factor: tuple[Array, Array],
+    solve: Callable[[Array], Array],
     layout: Layout,
     nuisances: Nuisances,
     errors: Array,
@@ -81,14 +82,14 @@ def fitted_noise(
         geometry: residuals at the estimate.
         sightings: Q of them.
         group: (Q,) a number for scan and surface of each.
-        factor: of the system that the estimate solves.
+        solve: gives H^-1 times some columns (D, ...) of the system that was solved.
         layout: its coordinates.
         nuisances: the levels that it was solved with.
-        errors: (`layout.errors`,) estimated errors of the LiDARs.
+        errors: (D,) estimated errors of the LiDARs.
     """
     offsets = geometry.offsets_m(sightings)
     sigma = nuisances.sighting[sightings.strip]
-    fitted = _fitted_share(geometry, sightings, factor, layout, sigma)
+    fitted = _fitted_share(geometry, sightings, solve, layout, sigma)
     free = 1.0 - min(fitted, MOST_FITTED)
     point = 1.0 / sightings.moments[:, 3, 3]
     total_sigma = _common_sigma(offsets, point, free)
@@ -104,14 +105,14 @@ def fitted_noise(
         nuisances,
         sighting=np.sqrt(np.maximum(own, LEAST_M**2)),
         shared=math.sqrt(shared),
-        strip=_strip_sigma(factor, layout, nuisances.strip, errors),
+        strip=_strip_sigma(solve, layout, nuisances.strip, errors),
     )
 
 
 def _fitted_share(
     geometry: Geometry,
     sightings: Sightings,
-    factor: tuple[Array, Array],
+    solve: Callable[[Array], Array],
     layout: Layout,
     sigma: Array,
 ) -> float:
@@ -123,7 +124,7 @@ def _fitted_share(
     root = 1.0 / np.sqrt(_variances(sightings, sigma))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
     seen = J.T @ (root[:, None] * signs)
-    return float((seen * solved(factor, seen)).sum() / PROBES / sightings.count)
+    return float((seen * solve(seen)).sum() / PROBES / sightings.count)
 
 
 def _common_sigma(offsets: Array, point: Array, free: float) -> float:
@@ -146,15 +147,16 @@ def _shared_variance(offsets: Array, group: IntArray) -> float:
 
 
 def _strip_sigma(
-    factor: tuple[Array, Array], layout: Layout, before: float, errors: Array
+    solve: Callable[[Array], Array], layout: Layout, before: float, errors: Array
 ) -> float:
     """1 sigma of how far LiDARs see a strip apart: one fixed-point step of its likelihood."""
-    first = layout.error + layout.lidars * (2 + layout.surfaces)
-    some = np.zeros((layout.size, layout.size - first))
-    some[first:] = np.eye(layout.size - first)
-    variance = np.diagonal(solved(factor, some)[first:])
-    known = np.maximum(1.0 - variance / before**2, 0.0).sum()
+    own = slice(layout.strip_error, layout.size)
+    count = layout.size - layout.strip_error
+    some = np.zeros((layout.size, PROBES))
+    some[own] = np.random.default_rng(1).choice([-1.0, 1.0], (count, PROBES))
+    variance = float((some[own] * solve(some)[own]).sum()) / PROBES
+    known = count - variance / before**2
     if known < 1.0:
         return before
-    found = float((errors[first - layout.error :] ** 2).sum() / known)
+    found = float((errors[own] ** 2).sum() / known)
     return float(np.clip(math.sqrt(found), LEAST_M, 0.05))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
     fitted_noise,
@@ -27,10 +29,8 @@ from caliv_graph.structure.system import (
     Rows,
     State,
     System,
-    factor_of,
     geometry_of,
     lidar_poses,
-    solved,
     stepped,
     system_of,
     whitened,
@@ -184,12 +184,12 @@ def _round(
         parameters=len(problem.prior.parameter_information),
         offsets=problem.offsets,
         lidars=len(patches.lidars),
-        strips=strips.count,
-        surfaces=int(strips.surface.max()) + 1,
+        surface_of=tuple(strips.surface.tolist()),
     )
-    errors = np.zeros(layout.errors)
+    errors = np.zeros(layout.size)
     # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.
-    errors[: 2 * layout.lidars] = state.errors[: 2 * layout.lidars] if len(state.errors) else 0.0
+    of_lidars = slice(layout.error, layout.plane)
+    errors[of_lidars] = state.errors[of_lidars] if len(state.errors) else 0.0
     state = replace(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
     )
@@ -240,7 +240,6 @@ def _geometry(
         layout,
         problem.patches.scan_lidar[scan],
         problem.pose_of_scan[scan],
-        strips.surface[sightings.strip],
         problem.twists,
     )
 
@@ -267,14 +266,15 @@ def _settled(found: Solved, steps: int) -> Solved:
     for number in range(steps):
         H, b = with_guesses(problem, found.state, found.system)
         factor = factor_of(H)
-        d = solved(factor, b)
+        solve = partial(found.system.surfaces.solve, factor)
+        d = found.system.surfaces.follow(solved(factor, b))
         state = stepped(found.state, layout, d)
         geometry = _geometry(problem, state, found.strips, sightings, layout)
         nuisances = fitted_noise(
             geometry,
             sightings,
             groups_of(sightings, found.strips),
-            factor,
+            solve,
             layout,
             found.nuisances,
             state.errors,
@@ -283,7 +283,7 @@ def _settled(found: Solved, steps: int) -> Solved:
         rows, system = _whitened(
             problem, state, geometry, found.strips, sightings, weights, nuisances, layout
         )
-        own = slice(layout.extrinsic, layout.plane)
+        own = slice(layout.extrinsic, layout.error)
         converged = number > 0 and float(d[own] @ H[own, own] @ d[own]) < SMALL_SIGMAS**2
         found = replace(
             found,
@@ -304,7 +304,7 @@ def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array,
     """The system's H and b with the guesses: they hold what structure does not determine."""
     layout = system.layout
     H, b = system.H.copy(), system.b.copy()
-    own = slice(layout.extrinsic, layout.plane)
+    own = slice(layout.extrinsic, layout.error)
     axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
     away = np.zeros(6 * layout.lidars)
     pairs = zip(state.T_vehicle_lidar, problem.guesses, strict=True)

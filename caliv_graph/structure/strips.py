@@ -32,6 +32,13 @@ SURFACE_GAP_M = 3.0
 with its reveals, painted alike."""
 
 
+LEVEL = 0.9
+"""Vertical component of a normal above which a strip is level: ground."""
+
+TILE_M = 6.0
+"""Edge of the tiles of the ground that count as a surface each."""
+
+
 @dataclass(frozen=True)
 class Strips:
     """K strips of one drive.
@@ -151,6 +158,10 @@ def _surfaces(centres: Array, normals: Array) -> IntArray:
     same = np.einsum("ki,ki->k", normals[a], normals[b]) > math.cos(SURFACE_ANGLE_RAD)
     for one in (a, b):
         same &= np.abs(np.einsum("ki,ki->k", between, normals[one])) < SURFACE_STEP_M
+    level = np.abs(normals[:, 2]) > LEVEL
+    tile = np.floor(centres[:, :2] / TILE_M)
+    same &= level[a] == level[b]
+    same &= ~level[a] | (tile[a] == tile[b]).all(axis=1)
     k = len(centres)
     links = coo_array((np.ones(int(same.sum())), (a[same], b[same])), shape=(k, k))
     _, number = connected_components(links, directed=False)

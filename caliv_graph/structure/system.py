@@ -6,18 +6,14 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.elimination import Surfaces, eliminated
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.sightings import Sightings, without_own_error
 from caliv_graph.trajectory.imu import exp_so3
-
-RIDGE = 1e-12
-"""Relative ridge under which the system is solved."""
 
 TILT_PRIOR_RAD = 0.5
 PLACE_PRIOR_M = 10.0
@@ -58,7 +54,7 @@ class State:
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
         normals_map: (K, 3).
-        errors: the LiDARs' errors, in the order of `Layout`.
+        errors: (D,) the LiDARs' errors, at their coordinates; else zero.
     """
 
     R_map_vehicle: Array
@@ -75,17 +71,26 @@ class State:
 class Layout:
     """Where each variable is among the D coordinates of the system.
 
-    In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), planes
-    (two tilts, offset), and the errors of the LiDARs: bias and its growth with incidence, bias on
-    each surface, offset on each strip, by LiDAR.
+    In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), bias of
+    each LiDAR and its growth with incidence; and what belongs to one surface each: planes (two
+    tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each strip.
     """
 
     poses: int
     parameters: int
     offsets: tuple[int, ...]
     lidars: int
-    strips: int
-    surfaces: int
+    surface_of: tuple[int, ...]
+
+    @property
+    def strips(self) -> int:
+        """K."""
+        return len(self.surface_of)
+
+    @property
+    def surfaces(self) -> int:
+        """Number of surfaces."""
+        return max(self.surface_of, default=-1) + 1
 
     @property
     def offset(self) -> int:
@@ -98,27 +103,38 @@ class Layout:
         return self.offset + len(self.offsets)
 
     @property
-    def plane(self) -> int:
-        """First coordinate of the planes."""
+    def error(self) -> int:
+        """First coordinate of the biases of the LiDARs."""
         return self.extrinsic + 6 * self.lidars
 
     @property
-    def error(self) -> int:
-        """First coordinate of the LiDARs' errors."""
+    def plane(self) -> int:
+        """First coordinate of the planes, and of all that belongs to one surface."""
+        return self.error + 2 * self.lidars
+
+    @property
+    def surface_error(self) -> int:
+        """First bias of a LiDAR on a surface."""
         return self.plane + 3 * self.strips
 
     @property
-    def errors(self) -> int:
-        """Number of these."""
-        return self.lidars * (2 + self.surfaces + self.strips)
+    def strip_error(self) -> int:
+        """First offset of a LiDAR on a strip."""
+        return self.surface_error + self.lidars * self.surfaces
 
     @property
     def size(self) -> int:
         """D."""
-        return self.error + self.errors
+        return self.strip_error + self.lidars * self.strips
+
+    def error_columns(self) -> IntArray:
+        """Coordinates of all errors of the LiDARs, in the order of `error_sigmas`."""
+        return np.concatenate(
+            [np.arange(self.error, self.plane), np.arange(self.surface_error, self.size)]
+        )
 
     def error_sigmas(self, nuisances: Nuisances) -> Array:
-        """(`errors`,) prior sigma of each."""
+        """1 sigma of each error of the LiDARs."""
         of_lidar = np.array([nuisances.bias, nuisances.incidence])
         return np.concatenate(
             [
@@ -127,6 +143,20 @@ class Layout:
                 np.full(self.lidars * self.strips, nuisances.strip),
             ]
         )
+
+    def of_surfaces(self) -> list[IntArray]:
+        """Coordinates that belong to each surface."""
+        surface = np.array(self.surface_of, dtype=np.int64)
+        strips = np.arange(self.strips)
+        where = [self.plane + 3 * strips + i for i in range(3)]
+        where += [self.strip_error + self.strips * i + strips for i in range(self.lidars)]
+        own = [np.arange(self.surfaces)] * self.lidars
+        of = np.concatenate([surface] * len(where) + own)
+        where += [self.surface_error + self.surfaces * i + own[0] for i in range(self.lidars)]
+        columns = np.concatenate(where)
+        order = np.argsort(of, kind="stable")
+        ends = np.cumsum(np.bincount(of, minlength=self.surfaces))[:-1]
+        return [np.sort(part) for part in np.split(columns[order], ends)]
 
 
 @dataclass(frozen=True)
@@ -177,14 +207,14 @@ class Rows:
     r: Array
     shared: scipy.sparse.csr_array
 
-    def normal_equations(self) -> tuple[Array, Array]:
+    def normal_equations(self) -> tuple[scipy.sparse.csr_array, Array]:
         """H (D, D) and b (D,), the shared offsets eliminated."""
         B = self.shared
         V = (self.J.T @ B).tocsr()
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
         H = self.J.T @ self.J - V @ (scipy.sparse.diags_array(inner) @ V.T)
         b = -(self.J.T @ self.r) + V @ (inner * (B.T @ self.r))
-        return np.asarray(H.toarray()), np.asarray(b)
+        return H.tocsr(), np.asarray(b)
 
 
 def whitened(
@@ -236,7 +266,6 @@ def geometry_of(
     layout: Layout,
     lidar: IntArray,
     pose: IntArray,
-    surface: IntArray,
     twists: Array | None,
 ) -> Geometry:
     """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
@@ -247,17 +276,18 @@ def geometry_of(
         layout: the coordinates.
         lidar: (Q,) index of the LiDAR of each.
         pose: (Q,) index of the pose of each.
-        surface: (Q,) index of the surface of each.
         twists: (M, 6) velocity at each pose, right perturbation per second; None: no offset is
             free.
     """
     q = sightings.count
     strip = sightings.strip
+    surface = np.array(layout.surface_of, dtype=np.int64)[strip]
     R, t = lidar_poses(state, lidar, pose, twists)
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
     cos = sightings.cos_incidence
-    errors = _errors_of(state, layout, lidar, surface, strip, cos)
+    error_columns = _error_columns(layout, lidar, surface, strip)
+    errors = _errors_of(state, error_columns, cos)
 
     plain = np.zeros((q, 4))
     plain[:, :3] = m
@@ -283,7 +313,7 @@ def geometry_of(
         6 * pose[:, None] + np.arange(6),
         layout.extrinsic + 6 * lidar[:, None] + np.arange(6),
         layout.plane + 3 * strip[:, None] + np.arange(3),
-        _error_columns(layout, lidar, surface, strip),
+        error_columns,
     ]
     if twists is not None and layout.offsets:
         by_offset = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
@@ -297,36 +327,36 @@ def geometry_of(
 
 def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:
     """(Q, 4) columns of the four errors of each sighting."""
-    first = layout.error
-    of_surface = first + 2 * layout.lidars + layout.surfaces * lidar + surface
-    of_strip = first + layout.lidars * (2 + layout.surfaces) + layout.strips * lidar + strip
-    return np.stack([first + 2 * lidar, first + 2 * lidar + 1, of_surface, of_strip], axis=1)
+    of_surface = layout.surface_error + layout.surfaces * lidar + surface
+    of_strip = layout.strip_error + layout.strips * lidar + strip
+    first = layout.error + 2 * lidar
+    return np.stack([first, first + 1, of_surface, of_strip], axis=1)
 
 
-def _errors_of(
-    state: State, layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray, cos: Array
-) -> Array:
+def _errors_of(state: State, columns: IntArray, cos: Array) -> Array:
     """(Q,) what the LiDARs' errors add to the residual of each sighting, metres."""
-    at = _error_columns(layout, lidar, surface, strip) - layout.error
-    e = state.errors[at]
+    e = state.errors[columns]
     return np.asarray(cos * (e[:, 0] + e[:, 2]) + (1.0 - cos) * e[:, 1] + e[:, 3])
 
 
 @dataclass(frozen=True)
 class System:
-    """A quadratic `d^T H d / 2 - b^T d` on all coordinates.
+    """A quadratic `d^T H d / 2 - b^T d` on all coordinates, the surfaces' own eliminated.
 
     Attributes:
-        H: (D, D) with all priors but those of the extrinsics.
-        b: (D,).
-        H_prior: (P, P) of it what the motion data say, P poses and parameters, without the
-            parameters' own priors.
+        layout: the coordinates.
+        H: (R, R) of the first R = `layout.plane` coordinates, without guesses of extrinsics.
+        b: (R,).
+        surfaces: what was eliminated.
+        H_prior: (P, P) of it what the motion data say, P coordinates of poses and parameters,
+            without the parameters' own priors.
         b_prior: (P,).
     """
 
     layout: Layout
     H: Array
     b: Array
+    surfaces: Surfaces
     H_prior: Array
     b_prior: Array
 
@@ -335,8 +365,17 @@ def system_of(
     rows: Rows, state: State, layout: Layout, prior: PosePrior, nuisances: Nuisances
 ) -> System:
     """The normal equations of structure and motion data."""
-    H, b = rows.normal_equations()
+    sparse, right = rows.normal_equations()
+    weight = np.zeros(layout.size)
+    weight[layout.plane : layout.surface_error] = np.tile(
+        [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
+    )
+    errors = layout.error_columns()
+    weight[errors] = layout.error_sigmas(nuisances) ** -2.0
+    right[errors] -= weight[errors] * state.errors[errors]
+    sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = 6 * layout.poses + layout.parameters
+    H, b, surfaces = eliminated(sparse, right, layout.plane, layout.of_surfaces())
     b_prior = prior.gradient - prior.information @ state.moved
     H[:size, :size] += prior.information
     b[:size] += b_prior
@@ -344,42 +383,7 @@ def system_of(
         own = slice(6 * layout.poses, size)
         H[own, own] += prior.parameter_information
         b[own] -= prior.parameter_information @ (prior.parameter_offset + state.moved[own])
-    planes = np.arange(layout.plane, layout.error)
-    H[planes, planes] += np.tile(
-        [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
-    )
-    errors = np.arange(layout.error, layout.size)
-    weight = layout.error_sigmas(nuisances) ** -2.0
-    H[errors, errors] += weight
-    b[errors] -= weight * state.errors
-    return System(layout, H, b, prior.information, b_prior)
-
-
-def factor_of(H: Array) -> tuple[Array, Array]:
-    """Scale (D,) and lower Cholesky factor of H scaled to a unit diagonal.
-
-    Raises:
-        SolveError: it is singular.
-    """
-    scale = np.sqrt(np.diagonal(H))
-    if not (scale > 0.0).all():
-        raise SolveError("structure: a variable has no information")
-    scaled = H / np.outer(scale, scale)
-    scaled[np.arange(len(H)), np.arange(len(H))] += RIDGE
-    try:
-        factor = scipy.linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
-    except scipy.linalg.LinAlgError:
-        raise SolveError("structure: the system is singular") from None
-    return scale, np.asarray(factor)
-
-
-def solved(factor: tuple[Array, Array], right: Array) -> Array:
-    """H^-1 right, from `factor_of(H)`."""
-    scale, L = factor
-    shaped = scale if right.ndim == 1 else scale[:, None]
-    return np.asarray(
-        scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
-    )
+    return System(layout, H, b, surfaces, prior.information, b_prior)
 
 
 def stepped(state: State, layout: Layout, d: Array) -> State:
@@ -388,8 +392,11 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
     xi = d[: 6 * m].reshape(m, 6)
     moved = [gtsam.Pose3.Expmap(v) for v in xi]
     R_d, t_d = stack(moved)
-    tangents = d[layout.extrinsic : layout.plane].reshape(-1, 6)
-    planes = d[layout.plane : layout.error].reshape(-1, 3)
+    tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
+    planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
+    errors = layout.error_columns()
+    all_errors = state.errors.copy()
+    all_errors[errors] += d[errors]
     B = tangent_axes(state.normals_map)
     turn = np.cross(state.normals_map, np.einsum("kj,kji->ki", planes[:, :2], B))
     normals = np.einsum("kij,kj->ki", exp_so3(turn), state.normals_map)
@@ -406,5 +413,5 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
         offsets_s=offsets,
         centres_map=state.centres_map + planes[:, 2:] * state.normals_map,
         normals_map=normals,
-        errors=state.errors + d[layout.error :],
+        errors=all_errors,
     )

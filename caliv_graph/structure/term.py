@@ -10,10 +10,10 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
+from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.solve import Problem, Solved, relative_motions, solve_structure
-from caliv_graph.structure.system import factor_of, solved
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 
@@ -86,7 +86,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     poses = (6 * kept[:, None] + np.arange(6)).ravel()
     parameters = np.arange(6 * layout.poses, layout.offset)
     of_motion = np.concatenate([poses, parameters])
-    keep = np.concatenate([of_motion, np.arange(layout.offset, layout.plane)])
+    keep = np.concatenate([of_motion, np.arange(layout.offset, layout.error)])
     H, b = system.H.copy(), system.b.copy()
     if layout.parameters:
         # The graph of the calibration has the priors of the parameters.

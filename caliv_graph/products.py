@@ -684,11 +684,11 @@ class LidarResult:
     """The reported extrinsic of one LiDAR.
 
     Attributes:
-        T_vehicle_lidar: the estimate, or the initial guess if the LiDAR saw no target.
+        T_vehicle_lidar: the estimate, or the initial guess if no data tell of it.
         cov: (6, 6) right perturbation (lidar frame), rotation then translation, rad and m.
         determined: per axis of `conventions.AXES`, vehicle axes.
         scans_used: scans of a target that carried weight.
-        saw_target: False if it never saw a target.
+        saw_target: False if it never saw a target. Structure may have determined it all the same.
         time_offset: (value, sigma) in seconds, header stamp minus true acquisition time; None: not
             estimated.
         guess: the initial guess; None: not known (another program's file).
@@ -701,6 +701,31 @@ class LidarResult:
     saw_target: bool
     time_offset: tuple[float, float] | None = None
     guess: Guess | None = None
+
+    @property
+    def has_data(self) -> bool:
+        """Whether it saw a target, or structure determines an axis; a trusted guess is no data."""
+        trusted = self.guess is not None and self.guess.fixed
+        return self.saw_target or (not trusted and any(self.determined.values()))
+
+
+@dataclass(frozen=True)
+class StructureSummary:
+    """What a calibration used of walls and other structure, all drives together.
+
+    Attributes:
+        strips: number of strips with weight.
+        surfaces: number of surfaces that they are parts of.
+        sightings: LiDAR -> number of pairs of a strip and a scan that sees it.
+        shared: pair of LiDARs, in the order of the result -> number of surfaces that both see.
+        offset_m: 1 sigma of the offset of a strip in a scan, root mean square over the drives.
+    """
+
+    strips: int
+    surfaces: int
+    sightings: Mapping[str, int]
+    shared: Mapping[tuple[str, str], int]
+    offset_m: float
 
 
 @dataclass(frozen=True)
@@ -738,7 +763,7 @@ class Calibration:
         lidars: in the config's order.
         cov_joint: (6n, 6n) over the LiDARs in that order, right perturbations.
         information_data: (6n, 6n) in the same coordinates, without any prior; zero rows and
-            columns for a LiDAR that saw no target.
+            columns for a LiDAR that no data tell of.
         undetermined: directions, vehicle axes.
         weak: directions, vehicle axes.
         unmet: requirements and limits that are not met, a sentence each.
@@ -751,6 +776,7 @@ class Calibration:
         contradictions: a sentence each; with any the status is inconsistent.
         suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
         vehicle: `lever_arm` and `imu_rotation`, where the solve estimated them.
+        structure: the structure that was used; None: none.
     """
 
     status: str
@@ -767,3 +793,4 @@ class Calibration:
     contradictions: tuple[str, ...] = ()
     suspects: tuple[Suspect, ...] = ()
     vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
+    structure: StructureSummary | None = None

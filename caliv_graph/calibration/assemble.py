@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,10 +13,20 @@ import numpy as np
 import caliv_graph
 from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array, Calibration, Guess, Recording, Solution, VehicleParameter
+from caliv_graph.products import (
+    Array,
+    Calibration,
+    Guess,
+    Recording,
+    Solution,
+    StructureSummary,
+    StructureTerm,
+    VehicleParameter,
+)
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess, limited_axes
 from caliv_graph.wording.directions import named, same_as_parameters
@@ -60,7 +71,12 @@ def assemble(
         solution.time_offsets,
     )
     provenance = _provenance(config, recordings, solution, digests)
-    result = replace(draft, provenance=provenance, vehicle=_vehicle(solution))
+    result = replace(
+        draft,
+        provenance=provenance,
+        vehicle=_vehicle(solution),
+        structure=structure_summary(solution.structure, tuple(guesses)),
+    )
     return unmet_requirements(result, config)
 
 
@@ -72,6 +88,7 @@ def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Ar
     information = solution.information_data.copy()
     gradient = None if solution.gradient_data is None else solution.gradient_data.copy()
     seen = {c.lidar for r in solution.registrations for c in r.observation.clouds}
+    seen |= lidars_with_structure(solution.structure)
     for i, name in enumerate(solution.lidars):
         rows = slice(6 * i, 6 * i + 6)
         guess = guesses[name]
@@ -88,6 +105,29 @@ def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Ar
             if gradient is not None:
                 gradient[rows] = 0.0
     return information, gradient
+
+
+def structure_summary(
+    terms: Sequence[StructureTerm], lidars: Sequence[str]
+) -> StructureSummary | None:
+    """The structure of all drives, counted; None if there is none. `lidars` are in their order."""
+    if not terms:
+        return None
+    strips = [strip for term in terms for strip in term.strips if strip.weight > 0.0]
+    seen: dict[tuple[int, int], set[str]] = {}
+    sightings: dict[str, int] = {}
+    for strip in strips:
+        seen.setdefault((strip.drive, strip.surface), set()).update(strip.scans)
+        for name, scans in strip.scans.items():
+            sightings[name] = sightings.get(name, 0) + scans
+    pairs = itertools.combinations([name for name in lidars if name in sightings], 2)
+    return StructureSummary(
+        strips=len(strips),
+        surfaces=len(seen),
+        sightings={name: sightings[name] for name in lidars if name in sightings},
+        shared={pair: sum(set(pair) <= by for by in seen.values()) for pair in pairs},
+        offset_m=float(np.sqrt(np.mean([term.offset_m**2 for term in terms]))),
+    )
 
 
 def _vehicle(solution: Solution) -> dict[str, VehicleParameter]:

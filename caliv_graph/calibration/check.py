@@ -149,6 +149,8 @@ def cloud_counts(
 ) -> tuple[CloudCount, ...]:
     """Per LiDAR, how many of its clouds do not fit, where in the drive, and where they lie."""
     observed = [c for r in solution.registrations for c in r.observation.clouds]
+    if not observed:
+        return ()
     weights = np.concatenate(solution.cloud_weights)
     down = weights < 0.5
     if solution.mode != "staged":  # `staged` holds the translation at the guess, so no cloud fits
@@ -204,7 +206,12 @@ def _middles(solution: Solution) -> Array:
 
 
 def registration_sigma(solution: Solution) -> tuple[float, float]:
-    """Sigma per axis of the median cloud's registration, scaled: rotation (rad), position (m)."""
+    """Sigma per axis of the median cloud's registration, scaled: rotation (rad), position (m).
+
+    Zeros without a target.
+    """
+    if not solution.registrations:
+        return 0.0, 0.0
     information = np.concatenate([r.information for r in solution.registrations])
     variance = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
     sigma = np.sqrt(np.median(variance.reshape(-1, 2, 3).mean(axis=2), axis=0))
@@ -230,7 +237,7 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
 
 
 def typical_speed(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> float:
-    """Median speed of the vehicle over the clouds, m/s."""
+    """Median speed of the vehicle over the poses of the graph, m/s."""
     speeds = [
         np.linalg.norm(twists_at(trajectories[drive], [stamp])[0, 3:])
         for drive, stamp in solution.T_map_vehicle

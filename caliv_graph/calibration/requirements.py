@@ -17,7 +17,7 @@ def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
     unmet = [
         f"lidar '{name}' never saw the target"
         for name, lidar in calibration.lidars.items()
-        if not lidar.saw_target and not config.lidars[name].fixed
+        if not lidar.has_data and not config.lidars[name].fixed
     ]
     for requirement in config.require:
         unmet += _unmet(calibration, requirement)
@@ -27,7 +27,7 @@ def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
 
 
 def _seen(calibration: Calibration) -> list[str]:
-    return [name for name, lidar in calibration.lidars.items() if lidar.saw_target]
+    return [name for name, lidar in calibration.lidars.items() if lidar.has_data]
 
 
 def _unmet(calibration: Calibration, requirement: str) -> list[str]:

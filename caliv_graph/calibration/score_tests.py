@@ -87,9 +87,9 @@ class CloudParts:
         """Of a solved graph; `trajectories` are one per drive."""
         self.solution = solution
         observed = [c for r in solution.registrations for c in r.observation.clouds]
-        self.lidar = np.array([solution.lidars.index(c.lidar) for c in observed])
+        self.lidar = np.array([solution.lidars.index(c.lidar) for c in observed], np.int64)
         self.place = [(c.drive, c.stamp_ns) for c in observed]
-        self.weighs = np.concatenate(solution.cloud_weights) > 0.01
+        self.weighs = np.concatenate([np.zeros(0), *solution.cloud_weights]) > 0.01
         self.twists = np.zeros((len(observed), 6))
         for drive in sorted({d for d, _ in self.place}):
             mine = [j for j, (d, _) in enumerate(self.place) if d == drive]

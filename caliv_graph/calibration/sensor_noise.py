@@ -98,10 +98,13 @@ def estimated_noise(
     """
     noise = state.config.noise
     evidence = linearised_evidence(state, registrations, trajectories)
-    if evidence is None:
-        usual = _usual(noise)
-        return replace(usual, levels=_levels(usual, noise, ()))
-    return estimated(evidence, noise)
+    return usual_noise(noise) if evidence is None else estimated(evidence, noise)
+
+
+def usual_noise(noise: NoiseConfig) -> SensorNoise:
+    """The figures of a config, and the usual ones where it is silent."""
+    usual = _usual(noise)
+    return replace(usual, levels=_levels(usual, noise, ()))
 
 
 def _usual(noise: NoiseConfig) -> SensorNoise:

@@ -40,8 +40,28 @@ def structure_graph(
 
 
 def lidars_with_structure(terms: Sequence[StructureTerm]) -> frozenset[str]:
-    """Names of the LiDARs of some terms."""
-    return frozenset(name for term in terms for name in term.T_vehicle_lidar)
+    """Names of the LiDARs that some terms say anything of."""
+    return frozenset(
+        name
+        for term in terms
+        for name, own in _rows_of_lidars(term).items()
+        if np.diag(term.information)[own].any()
+    )
+
+
+def nearest_extrinsics(
+    rough: Mapping[str, gtsam.Pose3], terms: Sequence[StructureTerm]
+) -> dict[str, gtsam.Pose3]:
+    """Where a solve begins: the rough extrinsics, and those of LiDARs that structure places."""
+    return {**rough, **{name: T for term in terms for name, T in term.T_vehicle_lidar.items()}}
+
+
+def _rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
+    """Where the coordinates of each LiDAR's extrinsic are in a term."""
+    first = len(term.gradient) - 6 * len(term.T_vehicle_lidar)
+    return {
+        name: slice(first + 6 * i, first + 6 * i + 6) for i, name in enumerate(term.T_vehicle_lidar)
+    }
 
 
 def _factor(
@@ -67,8 +87,9 @@ def _factor(
             held[row] = -offset_s
         row += 1
     # T_a = E S_a, hence d(T_a) = Ad(S_a^-1) d(E) + d(S_a).
-    for name in term.T_vehicle_lidar:
-        rows = slice(row, row + 6)
+    for name, rows in _rows_of_lidars(term).items():
+        if name not in problem.lidars:
+            continue
         _, *others = problem.extrinsic_keys_of(name)
         by_graph[rows, columns[key_extrinsic()]] = np.eye(6)
         for key in others:
@@ -76,7 +97,6 @@ def _factor(
             assert isinstance(S, gtsam.Pose3)
             by_graph[rows, columns[key_extrinsic()]] = S.inverse().AdjointMap()
             by_graph[rows, columns[key]] = np.eye(6)
-        row += 6
     information = by_graph.T @ term.information @ by_graph
     information = 0.5 * (information + information.T)
     gradient = by_graph.T @ (term.gradient - term.information @ held)
@@ -93,9 +113,9 @@ def _linearisation_point(
     problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3
 ) -> dict[int, gtsam.Pose3 | gtsam.Rot3 | Array]:
     """The graph's variables of a term, where the term was linearised; E, S_a last."""
-    missing = [name for name in term.T_vehicle_lidar if name not in problem.lidars]
+    missing = lidars_with_structure([term]) - set(problem.lidars)
     if missing:
-        raise ValueError(f"lidar '{missing[0]}' has structure, but is not in the problem")
+        raise ValueError(f"lidar '{min(missing)}' has structure, but is not in the problem")
     origin = problem.origins_map[term.drive]
     point: dict[int, gtsam.Pose3 | gtsam.Rot3 | Array] = {
         key_vehicle(i): moved_map(T, -origin)
@@ -111,8 +131,9 @@ def _linearisation_point(
     E = term.T_vehicle_lidar.get(problem.reference, T_vehicle_ref)
     point[key_extrinsic()] = E
     for name, T in term.T_vehicle_lidar.items():
-        for key in problem.extrinsic_keys_of(name)[1:]:
-            point[key] = E.between(T)
+        if name in problem.lidars:
+            for key in problem.extrinsic_keys_of(name)[1:]:
+                point[key] = E.between(T)
     return point
 
 

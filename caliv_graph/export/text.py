@@ -65,7 +65,7 @@ def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
     for name in lidars:
         result = request.calibration.lidars[name]
         axes = undetermined_axes(result)
-        if not result.saw_target:
+        if not result.has_data:
             lines.append(f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess")
         elif axes:
             lines.append(

@@ -86,6 +86,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         earlier=(),
         contradictions=contradictions,
         vehicle={},
+        structure=None,
     )
     calibration = _assembled(
         draft, _together_per_lidar(calibrations, guesses), fused, data, disagree
@@ -113,6 +114,7 @@ def _together_per_lidar(
             of_all[0],
             scans_used=sum(r.scans_used for r in of_all),
             saw_target=any(r.saw_target for r in of_all),
+            determined={axis: any(r.determined[axis] for r in of_all) for axis in AXES},
             time_offset=_mean_offset(of_all),
             guess=guess,
         )
@@ -238,7 +240,7 @@ def _assembled(
             T_vehicle_lidar=poses[name],
             cov=cov[block, block],
             determined=dict(uncertainty.determined[name])
-            if result.saw_target or fixed
+            if result.has_data or fixed
             else dict.fromkeys(AXES, False),
         )
     complete = not uncertainty.undetermined and all(

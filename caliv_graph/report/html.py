@@ -103,12 +103,12 @@ def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
     for name, lidar in calibration.lidars.items():
         if lidar.guess is not None and lidar.guess.fixed:
             out.append((name, "", "not estimated: 'fixed' in the config"))
-        elif not lidar.saw_target:
+        elif not lidar.has_data:
             out.append((name, "", "all six axes: no target seen, the extrinsic is the guess"))
         else:
             out.append((f"{name} to the vehicle", *_axes_texts(lidar.determined)))
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):
-        if all(calibration.lidars[n].saw_target for n in (source, to)):
+        if all(calibration.lidars[n].has_data for n in (source, to)):
             axes = _axes_texts(pair_determined(calibration, source, to))
             out.append((f"{source} to {to}", *axes))
     return out
@@ -180,7 +180,7 @@ def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Differences between guess and result; mm and mrad in vehicle axes."""
     rows = []
     for name, lidar in calibration.lidars.items():
-        if lidar.guess is None or lidar.guess.fixed or not lidar.saw_target:
+        if lidar.guess is None or lidar.guess.fixed or not lidar.has_data:
             continue
         moved = vehicle_axes_difference(lidar.T_vehicle_lidar, lidar.guess.T_vehicle_lidar)
         after = np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))

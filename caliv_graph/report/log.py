@@ -1,8 +1,8 @@
 """log.jsonl: the course and the results of a run, one JSON object per line, for programs.
 
 The first key of a line names its subject: `stage`, `recording`, `trajectory`, `ground`,
-`clouds`, `registration`, `iteration`, `solution`, `noise`, `residuals`, `down_weighted`, `result`
-or `warning`.
+`structure`, `clouds`, `registration`, `iteration`, `solution`, `noise`, `residuals`,
+`down_weighted`, `result` or `warning`.
 """
 
 from __future__ import annotations
@@ -55,6 +55,18 @@ def log_documents(
     yield from stage_documents(stages)
     if record is not None:
         yield from _trajectories(record)
+    for term in solution.structure:
+        yield {
+            "structure": term.drive,
+            "lidars": list(term.T_vehicle_lidar),
+            "poses": len(term.stamps_ns),
+            "strips": len(term.strips),
+            "dropped": sum(strip.weight == 0.0 for strip in term.strips),
+            "surfaces": len({strip.surface for strip in term.strips}),
+            "offset_m": rounded(term.offset_m),
+            "scatter_m": rounded(np.median([s.scatter_m for s in term.strips] or [0.0])),
+            "before_m": rounded(np.median([s.before_m for s in term.strips] or [0.0])),
+        }
     for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
         clouds = registration.observation.clouds
         for name in dict.fromkeys(cloud.lidar for cloud in clouds):

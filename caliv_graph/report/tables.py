@@ -63,7 +63,7 @@ def calibration_table(
     unseen = [
         f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess"
         for name, result in calibration.lidars.items()
-        if not result.saw_target
+        if not result.has_data
     ]
     undetermined = direction_texts(calibration.undetermined)
     parts += sentences("Not determined by this drive:", [*undetermined, *unseen])
@@ -86,7 +86,7 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
     for errors in evaluation["pairs"]:
         # A pair's axes are marked as determined in the axes of `to`; these errors are in vehicle
         # axes.
-        seen = all(calibration.lidars[errors[end]].saw_target for end in ("from", "to"))
+        seen = all(calibration.lidars[errors[end]].has_data for end in ("from", "to"))
         name = f"S2S {errors['from']} to {errors['to']}"
         table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
     parts = titled("Errors in vehicle axes (estimate minus truth)", table)

@@ -84,6 +84,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
             **_earlier_documents(calibration),
         },
         **_vehicle_document(calibration),
+        **_structure_document(calibration),
         "observability": {
             "undetermined": [_direction_document(d) for d in calibration.undetermined],
             "weak": [_direction_document(d) for d in calibration.weak],
@@ -192,6 +193,23 @@ def _vehicle_document(calibration: Calibration) -> dict[str, Any]:
             "limits": list(found.limits),
         }
     return {"vehicle": out} if out else {}
+
+
+def _structure_document(calibration: Calibration) -> dict[str, Any]:
+    """What was used of walls and other structure; nothing where none was."""
+    found = calibration.structure
+    if found is None:
+        return {}
+    document = {
+        "strips": found.strips,
+        "surfaces": found.surfaces,
+        "offset_m": found.offset_m,
+        "sightings": dict(found.sightings),
+        "shared_surfaces": [
+            {"from": a, "to": b, "surfaces": count} for (a, b), count in found.shared.items()
+        ],
+    }
+    return {"structure": document}
 
 
 def _guess_document(guess: Guess) -> dict[str, Any]:

@@ -49,6 +49,7 @@ from caliv_graph.results.fields import (
     symmetric,
     unit,
 )
+from caliv_graph.results.structure import StructurePart
 from caliv_graph.results.vehicle import VehiclePart
 from caliv_graph.uncertainty.observability import rigid_twist
 from caliv_graph.uncertainty.pairs import pair_covariance, sensor_pairs
@@ -255,6 +256,7 @@ class CalibrationModel(Part):
     suspects: tuple[_SuspectPart, ...] = ()
     provenance: dict[Text, Any] = Field({})
     vehicle: VehiclePart = VehiclePart()
+    structure: StructurePart | None = None
 
     @model_validator(mode="after")
     def _knows_all_names(self) -> Self:
@@ -302,6 +304,7 @@ class CalibrationModel(Part):
             gradient_data=None if gradient is None else np.array(gradient),
             earlier=tuple(part.term() for part in joint.earlier),
             vehicle=self.vehicle.parameters(),
+            structure=None if self.structure is None else self.structure.summary(),
         )
 
     def cov_pairs(self, calibration: Calibration) -> dict[tuple[str, str], Array]:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
 
 
@@ -45,6 +48,12 @@ class DrivePatches:
     def points(self) -> Array:
         """(N,) number of points."""
         return self.moments[:, 3, 3]
+
+    @property
+    def taken_ns(self) -> IntArray:
+        """(N,) stamp at which the points were taken."""
+        offsets = np.round(NANOSECONDS_PER_SECOND * self.time_s).astype(np.int64)
+        return np.asarray(self.stamps_ns[self.scan] + offsets)
 
     @property
     def centres_lidar(self) -> Array:

@@ -152,7 +152,7 @@ def scan_patches(
         motion = _sweep_motion(scan.stamp_ns, times_s, T_vehicle_lidar, trajectory)
     patches = planar_patches(scan.points_lidar, sigma_range_m, times_s, motion)
     begin, end = trajectory.span_ns
-    at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND)
+    at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND).astype(np.int64)
     keep: BoolArray = (at >= begin) & (at <= end)
     if not keep_level:
         up_lidar = (R_map_vehicle[0] @ T_vehicle_lidar.rotation().matrix())[2]

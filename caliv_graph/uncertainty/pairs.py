@@ -62,7 +62,7 @@ def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str,
     shift along the axes of `to`.
     """
     results = [calibration.lidars[name] for name in (source, to)]
-    if not all(result.saw_target for result in results):
+    if not all(result.has_data for result in results):
         return dict.fromkeys(AXES, False)
     if not calibration.undetermined:
         return dict.fromkeys(AXES, True)

@@ -89,8 +89,10 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
     )
 
 
-def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure:
-    """Robust weight of every cloud over time."""
+def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure | None:
+    """Robust weight of every cloud over time; None without a target."""
+    if not solution.registrations:
+        return None
     colour, shown = colours(lidars), labels(lidars)
     begin = first_stamp(c.stamp_ns for r in solution.registrations for c in r.observation.clouds)
     drives = len({c.drive for r in solution.registrations for c in r.observation.clouds})

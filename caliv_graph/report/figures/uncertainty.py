@@ -147,7 +147,7 @@ def spectrum_figure(solution: Solution) -> Figure:
 
 def correlation_figure(calibration: Calibration) -> Figure:
     """Correlations of all extrinsics in vehicle axes."""
-    names = [n for n, lidar in calibration.lidars.items() if lidar.saw_target]
+    names = [n for n, lidar in calibration.lidars.items() if lidar.has_data]
     rows = [i for i, n in enumerate(calibration.lidars) if n in names]
     pick = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in rows]) if rows else np.zeros(0, int)
     axes = np.zeros((len(pick), len(pick)))

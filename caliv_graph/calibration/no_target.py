@@ -1,0 +1,193 @@
+"""The calibration of drives without a target: structure and ground, by `auto` or `joint`.
+
+There are no clouds, and so no shape, no registration and no robust weights of clouds: the graph is
+reduced to the extrinsics and solved by Gauss-Newton steps.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from caliv_graph.calibration.graph import initial_values, motion_graph
+from caliv_graph.calibration.ground import ground_values
+from caliv_graph.calibration.ground_weights import ground_weights
+from caliv_graph.calibration.linear import CloudLinearisation
+from caliv_graph.calibration.noise import first_pose_noise
+from caliv_graph.calibration.pack import packed_solution
+from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
+from caliv_graph.calibration.robust import RobustWeights
+from caliv_graph.calibration.sensor_noise import usual_noise
+from caliv_graph.calibration.solve import (
+    COUPLED_SIGMAS,
+    COUPLED_STEPS,
+    OFFSET_DETERMINED_S,
+    WEIGHT_TOLERANCE,
+    SolveState,
+    base_graph,
+    covariance_of_mode,
+    keep_determined_offsets,
+    step_of_mode,
+)
+from caliv_graph.calibration.structure import (
+    lidars_with_structure,
+    nearest_extrinsics,
+    structure_graph,
+)
+from caliv_graph.calibration.structure_evidence import StructureEvidence, kept_stamps
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TargetError
+from caliv_graph.products import Array, GroundObservation, Iteration, Solution, StructureTerm
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.wording.offsets import undetermined_offset_sentences
+
+DECIDED_AFTER = 4
+"""Step from which the number of undetermined directions is fixed, so that a direction at the
+threshold does not make the estimate jump for ever: the terms are quadratic, and three steps are
+usual."""
+
+
+def solve_without_target(
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+    grounds: tuple[GroundObservation, ...],
+    structure: StructureEvidence,
+) -> Solution:
+    """Solves for the extrinsics by structure and ground.
+
+    Args:
+        trajectories: one per drive, with nodes at the scans of the structure.
+        config: guesses, mode, noise, ground.
+        progress: reports every stage.
+        grounds: the ground at the poses of `kept_stamps`.
+        structure: the patches.
+
+    Raises:
+        TargetError: structure says nothing, or the mode is the paper's, which needs a target.
+        SolveError: it could not be solved.
+    """
+    if config.solve.mode == "staged":
+        raise TargetError("solve.mode staged needs a target", "Set it to auto or joint")
+    noise = usual_noise(config.noise)
+    kept = kept_stamps(structure.patches)
+    guesses = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+    begun = time.perf_counter()
+    with progress.stage("solving walls and other surfaces", None):
+        terms = structure.terms(
+            trajectories, kept, guesses, noise.heave_m, first_pose_noise(config.noise), config
+        )
+    if not lidars_with_structure(terms):
+        raise TargetError(
+            "the LiDARs see neither a target nor structure that stands still, such as walls"
+        )
+    times = {"structure": time.perf_counter() - begun}
+    begun = time.perf_counter()
+    stamps = {term.drive: term.stamps_ns for term in terms}
+    problem = pose_problem(
+        [], trajectories, config, noise.heave_m, lidars_with_structure(terms), stamps
+    )
+    with progress.stage("solving the graph", COUPLED_STEPS) as advance:
+        loop = _Loop(problem, terms, grounds, config)
+        loop.solve(advance)
+        problem, sigmas_s = keep_determined_offsets(problem, loop.reduced)
+        if problem.offsets != loop.state.problem.offsets:
+            loop = _Loop(problem, terms, grounds, config)
+            loop.solve(advance)
+    solution = loop.solution()
+    times["graph"] = time.perf_counter() - begun
+    offsets = undetermined_offset_sentences(sigmas_s, OFFSET_DETERMINED_S)
+    warnings = (*offsets, *(line for term in terms for line in term.warnings))
+    return replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+
+
+class _Loop:
+    """Gauss-Newton steps of the reduced graph."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        terms: tuple[StructureTerm, ...],
+        grounds: tuple[GroundObservation, ...],
+        config: Config,
+    ) -> None:
+        """At the extrinsics of the terms."""
+        start = nearest_extrinsics({}, terms)
+        self.state = SolveState(
+            problem=problem,
+            config=config,
+            values=initial_values(problem, [], start),
+            noise=first_pose_noise(config.noise),
+            scale=1.0,
+            weights=RobustWeights(config.robust, 0),
+            motion=motion_graph(problem),
+            sound=np.ones(0, dtype=bool),
+            grounds=grounds,
+            structure=terms,
+            structure_factors=structure_graph(problem, terms, start),
+        )
+        state = self.state
+        state.values.insert(ground_values(problem, grounds, state.values, config.ground))
+        self.course: list[Iteration] = []
+        self.undetermined: int | None = None
+        self.converged = False
+        self.reduced = self._linearised()
+
+    def solve(self, advance: Callable[..., None]) -> None:
+        """Steps until one is small, `COUPLED_STEPS` at most."""
+        state = self.state
+        prior = state.problem.guess_information()
+        while len(self.course) < COUPLED_STEPS and not self.converged:
+            step, lost = step_of_mode(state, self.reduced, self.undetermined)
+            if len(self.course) + 1 >= DECIDED_AFTER:
+                self.undetermined = lost
+            sigmas = float(np.sqrt(step @ (self.reduced.D + prior) @ step))
+            state.values = self.reduced.move(step)
+            change = self._weigh()
+            self.reduced = self._linearised()
+            size = np.abs(step.reshape(-1, 6))
+            self.course.append(
+                Iteration(float(size[:, :3].max()), float(size[:, 3:].max()), sigmas, change, lost)
+            )
+            self.converged = sigmas < COUPLED_SIGMAS and change < WEIGHT_TOLERANCE
+            advance()
+
+    def _weigh(self) -> float:
+        """New weights of the ground; their largest change."""
+        state = self.state
+        if not state.grounds:
+            return 0.0
+        before = state.ground_weights
+        state.ground_weights = ground_weights(state.problem, state.grounds, state.values)
+        if before is None:
+            return 1.0
+        return float(np.abs(state.ground_weights.planes - before.planes).max())
+
+    def _linearised(self) -> Reduced:
+        nothing: tuple[Array, Array] = np.zeros((0, 0)), np.zeros(0)
+        lines = CloudLinearisation((), (), ())
+        state = self.state
+        return reduce_to_extrinsics(state.problem, state.values, base_graph(state), nothing, lines)
+
+    def solution(self) -> Solution:
+        """Packs the last estimate."""
+        state, reduced = self.state, self.reduced
+        cov = covariance_of_mode(state, reduced, self.undetermined)
+        packed = packed_solution(
+            state,
+            (),
+            reduced,
+            np.zeros((0, 6, 6)),
+            reduced.D,
+            cov,
+            held=(),
+            iterations=len(self.course),
+            converged=self.converged,
+            time_offsets=reduced.time_offsets(state.problem, cov),
+        )
+        return replace(packed, course=tuple(self.course))

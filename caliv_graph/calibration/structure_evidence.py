@@ -1,0 +1,108 @@
+"""From the patches of each drive to what structure says of the calibration's variables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.pose_priors import pose_priors
+from caliv_graph.config.model import Config
+from caliv_graph.products import IntArray, PoseNoise, StructureTerm
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+KEPT_POSES = 40
+"""Poses of a drive without a target that the calibration keeps, for the ground: spread over the
+drive, their views of it differ. All other poses of its structure are eliminated before."""
+
+StructureTerms = Callable[
+    [
+        Sequence[DrivePatches],
+        Sequence[PosePrior],
+        Sequence[IntArray],
+        Sequence[VehicleTrajectory],
+        Mapping[str, gtsam.Pose3],
+        Config,
+        frozenset[str],
+    ],
+    tuple[StructureTerm, ...],
+]
+"""Patches, priors of the poses, stamps of the poses to keep and trajectory of each drive; rough
+extrinsics, config, names of the LiDARs with a free time offset -> a term per drive."""
+
+
+def no_terms(*_: object) -> tuple[StructureTerm, ...]:
+    """Structure that says nothing."""
+    return ()
+
+
+@dataclass(frozen=True)
+class StructureEvidence:
+    """What the LiDARs see beside target and ground.
+
+    Attributes:
+        patches: per drive.
+        solve: how they become terms.
+    """
+
+    patches: tuple[DrivePatches, ...] = ()
+    solve: StructureTerms = no_terms
+
+    def terms(
+        self,
+        trajectories: Sequence[VehicleTrajectory],
+        kept_ns: Mapping[int, Sequence[int]],
+        start: Mapping[str, gtsam.Pose3],
+        heave_m: float,
+        noise: PoseNoise,
+        config: Config,
+    ) -> tuple[StructureTerm, ...]:
+        """The term of each drive that has structure.
+
+        Args:
+            trajectories: one per drive, with nodes at the stamps of the patches.
+            kept_ns: drive -> stamps of the poses that the calibration has.
+            start: rough T_vehicle_lidar of every LiDAR.
+            heave_m: 1 sigma of the heave.
+            noise: of given poses.
+            config: guesses and noise.
+
+        Raises:
+            SolveError: it could not be solved.
+        """
+        patches = [of for of in self.patches if len(of.scan) and len(kept_ns.get(of.drive, ()))]
+        if not patches:
+            return ()
+        kept = {of.drive: np.asarray(kept_ns[of.drive], np.int64) for of in patches}
+        stamps = {
+            of.drive: np.unique(np.concatenate([kept[of.drive], of.stamps_ns])) for of in patches
+        }
+        priors = pose_priors(trajectories, stamps, heave_m, noise, config)
+        return self.solve(
+            patches,
+            [priors[of.drive] for of in patches],
+            [kept[of.drive] for of in patches],
+            [trajectories[of.drive] for of in patches],
+            start,
+            config,
+            frozenset(config.lidars) if config.solve.time_offset else frozenset(),
+        )
+
+
+def kept_stamps(patches: Sequence[DrivePatches]) -> dict[int, list[int]]:
+    """Per drive with patches, stamps of the poses that a calibration without a target keeps.
+
+    They are those of scans of the LiDAR with most of them, evenly chosen.
+    """
+    out = {}
+    for of in patches:
+        if len(of.scan):
+            most = int(np.bincount(of.scan_lidar).argmax())
+            stamps = np.unique(of.stamps_ns[of.scan_lidar == most])
+            chosen = np.linspace(0, len(stamps) - 1, min(KEPT_POSES, len(stamps)))
+            out[of.drive] = stamps[np.round(chosen).astype(np.int64)].tolist()
+    return out

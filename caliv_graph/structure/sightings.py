@@ -32,12 +32,16 @@ class Sightings:
         moments: (Q, 4, 4) sum of w h h^T, h = (p, 1), p in the lidar frame at the scan's stamp, w
             in 1/m^2.
         cos_incidence: (Q,) cosine of the angle between beam and normal.
+        noise: (Q, 4, 4) what the noise of the points adds to `moments` in the mean. A plane that
+            is fitted to moments with noise in them turns towards the beams: on ground seen under 70
+            degrees by 0.1 mrad, of each LiDAR to its own side.
     """
 
     scan: IntArray
     strip: IntArray
     moments: Array
     cos_incidence: Array
+    noise: Array
 
     @property
     def count(self) -> int:
@@ -57,6 +61,7 @@ class Sightings:
             strip=self.strip[keep],
             moments=self.moments[keep],
             cos_incidence=self.cos_incidence[keep],
+            noise=self.noise[keep],
         )
 
 
@@ -102,12 +107,15 @@ def sightings_of(
     own, key = own[order], key[order]
     if not len(own):
         none = np.zeros(0, np.int64)
-        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros(0))
+        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 4, 4)))
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
     sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
     weight = point_weights(centres, normals_at_stamp[own], sigma)
     moments = np.add.reduceat(weight[:, None, None] * moments_at_stamp[own], starts)
+    noise = np.zeros_like(moments)
+    of_patch = weight * moments_at_stamp[own, 3, 3]
+    noise[:, :3, :3] = np.add.reduceat(of_patch[:, None, None] * _noise(centres, sigma), starts)
     centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
     cos = np.abs(np.einsum("qi,qi->q", centroid, normals_at_stamp[own[starts]]))
     return Sightings(
@@ -115,11 +123,23 @@ def sightings_of(
         strip=strips.of_patch[own[starts]],
         moments=moments,
         cos_incidence=cos / np.linalg.norm(centroid, axis=1),
+        noise=noise,
     )
 
 
-def without_own_error(sightings: Sightings, normals_lidar: Array, sigma_m: Array) -> Array:
-    """Moments (Q, 4, 4) with an error of each sighting eliminated: an offset and two tilts.
+def _noise(centres_lidar: Array, range_sigma_m: Array) -> Array:
+    """(N, 3, 3) covariance of the noise of a point: along its beam, and across it."""
+    distance = np.linalg.norm(centres_lidar, axis=1)
+    u = centres_lidar / distance[:, None]
+    across = ((BEAM_RAD * distance) ** 2)[:, None, None]
+    along = (range_sigma_m**2)[:, None, None]
+    return np.asarray(across * np.eye(3) + (along - across) * u[:, :, None] * u[:, None, :])
+
+
+def without_own_error(
+    sightings: Sightings, normals_lidar: Array, sigma_m: Array
+) -> tuple[Array, Array]:
+    """Moments (Q, 4, 4) without an error of each sighting, an offset and two tilts; and noise in them.
 
     `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`: however many points it has, a sighting knows its strip
     no better than `sigma_m` (Q,) at its middle. `normals_lidar` (Q, 3) at the scan's stamp.
@@ -132,5 +152,8 @@ def without_own_error(sightings: Sightings, normals_lidar: Array, sigma_m: Array
     N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN + np.eye(3) * sigma_m[:, None, None] ** -2.0
-    out = S - SN @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
-    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+    K = N @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
+    left = np.eye(4) - K
+    out = S @ left
+    noise = np.swapaxes(left, 1, 2) @ sightings.noise @ left
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2))), np.asarray(noise)

@@ -201,11 +201,13 @@ class Rows:
         J: (4 Q, D).
         r: (4 Q,).
         shared: (4 Q, G) derivatives by the offset of each surface in each scan, 1 sigma each.
+        of_noise: (D,) what the noise of the points adds to `J^T r` in the mean.
     """
 
     J: scipy.sparse.csr_array
     r: Array
     shared: scipy.sparse.csr_array
+    of_noise: Array
 
     def normal_equations(self) -> tuple[scipy.sparse.csr_array, Array]:
         """H (D, D) and b (D,), the shared offsets eliminated."""
@@ -213,7 +215,7 @@ class Rows:
         V = (self.J.T @ B).tocsr()
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
         H = self.J.T @ self.J - V @ (scipy.sparse.diags_array(inner) @ V.T)
-        b = -(self.J.T @ self.r) + V @ (inner * (B.T @ self.r))
+        b = self.of_noise - self.J.T @ self.r + V @ (inner * (B.T @ self.r))
         return H.tocsr(), np.asarray(b)
 
 
@@ -230,7 +232,8 @@ def whitened(
     `group` (Q,) numbers scan and surface of each, `weights` (Q,) are robust, `size` is D.
     """
     sigma_m = nuisances.sighting[sightings.strip]
-    S = without_own_error(sightings, geometry.normals_lidar, sigma_m) * weights[:, None, None]
+    S, noise = without_own_error(sightings, geometry.normals_lidar, sigma_m)
+    S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)
     C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     data = np.swapaxes(geometry.by @ C, 1, 2)
@@ -244,7 +247,10 @@ def whitened(
     shared = scipy.sparse.csr_array(
         (by_offset.ravel(), (np.arange(4 * q), own.ravel())), shape=(4 * q, len(groups))
     )
-    return Rows(J, np.einsum("qi,qij->qj", geometry.plain, C).ravel(), shared)
+    pull = np.einsum("qci,qij,qj->qc", geometry.by, noise, geometry.plain, optimize=True)
+    of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
+    r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
+    return Rows(J, r, shared, np.asarray(of_noise))
 
 
 def lidar_poses(

@@ -20,6 +20,9 @@ rough extrinsics are still in it."""
 LEAST_M = 2e-4
 """Smallest sigma of an offset: what no LiDAR resolves."""
 
+LEAST_RANGE_M = 1e-3
+"""Smallest noise along the beam: no LiDAR for vehicles has less."""
+
 OWN_STRIP = 10.0
 """Number of sightings that the common sigma counts as when the sigma of one strip is estimated."""
 
@@ -37,7 +40,7 @@ MOST_FITTED = 0.9
 def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     """(L,) noise along the beam of each LiDAR, from the scatter of patches about their planes.
 
-    The median: patches of leaves scatter more. At least a third of what is stated.
+    The median: patches of leaves scatter more. What is stated where there are too few patches.
     """
     centres = patches.centres_lidar
     distance = np.linalg.norm(centres, axis=1)
@@ -50,7 +53,7 @@ def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
         own = (patches.scan_lidar[patches.scan] == i) & (points >= 8.0) & (cos > 0.5)
         if own.sum() >= 50:
             found = float(np.median(variance[own] / cos[own] ** 2))
-            out[i] = np.sqrt(max(found, (stated_m / 3.0) ** 2))
+            out[i] = math.sqrt(max(found, LEAST_RANGE_M**2))
     return out
 
 

@@ -139,10 +139,11 @@ def _noise(centres_lidar: Array, range_sigma_m: Array) -> Array:
 def without_own_error(
     sightings: Sightings, normals_lidar: Array, sigma_m: Array
 ) -> tuple[Array, Array]:
-    """Moments (Q, 4, 4) without an error of each sighting, an offset and two tilts; and noise in them.
+    """Moments (Q, 4, 4) without the own error of each sighting; and what noise adds.
 
-    `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`: however many points it has, a sighting knows its strip
-    no better than `sigma_m` (Q,) at its middle. `normals_lidar` (Q, 3) at the scan's stamp.
+    That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
+    points it has, a sighting knows its strip no better than `sigma_m` (Q,) at its middle.
+    `normals_lidar` (Q, 3) at the scan's stamp.
     """
     S, centroid = sightings.moments, sightings.centroids_lidar
     axes = tangent_axes(normals_lidar) / TILT_LENGTH_M

@@ -20,6 +20,13 @@ PLACE_PRIOR_M = 10.0
 """Prior of a plane: a single ring of beams does not determine its tilt."""
 
 
+MOST_NOISE = 0.5
+"""Largest part of a strip's information on its tilt that may be noise of the points."""
+
+PLANE_ROWS = slice(12, 15)
+"""Where the derivatives by the plane are in `Geometry.by`: after pose and extrinsic."""
+
+
 @dataclass(frozen=True)
 class Nuisances:
     """1 sigma of errors of the LiDARs that are estimated beside all else, metres.
@@ -202,12 +209,14 @@ class Rows:
         r: (4 Q,).
         shared: (4 Q, G) derivatives by the offset of each surface in each scan, 1 sigma each.
         of_noise: (D,) what the noise of the points adds to `J^T r` in the mean.
+        shared_noise: (G,) the same of `shared^T r`.
     """
 
     J: scipy.sparse.csr_array
     r: Array
     shared: scipy.sparse.csr_array
     of_noise: Array
+    shared_noise: Array
 
     def normal_equations(self) -> tuple[scipy.sparse.csr_array, Array]:
         """H (D, D) and b (D,), the shared offsets eliminated."""
@@ -215,7 +224,8 @@ class Rows:
         V = (self.J.T @ B).tocsr()
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
         H = self.J.T @ self.J - V @ (scipy.sparse.diags_array(inner) @ V.T)
-        b = self.of_noise - self.J.T @ self.r + V @ (inner * (B.T @ self.r))
+        b = self.of_noise - self.J.T @ self.r
+        b += V @ (inner * (B.T @ self.r - self.shared_noise))
         return H.tocsr(), np.asarray(b)
 
 
@@ -247,10 +257,30 @@ def whitened(
     shared = scipy.sparse.csr_array(
         (by_offset.ravel(), (np.arange(4 * q), own.ravel())), shape=(4 * q, len(groups))
     )
-    pull = np.einsum("qci,qij,qj->qc", geometry.by, noise, geometry.plain, optimize=True)
+    noise *= _bearable(geometry, S, noise, sightings.strip)[:, None, None]
+    of_plane = np.einsum("qij,qj->qi", noise, geometry.plain)
+    pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
     of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
+    of_groups = np.bincount(number.ravel(), nuisances.shared * of_plane[:, 3], len(groups))
     r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
-    return Rows(J, r, shared, np.asarray(of_noise))
+    return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups))
+
+
+def _bearable(geometry: Geometry, S: Array, noise: Array, strip: IntArray) -> Array:
+    """(Q,) factors on the noise: less than MOST_NOISE of what a strip's moments say of its tilt.
+
+    Where a single ring of beams meets a wall all that is known of its tilt is noise.
+    """
+    by = geometry.by[:, PLANE_ROWS][:, :2]
+    count = int(strip.max(initial=-1)) + 1
+    both = []
+    for of in (S, noise):
+        blocks = by @ of @ np.swapaxes(by, 1, 2)
+        total = [np.bincount(strip, blocks[:, i, j], count) for i, j in ((0, 0), (0, 1), (1, 1))]
+        both.append(np.stack([total[0], total[1], total[1], total[2]], axis=1).reshape(-1, 2, 2))
+    known = both[0] + TILT_PRIOR_RAD**-2.0 * np.eye(2)
+    largest = np.abs(np.linalg.eigvals(np.linalg.solve(known, both[1]))).max(axis=1, initial=0.0)
+    return np.asarray(np.minimum(1.0, MOST_NOISE / np.maximum(largest, 1e-9))[strip])
 
 
 def lidar_poses(
@@ -291,13 +321,13 @@ def geometry_of(
     R, t = lidar_poses(state, lidar, pose, twists)
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
-    cos = sightings.cos_incidence
     error_columns = _error_columns(layout, lidar, surface, strip)
-    errors = _errors_of(state, error_columns, cos)
+    by_error = _by_error(sightings, m)
 
     plain = np.zeros((q, 4))
     plain[:, :3] = m
-    plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre) + errors
+    plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre)
+    plain += np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
 
     by_extrinsic = np.zeros((q, 6, 4))
     by_extrinsic[:, :3, :3] = -skew(m)
@@ -309,11 +339,6 @@ def geometry_of(
     by_plane[:, :2, :3] = B @ R
     by_plane[:, :2, 3] = np.einsum("qki,qi->qk", B, t - centre)
     by_plane[:, 2, 3] = -1.0
-    by_error = np.zeros((q, 4, 4))
-    by_error[:, 0, 3] = cos
-    by_error[:, 1, 3] = 1.0 - cos
-    by_error[:, 2, 3] = cos
-    by_error[:, 3, 3] = 1.0
     parts = [by_pose, by_extrinsic, by_plane, by_error]
     columns = [
         6 * pose[:, None] + np.arange(6),
@@ -339,10 +364,27 @@ def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: In
     return np.stack([first, first + 1, of_surface, of_strip], axis=1)
 
 
-def _errors_of(state: State, columns: IntArray, cos: Array) -> Array:
-    """(Q,) what the LiDARs' errors add to the residual of each sighting, metres."""
-    e = state.errors[columns]
-    return np.asarray(cos * (e[:, 0] + e[:, 2]) + (1.0 - cos) * e[:, 1] + e[:, 3])
+def _by_error(sightings: Sightings, normals_lidar: Array) -> Array:
+    """(Q, 4, 4) what each error of a LiDAR adds to the residual, linear in h = (p, 1).
+
+    A range that is too long by b moves a point by `-b cos(incidence)` along the normal; the cosine
+    changes over a strip: on ground that looks like a tilt. Errors: bias, its growth with
+    1 / cos(incidence), bias on the surface, offset on the strip.
+    """
+    centroid = sightings.centroids_lidar
+    distance = np.linalg.norm(centroid, axis=1)[:, None]
+    u = centroid / distance
+    cos = -np.einsum("qi,qi->q", normals_lidar, u)
+    # Along the plane only: a change along the normal would scale the points' scatter away.
+    slope = -cos[:, None] * (u + cos[:, None] * normals_lidar) / distance
+    out = np.zeros((len(u), 4, 4))
+    out[:, 0, :3] = slope
+    out[:, 0, 3] = cos - np.einsum("qi,qi->q", slope, centroid)
+    out[:, 1] = -out[:, 0]
+    out[:, 1, 3] += 1.0
+    out[:, 2] = out[:, 0]
+    out[:, 3, 3] = 1.0
+    return out
 
 
 @dataclass(frozen=True)

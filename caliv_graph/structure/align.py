@@ -47,9 +47,9 @@ SIGMA_M = 0.05
 SIGMA_RAD = 0.05
 """Sigmas of the residuals beside the prior: errors of poses, and of normals on uneven walls."""
 
-PER_SCAN = 10.0
-"""Residuals of a scan that count as independent: all share the error of its pose, so that hundreds
-of them must not override the prior where structure says nothing."""
+PER_SCAN = 100.0
+"""Residuals of a scan that count at most, about as many as it has patches of upright surfaces. More
+pairs say nothing new: against thousands of them the prior would not hold what they leave open."""
 
 MIN_MATCHES = 100
 """Fewest matches of a LiDAR that is aligned: with fewer it sees no structure."""

@@ -15,7 +15,7 @@ from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.trajectory.select import VehicleTrajectory
 
-SOURCES = 6000
+SOURCES = 3000
 """Patches that are compared, of all scans together."""
 
 PAIRS = 8
@@ -215,14 +215,16 @@ class Pairs:
         normal = np.einsum("nij,nj->ni", R[self._source], cloud.normal[self._source])
         other = np.full(len(self._source), -1)
         order = np.argsort(self._scan, kind="stable")
-        numbers, first = np.unique(self._scan[order], return_index=True)
+        numbers, count = np.unique(self._scan, return_counts=True)
+        ends = np.cumsum(count)
         reach_m = float(np.hypot(gate[0], NEIGHBOUR_M) + NORMAL_LEVER_M * gate[1])
-        for s, of_scan in zip(numbers.tolist(), np.split(order, first[1:]), strict=True):
+        for s, last, n in zip(numbers.tolist(), ends.tolist(), count.tolist(), strict=True):
+            of_scan = order[last - n : last]
             there = (centre[of_scan] - t_scan[s]) @ R_scan[s]
             at = np.hstack([there, NORMAL_LEVER_M * normal[of_scan] @ R_scan[s]])
             apart, near = cloud.trees[s].query(at, distance_upper_bound=reach_m)
             found = np.isfinite(apart)
-            other[of_scan[found]] = cloud.targets[s][near[found]]
+            other[of_scan[found]] = cloud.targets[s][np.asarray(near)[found]]
         other[cloud.scan[self._source] == self._scan] = -1
         hit = other >= 0
         i, j = self._source[hit], other[hit]

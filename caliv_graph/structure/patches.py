@@ -6,12 +6,12 @@ sufficient for every later use, at any pose (`README.md`, section 2), so that no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,17 @@ class DrivePatches:
     moments: Array
     normal_lidar: Array
     scatter_m: Array
+
+    def part(self, keep: BoolArray) -> DrivePatches:
+        """Some of the patches (N,), of the same scans."""
+        return replace(
+            self,
+            scan=self.scan[keep],
+            time_s=self.time_s[keep],
+            moments=self.moments[keep],
+            normal_lidar=self.normal_lidar[keep],
+            scatter_m=self.scatter_m[keep],
+        )
 
     @property
     def points(self) -> Array:

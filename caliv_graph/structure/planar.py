@@ -6,7 +6,7 @@ that lies along their border, and bias both halves.
 
 Cells are those of a cube around the LiDAR, halved until they span about `PATCH_M` at the range they
 see. A cell with too few points, or with one or two lines of them (the rings of a LiDAR of few
-channels), is judged again together with its neighbours, up to `MAX_PATCH_M`.
+channels), is judged again together with its neighbours: first above and below, then all around.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ ROOT_CELLS = 12
 FINEST = 5
 """Halvings of the coarsest cells at most: 0.23 degrees, 0.5 m at 120 m."""
 
-MERGES = 2
-"""How often undecided cells are joined with their neighbours: up to four times `PATCH_M`."""
+SHAPES = ((0, 0), (0, 1), (0, 2), (2, 2))
+"""Halvings that are undone across and along the axis of the LiDAR, in this order, for what is still
+undecided: rings of 2 degrees need cells of 7.5 to have three of them, but not so wide ones."""
 
 SLOT_S = 0.01
 """Points of a patch are from one slot of this length. Within 5 ms of their mean time, an extrinsic
@@ -144,7 +145,7 @@ def planar_patches(
         motion: of the LiDAR, over the span of these times; given with them.
     """
     points, times_s = _even_part(points, times_s)
-    cell, level = _cells(points)
+    cells = _cells(points)
     slot = np.zeros(len(points), dtype=np.int64)
     if times_s is not None and motion is not None:
         slot = np.clip(((times_s - motion.first_s) / SLOT_S).astype(np.int64), 0, None)
@@ -152,8 +153,8 @@ def planar_patches(
     left = np.arange(len(points))
     found: list[ScanPatches] = []
     uneven = grazing = 0
-    for _ in range(MERGES + 1):
-        groups = _grouped(cell[left], level[left], slot[left])
+    for undone in SHAPES:
+        groups = _grouped(cells, left, undone, slot)
         left = left[groups.order]
         at, times = points[left], None if times_s is None else times_s[left]
         patches, judged = _judged(groups, at, times, motion, slot[left], sigma_range_m)
@@ -161,8 +162,7 @@ def planar_patches(
         uneven += patches.uneven
         grazing += patches.grazing
         left = left[~judged]
-        left = left[level[left] > 0]
-        level[left] -= 1
+        left = left[cells.level[left] > 0]
         if not len(left):
             break
     return _joined(found, len(points), uneven, grazing)
@@ -176,18 +176,33 @@ def _even_part(points: Array, times_s: Array | None) -> tuple[Array, Array | Non
     return points[keep], None if times_s is None else times_s[keep]
 
 
-def _cells(points: Array) -> tuple[IntArray, IntArray]:
-    """Index of the finest cell of each point (N,), and halvings of the coarsest one (N,)."""
+@dataclass(frozen=True)
+class _Cells:
+    """The finest cell of each point (N,): face of the cube, places across and along the axis z.
+
+    `level` is how often the coarsest cell of the point is halved.
+    """
+
+    face: IntArray
+    across: IntArray
+    along: IntArray
+    level: IntArray
+
+
+def _cells(points: Array) -> _Cells:
+    """The cells of points (N, 3)."""
     size = np.abs(points)
     axis = np.argmax(size, axis=1)
     rows = np.arange(len(points))
-    along = points[rows, axis]
-    face = 2 * axis + (along < 0.0)
+    height = points[rows, axis]
+    face = 2 * axis + (height < 0.0)
     width = ROOT_CELLS << FINEST
+    # x: y and z; y: x and z; z: x and y.
+    across = np.where(axis == 0, points[:, 1], points[:, 0])
+    along = np.where(axis == 2, points[:, 1], points[:, 2])
     place = []
-    for step in (1, 2):
-        angle = np.arctan(points[rows, (axis + step) % 3] / np.abs(along))
-        part = (angle * (2.0 / math.pi) + 0.5) * width
+    for side in (across, along):
+        part = (np.arctan(side / np.abs(height)) * (2.0 / math.pi) + 0.5) * width
         place.append(np.clip(part.astype(np.int64), 0, width - 1))
     root = (face * ROOT_CELLS + (place[0] >> FINEST)) * ROOT_CELLS + (place[1] >> FINEST)
     # The level is common to a whole coarse cell, so that it does not depend on a point's noise.
@@ -197,7 +212,7 @@ def _cells(points: Array) -> tuple[IntArray, IntArray]:
     mean = np.bincount(root, log_range, number) / count
     level = np.round(mean + math.log2(0.5 * math.pi / ROOT_CELLS / PATCH_M))
     level = np.clip(level, 0, FINEST).astype(np.int64)
-    return (face * width + place[0]) * width + place[1], level[root]
+    return _Cells(face, place[0], place[1], level[root])
 
 
 @dataclass(frozen=True)
@@ -210,16 +225,13 @@ class _Groups:
     member: IntArray
 
 
-def _grouped(cell: IntArray, level: IntArray, slot: IntArray) -> _Groups:
-    """Groups points of the same cell at their level and of the same slot of time."""
+def _grouped(cells: _Cells, some: IntArray, undone: tuple[int, int], slot: IntArray) -> _Groups:
+    """Groups some points by cell, with halvings undone in either direction, and slot of time."""
     width = ROOT_CELLS << FINEST
-    rest, b = np.divmod(cell, width)
-    shift = FINEST - level
-    b >>= shift
-    a = (rest % width) >> shift
-    face = rest // width
-    # The level is a part of the key only through the coarse cell, which has one.
-    key = (((slot * 6 + face) * (FINEST + 1) + level) * width + a) * width + b
+    level = cells.level[some]
+    key = (slot[some] * 6 + cells.face[some]) * (FINEST + 1) + level
+    for place, back in zip((cells.across, cells.along), undone, strict=True):
+        key = key * width + (place[some] >> (FINEST - np.maximum(level - back, 0)))
     order = np.argsort(key, kind="stable")
     key = key[order]
     starts = np.ones(len(key), dtype=bool)
@@ -268,10 +280,10 @@ def _judged(
     # A thick group may become flat when it is seen as a part of nothing else: it is decided.
     tilt = np.maximum(scatter, sigma_range_m * cosine) / (width[:, 1] * np.sqrt(count) + 1e-12)
     broad = (width[:, 1] > MIN_WIDTH * np.maximum(scatter, 1e-6)) & (tilt < MAX_TILT_RAD)
-    spread, bend = _shape(p, group, first, count, centre, axes, width)
+    spread, bend, length = _shape(p, group, first, count, centre, axes, width)
     broad &= spread > MIN_SPREAD
     uneven = bend > MAX_BEND_M + 2.0 * scatter / np.sqrt(count)
-    seen = (cosine > MIN_INCIDENCE_COS) & (math.sqrt(12.0) * width[:, 2] < MAX_PATCH_M)
+    seen = (cosine > MIN_INCIDENCE_COS) & (length < MAX_PATCH_M)
     good = flat & broad & ~uneven & seen
     decided = ~flat | broad
     judged = np.zeros(len(points), dtype=bool)
@@ -307,8 +319,8 @@ def _shape(
     centre: Array,
     axes: Array,
     width: Array,
-) -> tuple[Array, Array]:
-    """How evenly groups are spread along their worse axis, and how bent they are in metres; (n,).
+) -> tuple[Array, Array, Array]:
+    """How evenly groups are spread along their worse axis, their bend and length in metres; (n,).
 
     The bend is the root mean square of the residuals' parts of second and third order.
     """
@@ -331,7 +343,8 @@ def _shape(
     sixth = np.add.reduceat(np.stack([uu * uu * uu, vv * vv * vv]), first, 1) / count
     bend += ru3**2 / np.maximum(sixth[0] - u3**2 - u4**2, MIN_SPREAD)
     bend += rv3**2 / np.maximum(sixth[1] - v3**2 - v4**2, MIN_SPREAD)
-    return spread, np.sqrt(bend)
+    length = np.maximum.reduceat(u, first) - np.minimum.reduceat(u, first)
+    return spread, np.sqrt(bend), length * width[:, 2]
 
 
 def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) -> ScanPatches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -85,6 +85,29 @@ def read_patches(
     return tuple(found)
 
 
+def level(
+    patches: DrivePatches,
+    trajectory: VehicleTrajectory,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+) -> BoolArray:
+    """(N,) whether patches are level, the ground rather than a wall, at these extrinsics.
+
+    Raises:
+        TrajectoryError: a scan is outside the trajectory's span.
+    """
+    if not len(patches.scan):
+        return np.zeros(0, dtype=bool)
+    R_map_vehicle, _ = trajectory.poses_at(patches.stamps_ns)
+    R, _ = stack([T_vehicle_lidar[name] for name in patches.lidars])
+    up_lidar = (R_map_vehicle @ R[patches.scan_lidar])[:, 2]
+    return _is_level(patches.normal_lidar, up_lidar[patches.scan])
+
+
+def _is_level(normals: Array, up: Array) -> BoolArray:
+    """Whether unit normals (n, 3) are within 25 degrees of up, (3,) or (n, 3)."""
+    return np.asarray(np.abs(np.sum(normals * up, axis=1)) > LEVEL_COS)
+
+
 def chosen_scans(
     stamps_ns: Sequence[Sequence[int] | IntArray], trajectory: VehicleTrajectory
 ) -> list[IntArray]:
@@ -156,7 +179,7 @@ def scan_patches(
     keep: BoolArray = (at >= begin) & (at <= end)
     if not keep_level:
         up_lidar = (R_map_vehicle[0] @ T_vehicle_lidar.rotation().matrix())[2]
-        keep &= np.abs(patches.normal_lidar @ up_lidar) < LEVEL_COS
+        keep &= ~_is_level(patches.normal_lidar, up_lidar)
     return patches.part(keep)
 
 

@@ -121,7 +121,7 @@ def test_a_car_stands_on_its_wheels_within_its_size() -> None:
 
 
 def test_a_car_drives_to_and_fro() -> None:
-    path = WalkerModel(shape="car", from_xy_m=(10.0, -4.0), to_xy_m=(10.0, 4.0), speed_m_s=2.0)
+    path = WalkerModel(body="car", from_xy_m=(10.0, -4.0), to_xy_m=(10.0, 4.0), speed_m_s=2.0)
     caster = RayCaster(make_world(WorldModel(walkers={"car": path})))
     # At 2 s and at 6 s it is at y = 0, its side towards the beam; in between it is elsewhere.
     times = np.array([2.0, 3.9, 6.0])

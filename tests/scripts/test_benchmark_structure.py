@@ -51,12 +51,13 @@ def test_rows_differ_from_the_shipped_scenario_as_they_say(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.chair])
 def test_both_lidars_see_the_chair_where_it_is_a_target(name: str) -> None:
-    recording = simulate_drive(scenario_of(name), 1)
+    recording = WholeRecording(scenario_of(name), 1)
     chair = recording.world.names.index(CHAIR)
     for lidar in recording.lidars:
-        stamps = recording.scan_stamps_ns(lidar)[::15]
-        seen = [(s.objects == chair).sum() for s in recording.scans_with_truth(lidar, stamps)]
-        assert sum(n > 30 for n in seen) >= 2, lidar
+        stamps = recording.scan_stamps_ns(lidar)
+        some = stamps[:: len(stamps) // 10]
+        seen = [(s.objects == chair).sum() for s in recording.scans_with_truth(lidar, some)]
+        assert max(seen) > 30, lidar
 
 
 @pytest.mark.parametrize("name", ["yard", "yard_s", "yard_arc_chair", "street", "car_park"])

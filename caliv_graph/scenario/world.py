@@ -154,7 +154,7 @@ def make_world(model: WorldModel, vehicle_body: Sequence[BodyBoxModel] = ()) -> 
     T_map_ground = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z]))
     meshes = {GROUND: ground(model.ground, terrain).moved(T_map_ground)}
     walkers: dict[str, Walker | Carried] = {
-        name: Walker(car() if who.shape == "car" else person(), who, z, terrain)
+        name: Walker(car() if who.body == "car" else person(), who, z, terrain)
         for name, who in model.walkers.items()
     }
     for name, placed in model.objects.items():

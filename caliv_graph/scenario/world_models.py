@@ -298,7 +298,7 @@ class WalkerModel(Section):
     A car turns at the ends within no time.
     """
 
-    shape: Literal["person", "car"] = Field("person", description="what moves")
+    body: Literal["person", "car"] = Field("person", description="what moves")
     from_xy_m: Pair = Field(description="metres, one end of the line in the map")
     to_xy_m: Pair = Field(description="metres, the other end")
     speed_m_s: Positive = Field(1.3, description="metres per second")

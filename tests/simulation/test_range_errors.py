@@ -1,0 +1,87 @@
+"""Systematic errors of ranges: a constant of the LiDAR, and one that grows with the incidence."""
+
+import math
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.config.model import PoseConfig
+from caliv_graph.products import Array
+from caliv_graph.scenario.drive_models import StandstillDrive
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world import make_world
+from caliv_graph.scenario.world_models import BodyBoxModel, GroundModel, WorldModel
+from caliv_graph.simulation.lidar import SimulatedLidar
+from caliv_graph.simulation.rays import RayCaster
+from caliv_graph.simulation.recording import simulate_drive
+
+HEIGHT_M = 2.0
+
+LIDAR = LidarModel(
+    mounting=PoseConfig(xyz=(0.0, 0.0, HEIGHT_M)),
+    # Below the horizontal: incidences of 30, 45, 60, 78, 84 degrees on level ground.
+    elevations_deg=(-60.0, -45.0, -30.0, -12.0, -6.0),
+    horizontal_fov_deg=(-10.0, 10.0),
+    horizontal_resolution_deg=10.0,
+    range_sigma_m=0.0,
+)
+
+
+def ranges(model: LidarModel, range_bias_m: float = 0.0, body: tuple[Any, ...] = ()) -> Array:
+    """(channels, columns) metres to level ground."""
+    world = make_world(WorldModel(), body)
+    lidar = SimulatedLidar(
+        model, world, RayCaster(world), None, np.random.default_rng(1), range_bias_m
+    )
+    points = lidar.scan(gtsam.Pose3()).points_lidar
+    return np.asarray(np.linalg.norm(points, axis=1).reshape(5, 2))
+
+
+def test_a_constant_error_lengthens_every_range() -> None:
+    noisy = LIDAR.model_copy(update={"range_sigma_m": 0.02})
+    difference_m = ranges(noisy, 0.007) - ranges(noisy)
+    np.testing.assert_allclose(difference_m, 0.007, atol=1e-12)
+
+
+def test_the_error_of_incidence_is_b_at_60_degrees_and_constant_beyond_80() -> None:
+    model = LIDAR.model_copy(update={"incidence_bias_m": 0.002})
+    difference_m = (ranges(model) - ranges(LIDAR))[:, 0]
+    secants = [1.0 / math.cos(math.radians(angle)) for angle in (30.0, 45.0, 60.0, 78.0, 80.0)]
+    np.testing.assert_allclose(difference_m, 0.002 * (np.array(secants) - 1.0), atol=2e-6)
+    assert difference_m[2] == pytest.approx(0.002, abs=1e-6)
+
+
+def test_the_vehicle_itself_is_hit_squarely() -> None:
+    # A plate below the LiDAR that all beams hit at a slant.
+    body = (BodyBoxModel(centre_m=(20.0, 0.0, 0.5), size_m=(60.0, 60.0, 0.1)),)
+    model = LIDAR.model_copy(update={"incidence_bias_m": 0.002})
+    np.testing.assert_array_equal(ranges(model, body=body), ranges(LIDAR, body=body))
+
+
+def biased_scenario(**changes: float) -> Scenario:
+    model = LIDAR.model_copy(update=changes)
+    return Scenario(
+        name="biased",
+        drive=StandstillDrive(duration_s=0.3),
+        lidars={"one": model, "other": model},
+        world=WorldModel(ground=GroundModel(half_size_m=50.0)),
+    )
+
+
+def test_drawn_errors_are_each_lidar_s_own_and_in_the_truth() -> None:
+    scenario = biased_scenario(range_bias_m=0.1, range_bias_sigma_m=0.01)
+    drawn = [list(simulate_drive(scenario, seed).truth.range_bias_m.values()) for seed in range(50)]
+    values = np.array(drawn)
+    assert values.mean() == pytest.approx(0.1, abs=0.004)
+    assert values.std() == pytest.approx(0.01, rel=0.3)
+    assert abs(np.corrcoef(values.T)[0, 1]) < 0.4
+    recording, exact = simulate_drive(scenario, 3), simulate_drive(biased_scenario(), 3)
+    for name, bias_m in recording.truth.range_bias_m.items():
+        (biased, *_), (plain, *_) = recording.scans(name), exact.scans(name)
+        longer_m = np.linalg.norm(biased.points_lidar, axis=1) - np.linalg.norm(
+            plain.points_lidar, axis=1
+        )
+        np.testing.assert_allclose(longer_m, bias_m, atol=1e-9)

@@ -322,7 +322,7 @@ def _calibrate(
             prepared.config,
             progress,
             prepared.grounds,
-            StructureEvidence(prepared.patches, structure_terms),
+            structure_evidence(prepared),
         )
     except TargetError as error:
         raise without_anything(prepared, error) from error
@@ -343,6 +343,11 @@ def _calibrate(
         scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
     )
     return CalibrationRun(calibration, solution, prepared.observations, warnings, record)
+
+
+def structure_evidence(prepared: Prepared) -> StructureEvidence:
+    """The structure of prepared drives, for the solve."""
+    return StructureEvidence(prepared.patches, structure_terms)
 
 
 def without_anything(prepared: Prepared, error: TargetError) -> TargetError:

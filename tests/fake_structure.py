@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -110,8 +110,10 @@ class Structure:
         one = {next(iter(self.truth)): 5}
         return tuple(
             Strip(drive, surface, np.zeros(3), np.eye(3)[0], scans, {}, 0.004, 0.02, weight)
-            for surface, scans, weight in ((0, every, 1.0), (0, every, 0.5), (1, one, 1.0))
-        ) + (Strip(drive, 2, np.zeros(3), np.eye(3)[0], every, {}, 0.05, 0.05, 0.0),)
-
-
-Terms = Callable[..., tuple[StructureTerm, ...]]
+            for surface, scans, weight in (
+                (0, every, 1.0),
+                (0, every, 0.5),
+                (1, one, 1.0),
+                (2, every, 0.0),
+            )
+        )

@@ -133,7 +133,7 @@ def test_the_keys_of_a_result_are_those_of_the_table(
     written -= {"lidars", "joint", "observability", "vehicle"}
     # Only where a time offset was estimated, with --prior, where what was measured by hand has a
     # sigma, and where structure was used.
-    written |= {"lidars.<name>.time_offset", "joint.earlier"}
+    written |= {"lidars.<name>.time_offset", "lidars.<name>.saw_structure", "joint.earlier"}
     written |= {"vehicle.lever_arm", "vehicle.imu_rotation", "structure"}
 
     assert set(first_cells(RESULTS, "## Keys of calibration.yaml")) == written

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
@@ -13,6 +14,11 @@ from caliv_graph.calibration.check import check
 from caliv_graph.calibration.choose import choose_static, displaced
 from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.structure_evidence import (
+    StructureEvidence,
+    kept_stamps,
+)
+from caliv_graph.calibration.structure_evidence import no_terms as structure_terms
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -40,12 +46,19 @@ from caliv_graph.products import (
 )
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
+from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
 from caliv_graph.wording.suspects import motion_sentence
+
+
+def read_patches(*_: object) -> tuple[DrivePatches, ...]:
+    """None yet."""
+    return ()
 
 
 @dataclass(frozen=True)
@@ -60,6 +73,8 @@ class Prepared:
         warnings: for the user, a line each.
         config: the config, with the guesses that the search for the target had to replace.
         contradictions: how guesses and stamps contradict what the LiDARs see, a sentence each.
+        patches: pieces of walls and other surfaces, per drive; empty: structure is not used.
+        no_target: why no target was found; None: one was, or none was to be looked for.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -69,6 +84,8 @@ class Prepared:
     warnings: tuple[str, ...]
     config: Config
     contradictions: tuple[str, ...] = ()
+    patches: tuple[DrivePatches, ...] = ()
+    no_target: TargetError | None = None
 
 
 def prepare(
@@ -77,7 +94,7 @@ def prepare(
     motions: Mapping[int, MotionData],
     progress: Progress,
 ) -> Prepared:
-    """Smooths the trajectories and finds target and ground along them.
+    """Smooths the trajectories and finds target, ground and structure along them.
 
     Args:
         recordings: opened drives.
@@ -93,26 +110,40 @@ def prepare(
     raise_fatal(raw)
     findings = raw
     rough: Sequence[VehicleTrajectory] = ()
+    no_target: TargetError | None = None
+    misplaced: tuple[str, ...] = ()
+    observations: tuple[TargetObservation, ...] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         config, misplaced, observations = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
-        causes = (*findings, *heading_findings(rough, motions, config, raw))
-        if isinstance(error, TargetError) and not causes:
-            said = _doubts_about_motion(rough, motions, config)
-            if said:
-                raise TargetError(error.what, said) from error
-        raise with_cause(error, causes) from error
-    grounds, ground_warnings = measure_grounds(recordings, rough, observations, config, progress)
+        caused = _with_cause(error, rough, motions, config, (findings, raw))
+        if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
+            raise caused from error
+        no_target = caused
+    patches = _patches(recordings, rough, config, progress)
+    if no_target is not None and not kept_stamps(patches):
+        raise no_target
+    grounds, ground_warnings = measure_grounds(
+        recordings,
+        rough,
+        observations,
+        config,
+        progress,
+        others={patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)},
+        kept_ns=None if observations else kept_stamps(patches),
+    )
     with progress.stage("smoothing the trajectory at the target's scans", None):
-        stamps = _stamps_seen(len(recordings), observations)
+        stamps = _stamps_seen(len(recordings), observations, patches)
         del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(recordings, config, stamps, motions)
     warnings = [w for r in recordings for w in r.warnings()]
     warnings += [w for t in trajectories for w in t.warnings]
     warnings += [w for o in observations for w in o.warnings]
+    if no_target is not None:
+        warnings.append(no_target_sentence(no_target.what))
     return Prepared(
         tuple(trajectories),
         tuple(observations),
@@ -121,7 +152,43 @@ def prepare(
         (*warnings, *ground_warnings, *warnings_of(findings)),
         config,
         (*misplaced, *displaced(observations, trajectories, config)),
+        patches,
+        no_target,
     )
+
+
+def _uses(config: Config) -> bool:
+    """Whether structure is used; the paper's procedure does without."""
+    return config.structure.use and config.solve.mode != "staged"
+
+
+def _patches(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+) -> tuple[DrivePatches, ...]:
+    """The patches of every drive, if structure is used."""
+    if not _uses(config):
+        return ()
+    return read_patches(recordings, trajectories, config, progress)
+
+
+def _with_cause(
+    error: TrajectoryError | TargetError,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+    findings: tuple[Sequence[Finding], Sequence[Finding]],
+) -> CalivError:
+    """An error with what most likely caused it; `findings` are all so far, and the raw ones."""
+    found, raw = findings
+    causes = (*found, *heading_findings(trajectories, motions, config, raw))
+    if isinstance(error, TargetError) and not causes:
+        said = _doubts_about_motion(trajectories, motions, config)
+        if said:
+            return TargetError(error.what, said)
+    return with_cause(error, causes)
 
 
 def _targets(
@@ -134,6 +201,8 @@ def _targets(
 
     The sentences say how these guesses contradict what the LiDARs see.
     """
+    if config.target is False:
+        return config, (), ()
     searched = (
         find_target(recordings, trajectories, config, progress) if config.target is None else []
     )
@@ -199,9 +268,14 @@ def _doubts_about_motion(
         return ""
 
 
-def _stamps_seen(drives: int, observations: Sequence[TargetObservation]) -> list[list[int]]:
-    """Per drive the stamps of the scans that see a target."""
+def _stamps_seen(
+    drives: int,
+    observations: Sequence[TargetObservation],
+    patches: Sequence[DrivePatches],
+) -> list[list[int]]:
+    """Per drive the stamps of the scans that see a target, and of those with patches."""
     seen = {(cloud.drive, cloud.stamp_ns) for o in observations for cloud in o.clouds}
+    seen |= {(of.drive, stamp) for of in patches for stamp in of.stamps_ns.tolist()}
     return [sorted(stamp for d, stamp in seen if d == drive) for drive in range(drives)]
 
 
@@ -241,9 +315,17 @@ def _calibrate(
     guessed = config if prior is None else starting_from(config, prior, digests)
 
     prepared = prepare(recordings, guessed, motions, progress)
-    solution, trajectories = estimate_with_noise(
-        prepared.observations, prepared.trajectories, prepared.config, progress, prepared.grounds
-    )
+    try:
+        solution, trajectories = estimate_with_noise(
+            prepared.observations,
+            prepared.trajectories,
+            prepared.config,
+            progress,
+            prepared.grounds,
+            structure_evidence(prepared),
+        )
+    except TargetError as error:
+        raise without_anything(prepared, error) from error
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(
         calibration, solution, recordings, prepared.trajectories, motions, prepared.config
@@ -261,6 +343,18 @@ def _calibrate(
         scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
     )
     return CalibrationRun(calibration, solution, prepared.observations, warnings, record)
+
+
+def structure_evidence(prepared: Prepared) -> StructureEvidence:
+    """The structure of prepared drives, for the solve."""
+    return StructureEvidence(prepared.patches, structure_terms)
+
+
+def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
+    """The error of drives of which structure tells nothing; with why there is no target."""
+    if prepared.no_target is None:
+        return error
+    return TargetError(nothing_sentence(str(prepared.no_target), error.what))
 
 
 def with_prior(

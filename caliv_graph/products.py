@@ -688,10 +688,11 @@ class LidarResult:
         cov: (6, 6) right perturbation (lidar frame), rotation then translation, rad and m.
         determined: per axis of `conventions.AXES`, vehicle axes.
         scans_used: scans of a target that carried weight.
-        saw_target: False if it never saw a target. Structure may have determined it all the same.
+        saw_target: False if it never saw a target.
         time_offset: (value, sigma) in seconds, header stamp minus true acquisition time; None: not
             estimated.
         guess: the initial guess; None: not known (another program's file).
+        saw_structure: whether structure was used that it saw; also of a LiDAR without a target.
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -701,12 +702,12 @@ class LidarResult:
     saw_target: bool
     time_offset: tuple[float, float] | None = None
     guess: Guess | None = None
+    saw_structure: bool = False
 
     @property
     def has_data(self) -> bool:
-        """Whether it saw a target, or structure determines an axis; a trusted guess is no data."""
-        trusted = self.guess is not None and self.guess.fixed
-        return self.saw_target or (not trusted and any(self.determined.values()))
+        """Whether it saw anything that it is calibrated by."""
+        return self.saw_target or self.saw_structure
 
 
 @dataclass(frozen=True)

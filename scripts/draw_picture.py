@@ -159,7 +159,7 @@ def points_in_the_map(config: Config, before: Poses, after: Poses) -> Points:
     Raises:
         CalivError: the recording cannot be read, or the config names no region.
     """
-    if config.target is None:
+    if not config.target:
         raise CalivError("config.yaml: names no target region")
     low, high = np.array(config.target[0].min), np.array(config.target[0].max)
     recording = open_recording(config)

@@ -227,7 +227,7 @@ def simulated(scenario: Scenario, seed: int, folder: Path) -> ChairDrive:
     """
     simulate_caliv(scenario, folder, seed, threads=1)
     config = load_config(folder / "config.yaml")
-    assert config.target is not None
+    assert config.target
     regions = tuple(r.model_copy(update={"frame": "start"}) for r in config.target)
     config = config.model_copy(update={"target": regions, "ground": GroundConfig(use=False)})
     reader = open_recording(config)

@@ -131,10 +131,10 @@ def test_the_keys_of_a_result_are_those_of_the_table(
         f"{section}.{key}" for section in ("joint", "observability") for key in document[section]
     }
     written -= {"lidars", "joint", "observability", "vehicle"}
-    # Only where a time offset was estimated, with --prior, and where what was measured by hand has
-    # a sigma.
-    written |= {"lidars.<name>.time_offset", "joint.earlier"}
-    written |= {"vehicle.lever_arm", "vehicle.imu_rotation"}
+    # Only where a time offset was estimated, with --prior, where what was measured by hand has a
+    # sigma, and where structure was used.
+    written |= {"lidars.<name>.time_offset", "lidars.<name>.saw_structure", "joint.earlier"}
+    written |= {"vehicle.lever_arm", "vehicle.imu_rotation", "structure"}
 
     assert set(first_cells(RESULTS, "## Keys of calibration.yaml")) == written
 

@@ -69,6 +69,7 @@ def assemble(
         _scans_used(solution),
         gradient,
         solution.time_offsets,
+        lidars_with_structure(solution.structure),
     )
     provenance = _provenance(config, recordings, solution, digests)
     result = replace(

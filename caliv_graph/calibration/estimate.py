@@ -15,39 +15,36 @@ import gtsam
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.linear import linearise_clouds
-from caliv_graph.calibration.no_target import solve_without_target
+from caliv_graph.calibration.no_target import (
+    solution_without_target,
+    solve_structure_and_ground,
+)
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import estimated_noise, with_floors, with_noise
-from caliv_graph.calibration.solve import (
-    OFFSET_DETERMINED_S,
-    SolveState,
-    solve_registered,
-    with_determined_offsets,
-)
+from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
-from caliv_graph.calibration.structure import lidars_with_structure, nearest_extrinsics
-from caliv_graph.calibration.structure_evidence import StructureEvidence
+from caliv_graph.calibration.structure import lidars_with_structure
+from caliv_graph.calibration.structure_evidence import (
+    NO_STRUCTURE,
+    StructureEvidence,
+    solved_with_structure,
+)
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import (
     GroundObservation,
-    PoseNoise,
     Registration,
     Solution,
     StructureTerm,
     TargetObservation,
 )
 from caliv_graph.registration.register import JointRegistration, register_jointly
-from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.wording.offsets import undetermined_offset_sentences
-
-NO_STRUCTURE = StructureEvidence()
 
 
 def estimate(
@@ -87,10 +84,10 @@ def estimate_with_noise(
     used = usable(observations)
     if not used and structure.patches:
         with threadpool_limits(limits=1):
-            solution = solve_without_target(
+            solved = solve_structure_and_ground(
                 trajectories, config, progress, tuple(grounds), structure
             )
-        return solution, tuple(trajectories)
+            return solution_without_target(solved), tuple(trajectories)
     problem = pose_problem(used, trajectories, config)
     if config.solve.mode == "staged":
         grounds, structure = (), NO_STRUCTURE
@@ -146,18 +143,20 @@ def _estimate(
     times["registration"] += time.perf_counter() - begun
 
     begun = time.perf_counter()
-    evidence = (rough.state.noise, noise.heave_m, structure)
-    terms = _terms(problem, trajectories, extrinsics, evidence, config, progress)
-    times["structure"] = time.perf_counter() - begun
+    terms: tuple[StructureTerm, ...] = ()
+    if structure.patches:
+        with progress.stage("solving walls and other surfaces", None):
+            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m)
+        times["structure"] = time.perf_counter() - begun
 
     begun = time.perf_counter()
-    offsets = rough.warnings
     if terms:
         others = lidars_with_structure(terms)
         problem = pose_problem(observations, trajectories, config, noise.heave_m, others)
-        solve, offsets = _solved_with_structure(
+        solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics
         )
+        rough = replace(rough, offsets_s=offsets_s)
     else:
         solve = solve_registered(problem, registrations, grounds, config, found)
     times["graph"] = rough.graph_s
@@ -171,53 +170,9 @@ def _estimate(
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     said = (line for term in terms for line in term.warnings)
-    warnings = (*offsets, *alike, *said, *_unconverged(solution.registrations))
+    warnings = (*rough.warnings, *alike, *said, *_unconverged(solution.registrations))
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
     return solution, tuple(trajectories)
-
-
-def _terms(
-    problem: Problem,
-    trajectories: Sequence[VehicleTrajectory],
-    extrinsics: Mapping[str, gtsam.Pose3],
-    evidence: tuple[PoseNoise, float, StructureEvidence],
-    config: Config,
-    progress: Progress,
-) -> tuple[StructureTerm, ...]:
-    """What structure says of the poses of a problem, from rough extrinsics.
-
-    `evidence` is the noise of given poses, 1 sigma of the heave in metres, and the patches.
-    """
-    noise, heave_m, structure = evidence
-    if not structure.patches:
-        return ()
-    kept: dict[int, list[int]] = {}
-    for drive, stamp in problem.poses:
-        kept.setdefault(drive, []).append(stamp)
-    start = {n: extrinsics.get(n, lidar.initial.pose()) for n, lidar in config.lidars.items()}
-    with progress.stage("solving walls and other surfaces", None):
-        return structure.terms(trajectories, kept, start, heave_m, noise, config)
-
-
-def _solved_with_structure(
-    problem: Problem,
-    registrations: Sequence[Registration],
-    grounds: tuple[GroundObservation, ...],
-    config: Config,
-    turns: tuple[Symmetry | None, ...],
-    terms: tuple[StructureTerm, ...],
-    rough: Mapping[str, gtsam.Pose3],
-) -> tuple[SolveState, tuple[str, ...]]:
-    """The graph with structure, without the time offsets that it leaves undetermined.
-
-    Also a sentence for each of these: structure may determine what the target does not.
-    """
-    start = nearest_extrinsics(rough, terms)
-    solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
-    problem, sigmas_s = with_determined_offsets(solve, registrations)
-    if problem.offsets != solve.problem.offsets:
-        solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
-    return solve, tuple(undetermined_offset_sentences(sigmas_s, OFFSET_DETERMINED_S))
 
 
 def _deskewed(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.problem import Problem, pose_problem
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights
-from caliv_graph.calibration.sensor_noise import usual_noise
+from caliv_graph.calibration.sensor_noise import SensorNoise, usual_noise
 from caliv_graph.calibration.solve import (
     COUPLED_SIGMAS,
     COUPLED_STEPS,
@@ -52,13 +52,44 @@ threshold does not make the estimate jump for ever: the terms are quadratic, and
 usual."""
 
 
-def solve_without_target(
+@dataclass
+class StructureSolve:
+    """A graph of structure and ground, solved.
+
+    Attributes:
+        state: the solved graph.
+        reduced: linearised there.
+        offsets_s: LiDAR -> 1 sigma in seconds of each time offset that was asked for.
+        course: the steps.
+        undetermined: number of undetermined directions, mode `auto`, once it was fixed.
+        converged: whether the last step was small.
+        noise: heave and waves of the ground.
+        times_s: seconds per stage.
+    """
+
+    state: SolveState
+    reduced: Reduced
+    offsets_s: dict[str, float]
+    course: tuple[Iteration, ...]
+    undetermined: int | None
+    converged: bool
+    noise: SensorNoise
+    times_s: dict[str, float]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Of time offsets that stay undetermined, and of the structure."""
+        offsets = undetermined_offset_sentences(self.offsets_s, OFFSET_DETERMINED_S)
+        return (*offsets, *(line for term in self.state.structure for line in term.warnings))
+
+
+def solve_structure_and_ground(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
     grounds: tuple[GroundObservation, ...],
     structure: StructureEvidence,
-) -> Solution:
+) -> StructureSolve:
     """Solves for the extrinsics by structure and ground.
 
     Args:
@@ -82,28 +113,58 @@ def solve_without_target(
         terms = structure.terms(
             trajectories, kept, guesses, noise.heave_m, first_pose_noise(config.noise), config
         )
-    if not lidars_with_structure(terms):
+    others = lidars_with_structure(terms)
+    if not others:
         raise TargetError(
             "the LiDARs see neither a target nor structure that stands still, such as walls"
         )
     times = {"structure": time.perf_counter() - begun}
     begun = time.perf_counter()
     stamps = {term.drive: term.stamps_ns for term in terms}
-    problem = pose_problem(
-        [], trajectories, config, noise.heave_m, lidars_with_structure(terms), stamps
-    )
+    problem = pose_problem([], trajectories, config, noise.heave_m, others, stamps)
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
         loop = _Loop(problem, terms, grounds, config)
         loop.solve(advance)
-        problem, sigmas_s = keep_determined_offsets(problem, loop.reduced)
+        problem, offsets_s = keep_determined_offsets(problem, loop.reduced)
         if problem.offsets != loop.state.problem.offsets:
             loop = _Loop(problem, terms, grounds, config)
             loop.solve(advance)
-    solution = loop.solution()
     times["graph"] = time.perf_counter() - begun
-    offsets = undetermined_offset_sentences(sigmas_s, OFFSET_DETERMINED_S)
-    warnings = (*offsets, *(line for term in terms for line in term.warnings))
-    return replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+    return StructureSolve(
+        loop.state,
+        loop.reduced,
+        offsets_s,
+        tuple(loop.course),
+        loop.undetermined,
+        loop.converged,
+        noise,
+        times,
+    )
+
+
+def solution_without_target(solved: StructureSolve) -> Solution:
+    """Packs the estimate of a solve, its covariance by the mode."""
+    state, reduced = solved.state, solved.reduced
+    cov = covariance_of_mode(state, reduced, solved.undetermined)
+    packed = packed_solution(
+        state,
+        (),
+        reduced,
+        np.zeros((0, 6, 6)),
+        reduced.D,
+        cov,
+        held=(),
+        iterations=len(solved.course),
+        converged=solved.converged,
+        time_offsets=reduced.time_offsets(state.problem, cov),
+    )
+    return replace(
+        packed,
+        course=solved.course,
+        stage_times_s=solved.times_s,
+        warnings=solved.warnings,
+        sensor_noise=solved.noise.levels,
+    )
 
 
 class _Loop:
@@ -173,21 +234,3 @@ class _Loop:
         lines = CloudLinearisation((), (), ())
         state = self.state
         return reduce_to_extrinsics(state.problem, state.values, base_graph(state), nothing, lines)
-
-    def solution(self) -> Solution:
-        """Packs the last estimate."""
-        state, reduced = self.state, self.reduced
-        cov = covariance_of_mode(state, reduced, self.undetermined)
-        packed = packed_solution(
-            state,
-            (),
-            reduced,
-            np.zeros((0, 6, 6)),
-            reduced.D,
-            cov,
-            held=(),
-            iterations=len(self.course),
-            converged=self.converged,
-            time_offsets=reduced.time_offsets(state.problem, cov),
-        )
-        return replace(packed, course=tuple(self.course))

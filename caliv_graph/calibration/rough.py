@@ -42,7 +42,7 @@ class RoughSolve:
             the clouds that took part.
         registrations: of those clouds, a placement each.
         offsets_s: LiDAR -> 1 sigma in seconds of each time offset that was asked for.
-        warnings: time offsets that the drive does not determine, and symmetric targets.
+        symmetric: a warning for each symmetric target.
         registration_s: seconds that the registration took.
         graph_s: seconds that the graph took.
     """
@@ -50,9 +50,15 @@ class RoughSolve:
     state: SolveState
     registrations: tuple[Registration, ...]
     offsets_s: dict[str, float]
-    warnings: tuple[str, ...]
+    symmetric: tuple[str, ...]
     registration_s: float
     graph_s: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Time offsets that the drive does not determine, and symmetric targets."""
+        offsets = undetermined_offset_sentences(self.offsets_s, OFFSET_DETERMINED_S)
+        return (*offsets, *self.symmetric)
 
 
 def rough_solve(
@@ -98,10 +104,7 @@ def rough_solve(
         if problem.offsets != solve.problem.offsets:
             solve = solve_registered(problem, registrations, grounds, config, found)
             graph_s += solve.graph_seconds
-    offsets = tuple(undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S))
-    return RoughSolve(
-        solve, tuple(registrations), offsets_s, (*offsets, *alike), registration_s, graph_s
-    )
+    return RoughSolve(solve, tuple(registrations), offsets_s, alike, registration_s, graph_s)
 
 
 def roughly_used(

@@ -9,8 +9,18 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.pose_priors import pose_priors
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.solve import SolveState, solve_registered, with_determined_offsets
+from caliv_graph.calibration.structure import nearest_extrinsics
 from caliv_graph.config.model import Config
-from caliv_graph.products import IntArray, PoseNoise, StructureTerm
+from caliv_graph.products import (
+    GroundObservation,
+    IntArray,
+    PoseNoise,
+    Registration,
+    StructureTerm,
+)
+from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -91,6 +101,51 @@ class StructureEvidence:
             config,
             frozenset(config.lidars) if config.solve.time_offset else frozenset(),
         )
+
+    def terms_beside(
+        self,
+        state: SolveState,
+        problem: Problem,
+        trajectories: Sequence[VehicleTrajectory],
+        heave_m: float,
+    ) -> tuple[StructureTerm, ...]:
+        """`terms` on the poses of a problem, from where a rough solve put its LiDARs."""
+        kept: dict[int, list[int]] = {}
+        for drive, stamp in problem.poses:
+            kept.setdefault(drive, []).append(stamp)
+        start = {
+            name: state.problem.extrinsic(state.values, name)
+            if name in state.problem.lidars
+            else lidar.initial.pose()
+            for name, lidar in state.config.lidars.items()
+        }
+        return self.terms(trajectories, kept, start, heave_m, state.noise, state.config)
+
+
+NO_STRUCTURE = StructureEvidence()
+
+
+def solved_with_structure(
+    problem: Problem,
+    registrations: Sequence[Registration],
+    grounds: tuple[GroundObservation, ...],
+    config: Config,
+    turns: tuple[Symmetry | None, ...],
+    terms: tuple[StructureTerm, ...],
+    rough: Mapping[str, gtsam.Pose3],
+) -> tuple[SolveState, dict[str, float]]:
+    """`solve_registered` with structure, without the time offsets that it leaves undetermined.
+
+    Structure may determine what the target does not: all offsets of the problem are free first.
+    `rough` are extrinsics of the LiDARs that saw the target. Also returns LiDAR -> 1 sigma in
+    seconds of each offset.
+    """
+    start = nearest_extrinsics(rough, terms)
+    solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
+    problem, sigmas_s = with_determined_offsets(solve, registrations)
+    if problem.offsets != solve.problem.offsets:
+        solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
+    return solve, sigmas_s
 
 
 def kept_stamps(patches: Sequence[DrivePatches]) -> dict[int, list[int]]:

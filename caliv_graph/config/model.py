@@ -165,6 +165,12 @@ class GroundConfig(Section):
     )
 
 
+class StructureConfig(Section):
+    """Walls, fronts, containers and other flat structure that stands still."""
+
+    use: bool = Field(True, description="used where it is")
+
+
 class NoiseConfig(Section):
     """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
 
@@ -334,12 +340,15 @@ class Config(Section):
     topics: TopicsConfig = TopicsConfig()
     lidars: Annotated[dict[str, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
     reference: str = Field("", description="reference LiDAR; empty: the first")
-    target: tuple[TargetRegion, ...] | None = Field(
-        None,
-        min_length=1,
-        description="one region or a list of them; absent: the target is searched for",
+    target: Annotated[tuple[TargetRegion, ...], Field(min_length=1)] | Literal[False] | None = (
+        Field(
+            None,
+            description="one region or a list of them; absent: it is searched for; false: none "
+            "is looked for, and structure calibrates alone",
+        )
     )
     ground: GroundConfig = GroundConfig()
+    structure: StructureConfig = StructureConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()
     noise: NoiseConfig = NoiseConfig()
@@ -389,6 +398,20 @@ class Config(Section):
     @classmethod
     def _one_region_or_many(cls, raw: Any) -> Any:
         return [raw] if isinstance(raw, Mapping) else raw
+
+    @model_validator(mode="after")
+    def _something_to_calibrate_by(self) -> Config:
+        if self.target is False and not self.structure.use:
+            raise ValueError(
+                "target: false leaves structure alone, and 'structure.use' is false: nothing is "
+                "left to calibrate by"
+            )
+        if self.target is False and self.solve.mode == "staged":
+            raise ValueError(
+                "target: false leaves structure alone, which 'solve.mode: staged' does not use: "
+                "set it to auto or joint"
+            )
+        return self
 
     @field_validator("limits")
     @classmethod

@@ -73,6 +73,8 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
     An unknown key comes first: a typo also causes a missing key. `root` models the whole file.
     """
     errors = error.errors(include_url=False)
+    # That a value is not the one word or `false` of another branch of a union says nothing.
+    errors = [e for e in errors if not str(e["loc"][-1:]).startswith("('literal[")] or errors
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
     # An unknown key is a key of the file, even if it looks like the branch of a union.
     is_unknown = first["type"] == "extra_forbidden"

@@ -114,7 +114,7 @@ def _together_per_lidar(
             of_all[0],
             scans_used=sum(r.scans_used for r in of_all),
             saw_target=any(r.saw_target for r in of_all),
-            determined={axis: any(r.determined[axis] for r in of_all) for axis in AXES},
+            saw_structure=any(r.saw_structure for r in of_all),
             time_offset=_mean_offset(of_all),
             guess=guess,
         )

@@ -281,7 +281,7 @@ def _covariance_document(predicted: PredictedCovariance) -> dict[str, Any]:
         name: {
             "sigma_vehicle_axes": _sigma_document(sigma),
             "determined": content["lidars"][name]["determined"],
-            "sees_target": name not in predicted.unseeing,
+            "sees_target": predicted.calibration.lidars[name].saw_target,
             **(
                 {"time_offset": {"sigma": predicted.offsets_s[name]}}
                 if name in predicted.offsets_s

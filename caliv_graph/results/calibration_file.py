@@ -176,6 +176,7 @@ def _lidar_document(result: LidarResult) -> dict[str, Any]:
         **offset,
         **({} if result.guess is None else {"guess": _guess_document(result.guess)}),
         "saw_target": bool(result.saw_target),
+        **({"saw_structure": True} if result.saw_structure else {}),
         "scans_used": int(result.scans_used),
     }
 

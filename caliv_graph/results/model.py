@@ -112,6 +112,7 @@ class _LidarPart(Part):
     guess: _GuessPart | None = None
     scans_used: Count = 0
     saw_target: StrictBool | None = None
+    saw_structure: StrictBool = False
 
     def result(self, has_data: bool) -> LidarResult:
         """The result of the LiDAR; one whose data has information saw the target."""
@@ -124,6 +125,7 @@ class _LidarPart(Part):
             saw_target=has_data if self.saw_target is None else self.saw_target,
             time_offset=None if offset is None else (offset.value, offset.sigma),
             guess=None if self.guess is None else self.guess.guess(),
+            saw_structure=self.saw_structure,
         )
 
 

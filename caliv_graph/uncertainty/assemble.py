@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -24,6 +24,7 @@ def assemble_matrices(
     scans: Mapping[str, int],
     gradient: Array | None = None,
     time_offsets: Mapping[str, tuple[float, float]] = _NO_OFFSETS,
+    structure: Collection[str] = (),
 ) -> Calibration:
     """A calibration of every LiDAR, without requirements and provenance.
 
@@ -37,6 +38,7 @@ def assemble_matrices(
         scans: LiDAR -> clouds of a target that carry weight; absent: none.
         gradient: (6n,) of the data's log-likelihood, vehicle axes.
         time_offsets: LiDAR -> value and sigma in seconds, where estimated.
+        structure: names of the LiDARs that saw structure.
     """
     names = list(guesses)
     poses = {name: solved.get(name, guesses[name].T_vehicle_lidar) for name in names}
@@ -59,6 +61,7 @@ def assemble_matrices(
             saw_target=scans.get(name, 0) > 0,
             time_offset=time_offsets.get(name),
             guess=guesses[name],
+            saw_structure=name in structure,
         )
         for row, name in enumerate(names)
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -87,6 +87,7 @@ def predict_covariance(
     guess_sigmas: Mapping[str, Array],
     scans: Mapping[str, int],
     offsets_s: Mapping[str, float],
+    structure: Collection[str] = (),
 ) -> PredictedCovariance:
     """Verdicts and sigmas from the data's information.
 
@@ -100,6 +101,7 @@ def predict_covariance(
         guess_sigmas: LiDAR -> (6,) of its initial guess, vehicle axes.
         scans: LiDAR -> number of clouds of a target; absent: none.
         offsets_s: LiDAR -> 1 sigma of its time offset.
+        structure: names of the LiDARs that see structure.
     """
     solved = {name: T_vehicle_lidar[name] for name in lidars}
     prior = np.diag(np.concatenate([guess_sigmas[name] for name in lidars]) ** -2.0)
@@ -114,6 +116,13 @@ def predict_covariance(
         uncertainty=uncertainty,
         offsets_s=dict(offsets_s),
         calibration=assemble_matrices(
-            solved, guesses, cov, information_data, uncertainty, reference, scans
+            solved,
+            guesses,
+            cov,
+            information_data,
+            uncertainty,
+            reference,
+            scans,
+            structure=structure,
         ),
     )

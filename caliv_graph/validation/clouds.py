@@ -157,7 +157,7 @@ def target_regions(
         RecordingError: a cloud could not be read.
     """
     if config.target is not None:
-        return config.target, ()
+        return config.target or (), ()
     try:
         (found,) = find_target([recording], [trajectory], config, progress)
     except TargetError:

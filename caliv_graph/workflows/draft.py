@@ -428,6 +428,7 @@ _NO_TARGET_TEMPLATE = """\
 _SEARCHED_TARGET_TEMPLATE = """\
 # The target is searched for. If that fails, or other objects are near it, give a box around it,
 # with nothing else above the ground in it: metres, in the map, or from the vehicle's first pose.
+# If there is none, 'target: false': walls and other structure calibrate alone.
 # target:
 #   min: [10.0, -14.0, -1.0]
 #   max: [20.0, -4.0, 3.0]

@@ -14,7 +14,7 @@ import numpy as np
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.common.progress import Progress
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, StructureConfig
 from caliv_graph.errors import RegistrationError, SolveError, TargetError
 from caliv_graph.fusion.compare import Comparison, compare
 from caliv_graph.fusion.terms import drive_digest
@@ -110,11 +110,16 @@ def split_halves(
         RecordingError, TrajectoryError: the recording could not be read.
     """
     motion = recording.motion() if motion is None else motion
+    # Both halves would have the same structure, and agree by it.
+    config = config.model_copy(update={"structure": StructureConfig(use=False)})
     try:
         prepared = prepare([recording], config, {0: motion}, progress)
     except TargetError as e:
         return Repeatability(("", ""), None, reason=str(e))
     observations, config = prepared.observations, prepared.config
+    if not observations:
+        reason = "without a target the drive is not halved: both halves would see the same walls"
+        return Repeatability(("", ""), None, reason=reason)
     fewest = config.extraction.min_scans
     names, halves = ("first passes", "later passes"), [split(o, fewest) for o in observations]
     by_passes = None not in halves

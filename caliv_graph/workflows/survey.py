@@ -12,14 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from caliv_graph.calibration.no_target import solve_structure_and_ground
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
-from caliv_graph.calibration.rough import RoughSolve, rough_solve
-from caliv_graph.calibration.solve import reduced_registered
+from caliv_graph.calibration.rough import rough_solve, roughly_used
+from caliv_graph.calibration.solve import SolveState, reduced_registered
+from caliv_graph.calibration.structure import lidars_with_structure
+from caliv_graph.calibration.structure_evidence import (
+    NO_STRUCTURE,
+    StructureEvidence,
+    solved_with_structure,
+)
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
-from caliv_graph.pipeline import prepare
+from caliv_graph.pipeline import prepare, structure_evidence, without_anything
 from caliv_graph.products import Array, GroundObservation, Recording, TargetObservation
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
@@ -56,14 +64,18 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     """
     motions = {i: recording.motion() for i, recording in enumerate(recordings)}
     prepared = prepare(recordings, config, motions, progress)
-    with threadpool_limits(limits=1):
-        found = survey_observations(
-            prepared.observations,
-            prepared.trajectories,
-            prepared.grounds,
-            prepared.config,
-            progress,
-        )
+    try:
+        with threadpool_limits(limits=1):
+            found = survey_observations(
+                prepared.observations,
+                prepared.trajectories,
+                prepared.grounds,
+                prepared.config,
+                progress,
+                structure_evidence(prepared),
+            )
+    except TargetError as error:
+        raise without_anything(prepared, error) from error
     return replace(
         found,
         names=tuple(recording.name for recording in recordings),
@@ -82,29 +94,50 @@ def survey_observations(
     grounds: Sequence[GroundObservation],
     config: Config,
     progress: Progress,
+    structure: StructureEvidence = NO_STRUCTURE,
 ) -> Survey:
     """The same from extracted targets and grounds; without names and the warnings before it.
 
     Raises:
         RegistrationError, SolveError: it could not be done.
     """
-    observations = usable(observations)
-    problem = pose_problem(observations, trajectories, config)
+    used = usable(observations)
+    if not used and structure.patches:
+        alone = solve_structure_and_ground(
+            trajectories, config, progress, tuple(grounds), structure
+        )
+        return _verdict(alone.state, alone.reduced.D, alone.offsets_s, alone.warnings, used, config)
+    problem = pose_problem(used, trajectories, config)
     limit = min(config.registration.max_iterations, ROUGH_ITERATIONS)
-    solved = rough_solve(
-        problem, observations, tuple(grounds), config, progress, limit, look_for_symmetries=True
+    rough = rough_solve(
+        problem, used, tuple(grounds), config, progress, limit, look_for_symmetries=True
     )
-    D = reduced_registered(solved.state, solved.registrations).D
-    return _verdict(solved, D, observations, config)
+    state = rough.state
+    terms = structure.terms_beside(state, problem, trajectories, problem.heave_m)
+    if terms:
+        others = lidars_with_structure(terms)
+        problem = pose_problem(used, trajectories, config, None, others)
+        problem, used = roughly_used(problem, used, config.extraction.min_scans)
+        extrinsics = {
+            name: state.problem.extrinsic(state.values, name) for name in state.problem.lidars
+        }
+        state, offsets_s = solved_with_structure(
+            problem, rough.registrations, tuple(grounds), config, state.turns, terms, extrinsics
+        )
+        rough = replace(rough, offsets_s=offsets_s)
+    D = reduced_registered(state, rough.registrations).D
+    return _verdict(state, D, rough.offsets_s, rough.warnings, used, config)
 
 
 def _verdict(
-    solved: RoughSolve,
+    state: SolveState,
     D: Array,
+    offsets_s: Mapping[str, float],
+    warnings: Sequence[str],
     observations: Sequence[TargetObservation],
     config: Config,
 ) -> Survey:
-    problem, weights = solved.state.problem, solved.state.weights.values
+    problem, weights = state.problem, state.weights.values
     scans: dict[tuple[str, str], int] = {}
     for j in np.flatnonzero(weights >= 0.5).tolist():
         target = observations[int(problem.cloud_placement[j])].name
@@ -115,7 +148,7 @@ def _verdict(
         problem.lidars,
         problem.reference,
         {
-            name: problem.extrinsic(solved.state.values, name)
+            name: problem.extrinsic(state.values, name)
             if name in problem.lidars
             else lidar.initial.pose()
             for name, lidar in config.lidars.items()
@@ -125,7 +158,8 @@ def _verdict(
             for name, lidar in config.lidars.items()
         },
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},
-        solved.offsets_s,
+        offsets_s,
+        lidars_with_structure(state.structure),
     )
     unmet = unmet_requirements(covariance.calibration, config).unmet
-    return Survey((), named_prediction(covariance), scans, unmet, solved.warnings)
+    return Survey((), named_prediction(covariance), scans, unmet, tuple(warnings))

@@ -187,7 +187,7 @@ def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others()
 def test_two_targets_in_a_drive() -> None:
     recording = KeptDrive(scenario(RIGHT, {**TWO_CHAIRS}), 14)
     both = config(recording)
-    assert both.target is not None
+    assert both.target
     assert len(both.target) == 2
     run = calibrate([recording], both, SilentProgress())
     assert [o.name for o in run.observations] == ["target 1", "target 2"]

@@ -50,7 +50,7 @@ def test_guesses_of_a_caliv_config_beside_the_data(drive: Path, tmp_path: Path) 
     assert config.lidars["sensor_1"].initial.rpy_deg == (0.0, 10.0, 0.0)
     assert config.lidars["sensor_2"].initial.xyz == (-0.4, 0.003, 2.1)
     assert config.lidars["sensor_2"].initial.rpy_deg == (1.0, 10.0, 180.0)
-    assert config.target is not None
+    assert config.target
     assert config.target[0].min == (10.0, -14.0, -5.0)
     assert config.target[0].max == (20.0, -4.0, 5.0)
     assert "TODO" not in out.read_text()

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import pytest
 import yaml
@@ -200,10 +200,21 @@ def test_one_target_or_several() -> None:
         parse(target=[REGION, {**REGION, "frame": "start"}]).target,
     )
 
-    assert one is not None
-    assert two is not None
+    assert one
+    assert two
     assert [region.frame for region in one] == ["map"]
     assert [region.frame for region in two] == ["map", "start"]
+
+
+def test_no_target_is_looked_for_if_the_config_says_so() -> None:
+    config = parse(target=False)
+
+    assert config.target is False
+    assert yaml.safe_load(dump_config(config))["target"] is False
+    assert config.structure.use
+    for contradiction in ({"structure": {"use": False}}, {"solve": {"mode": "staged"}}):
+        with pytest.raises(ConfigError, match="target: false leaves structure alone"):
+            parse(target=False, **contradiction)
 
 
 def test_sigmas_are_one_number_or_three() -> None:
@@ -267,7 +278,7 @@ def models_in(annotation: Any) -> Iterator[tuple[type[BaseModel], str]]:
         yield annotation, ""
     elif get_origin(annotation) is dict:
         yield from ((model, "*.") for model, _ in models_in(get_args(annotation)[1]))
-    elif get_origin(annotation) in (tuple, Union, UnionType):
+    elif get_origin(annotation) in (tuple, Union, UnionType, Annotated):
         for argument in get_args(annotation):
             yield from models_in(argument)
 

@@ -336,6 +336,6 @@ def test_given_poses_come_with_their_own_map_and_next_to_no_noise() -> None:
     assert config.noise.pose_position_m == 1e-4
     assert config.topics.imu is None
     low, high = recording.world.bounds("chair")
-    assert config.target is not None
+    assert config.target
     middle = 0.5 * np.add(config.target[0].min, config.target[0].max)
     np.testing.assert_allclose(middle, 0.5 * (low + high), atol=1e-3)

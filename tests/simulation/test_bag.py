@@ -356,7 +356,7 @@ def test_config_is_ready_to_run_on_the_bag(folder: Path) -> None:
     # All but the LiDARs' noise is in the messages.
     assert config.noise.model_dump(exclude_unset=True) == {"lidar_range_m": 0.01}
     # The map of a bag begins at the antenna's first fix: (0.5, -0.2, 1.7) here.
-    assert config.target is not None
+    assert config.target
     (region,) = config.target
     assert region.min == pytest.approx((8.1 - 5.0, -3.16 - 5.0, -6.7), abs=0.03)
     assert region.max == pytest.approx((8.87 + 5.0, -2.44 + 5.0, 4.55), abs=0.03)

@@ -252,7 +252,7 @@ def test_config_is_ready_to_run(small: SimulatedDrive) -> None:
     assert config.noise.pose_position_m == 0.005
     assert config.noise.pose_rotation_deg == pytest.approx(0.0573, abs=1e-4)
     assert config.noise.pose_drift_position_m is None
-    assert config.target is not None
+    assert config.target
     (region,) = config.target
     assert region.min == pytest.approx((9.0 - 0.40 - 5.0, -3.0 - 0.36 - 5.0, -5.0), abs=0.01)
     assert region.max == pytest.approx((9.0 + 0.37 + 5.0, -3.0 + 0.36 + 5.0, 6.25), abs=0.01)

@@ -54,11 +54,13 @@ def extract_targets(
         vehicle stood.
 
     Raises:
-        TargetError: no LiDAR sees a target, or none was found.
+        TargetError: no LiDAR sees a target, none was found, or none is to be looked for.
         RecordingError: a cloud could not be read.
     """
     if config.target is None and not searched:
         searched = find_target(recordings, trajectories, config, progress)
+    if config.target is False:
+        raise TargetError("target: false: no target is looked for")
     regions: list[tuple[TargetRegion, ...]] = (
         [tuple(f.region for f in (found, *found.others)) for found in searched]
         if config.target is None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -139,6 +139,8 @@ def measure_grounds(
     targets: Sequence[TargetObservation],
     config: Config,
     progress: Progress,
+    others: Collection[str] = (),
+    kept_ns: Mapping[int, Sequence[int]] | None = None,
 ) -> tuple[tuple[GroundObservation, ...], tuple[str, ...]]:
     """The ground in the scans of all LiDARs, whenever one of them sees a target; and warnings.
 
@@ -146,13 +148,23 @@ def measure_grounds(
     them, and the ground determines S2S to the 2 mm of a plane. Observations are by drive, LiDAR and
     stamp, each at the stamp of a pose: those of the clouds of `targets`.
 
+    Args:
+        recordings: the drives.
+        trajectories: one per drive.
+        targets: clouds of each target placement.
+        config: guesses, noise, ground.
+        progress: reports every scan.
+        others: names of LiDARs whose ground is measured although they saw no target.
+        kept_ns: drive -> stamps of further poses.
+
     Raises:
         RecordingError: a cloud could not be read.
     """
     if not config.ground.use:
         return (), ()
-    poses = sorted({(c.drive, c.stamp_ns) for o in targets for c in o.clouds})
-    seeing = {c.lidar for o in targets for c in o.clouds}
+    further = {(d, stamp) for d, stamps in (kept_ns or {}).items() for stamp in stamps}
+    poses = sorted({(c.drive, c.stamp_ns) for o in targets for c in o.clouds} | further)
+    seeing = {c.lidar for o in targets for c in o.clouds} | set(others)
     names = [n for n, lidar in config.lidars.items() if n in seeing or lidar.fixed]
     wanted: list[tuple[int, str, dict[int, int]]] = []
     for drive, recording in enumerate(recordings):

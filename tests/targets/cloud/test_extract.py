@@ -120,7 +120,7 @@ def extracted(
     points_lidar: Array, config: Config, T_map_vehicle: gtsam.Pose3 = T_MAP_VEHICLE
 ) -> tuple[TargetCloud | None, Mapping[str, int]]:
     """The target in one scan, and what scans were rejected for."""
-    assert config.target is not None
+    assert config.target
     extractor = RegionExtractor(config.target[0], config, standing(T_map_vehicle))
     cloud = cloud_in(extractor, LidarScan("front", 0, points_lidar, "0.pcd"))
     return cloud, extractor.tallies["front"].rejected

@@ -18,7 +18,6 @@ from caliv_graph.calibration.structure_evidence import (
     StructureEvidence,
     kept_stamps,
 )
-from caliv_graph.calibration.structure_evidence import no_terms as structure_terms
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -47,6 +46,8 @@ from caliv_graph.products import (
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.read import read_patches
+from caliv_graph.structure.term import structure_terms
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
@@ -54,11 +55,6 @@ from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
 from caliv_graph.wording.suspects import motion_sentence
-
-
-def read_patches(*_: object) -> tuple[DrivePatches, ...]:
-    """None yet."""
-    return ()
 
 
 @dataclass(frozen=True)
@@ -171,7 +167,7 @@ def _patches(
     """The patches of every drive, if structure is used."""
     if not _uses(config):
         return ()
-    return read_patches(recordings, trajectories, config, progress)
+    return read_patches(recordings, trajectories, config, progress, keep_level=True)
 
 
 def _with_cause(

@@ -358,6 +358,7 @@ class StructureTerm:
         gradient: (6 m + 3 k + o + 6 n,).
         strips: the strips, for the report.
         offset_m: 1 sigma of the offset of a strip in a scan, estimated.
+        ground: LiDARs whose ground is in it, and the vehicle's stand on it if that is known.
         warnings: for the user, a line each.
     """
 
@@ -371,6 +372,7 @@ class StructureTerm:
     gradient: Array
     strips: tuple[Strip, ...]
     offset_m: float
+    ground: frozenset[str] = frozenset()
     warnings: tuple[str, ...] = ()
 
 

@@ -29,6 +29,7 @@ from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
+    other_grounds,
     solved_with_structure,
 )
 from caliv_graph.common.progress import Progress
@@ -152,6 +153,7 @@ def _estimate(
     begun = time.perf_counter()
     if terms:
         others = lidars_with_structure(terms)
+        grounds = other_grounds(grounds, terms)
         problem = pose_problem(observations, trajectories, config, noise.heave_m, others)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics

@@ -38,7 +38,11 @@ from caliv_graph.calibration.structure import (
     nearest_extrinsics,
     structure_graph,
 )
-from caliv_graph.calibration.structure_evidence import StructureEvidence, kept_stamps
+from caliv_graph.calibration.structure_evidence import (
+    StructureEvidence,
+    kept_stamps,
+    other_grounds,
+)
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
@@ -118,6 +122,7 @@ def solve_structure_and_ground(
         raise TargetError(
             "the LiDARs see neither a target nor structure that stands still, such as walls"
         )
+    grounds = other_grounds(grounds, terms)
     times = {"structure": time.perf_counter() - begun}
     begun = time.perf_counter()
     stamps = {term.drive: term.stamps_ns for term in terms}

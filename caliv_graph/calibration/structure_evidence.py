@@ -38,11 +38,13 @@ StructureTerms = Callable[
         Mapping[str, gtsam.Pose3],
         Config,
         frozenset[str],
+        float,
     ],
     tuple[StructureTerm, ...],
 ]
 """Patches, priors of the poses, stamps of the poses to keep and trajectory of each drive; rough
-extrinsics, config, names of the LiDARs with a free time offset -> a term per drive."""
+extrinsics, config, names of the LiDARs with a free time offset, 1
+sigma of the heave -> a term per drive."""
 
 
 def no_terms(*_: object) -> tuple[StructureTerm, ...]:
@@ -100,6 +102,7 @@ class StructureEvidence:
             start,
             config,
             frozenset(config.lidars) if config.solve.time_offset else frozenset(),
+            heave_m,
         )
 
     def terms_beside(
@@ -120,6 +123,20 @@ class StructureEvidence:
             for name, lidar in state.config.lidars.items()
         }
         return self.terms(trajectories, kept, start, heave_m, state.noise, state.config)
+
+
+def other_grounds(
+    grounds: tuple[GroundObservation, ...], terms: Sequence[StructureTerm]
+) -> tuple[GroundObservation, ...]:
+    """The ground planes of drives whose terms do not have the ground: it counts once.
+
+    In the terms it is cell by cell, under a range bias of each LiDAR that tilts and lifts all its
+    planes alike.
+    """
+    seen = {(o.drive, o.lidar) for o in grounds}
+    within = {(term.drive, name) for term in terms for name in term.ground}
+    drives = {drive for drive, _ in seen if all(k in within for k in seen if k[0] == drive)}
+    return tuple(o for o in grounds if o.drive not in drives)
 
 
 NO_STRUCTURE = StructureEvidence()

@@ -93,11 +93,10 @@ def _target_regions(recording: SimulatedRecording, has_bag: bool) -> list[dict[s
 
 
 def _target_section(recording: SimulatedRecording, has_bag: bool) -> dict[str, Any]:
-    """The config's `target`; without it the program searches for one."""
-    scenario = recording.scenario
-    if scenario.config_target == "search" or not scenario.world.targets:
+    """The config's `target`: false where there is none; without it the program searches for one."""
+    if recording.scenario.config_target == "search":
         return {}
-    return {"target": _target_regions(recording, has_bag)}
+    return {"target": _target_regions(recording, has_bag) or False}
 
 
 def _first_antenna_position(recording: SimulatedRecording) -> Array:

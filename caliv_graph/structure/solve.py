@@ -21,6 +21,7 @@ from caliv_graph.structure.noise import (
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
+from caliv_graph.structure.standing import Standing, stands_of
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
     Geometry,
@@ -69,6 +70,7 @@ class Problem:
         guesses: n guesses of T_vehicle_lidar.
         guess_information: (6 n, 6 n) of them, vehicle axes.
         range_sigma_m: noise along the beam as stated.
+        standing: what is known of how the vehicle stands on the ground.
     """
 
     patches: DrivePatches
@@ -80,6 +82,7 @@ class Problem:
     guesses: tuple[gtsam.Pose3, ...]
     guess_information: Array
     range_sigma_m: float
+    standing: Standing
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def _round(
     )
     errors = np.zeros(layout.size)
     # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.
-    of_lidars = slice(layout.error, layout.plane)
+    of_lidars = slice(layout.error, layout.plane)  # and of the vehicle's stand
     errors[of_lidars] = state.errors[of_lidars] if len(state.errors) else 0.0
     state = replace(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
@@ -256,7 +259,9 @@ def _whitened(
 ) -> tuple[Rows, System]:
     group = groups_of(sightings, strips)
     rows = whitened(geometry, sightings, group, nuisances, weights, layout.size)
-    return rows, system_of(rows, state, layout, problem.prior, nuisances)
+    stands = stands_of(state.t_map_vehicle, strips.centres_map, strips.normals_map)
+    system = system_of(rows, state, layout, problem.prior, nuisances, problem.standing, stands)
+    return rows, system
 
 
 def _settled(found: Solved, steps: int) -> Solved:

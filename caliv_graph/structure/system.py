@@ -13,6 +13,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import Surfaces, eliminated
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.sightings import Sightings, without_own_error
+from caliv_graph.structure.standing import Standing, Stands, standing_rows
 from caliv_graph.trajectory.imu import exp_so3
 
 TILT_PRIOR_RAD = 0.5
@@ -61,7 +62,7 @@ class State:
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
         normals_map: (K, 3).
-        errors: (D,) the LiDARs' errors, at their coordinates; else zero.
+        errors: (D,) errors of LiDARs, height and tilt at their coordinates; else zero.
     """
 
     R_map_vehicle: Array
@@ -79,7 +80,8 @@ class Layout:
     """Where each variable is among the D coordinates of the system.
 
     In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), bias of
-    each LiDAR and its growth with incidence; and what belongs to one surface each: planes (two
+    each LiDAR and its growth with incidence, error of the vehicle's height and tilt above the
+    ground (3); and what belongs to one surface each: planes (two
     tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each strip.
     """
 
@@ -117,6 +119,11 @@ class Layout:
     @property
     def plane(self) -> int:
         """First coordinate of the planes, and of all that belongs to one surface."""
+        return self.standing + 3
+
+    @property
+    def standing(self) -> int:
+        """Error of the vehicle's height above ground, and the two of its tilt."""
         return self.error + 2 * self.lidars
 
     @property
@@ -137,7 +144,7 @@ class Layout:
     def error_columns(self) -> IntArray:
         """Coordinates of all errors of the LiDARs, in the order of `error_sigmas`."""
         return np.concatenate(
-            [np.arange(self.error, self.plane), np.arange(self.surface_error, self.size)]
+            [np.arange(self.error, self.standing), np.arange(self.surface_error, self.size)]
         )
 
     def error_sigmas(self, nuisances: Nuisances) -> Array:
@@ -410,17 +417,39 @@ class System:
 
 
 def system_of(
-    rows: Rows, state: State, layout: Layout, prior: PosePrior, nuisances: Nuisances
+    rows: Rows,
+    state: State,
+    layout: Layout,
+    prior: PosePrior,
+    nuisances: Nuisances,
+    standing: Standing,
+    stands: Stands,
 ) -> System:
-    """The normal equations of structure and motion data."""
+    """The normal equations of structure, motion data, and of a vehicle that stands on the ground."""
     sparse, right = rows.normal_equations()
+    own_errors = slice(layout.standing, layout.plane)
+    J, r = standing_rows(
+        standing,
+        stands,
+        state.R_map_vehicle,
+        state.t_map_vehicle,
+        state.centres_map,
+        state.normals_map,
+        state.errors[own_errors],
+        layout.standing,
+        layout.plane,
+        layout.size,
+    )
+    sparse, right = sparse + J.T @ J, right - J.T @ r
     weight = np.zeros(layout.size)
     weight[layout.plane : layout.surface_error] = np.tile(
         [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
     )
     errors = layout.error_columns()
     weight[errors] = layout.error_sigmas(nuisances) ** -2.0
-    right[errors] -= weight[errors] * state.errors[errors]
+    tilt = standing.tilt_sigma_rad or 1.0
+    weight[own_errors] = np.array([standing.height_sigma_m, tilt, tilt]) ** -2.0
+    right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = 6 * layout.poses + layout.parameters
     H, b, surfaces = eliminated(sparse, right, layout.plane, layout.of_surfaces())
@@ -442,7 +471,7 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
     R_d, t_d = stack(moved)
     tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
     planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
-    errors = layout.error_columns()
+    errors = np.concatenate([layout.error_columns(), np.arange(layout.standing, layout.plane)])
     all_errors = state.errors.copy()
     all_errors[errors] += d[errors]
     B = tangent_axes(state.normals_map)

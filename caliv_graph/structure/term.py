@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import gtsam
@@ -10,11 +11,18 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
+from caliv_graph.structure.align import align_patches
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.read import level
 from caliv_graph.structure.solve import Problem, Solved, relative_motions, solve_structure
+from caliv_graph.structure.standing import Standing
+from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+
+HELD_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
+"""Sigmas of an extrinsic that the user trusts: 0.01 mrad and 0.1 mm."""
 
 
 def structure_terms(
@@ -24,12 +32,13 @@ def structure_terms(
     trajectories: Sequence[VehicleTrajectory],
     start: Mapping[str, gtsam.Pose3],
     config: Config,
-    free_offsets: frozenset[str] = frozenset(),
+    free_offsets: frozenset[str],
+    heave_m: float,
 ) -> tuple[StructureTerm, ...]:
     """The term of each drive that has structure.
 
     Args:
-        patches: of each drive.
+        patches: of each drive, those of the ground included.
         priors: per drive what the motion data say of the poses at the stamps of its patches' scans
             and at those that are kept.
         kept_ns: per drive the stamps of the poses that the terms are to be on, ascending.
@@ -37,19 +46,36 @@ def structure_terms(
         start: rough T_vehicle_lidar.
         config: guesses and noise.
         free_offsets: LiDARs whose time offset is estimated.
+        heave_m: 1 sigma of the heave.
 
     Raises:
         SolveError: a system is singular.
     """
+    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
+    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
+    aligned = align_patches(patches, trajectories, start, held).T_vehicle_lidar
     out = []
     for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
-        if not len(own.scan):
+        used = own
+        if not config.ground.use:
+            used = own.part(~level(own, trajectory, aligned))
+        if not len(used.scan):
             continue
-        problem = problem_of(own, prior, trajectory, config, free_offsets)
-        found = solve_structure(problem, start)
+        problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
+        found = solve_structure(problem, aligned)
         if found is not None:
             out.append(term_of(found, np.searchsorted(prior.stamps_ns, kept)))
     return tuple(out)
+
+
+GROUND_SIGHTINGS = 50
+"""Fewest sightings of level strips with which they stand for the ground planes of a LiDAR."""
+
+
+def _guess_sigmas(config: Config, name: str) -> Array:
+    """(6,) of the guess of a LiDAR, vehicle axes; of a trusted one next to nothing."""
+    lidar = config.lidars[name]
+    return HELD_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
 
 
 def problem_of(
@@ -57,6 +83,7 @@ def problem_of(
     prior: PosePrior,
     trajectory: VehicleTrajectory,
     config: Config,
+    heave_m: float,
     free_offsets: frozenset[str] = frozenset(),
 ) -> Problem:
     """What the solve of one drive is given."""
@@ -71,8 +98,24 @@ def problem_of(
         twists=twists_at(trajectory, stamps) if offsets else None,
         offsets=offsets,
         guesses=tuple(lidar.initial.pose() for lidar in lidars),
-        guess_information=np.diag(np.concatenate([c.sigma.sigmas() for c in lidars]) ** -2.0),
+        guess_information=np.diag(
+            np.concatenate([_guess_sigmas(config, name) for name in patches.lidars]) ** -2.0
+        ),
         range_sigma_m=config.noise.lidar_range_m,
+        standing=standing_of(config, heave_m),
+    )
+
+
+def standing_of(config: Config, heave_m: float) -> Standing:
+    """What a config says of how the vehicle stands on the ground."""
+    ground = config.ground
+    tilt = ground.parallel_sigma_deg if ground.use else None
+    return Standing(
+        height_m=ground.vehicle_height if ground.use else None,
+        height_sigma_m=ground.sigma,
+        tilt_sigma_rad=None if tilt is None else math.radians(tilt),
+        heave_m=heave_m,
+        sway_rad=math.radians(config.noise.sway_deg),
     )
 
 
@@ -113,7 +156,18 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         gradient=gradient,
         strips=strips_of(found),
         offset_m=float(np.median(found.nuisances.sighting)),
+        ground=_ground(found),
     )
+
+
+def _ground(found: Solved) -> frozenset[str]:
+    """LiDARs of which level strips determine the ground."""
+    level_strips = found.state.normals_map[:, 2] > LEVEL
+    own = level_strips[found.sightings.strip] & (found.weights > 0.0)
+    lidar = found.problem.patches.scan_lidar[found.sightings.scan]
+    names = found.problem.patches.lidars
+    count = np.bincount(lidar[own], minlength=len(names))
+    return frozenset(n for n, c in zip(names, count, strict=True) if c >= GROUND_SIGHTINGS)
 
 
 def _marginal(H: Array, b: Array, keep: IntArray) -> tuple[Array, Array]:

@@ -1,0 +1,139 @@
+"""The vehicle stands on the ground: its height, and its tilt if the user states one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.spatial import cKDTree
+
+from caliv_graph.geometry.se3 import skew, tangent_axes
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.strips import CELL_M, LEVEL
+
+UNEVEN_M = 0.005
+"""1 sigma of the ground below the wheels against the middle of a strip below the vehicle: four
+wheels stand on other strips, each uneven by some millimetres."""
+
+UNEVEN_RAD = 0.005
+"""1 sigma of the tilt of a strip against that of the ground below four wheels: the same over half a
+strip."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What is known of how the vehicle stands.
+
+    Attributes:
+        height_m: height of the vehicle frame above the ground; None: unknown.
+        height_sigma_m: 1 sigma of it over the drive.
+        tilt_sigma_rad: 1 sigma of the vehicle's tilt on the ground over the drive; None: unknown.
+        heave_m: 1 sigma of the height from scan to scan.
+        sway_rad: 1 sigma of the tilt from scan to scan.
+    """
+
+    height_m: float | None
+    height_sigma_m: float
+    tilt_sigma_rad: float | None
+    heave_m: float
+    sway_rad: float
+
+
+@dataclass(frozen=True)
+class Stands:
+    """Poses and the level strip below each: pose (S,), strip (S,)."""
+
+    pose: IntArray
+    strip: IntArray
+
+
+def stands_of(t_map_vehicle: Array, centres_map: Array, normals_map: Array) -> Stands:
+    """The level strip below each pose, where there is one.
+
+    Args:
+        t_map_vehicle: (M, 3) metres.
+        centres_map: (K, 3) of all strips.
+        normals_map: (K, 3).
+    """
+    level = np.flatnonzero(normals_map[:, 2] > LEVEL)
+    none = np.zeros(0, dtype=np.int64)
+    if not len(level) or not len(t_map_vehicle):
+        return Stands(none, none)
+    found = cKDTree(centres_map[level, :2]).query(t_map_vehicle[:, :2])
+    apart, nearest = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
+    below = apart < 0.5 * np.sqrt(2.0) * CELL_M
+    return Stands(np.flatnonzero(below), level[nearest[below]])
+
+
+def standing_rows(
+    standing: Standing,
+    stands: Stands,
+    R_map_vehicle: Array,
+    t_map_vehicle: Array,
+    centres_map: Array,
+    normals_map: Array,
+    errors: Array,
+    first: int,
+    plane: int,
+    size: int,
+) -> tuple[scipy.sparse.csr_array, Array]:
+    """Whitened residuals of height and tilt, J (r, `size`) and r.
+
+    Height: `n . (t - c) - height - error`; tilt: x and y of the normal in the vehicle frame, less
+    the error of the drive.
+
+    Args:
+        standing: what is known.
+        stands: which pose is above which strip.
+        R_map_vehicle: (M, 3, 3).
+        t_map_vehicle: (M, 3) metres.
+        centres_map: (K, 3) points of the planes.
+        normals_map: (K, 3).
+        errors: (3,) errors of height (m) and tilt (rad, x and y) at the estimate.
+        first: coordinate of the first of them.
+        plane: first coordinate of the planes.
+        size: number of coordinates.
+    """
+    pose, strip = stands.pose, stands.strip
+    s = len(pose)
+    R, n = R_map_vehicle[pose], normals_map[strip]
+    n_vehicle = np.einsum("sji,sj->si", R, n)
+    away = t_map_vehicle[pose] - centres_map[strip]
+    B = tangent_axes(n)
+    blocks, columns, rows, residuals = [], [], [], []
+    poses = 6 * pose[:, None] + np.arange(6)
+    planes = plane + 3 * strip[:, None] + np.arange(3)
+    count = 0
+    if standing.height_m is not None:
+        sigma = np.hypot(standing.heave_m, UNEVEN_M)
+        J = np.zeros((s, 1, 10))
+        J[:, 0, 3:6] = n_vehicle
+        J[:, 0, 6:8] = np.einsum("ski,si->sk", B, away)
+        J[:, 0, 8:10] = -1.0
+        r = np.einsum("si,si->s", n, away) - standing.height_m - errors[0]
+        blocks.append((J / sigma).ravel())
+        residuals.append(r / sigma)
+        where = np.concatenate([poses, planes, np.full((s, 1), first)], axis=1)
+        columns.append(where.ravel())
+        rows.append(np.repeat(np.arange(s), 10))
+        count = s
+    if standing.tilt_sigma_rad is not None:
+        sigma = np.hypot(standing.sway_rad, UNEVEN_RAD)
+        J = np.zeros((s, 2, 10))
+        J[:, :, :3] = skew(n_vehicle)[:, :2]
+        J[:, :, 6:8] = np.einsum("sji,skj->sik", R, B)[:, :2]
+        J[:, 0, 8] = J[:, 1, 9] = -1.0
+        r = (n_vehicle[:, :2] - errors[1:]) / sigma
+        tilt = np.full((s, 1), first + 1)
+        where = np.concatenate([poses, planes[:, :2], tilt, tilt + 1], axis=1)
+        blocks.append((J / sigma).ravel())
+        residuals.append(r.ravel())
+        columns.append(np.repeat(where, 2, axis=0).ravel())
+        rows.append(count + np.repeat(np.arange(2 * s), 10))
+        count += 2 * s
+    if not blocks or not count:
+        return scipy.sparse.csr_array((0, size)), np.zeros(0)
+    where_all = np.concatenate(rows), np.concatenate(columns)
+    J_all = scipy.sparse.csr_array((np.concatenate(blocks), where_all), shape=(count, size))
+    return J_all, np.concatenate(residuals)

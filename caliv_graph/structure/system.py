@@ -425,7 +425,7 @@ def system_of(
     standing: Standing,
     stands: Stands,
 ) -> System:
-    """The normal equations of structure, motion data, and of a vehicle that stands on the ground."""
+    """The normal equations of structure, motion data, and how the vehicle stands."""
     sparse, right = rows.normal_equations()
     own_errors = slice(layout.standing, layout.plane)
     J, r = standing_rows(

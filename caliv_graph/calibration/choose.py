@@ -185,6 +185,25 @@ def _late(
     return first if max(map(abs, first.late_s.values())) > LATE_S else None
 
 
+def late_by_centres(
+    observation: TargetObservation,
+    trajectory: VehicleTrajectory,
+    config: Config,
+    names: Sequence[str],
+) -> float | None:
+    """Common lateness (s) of the stamps of some LiDARs that brings the clouds to one place.
+
+    None: they lie at one place, or no lateness brings them there.
+    """
+    of = _agreement(observation, trajectory, config)
+    if of.sightings is None or of.scatter_m <= AGREE_M:
+        return None
+    place = fit_place(of.sightings, _guesses(config), late=names)
+    if not place.late_s or place.scatter_m > EXPLAINS * of.scatter_m:
+        return None
+    return float(np.mean(list(place.late_s.values())))
+
+
 def _why_none_stands(
     candidates: Sequence[TriedCandidate], scatter: Sequence[float]
 ) -> tuple[str, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.clock_suspects import clock_solved_again, is_lidar_clock
 from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
@@ -94,6 +95,8 @@ def _first_solved(
     if not ranked or ranked[0].freed.sigmas <= CONTRADICTION_SIGMAS:
         return ranked
     first, *rest = ranked
+    if solution is not None and is_lidar_clock(first.candidate.name):
+        return clock_solved_again(ranked, solution, trajectories, motions, config)
     again = solved_again(first, solution, trajectories, motions, config)
     # How far the first linearisation contradicts stays; what the input takes is known better now.
     freed = replace(first.freed, change=again.change, cov=again.cov)
@@ -135,7 +138,7 @@ def solved_again(
             scores = suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
-    index = [c.name for c in scores.candidates].index(name)
+    index = scores.index(name)
     # The sigma that freed it is no property of the input.
     candidates = list(scores.candidates)
     candidates[index] = first.candidate

@@ -142,6 +142,10 @@ class Scores:
         """(K,) of all parameters."""
         return np.concatenate([c.allowance for c in self.candidates])
 
+    def index(self, name: str) -> int:
+        """Of a candidate; ValueError if it is none of them."""
+        return [c.name for c in self.candidates].index(name)
+
     def freed(self, tested: Collection[int], beside: Collection[int] = ()) -> Freed:
         """Frees candidates by index, those `beside` having been freed before.
 

@@ -246,7 +246,13 @@ def _calibrate(
     )
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(
-        calibration, solution, recordings, prepared.trajectories, motions, prepared.config
+        calibration,
+        solution,
+        recordings,
+        prepared.trajectories,
+        motions,
+        prepared.config,
+        displaced=bool(prepared.contradictions),
     )
     calibration = contradicted(
         calibration, prepared.contradictions, contradictions_of(prepared.findings)

@@ -223,6 +223,7 @@ def perform(name: str, seed: int, beams: Path) -> dict[str, Any]:
                 "change": s.change,
                 "sigmas": s.sigmas,
                 "explains": s.explains,
+                "determined": s.determined,
             }
             for s in first
         ],
@@ -247,20 +248,28 @@ def hit(line: Mapping[str, Any]) -> bool:
 
 
 def worst_sigmas(line: Mapping[str, Any]) -> float | None:
-    """Error of the first suspect's value over its sigma, the worst coordinate; None: unknown."""
+    """Error of the first suspect's value over its sigma, the worst coordinate; None: unknown.
+
+    A coordinate that the run calls not determined has no value.
+    """
     truth = ROWS[line["row"]].truth
     if truth is None or not line["suspects"] or not hit(line):
         return None
     first = line["suspects"][0]
     off = np.abs(np.array(first["value"][: len(truth)]) - np.array(truth))
-    return float((off / np.array(first["sigma"][: len(truth)])).max())
+    told = np.array(first["determined"] or [True] * len(truth))[: len(truth)]
+    return float((off / np.array(first["sigma"][: len(truth)]))[told].max())
 
 
 def text_of(line: Mapping[str, Any]) -> str:
     """A run in one line."""
     if line["suspects"]:
         first = line["suspects"][0]
-        numbers = [f"{v:.3f}+-{s:.3f}" for v, s in zip(first["value"], first["sigma"], strict=True)]
+        told = first["determined"] or [True] * len(first["value"])
+        numbers = [
+            f"{value:.3f}+-{sigma:.3f}" if known else "not determined"
+            for value, sigma, known in zip(first["value"], first["sigma"], told, strict=True)
+        ]
         found = f"{first['input']} {' '.join(numbers)}, {first['sigmas']:.1f} sigma"
     else:
         found = line["said"][0] if line["said"] else ""

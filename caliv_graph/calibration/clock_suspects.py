@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from caliv_graph.calibration.choose import late_by_centres
+from caliv_graph.calibration.choose import late_stamps
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.score_tests import MIN_CLOUDS
@@ -27,7 +27,8 @@ from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.uncertainty.suspects import Ranked, Scores
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
+from caliv_graph.uncertainty.suspects import Freed, Ranked, Scores
 
 ALL_LIDARS = "lidars.*.time_offset"
 """The candidate whose parameter is one clock for all LiDARs."""
@@ -56,55 +57,85 @@ def clock_solved_again(
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
-) -> tuple[Ranked, ...]:
-    """The ranking with the value of its first, a LiDAR's clock, and what is left once it is freed.
+    displaced: bool,
+) -> tuple[Ranked, ...] | None:
+    """The ranking led by a LiDAR's clock, with its value and what is left once it is freed.
 
-    Gauss-Newton on the lateness, a solve of the graph within each step. `trajectories` are one per
-    drive, `motions` by the index of the drive. The ranking as it is where no solve succeeds.
+    The clock that the ranking begins with; or, of `displaced` targets (`choose.displaced`), the one
+    that brings the clouds to one place: half of them may have lost their weight, and contradict
+    nothing any more. `trajectories` are one per drive, `motions` by the index of the drive.
+
+    None: no clock is suspect, its solve fails, or it leaves what led before.
     """
-    first, *rest = ranked
-    name = first.candidate.name
-    whose = solution.lidars if name == ALL_LIDARS else (name.split(".")[1],)
+    name, late_s = ranked[0].candidate.name, float(ranked[0].freed.change[0])
     whole = [r.observation for r in solution.registrations]
-    observations = [_some_clouds(o, solution.lidars) for o in whole]
     most = max(whole, key=lambda o: len(o.clouds))
     try:
-        begun = late_by_centres(most, trajectories[most.clouds[0].drive], config, whose)
-        late_s = float(first.freed.change[0]) if begun is None else begun
-        for _ in range(SOLVES):
-            moved = _moved(observations, trajectories, whose, late_s)
-            scores = _scores_of(moved, trajectories, motions, config)
-            freed = scores.freed([scores.index(name)])
-            late_s += float(freed.change[0])
-            if abs(freed.change[0]) < SETTLED * math.sqrt(freed.cov[0, 0]):
-                break
-        else:
-            return tuple(ranked)
+        if displaced:
+            late = late_stamps(most, trajectories[most.clouds[0].drive], config)
+            if late:
+                name = ALL_LIDARS if len(late) > 1 else f"lidars.{next(iter(late))}.time_offset"
+                late_s = float(np.mean(list(late.values())))
+        led = next((r for r in ranked if r.candidate.name == name), None)
+        if led is None or not is_lidar_clock(name):
+            return None
+        observations = [_some_clouds(o, solution.lidars) for o in whole]
+        solved = _solved(name, late_s, observations, solution, trajectories, motions, config)
     except CalivError:
-        return tuple(ranked)
-    found = replace(first.freed, change=np.array([late_s]), cov=freed.cov)
+        return None
+    if solved is None:
+        return None
+    scores, freed = solved
+    # The score at stamps that are right says nothing of the clock: its distance from zero does.
+    squares = max(led.freed.squares, float(freed.change[0] ** 2 / freed.cov[0, 0]))
+    found = replace(led.freed, change=freed.change, cov=freed.cov, squares=squares)
+    rest = tuple(_with_first_freed(r, scores, name) for r in ranked if r is not led)
+    if led is not ranked[0] and rest[0].sigmas_left > CONTRADICTION_SIGMAS:
+        return None
     part = sum(len(o.clouds) for o in observations) / sum(len(o.clouds) for o in whole)
-    explains = max(first.explains, 1.0 - _excess_left(scores, name) / part / _excess(first))
-    led = replace(first, freed=found, explains=explains)
-    return (led, *(_with_first_freed(r, scores, name) for r in rest))
+    explains = max(led.explains, 1.0 - _excess_left(scores, name) / part / max(squares, 1.0))
+    led = replace(led, freed=found, explains=explains, sigmas_left=found.sigmas)
+    return (led, *rest)
 
 
-def _excess(first: Ranked) -> float:
-    """Squares beyond those of noise that freeing all candidates takes off, by the first's part."""
-    return (first.freed.squares - first.freed.dof) / first.explains
+def _solved(
+    name: str,
+    late_s: float,
+    observations: Sequence[TargetObservation],
+    solution: Solution,
+    trajectories: Sequence[VehicleTrajectory],
+    motions: Mapping[int, MotionData],
+    config: Config,
+) -> tuple[Scores, Freed] | None:
+    """Gauss-Newton on the lateness from `late_s`, a solve of the graph within each step.
+
+    The scores at the last stamps, and the clock's value with its covariance; None: no convergence.
+    """
+    lidar = name.removeprefix("lidars.").removesuffix(".time_offset")
+    whose = solution.lidars if name == ALL_LIDARS else (lidar,)
+    for _ in range(SOLVES):
+        moved = _moved(observations, trajectories, whose, late_s)
+        scores = _scores_of(moved, trajectories, motions, config)
+        if name not in scores.names:
+            return None
+        freed = scores.freed([scores.index(name)])
+        step_s = float(freed.change[0])
+        late_s += step_s
+        if abs(step_s) < SETTLED * math.sqrt(freed.cov[0, 0]):
+            return scores, replace(freed, change=np.array([late_s]))
+    return None
 
 
 def _excess_left(scores: Scores, first: str) -> float:
-    """The same of all others once the first is freed, at stamps that are right."""
-    others = [i for i, c in enumerate(scores.candidates) if c.name != first]
+    """Squares beyond those of noise that all others explain once the first is freed."""
+    others = [i for i, name in enumerate(scores.names) if name != first]
     left = scores.freed(others, [scores.index(first)])
     return max(left.squares - left.dof, 0.0)
 
 
 def _with_first_freed(ranked: Ranked, scores: Scores, first: str) -> Ranked:
     """A candidate with the sigmas that it has where the clock is right."""
-    names = [c.name for c in scores.candidates]
-    if ranked.candidate.name not in names:
+    if ranked.candidate.name not in scores.names:
         return ranked
     left = scores.freed([scores.index(ranked.candidate.name)], [scores.index(first)])
     return replace(ranked, sigmas_left=left.sigmas)

@@ -256,8 +256,9 @@ def _worst_error(
 ) -> tuple[float, float]:
     """Largest error of an extrinsic's rotation (rad) and of its x or y (m)."""
     errors = evaluate(calibration, T_vehicle_lidar)["lidars"].values()
-    turn = max(float(np.abs(of["rotation_rad"]).max()) for of in errors)
-    return turn, max(float(np.abs(of["translation_m"][:2]).max()) for of in errors)
+    s2v = [of["s2v"] for of in errors]
+    turn = max(float(np.abs(of["rotation_rad"]).max()) for of in s2v)
+    return turn, max(float(np.abs(of["translation_m"][:2]).max()) for of in s2v)
 
 
 def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:

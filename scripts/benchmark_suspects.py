@@ -213,10 +213,10 @@ def perform(name: str, seed: int, beams: Path, try_suspects: bool = False) -> di
     line: dict[str, Any] = {"row": name, "seed": seed, "code": code_digest()}
     begun = time.process_time()
     try:
-        calibration = calibrate([recording], config, SilentProgress()).calibration
+        done = calibrate([recording], config, SilentProgress())
     except CalivError as e:
         return {**line, "exit": USAGE, "said": [str(e)], "suspects": []}
-    truth = drive.truth.T_vehicle_lidar
+    calibration, truth = done.calibration, drive.truth.T_vehicle_lidar
     tried: dict[str, Any] = {}
     trial = trial_of(calibration, config) if try_suspects else None
     if trial is not None:
@@ -246,6 +246,7 @@ def perform(name: str, seed: int, beams: Path, try_suspects: bool = False) -> di
             for s in first
         ],
         "bounds": {s.input: s.sigma for s in calibration.suspects},
+        "correlated": [n.name for n in done.solution.sensor_noise if n.time_s is not None],
         "cpu_s": time.process_time() - begun,
         **tried,
     }

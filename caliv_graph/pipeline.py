@@ -324,7 +324,13 @@ def _calibrate(
         raise without_anything(prepared, error) from error
     calibration = assemble(solution, config, recordings, digests)
     calibration, doubts = check(
-        calibration, solution, recordings, prepared.trajectories, motions, prepared.config
+        calibration,
+        solution,
+        recordings,
+        prepared.trajectories,
+        motions,
+        prepared.config,
+        displaced=bool(prepared.contradictions),
     )
     calibration = contradicted(
         calibration, prepared.contradictions, contradictions_of(prepared.findings)

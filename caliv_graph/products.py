@@ -744,6 +744,8 @@ class Suspect:
         explains: part of all contradictions that freeing it takes away, 0 to 1.
         sigmas: of a normal variable with the same p-value, one sound input in mind.
         sigmas_left: the same once the first of the ranking is freed; of the first, `sigmas`.
+        determined: whether the data determine each coordinate: where not, `value` is what the input
+            is now. Empty: all.
     """
 
     input: str
@@ -754,6 +756,7 @@ class Suspect:
     explains: float
     sigmas: float
     sigmas_left: float
+    determined: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True)

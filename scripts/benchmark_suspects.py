@@ -4,13 +4,16 @@ Needs the environment that scripts/demo makes:
 
     .venv/bin/python scripts/benchmark_suspects.py --seeds 5
     .venv/bin/python scripts/benchmark_suspects.py --seeds 1 --rows "lever arm zeros" clean
+    .venv/bin/python scripts/benchmark_suspects.py --rows "lever arm zeros" --try-suspects
     .venv/bin/python scripts/benchmark_suspects.py --summary
 
 A figure-eight whose antenna is at (1.2, 0.3, 0.85) m and whose IMU is turned by (1, -2, 5) degrees,
 clouds at 2 Hz. Each row changes one input of the config or one clock, and leaves the drive as it
 is; signs and directions are drawn per seed. A run is
 a line in out/suspects/runs.jsonl, written when it ends; a second start runs the missing ones.
-Runs of another version of the program do not count unless --any-version is given.
+Runs of another version of the program do not count unless --any-version is given. With
+--try-suspects the second run of `calibrate --try-suspects` follows each that is called
+inconsistent, and the errors of both against the truth are printed.
 """
 
 from __future__ import annotations
@@ -38,9 +41,11 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config, PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, GivenPoses, Recording
+from caliv_graph.products import Array, Calibration, GivenPoses, Recording
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation import SimulatedRecording
+from caliv_graph.uncertainty.evaluation import evaluate
+from caliv_graph.workflows.suspects import trial_of
 from scripts._command import add_beams
 from scripts._runs import add_line, code_digest, json_lines
 from scripts._tables_rows import View, config_for, true_poses
@@ -165,6 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5, help="1 to N (default: 5)")
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--try-suspects", action="store_true", help="the second run as well")
     parser.add_argument("--summary", action="store_true", help="only print what is there")
     parser.add_argument("--any-version", action="store_true", help="count runs of older text too")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/suspects)")
@@ -177,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in range(1, asked.seeds + 1):
             for row in asked.rows:
                 if (row, seed) not in done:
-                    line = perform(row, seed, asked.beams)
+                    line = perform(row, seed, asked.beams, asked.try_suspects)
                     add_line(path, line)
                     print(text_of(line), flush=True)
     print(summary(lines_of(path, asked.any_version)))
@@ -198,8 +204,8 @@ def scenario() -> Scenario:
     )
 
 
-def perform(name: str, seed: int, beams: Path) -> dict[str, Any]:
-    """Simulates and calibrates once; returns the line to write."""
+def perform(name: str, seed: int, beams: Path, try_suspects: bool = False) -> dict[str, Any]:
+    """Simulates and calibrates once, or twice; returns the line to write."""
     row, model = ROWS[name], scenario()
     drive = ThinnedRecording(model, cached_selection(model, beams), seed, waves=GroundWaves())
     recording = row.recording(drive)
@@ -207,9 +213,21 @@ def perform(name: str, seed: int, beams: Path) -> dict[str, Any]:
     line: dict[str, Any] = {"row": name, "seed": seed, "code": code_digest()}
     begun = time.process_time()
     try:
-        calibration = calibrate([recording], config, SilentProgress()).calibration
+        done = calibrate([recording], config, SilentProgress())
     except CalivError as e:
         return {**line, "exit": USAGE, "said": [str(e)], "suspects": []}
+    calibration, truth = done.calibration, drive.truth.T_vehicle_lidar
+    tried: dict[str, Any] = {}
+    trial = trial_of(calibration, config) if try_suspects else None
+    if trial is not None:
+        second = calibrate([recording], trial.config, SilentProgress()).calibration
+        tried["tried"] = {
+            "change": trial.change,
+            "exit": exit_code(second),
+            "said": list(second.contradictions),
+            "worst_before": _worst_error(calibration, truth),
+            "worst_after": _worst_error(second, truth),
+        }
     first = calibration.suspects[:3]
     return {
         **line,
@@ -223,12 +241,25 @@ def perform(name: str, seed: int, beams: Path) -> dict[str, Any]:
                 "change": s.change,
                 "sigmas": s.sigmas,
                 "explains": s.explains,
+                "determined": s.determined,
             }
             for s in first
         ],
         "bounds": {s.input: s.sigma for s in calibration.suspects},
+        "correlated": [n.name for n in done.solution.sensor_noise if n.time_s is not None],
         "cpu_s": time.process_time() - begun,
+        **tried,
     }
+
+
+def _worst_error(
+    calibration: Calibration, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> tuple[float, float]:
+    """Largest error of an extrinsic's rotation (rad) and of its x or y (m)."""
+    errors = evaluate(calibration, T_vehicle_lidar)["lidars"].values()
+    s2v = [of["s2v"] for of in errors]
+    turn = max(float(np.abs(of["rotation_rad"]).max()) for of in s2v)
+    return turn, max(float(np.abs(of["translation_m"][:2]).max()) for of in s2v)
 
 
 def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
@@ -247,27 +278,43 @@ def hit(line: Mapping[str, Any]) -> bool:
 
 
 def worst_sigmas(line: Mapping[str, Any]) -> float | None:
-    """Error of the first suspect's value over its sigma, the worst coordinate; None: unknown."""
+    """Error of the first suspect's value over its sigma, the worst coordinate; None: unknown.
+
+    A coordinate that the run calls not determined has no value.
+    """
     truth = ROWS[line["row"]].truth
     if truth is None or not line["suspects"] or not hit(line):
         return None
     first = line["suspects"][0]
     off = np.abs(np.array(first["value"][: len(truth)]) - np.array(truth))
-    return float((off / np.array(first["sigma"][: len(truth)])).max())
+    told = np.array(first["determined"] or [True] * len(truth))[: len(truth)]
+    return float((off / np.array(first["sigma"][: len(truth)]))[told].max())
 
 
 def text_of(line: Mapping[str, Any]) -> str:
     """A run in one line."""
     if line["suspects"]:
         first = line["suspects"][0]
-        numbers = [f"{v:.3f}+-{s:.3f}" for v, s in zip(first["value"], first["sigma"], strict=True)]
+        told = first["determined"] or [True] * len(first["value"])
+        numbers = [
+            f"{value:.3f}+-{sigma:.3f}" if known else "not determined"
+            for value, sigma, known in zip(first["value"], first["sigma"], told, strict=True)
+        ]
         found = f"{first['input']} {' '.join(numbers)}, {first['sigmas']:.1f} sigma"
     else:
         found = line["said"][0] if line["said"] else ""
     worst = worst_sigmas(line)
     off = "" if worst is None else f", value off by {worst:.1f} sigma"
     mark = "hit" if hit(line) else "MISSED"
-    return f"{line['row']}, seed {line['seed']}: exit {line['exit']}, {mark}: {found}{off}"
+    text = f"{line['row']}, seed {line['seed']}: exit {line['exit']}, {mark}: {found}{off}"
+    if "tried" in line:
+        tried = line["tried"]
+        before, after = (
+            f"{1e3 * turn:.1f} mrad, {1e3 * shift:.0f} mm"
+            for turn, shift in (tried["worst_before"], tried["worst_after"])
+        )
+        text += f"; with {tried['change']} exit {tried['exit']}, errors {before} -> {after}"
+    return text
 
 
 def summary(lines: Sequence[Mapping[str, Any]]) -> str:

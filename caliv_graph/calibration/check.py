@@ -61,10 +61,12 @@ def check(
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
+    displaced: bool = False,
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Tests a calibration against its data and its initial guesses.
 
-    `recordings` and `trajectories` are one per drive, `motions` by the index of the drive. Returns
+    `recordings` and `trajectories` are one per drive, `motions` by the index of the drive;
+    `displaced`: some target is at one place only with late stamps or another guess. Returns
     the calibration, inconsistent if something contradicts something, with its suspects; and
     warnings: headings that disagree, and what could not be tested.
     """
@@ -76,7 +78,7 @@ def check(
     untested: tuple[str, ...] = ()
     try:
         between = score_tests(solution, trajectories, trusted)
-        suspects = ranked_suspects(solution, trajectories, motions, config)
+        suspects = ranked_suspects(solution, trajectories, motions, config, displaced)
     except (SolveError, TrajectoryError) as e:
         # The result stands, and the user must know that it was not tested.
         between, suspects = (), ()

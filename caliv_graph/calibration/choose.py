@@ -154,8 +154,8 @@ def cause_of(of: Agreement, config: Config) -> str | None:
     guesses = _guesses(config)
     enough = EXPLAINS * of.scatter_m
     begin = f"its clouds lie at one place of the map to {of.scatter_m:.2f} m only, but to "
-    late = None if config.solve.time_offset else _late(of.sightings, guesses, names)
-    if late is not None and late.scatter_m <= enough:
+    late = _late_of(of, config)
+    if late is not None:
         by = " and ".join(f"those of '{name}' by {s:+.2f} s" for name, s in late.late_s.items())
         return (
             f"{begin}{late.scatter_m:.2f} m if stamps are late: {by}. The displacement grows with "
@@ -183,6 +183,27 @@ def _late(
     least = min(place.scatter_m for place in tried)
     first = next(place for place in tried if place.scatter_m <= FEWER * least)
     return first if max(map(abs, first.late_s.values())) > LATE_S else None
+
+
+def late_stamps(
+    observation: TargetObservation, trajectory: VehicleTrajectory, config: Config
+) -> Mapping[str, float]:
+    """LiDAR -> lateness (s) of its stamps that brings the clouds to one place of the map.
+
+    Empty: they lie at one place, or no lateness brings them there.
+    """
+    of = _agreement(observation, trajectory, config)
+    late = _late_of(of, config)
+    return {} if late is None else late.late_s
+
+
+def _late_of(of: Agreement, config: Config) -> Place | None:
+    """The place with late stamps, if these explain why the clouds are not at one."""
+    if of.sightings is None or of.scatter_m <= AGREE_M or config.solve.time_offset:
+        return None
+    names = [name for name in config.lidars if name in of.sightings.lidars]
+    late = _late(of.sightings, _guesses(config), names)
+    return late if late is not None and late.scatter_m <= EXPLAINS * of.scatter_m else None
 
 
 def _why_none_stands(

@@ -25,6 +25,7 @@ from caliv_graph.calibration.ground import (
 )
 from caliv_graph.calibration.ground_factors import ground_plane_factor
 from caliv_graph.calibration.linear import linearise_clouds
+from caliv_graph.calibration.motion_suspects import motion_parts
 from caliv_graph.calibration.noise import evenly_over_drives
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.solve import SolveState, measured_poses, of_single_clouds
@@ -141,19 +142,50 @@ def linearised_evidence(
             *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
         )
     known = scipy.linalg.block_diag(*(row.known for row in rows))
-    effects = []
+    effects, inputs, scales = [], np.zeros((starts[-1], 0)), np.zeros(0)
+    drives = _of_drives(problem, poses, trajectories)
+    if drives:
+        # What the user typed may be wrong: an arm that is off moves the poses as slowly as the
+        # vehicle turns, and is no noise of the fixes.
+        smoothed_drives = {drive: of.trajectory for drive, of in drives.items()}
+        stamps = {drive: np.array(of.stamps_ns) for drive, of in drives.items()}
+        candidates, parts_of = motion_parts(smoothed_drives, stamps)
+        scales = np.concatenate([c.scale for c in candidates])
+        inputs = np.zeros((starts[-1], len(scales)))
+    for drive, of in drives.items():
+        J = by_pose[:, of.columns]
+        information = of.trajectory.joint_information(of.stamps_ns)[0]
+        known = known + J @ np.linalg.solve(information, J.T)
+        inputs += J @ parts_of[drive].poses
+        effects.append((of.columns, _effects(of.trajectory, of.stamps_ns)))
+    ridge = np.concatenate([*(_weak(problem, key, sizes[key]) for key in others), scales**-2.0])
+    residuals = np.concatenate([row.residual for row in rows])
+    observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
+    return Evidence(observed, by_pose, white, effects)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """A smoothed drive: its stamps, ascending, and where its poses are among all."""
+
+    trajectory: SmoothedTrajectory
+    stamps_ns: Sequence[int]
+    columns: IntArray
+
+
+def _of_drives(
+    problem: Problem, poses: IntArray, trajectories: Sequence[VehicleTrajectory]
+) -> dict[int, _Drive]:
+    """The drives of some poses, all of them smoothed."""
+    out = {}
     for drive in sorted({problem.poses[i][0] for i in poses.tolist()}):
         trajectory = trajectories[drive]
         assert isinstance(trajectory, SmoothedTrajectory)
         mine = [n for n, i in enumerate(poses.tolist()) if problem.poses[i][0] == drive]
         stamps = [problem.poses[poses[n]][1] for n in mine]
-        own = (6 * np.array(mine)[:, None] + np.arange(6)).ravel()
-        J = by_pose[:, own]
-        known = known + J @ np.linalg.solve(trajectory.joint_information(stamps)[0], J.T)
-        effects.append((own, _effects(trajectory, stamps)))
-    ridge = np.concatenate([_weak(problem, key, sizes[key]) for key in others])
-    residuals = np.concatenate([row.residual for row in rows])
-    return Evidence(Observed(residuals, design, ridge, known), by_pose, white, effects)
+        columns = (6 * np.array(mine)[:, None] + np.arange(6)).ravel()
+        out[drive] = _Drive(trajectory, stamps, columns)
+    return out
 
 
 def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[str, ErrorEffects]:

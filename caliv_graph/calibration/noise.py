@@ -18,6 +18,13 @@ from scipy.optimize import minimize, minimize_scalar
 
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
+from caliv_graph.calibration.pose_effects import (
+    motion_covariance,
+    pose_covariance,
+    pose_effects,
+    pose_parts,
+    stated_effect,
+)
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.robust import own_blocks
 from caliv_graph.config.model import NoiseConfig
@@ -93,8 +100,8 @@ def sound_clouds(
     given = problem.given()[problem.cloud_pose]
     V = np.linalg.inv(information)
     V += np.einsum("jax,jx,jbx->jab", B * given[:, None, None], spread, B)
-    V += _stated_effect(problem, B, every)
-    V += np.einsum("jax,jxy,jby->jab", B, _motion_covariance(problem, values, every), B)
+    V += stated_effect(problem, B, every)
+    V += np.einsum("jax,jxy,jby->jab", B, motion_covariance(problem, values, every), B)
     r = r.reshape(-1, 6)
     squared = np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0])
     return np.asarray(squared < GROSS * np.median(squared))
@@ -182,7 +189,7 @@ def fit_scale(
     r, A, B = _stacked(problem, lines, there, values, every)
     # From the solved to the given poses: the gradient follows.
     y = gradient - H @ r
-    K = _pose_covariance(problem, values, every, B, noise)
+    K = pose_covariance(problem, values, every, B, noise)
     chosen = evenly_over_drives(problem, np.trace(own_blocks(H), axis1=1, axis2=2) > 0.0)
     rows = (6 * chosen[:, None] + np.arange(6)).ravel()
     across = H[rows]
@@ -246,7 +253,7 @@ class _RestrictedLikelihood:
         chosen = evenly_over_drives(problem, sound)
         lines = linearise_clouds(problem, values)
         r, A, B = _stacked(problem, lines, measured, values, chosen)
-        known, parts = _pose_parts(problem, values, chosen, B, first)
+        known, parts = pose_parts(problem, values, chosen, B, first)
         return cls(
             residuals=r,
             design=A,
@@ -274,49 +281,6 @@ class _RestrictedLikelihood:
         return float(
             np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)
         )
-
-
-def _pose_parts(
-    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
-) -> tuple[Array, tuple[Array, ...]]:
-    """What pose errors do to the residuals of m clouds: (6m, 6m) covariances.
-
-    That of smoothed poses and stated white errors; and what the variances of white rotation and
-    position, Gauss-Markov rotation and position multiply. B (m, 6, 6) are the effects of pose
-    errors, `noise` has the time of the Gauss-Markov part.
-    """
-    times = problem.times_s()[problem.cloud_pose[chosen]]
-    drives = problem.drives()[problem.cloud_pose[chosen]]
-    apart = np.abs(times[:, None] - times[None])
-    together = drives[:, None] == drives[None]
-    same = ((apart < 1e-9) & together).astype(np.float64)
-    slow = np.where(together, np.exp(-apart / noise.drift_time_s), 0.0)
-    joint = _motion_covariance(problem, values, chosen, together=True)
-    known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
-    known += _stated_effect(problem, B, chosen, same)
-    # Rotation and position parts of what a pose error does to the clouds' residuals.
-    unstated = ~problem.stated()[problem.cloud_pose[chosen]]
-    B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
-    effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
-    spread = [e @ e.T for e in effect]
-    same = same * np.outer(unstated, unstated)
-    ones = np.ones((6, 6))
-    return known.reshape(6 * len(chosen), 6 * len(chosen)), (
-        spread[0] * np.kron(same, ones),
-        spread[1] * np.kron(same, ones),
-        spread[0] * np.kron(slow, ones),
-        spread[1] * np.kron(slow, ones),
-    )
-
-
-def _pose_covariance(
-    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
-) -> Array:
-    """(6m, 6m) covariance of the residuals of m clouds by pose errors; see `_pose_parts`."""
-    known, parts = _pose_parts(problem, values, chosen, B, noise)
-    for sigma, part in zip(astuple(noise)[:4], parts, strict=True):
-        known = known + sigma**2 * part
-    return np.asarray(known)
 
 
 def evenly_over_drives(problem: Problem, sound: BoolArray, most: int | None = None) -> IntArray:
@@ -347,7 +311,7 @@ def squares_without_own_pose(
     `Log(predicted measured^-1)` at `values`, `information` (J, 6, 6) is without robust weights.
     """
     white = np.array([noise.white_rotation_rad] * 3 + [noise.white_position_m] * 3)
-    B = _pose_effects(problem, lines, values, np.arange(problem.clouds))
+    B = pose_effects(problem, lines, values, np.arange(problem.clouds))
     found = np.zeros((len(problem.poses), 6))
     for i in np.flatnonzero(problem.given()).tolist():
         given = problem.T_map_vehicle[i]
@@ -356,72 +320,11 @@ def squares_without_own_pose(
         error = np.concatenate([turn, X.translation() - given.translation()])
         found[i] = error - values.atVector(key_pose_error(i))
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
-    stated = _stated_effect(problem, B, np.arange(problem.clouds))
+    stated = stated_effect(problem, B, np.arange(problem.clouds))
     fitted = problem.given() & ~problem.stated()
     B = B * fitted[problem.cloud_pose][:, None, None]
     V = np.linalg.inv(information) + np.einsum("jax,x,jbx->jab", B, white**2, B) + stated
     return np.asarray(np.einsum("ja,ja->j", r, np.linalg.solve(V, r[..., None])[..., 0]))
-
-
-def _stated_effect(
-    problem: Problem, B: Array, chosen: IntArray, same: Array | None = None
-) -> Array:
-    """(m, 6, 6) added to the covariance of the chosen clouds' residuals by stated white errors.
-
-    `B` (m, 6, 6): effects of pose errors. With `same` (m, m), 1 where two clouds share a pose:
-    (m, 6, m, 6).
-    """
-    m, pose = len(chosen), problem.cloud_pose[chosen]
-    stated = problem.stated()[pose]
-    if problem.stated_cov is None or not stated.any():
-        return np.zeros((m, 6, 6) if same is None else (m, 6, m, 6))
-    cov = np.zeros((m, 6, 6))
-    cov[stated] = problem.stated_cov[pose[stated]]
-    if same is None:
-        return np.asarray(np.einsum("jax,jxy,jby->jab", B, cov, B))
-    return np.asarray(np.einsum("pax,pxy,qby,pq->paqb", B, cov, B, same, optimize=True))
-
-
-def _motion_covariance(
-    problem: Problem, values: gtsam.Values, chosen: IntArray, together: bool = False
-) -> Array:
-    """(m, 6, 6) covariance that motion data leave to the poses of clouds; zero for given poses.
-
-    If `together` (m, m, 6, 6). Rotation in vehicle axes, position in map axes.
-    """
-    m = len(chosen)
-    out = np.zeros((m, m, 6, 6) if together else (m, 6, 6))
-    pose = problem.cloud_pose[chosen]
-    for drive, information in problem.motion.items():
-        of_drive = np.flatnonzero(problem.drives() == drive)
-        axes = np.tile(np.eye(6), (len(of_drive), 1, 1))
-        for n, i in enumerate(of_drive.tolist()):
-            axes[n, 3:, 3:] = values.atPose3(key_vehicle(i)).rotation().matrix()
-        n = len(of_drive)
-        cov = np.linalg.inv(information).reshape(n, 6, n, 6).swapaxes(1, 2)
-        mine = np.flatnonzero(np.isin(pose, of_drive))
-        local = np.searchsorted(of_drive, pose[mine])
-        A = axes[local]
-        if together:
-            out[np.ix_(mine, mine)] = np.einsum(
-                "pax,pqxy,qby->pqab", A, cov[np.ix_(local, local)], A, optimize=True
-            )
-        else:
-            out[mine] = A @ cov[local, local] @ np.swapaxes(A, 1, 2)
-    return out
-
-
-def _pose_effects(
-    problem: Problem, lines: CloudLinearisation, values: gtsam.Values, chosen: IntArray
-) -> Array:
-    """(m, 6, 6) residuals of clouds by pose errors: rotation in vehicle, position in map axes."""
-    B = np.zeros((len(chosen), 6, 6))
-    for row, j in enumerate(chosen):
-        key = key_vehicle(int(problem.cloud_pose[j]))
-        jacobian = lines.jacobians[j][lines.keys[j].index(key)]
-        B[row, :, :3] = jacobian[:, :3]
-        B[row, :, 3:] = jacobian[:, 3:] @ values.atPose3(key).rotation().matrix().T
-    return B
 
 
 def _stacked(
@@ -440,7 +343,7 @@ def _stacked(
     columns |= {key: 6 * len(keys) + i for i, key in enumerate(problem.offset_keys())}
     r = np.zeros(6 * len(chosen))
     A = np.zeros((6 * len(chosen), 6 * len(keys) + len(problem.offset_keys())))
-    B = _pose_effects(problem, lines, values, chosen)
+    B = pose_effects(problem, lines, values, chosen)
     for row, j in enumerate(chosen):
         block = slice(6 * row, 6 * row + 6)
         r[block] = gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse()))

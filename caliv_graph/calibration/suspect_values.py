@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.clock_suspects import clock_solved_again, is_lidar_clock
 from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import retract_vehicle_axes
-from caliv_graph.products import Array, Guess, MotionData, Solution, Suspect
+from caliv_graph.products import Array, BoolArray, Guess, MotionData, Solution, Suspect
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
@@ -28,9 +29,6 @@ FREE_ARM_M = 2.0
 FREE_ROTATION_DEG = 30.0
 """The same of the IMU's rotation, degrees."""
 
-KNOWN = 0.1
-"""Sigma over the candidate's scale below which the linear change is where the next solve begins."""
-
 _POSE_UNITS = ("m",) * 3 + ("deg",) * 3
 """Of a pose as the config has it: xyz, then roll, pitch, yaw."""
 
@@ -43,6 +41,7 @@ class _Quantity:
     change: Array
     sigma: Array
     units: tuple[str, ...]
+    determined: BoolArray
     value: Array | None = None
 
 
@@ -51,10 +50,12 @@ def ranked_suspects(
     trajectories: Sequence[VehicleTrajectory],
     motions: Mapping[int, MotionData],
     config: Config,
+    displaced: bool = False,
 ) -> tuple[Suspect, ...]:
     """The inputs of a calibration that could be wrong, ranked, in the units of the config's keys.
 
-    `trajectories` are one per drive, `motions` by the index of the drive.
+    `trajectories` are one per drive, `motions` by the index of the drive; `displaced`: some target
+    is at one place only with late stamps or another guess (`choose.displaced`).
 
     Raises:
         SolveError: the graph is singular.
@@ -62,8 +63,17 @@ def ranked_suspects(
     """
     guesses = {name: configured_guess(config, name) for name in solution.lidars}
     ranked = ranking(suspect_scores(solution, trajectories, guesses))
+    if ranked and (displaced or (_leads(ranked) and is_lidar_clock(ranked[0].candidate.name))):
+        clock = clock_solved_again(ranked, solution, trajectories, motions, config, displaced)
+        if clock is not None:
+            return named_suspects(clock, config, guesses)
     ranked = _first_solved(ranked, solution, trajectories, motions, config)
     return named_suspects(ranked, config, guesses)
+
+
+def _leads(ranked: Sequence[Ranked]) -> bool:
+    """Whether the first explains a contradiction."""
+    return bool(ranked) and ranked[0].freed.sigmas > CONTRADICTION_SIGMAS
 
 
 def motion_suspects(
@@ -91,12 +101,12 @@ def _first_solved(
     config: Config,
 ) -> tuple[Ranked, ...]:
     """The ranking with the value of its first suspect as `solved_again` has it, if it matters."""
-    if not ranked or ranked[0].freed.sigmas <= CONTRADICTION_SIGMAS:
+    if not _leads(ranked):
         return ranked
     first, *rest = ranked
     again = solved_again(first, solution, trajectories, motions, config)
     # How far the first linearisation contradicts stays; what the input takes is known better now.
-    freed = replace(first.freed, change=again.change, cov=again.cov)
+    freed = replace(again, squares=first.freed.squares, dof=first.freed.dof)
     return (replace(first, freed=freed), *rest)
 
 
@@ -114,8 +124,7 @@ def solved_again(
     motion data say it alone.
     """
     name = first.candidate.name
-    known = np.sqrt(np.diag(first.freed.cov)) < KNOWN * first.candidate.scale
-    begun = np.where(known, first.freed.change, 0.0)
+    begun = np.where(first.freed.determined, first.freed.change, 0.0)
     free = freed_in_smoother(config, name, begun)
     if free is None:
         return first.freed
@@ -135,7 +144,7 @@ def solved_again(
             scores = suspect_scores(solution, again, guesses)
     except TrajectoryError:
         return first.freed
-    index = [c.name for c in scores.candidates].index(name)
+    index = scores.index(name)
     # The sigma that freed it is no property of the input.
     candidates = list(scores.candidates)
     candidates[index] = first.candidate
@@ -187,6 +196,7 @@ def named_suspects(
                 explains=each.explains,
                 sigmas=each.freed.sigmas,
                 sigmas_left=each.sigmas_left,
+                determined=() if q.determined.all() else tuple(q.determined.tolist()),
             )
         )
     return tuple(out)
@@ -194,28 +204,29 @@ def named_suspects(
 
 def _quantity(name: str, freed: Freed, config: Config, guesses: Mapping[str, Guess]) -> _Quantity:
     """The parameters of a candidate as the quantity that a user knows."""
-    change, sigma = freed.change, np.sqrt(np.diag(freed.cov))
-    if name == "gnss.lever_arm":
+    change, sigma, known = freed.change, np.sqrt(np.diag(freed.cov)), freed.determined
+    if name == LEVER_ARM.name:
         now = np.zeros(3) if config.gnss.lever_arm is None else np.array(config.gnss.lever_arm)
-        return _Quantity(now, change, sigma, ("m",) * 3)
+        return _Quantity(now, np.where(known, change, 0.0), sigma, ("m",) * 3, known)
     if name == "ground.vehicle_height":
-        return _Quantity(np.array([config.ground.vehicle_height or 0.0]), change, sigma, ("m",))
-    if name == "imu.T_vehicle_imu":
-        return _imu_rotation(change, sigma, config)
-    if name.endswith((".drift",)) or ".drift." in name:
-        return _drift(change, sigma)
+        now = np.array([config.ground.vehicle_height or 0.0])
+        return _Quantity(now, change, sigma, ("m",), known)
+    if name == IMU_ROTATION.name:
+        return _imu_rotation(freed, config)
+    if name.endswith(".drift") or ".drift." in name:
+        return _drift(change, sigma, known)
     if name.endswith("time_offset"):
-        return _Quantity(np.zeros(1), change, sigma, ("s",))
+        return _Quantity(np.zeros(1), change, sigma, ("s",), known)
     if name == "imu.yaw_bias":
-        return _Quantity(np.zeros(1), np.degrees(change), np.degrees(sigma), ("deg",))
+        return _Quantity(np.zeros(1), np.degrees(change), np.degrees(sigma), ("deg",), known)
     if name.endswith(".scale"):
-        return _Quantity(np.ones(1), change, sigma, ("1",))
-    moved, spread = _as_pose(change), _as_pose(sigma)
+        return _Quantity(np.ones(1), change, sigma, ("1",), known)
+    moved, spread, known = _as_pose(change), _as_pose(sigma), np.roll(known, 3)
     if name.endswith(".initial"):
         guess = guesses[name.removeprefix("lidars.").removesuffix(".initial")].T_vehicle_lidar
-        T = retract_vehicle_axes(guess, change)
-        return _Quantity(_pose(guess), moved, spread, _POSE_UNITS, value=_pose(T))
-    return _Quantity(np.zeros(6), moved, spread, _POSE_UNITS)
+        value = _pose(retract_vehicle_axes(guess, change))
+        return _Quantity(_pose(guess), moved, spread, _POSE_UNITS, known, value)
+    return _Quantity(np.zeros(6), moved, spread, _POSE_UNITS, known)
 
 
 def _as_pose(d: Array) -> Array:
@@ -228,17 +239,17 @@ def _pose(T: gtsam.Pose3) -> Array:
     return np.concatenate([T.translation(), np.degrees(T.rotation().rpy())])
 
 
-def _imu_rotation(change: Array, sigma: Array, config: Config) -> _Quantity:
+def _imu_rotation(freed: Freed, config: Config) -> _Quantity:
     """rpy_deg of T_vehicle_imu; the sigmas are those about the vehicle's axes."""
     rpy_deg = config.imu.T_vehicle_imu.rpy_deg
     now = np.radians(np.zeros(3) if rpy_deg is None else np.array(rpy_deg))
-    R = gtsam.Rot3.Expmap(change).compose(gtsam.Rot3.RzRyRx(*now))
-    value = np.degrees(R.rpy())
-    units = ("deg",) * 3
-    return _Quantity(np.degrees(now), np.degrees(change), np.degrees(sigma), units, value=value)
+    R = gtsam.Rot3.Expmap(freed.change).compose(gtsam.Rot3.RzRyRx(*now))
+    sigma = np.degrees(np.sqrt(np.diag(freed.cov)))
+    change, value = np.degrees(freed.change), np.degrees(R.rpy())
+    return _Quantity(np.degrees(now), change, sigma, ("deg",) * 3, freed.determined, value)
 
 
-def _drift(change: Array, sigma: Array) -> _Quantity:
+def _drift(change: Array, sigma: Array, known: BoolArray) -> _Quantity:
     """Range of the drift over the drive per map axis (and of the yaw, degrees)."""
     axes = len(change) // DRIFT_WAVES
     waves = change.reshape(DRIFT_WAVES, axes)
@@ -249,4 +260,5 @@ def _drift(change: Array, sigma: Array) -> _Quantity:
     spread = 2.0 * np.linalg.norm(sigma.reshape(DRIFT_WAVES, axes), axis=0)
     unit = np.array([1.0] * 3 + [180.0 / np.pi] * (axes - 3))
     units = ("m",) * 3 + ("deg",) * (axes - 3)
-    return _Quantity(np.zeros(axes), size * unit, spread * unit, units)
+    told = np.asarray(known.reshape(DRIFT_WAVES, axes).all(axis=0), bool)
+    return _Quantity(np.zeros(axes), size * unit, spread * unit, units, told)

@@ -156,6 +156,7 @@ def _suspect_documents(calibration: Calibration) -> dict[str, Any]:
             "explains": s.explains,
             "sigmas": s.sigmas,
             "sigmas_left": s.sigmas_left,
+            **({} if all(s.determined) else {"determined": list(s.determined)}),
         }
         for s in calibration.suspects
     ]

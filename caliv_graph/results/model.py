@@ -228,6 +228,7 @@ class _SuspectPart(Part):
     change: tuple[Finite, ...] = ()
     units: tuple[Text, ...] = ()
     sigmas_left: Finite = 0.0
+    determined: tuple[bool, ...] = ()
 
     def suspect(self) -> Suspect:
         """The same as a product."""
@@ -240,6 +241,7 @@ class _SuspectPart(Part):
             explains=self.explains,
             sigmas=self.sigmas,
             sigmas_left=self.sigmas_left,
+            determined=self.determined,
         )
 
 

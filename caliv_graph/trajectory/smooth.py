@@ -65,12 +65,7 @@ def smooth_trajectory(
     data, warnings = check_input(motion, config)
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
-    if needs_guess(data):
-        data = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
-    states = solve_from_the_start(data, nodes, first_states(data, nodes))
-    parameters = uncertain_parameters(data)
-    if are_wide(parameters):
-        data, states, parameters = _roughly_settled(data, nodes, states, parameters)
+    data, states, parameters = _begun(data, nodes)
     errors = errors_in(data, [*configured_errors(config), *correlated])
     robust = solve_without_outliers(data, nodes, states)
     warnings += [*lines, *robust.warnings]
@@ -84,9 +79,8 @@ def smooth_trajectory(
     if parameters:
         kernel = data.config.robust.kernel
         settled = settle(data, nodes, estimate, robust.dropped, kernel, parameters)
-        data, estimate = settled.data, settled.estimate
-    linear = estimate.graph.factors.linearize(estimate.values)
-    cov_imu, yaw_sigma = covariances_of(linear, data, estimate.states)
+    linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
+    cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
     last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)
     data, estimate = last.settled.data, last.settled.estimate
     warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
@@ -113,6 +107,19 @@ def smooth_trajectory(
         correlated=tuple(errors),
         errors=last.errors,
     )
+
+
+def _begun(
+    data: SmootherInput, nodes: IntArray
+) -> tuple[SmootherInput, States, tuple[UncertainParameter, ...]]:
+    """Input, states and uncertain parameters with all fixes, outliers among them."""
+    if needs_guess(data):
+        data = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
+    states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    parameters = uncertain_parameters(data)
+    if are_wide(parameters):
+        return _roughly_settled(data, nodes, states, parameters)
+    return data, states, parameters
 
 
 def _last_step(

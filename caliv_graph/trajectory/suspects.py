@@ -25,6 +25,11 @@ ARM_M = 0.01
 """Allowance, 1 sigma, of a lever arm without a sigma: the error of an RTK receiver that does not
 average out over a drive is about as large."""
 
+ARM_KNOWN_M = 0.3
+"""Largest sigma at which a direction of a lever arm counts as determined, where the config gives no
+wider one. On level ground the height of an antenna shows in the tilts alone, of which the
+linearised graph claims more than there is: at sigmas of 0.5 m it wandered by metres."""
+
 ROTATION_RAD = math.radians(0.1)
 """The same of the IMU's rotation: a mount on a surface that was made for it."""
 
@@ -68,7 +73,7 @@ def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, 
     """The inputs of a smoothed trajectory that could be wrong: those that it has."""
     data, out = smoothed.data, []
     if data.positions is not None:
-        out.append(_known(smoothed, LEVER_ARM, ARM_M, 3.0))
+        out.append(_known(smoothed, LEVER_ARM, ARM_M, ARM_KNOWN_M))
         out.append(_plain(_gnss_clock(smoothed), GNSS_CLOCK_S, 1.0))
     if data.positions is not None or data.motion.twist is not None:
         out.append(_known(smoothed, IMU_ROTATION, ROTATION_RAD, 0.5))

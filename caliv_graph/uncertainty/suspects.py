@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 from scipy.special import gammaincc, gammaln, ndtri_exp
 
-from caliv_graph.products import Array
+from caliv_graph.products import Array, BoolArray
 
 DRIFT_M = 0.01
 """Allowance, 1 sigma per half wave over a drive, of given poses: what a good GNSS/INS leaves. The
@@ -66,15 +66,18 @@ class Freed:
 
     Attributes:
         change: (k,) that the parameters would take, along what is determined.
-        cov: (k, k) of it, all allowances considered; along what is not determined, `scale`.
+        cov: (k, k) of it, all allowances considered; along what is not determined, what the data
+            leave, at most `FREED` scales.
         squares: what freeing them takes off chi-square.
         dof: directions that are determined.
+        determined: (k,) whether each parameter lies mostly along these.
     """
 
     change: Array
     cov: Array
     squares: float
     dof: int
+    determined: BoolArray
 
     @property
     def log_p(self) -> float:
@@ -142,6 +145,15 @@ class Scores:
         """(K,) of all parameters."""
         return np.concatenate([c.allowance for c in self.candidates])
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the candidates."""
+        return tuple(c.name for c in self.candidates)
+
+    def index(self, name: str) -> int:
+        """Of a candidate; ValueError if it is none of them."""
+        return self.names.index(name)
+
     def freed(self, tested: Collection[int], beside: Collection[int] = ()) -> Freed:
         """Frees candidates by index, those `beside` having been freed before.
 
@@ -164,18 +176,20 @@ class Scores:
             c_i = c_i - cross.T @ solved[:, -1]
         values, vectors = np.linalg.eigh(0.5 * (D_i + D_i.T))
         known = values > 1.0
+        left = np.maximum(values[~known], FREED**-2.0)
         V, values = vectors[:, known], values[known]
         along = (V.T @ c_i) / values
         cov = np.diag(self.misfit / values)
         null = cov + (V.T * allowance[of] ** 2) @ V
         squares = float(along @ np.linalg.solve(null, along)) if len(along) else 0.0
         unit, lost = self.scale[of], vectors[:, ~known]
-        spread_all = V @ cov @ V.T + lost @ lost.T + np.diag(allowance[of] ** 2)
+        spread_all = V @ cov @ V.T + (lost / left) @ lost.T + np.diag(allowance[of] ** 2)
         return Freed(
             change=unit * (V @ along),
             cov=np.outer(unit, unit) * spread_all,
             squares=max(squares, 0.0),
             dof=len(along),
+            determined=np.asarray((V**2).sum(axis=1) > 0.5),
         )
 
     def _rows(self, which: Collection[int]) -> Array:

@@ -47,7 +47,7 @@ def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
         case CoarseRegistrations():
             return _coarse(found, led)
         case RangesDisagree():
-            return _ranges(found)
+            return _ranges(found, led)
         case ScoreTest():
             return f"{_score_test(found)}. {_SCORE_TEST_REMEDIES[found.kind]}"
         case Assumed():
@@ -150,15 +150,20 @@ def _coarse(found: CoarseRegistrations, led: bool) -> str:
 _COARSE_REMEDY = " Check the stamps of every LiDAR, and that no mount and no target moved"
 
 
-def _ranges(found: RangesDisagree) -> str:
+def _ranges(found: RangesDisagree, led: bool) -> str:
     names = " and ".join(f"'{name}'" for name in found.lidars)
     sigma, limit = 1e3 * found.sigma_m, 1e3 * RANGE_BIAS_LIMIT_M
     return (
         f"the ranges of the lidars {names} on the targets contradict each other: no mounting "
         f"brings them together unless each range on each target is off by at least {sigma:.0f} mm "
-        f"(1 sigma; limit {limit:.0f} mm). Check the range calibration of the LiDARs and that no "
-        "target moved; use matt targets of one material, and see each from several sides"
+        f"(1 sigma; limit {limit:.0f} mm){'' if led else _RANGES_REMEDY}"
     )
+
+
+_RANGES_REMEDY = (
+    ". Check the range calibration of the LiDARs and that no target moved; use matt targets of one "
+    "material, and see each from several sides"
+)
 
 
 _SCORE_TEST_REMEDIES = {

@@ -37,10 +37,12 @@ def motion_sentence(suspects: Sequence[Suspect]) -> str:
 
 def suspect_row(suspect: Suspect) -> tuple[str, str, str, str, str]:
     """Of a table: input, change with its sigma, value, sigmas, and sigmas with the first freed."""
+    told = suspect.determined
+    sigma = vector(suspect.sigma, suspect.units, told, "-")
     return (
         suspect.input,
-        f"{vector(suspect.change, suspect.units)} (sigma {vector(suspect.sigma, suspect.units)})",
-        vector(suspect.value, suspect.units),
+        f"{vector(suspect.change, suspect.units, told)} (sigma {sigma})",
+        vector(suspect.value, suspect.units, told),
         f"{suspect.sigmas:.1f}",
         f"{suspect.sigmas_left:.1f}",
     )
@@ -48,63 +50,81 @@ def suspect_row(suspect: Suspect) -> tuple[str, str, str, str, str]:
 
 def _by(suspect: Suspect) -> str:
     """By how much the input is off, and the value that it would take."""
-    by = f"by {vector(suspect.change, suspect.units)}"
+    told, units = suspect.determined, suspect.units
     late = suspect.change[0]
     if suspect.input.endswith("time_offset"):
         way = "late" if late > 0.0 else "early"
         return f"the stamps are {abs(late):.3f} +- {suspect.sigma[0]:.3f} s {way}"
-    value = ""
+    by = f"by {vector(suspect.change, units, told)}"
     if suspect.value != suspect.change:
-        value = f", so that it is {vector(suspect.value, suspect.units)}"
-    return f"{by}{value} (sigma {vector(suspect.sigma, suspect.units)})"
+        change = vector(suspect.change, units, told, "-")
+        by = f"by {change}, so that it is {vector(suspect.value, units, told)}"
+    return f"{by} (sigma {vector(suspect.sigma, units, told, '-')})"
 
 
-def vector(numbers: Sequence[float], units: Sequence[str]) -> str:
-    """Numbers with their units, those of one unit in brackets together."""
+def vector(
+    numbers: Sequence[float],
+    units: Sequence[str],
+    determined: Sequence[bool] = (),
+    otherwise: str = "not determined",
+) -> str:
+    """Numbers with their units, those of one unit in brackets together.
+
+    `otherwise` stands where a coordinate is not `determined`; empty: all are.
+    """
     out = []
+    known = determined or (True,) * len(numbers)
     for unit in dict.fromkeys(units):
         digits = {"m": 2, "deg": 1, "s": 3, "1": 3}[unit]
-        some = [f"{x:.{digits}f}" for x, u in zip(numbers, units, strict=True) if u == unit]
+        some = [
+            f"{x:.{digits}f}" if told else otherwise
+            for x, u, told in zip(numbers, units, known, strict=True)
+            if u == unit
+        ]
         text = some[0] if len(some) == 1 else f"({', '.join(some)})"
         out.append(text if unit == "1" else f"{text} {unit}")
     return " and ".join(out)
 
 
+_REMEDIES = {
+    "gnss.lever_arm": "Measure the antenna in the vehicle frame again, or set gnss.lever_arm: null",
+    "gnss.time_offset": "Check the clock of the GNSS receiver against that of the IMU",
+    "imu.T_vehicle_imu": "Check imu.T_vehicle_imu, or set its rpy_deg: null",
+    "imu.yaw_bias": "Check the heading of the IMU's orientation, or set imu.yaw_bias",
+    "imu.gyroscope.scale": "Check the unit and the axes of the IMU's messages",
+    "imu.accelerometer.scale": "Check the unit and the axes of the IMU's messages",
+    "twist.scale": "Check the unit and the scale of the velocities in topics.twist",
+    "ground.vehicle_height": "Measure the height of the vehicle frame above the ground again",
+    "poses.frame": "Check that topics.pose has the poses of the vehicle frame",
+    "poses.drift": "The given poses drift by this range over the drive: use better ones",
+    "gnss.drift": "The GNSS positions drift by this range over the drive: use better ones",
+    "lidars.*.time_offset": (
+        "Check the clocks of the LiDARs against those of IMU and GNSS or of the poses, or set "
+        "solve.time_offset"
+    ),
+}
+"""What to check or to set, by the name of the input; drifts of one of several drives likewise."""
+
+_REMEDIES_OF_LIDAR = {
+    "time_offset": "Correct the clock of lidar '{lidar}', or set solve.time_offset",
+    "initial": (
+        "Check the initial guess of lidar '{lidar}' (metres, degrees, signs, T_vehicle_lidar and "
+        "not its inverse) and that the topic is its"
+    ),
+    "mount.halves": (
+        "Check whether the mount of lidar '{lidar}' or the target moved during the drive"
+    ),
+    "mount.turns": "Check whether the mount of lidar '{lidar}' or the target moved in turns",
+}
+
+
 def remedy(suspect: Suspect) -> str:
     """What to check or to set."""
     name = suspect.input
-    lidar = name.removeprefix("lidars.").rsplit(".", 1)[0]
-    if name == "gnss.lever_arm":
-        return "Measure the antenna in the vehicle frame again, or set gnss.lever_arm: null"
-    if name == "imu.T_vehicle_imu":
-        return "Check imu.T_vehicle_imu, or set its rpy_deg: null"
-    if name == "ground.vehicle_height":
-        return "Measure the height of the vehicle frame above the ground again"
-    if name == "lidars.*.time_offset":
-        return (
-            "Check the clocks of the LiDARs against those of IMU and GNSS or of the poses, or set "
-            "solve.time_offset"
-        )
-    if name == "gnss.time_offset":
-        return "Check the clock of the GNSS receiver against that of the IMU"
-    if name.endswith(".time_offset"):
-        return f"Correct the clock of lidar '{lidar}', or set solve.time_offset"
-    if name.endswith(".initial"):
-        return (
-            f"Check the initial guess of lidar '{lidar}' (metres, degrees, signs, T_vehicle_lidar "
-            "and not its inverse) and that the topic is its"
-        )
-    if ".mount." in name:
-        lidar, part = name.removeprefix("lidars.").split(".mount.")
-        when = {"halves": "during the drive", "turns": "in turns"}[part]
-        return f"Check whether the mount of lidar '{lidar}' or the target moved {when}"
-    if ".drift" in name:
-        source = "given poses" if name.startswith("poses") else "GNSS positions"
-        return f"The {source} drift by this range over the drive: use better ones"
-    if name == "poses.frame":
-        return "Check that topics.pose has the poses of the vehicle frame"
-    if name == "twist.scale":
-        return "Check the unit and the scale of the velocities in topics.twist"
-    if name == "imu.yaw_bias":
-        return "Check the heading of the IMU's orientation, or set imu.yaw_bias"
-    return "Check the unit and the axes of the IMU's messages"
+    if name in _REMEDIES:
+        return _REMEDIES[name]
+    for kind, text in _REMEDIES_OF_LIDAR.items():
+        if name.startswith("lidars.") and name.endswith(f".{kind}"):
+            return text.format(lidar=name.removeprefix("lidars.").removesuffix(f".{kind}"))
+    source, _, _ = name.rpartition(".")  # a drift of one of several drives ends with its number
+    return _REMEDIES[source]

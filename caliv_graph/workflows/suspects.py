@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from caliv_graph.calibration.suspect_values import FREE_ARM_M
 from caliv_graph.config.model import Config, PoseConfig, PoseSigmaConfig
 from caliv_graph.config.sections import Section
 from caliv_graph.products import Calibration, Suspect
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
-
-KNOWN_M = 0.3
-"""Sigma of a lever arm's coordinate above which it is left at what the user typed."""
 
 DRIFT_TIME_S = 20.0
 """Correlation time of given poses that drift over a drive of a minute."""
@@ -64,12 +62,11 @@ def _changed(first: Suspect, config: Config) -> tuple[str, Mapping[str, object]]
     """Section of the config and its new values."""
     name = first.input
     if name == "gnss.lever_arm":
-        typed = config.gnss.lever_arm or (0.0, 0.0, 0.0)
-        arm = tuple(
-            value if sigma < KNOWN_M else now
-            for value, sigma, now in zip(first.value, first.sigma, typed, strict=True)
-        )
-        return "gnss", {"lever_arm": arm, "lever_arm_sigma": max(first.sigma)}
+        # A coordinate that is not determined has the value that was typed.
+        return "gnss", {
+            "lever_arm": first.value,
+            "lever_arm_sigma": min(max(first.sigma), FREE_ARM_M),
+        }
     if name == "imu.T_vehicle_imu":
         T = config.imu.T_vehicle_imu.model_copy(update={"rpy_deg": first.value})
         return "imu", {"T_vehicle_imu": T, "rotation_sigma_deg": max(first.sigma)}

@@ -100,6 +100,26 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
 
 
+def test_a_lever_arm_that_is_off_is_no_error_of_the_fixes_once_it_is_free() -> None:
+    """Its effect turns with the vehicle, as slowly as an error of seconds."""
+    heading = np.linspace(0.0, 4.0 * math.pi, POSES)
+    turned = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    moved = np.zeros((POSES, 6, 2))
+    moved[:, 3:5] = -turned.transpose(2, 0, 1)
+    sound = evidence(1, 5e-3, None)
+    by_arm = sound.by_pose @ moved.reshape(-1, 2)
+    seen = replace(sound.observed, residuals=sound.observed.residuals + by_arm @ [0.1, -0.05])
+    free = replace(
+        seen,
+        design=np.hstack([seen.design, by_arm]),
+        ridge=np.concatenate([seen.ridge, [1.0, 1.0]]),
+    )
+
+    (error,) = estimated(replace(sound, observed=seen), NoiseConfig()).correlated
+    assert error.sigmas[0] > 0.02
+    assert estimated(replace(sound, observed=free), NoiseConfig()).correlated == ()
+
+
 def test_levels_of_the_config_are_kept() -> None:
     true = CorrelatedError("gnss", (0.02, 0.02, 0.015), 10.0)
     config = NoiseConfig(heave_m=0.004, gnss_correlated_horizontal_m=0.0)

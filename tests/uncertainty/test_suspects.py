@@ -90,7 +90,8 @@ def test_what_the_data_do_not_tell_is_left_out() -> None:
     (found,) = ranking(scores([candidate("a", 2)], np.diag([1.0, 1e-6]), [4.0, 1e-3]))
     assert found.freed.dof == 1
     assert found.freed.change == pytest.approx([4.0, 0.0])
-    assert math.sqrt(found.freed.cov[1, 1]) == pytest.approx(100.0)
+    assert found.freed.determined.tolist() == [True, False]
+    assert math.sqrt(found.freed.cov[1, 1]) == pytest.approx(1000.0)
 
 
 def test_chance_alone_is_uniform_in_p() -> None:

@@ -15,6 +15,7 @@ from caliv_graph.uncertainty.consistency import (
     CoarseRegistrations,
     GuessContradiction,
     Heading,
+    RangesDisagree,
     ScoreTest,
     ScoreTestKind,
 )
@@ -155,3 +156,10 @@ def test_a_heading_comes_with_its_angle_and_the_allowance() -> None:
     assert "contradict each other by +1.00 +- 0.12 degrees (9 sigma)" in text
     measured = Heading("drive", degree, 3e-3, told_apart=True, measured=True)
     assert "+1.00 +- 0.17 degrees" in contradiction_sentence(measured)
+
+
+def test_ranges_that_disagree_give_no_advice_after_a_suspect() -> None:
+    found = RangesDisagree(0.013, ("front", "rear"))
+    alone, after = contradiction_sentence(found), contradiction_sentence(found, led=True)
+    assert alone.startswith(f"{after}. Check the range calibration of the LiDARs")
+    assert after.endswith("off by at least 13 mm (1 sigma; limit 5 mm)")

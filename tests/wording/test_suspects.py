@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from caliv_graph.products import Suspect
-from caliv_graph.wording.suspects import motion_sentence, ranking_sentence, remedy
+from caliv_graph.wording.suspects import motion_sentence, ranking_sentence, remedy, suspect_row
 
 ARM = Suspect(
     "gnss.lever_arm",
@@ -33,6 +35,17 @@ def test_the_first_suspect_leads_and_what_remains_follows() -> None:
     )
 
 
+def test_a_coordinate_that_is_not_determined_has_no_number() -> None:
+    flat = replace(ARM, determined=(True, True, False))
+    assert ranking_sentence([flat]).startswith(
+        "most likely: gnss.lever_arm, by (0.19, 0.01, -) m, so that it is (1.19, 0.31, not "
+        "determined) m (sigma (0.02, 0.02, -) m); it explains"
+    )
+    _, by, value, *_ = suspect_row(flat)
+    assert by == "(0.19, 0.01, not determined) m (sigma (0.02, 0.02, -) m)"
+    assert value == "(1.19, 0.31, not determined) m"
+
+
 def test_a_clock_is_late_or_early_and_has_a_key() -> None:
     text = ranking_sentence([suspect("lidars.rear.time_offset", 9.0, 9.0)])
     assert "the stamps are 0.100 +- 0.010 s late" in text
@@ -53,6 +66,8 @@ def test_nothing_is_said_below_five_sigma() -> None:
         ("lidars.front.mount.halves", "the mount of lidar 'front' or the target moved during"),
         ("poses.drift", "given poses drift"),
         ("gnss.drift.1", "GNSS positions drift"),
+        ("imu.yaw_bias", "imu.yaw_bias"),
+        ("imu.gyroscope.scale", "IMU's messages"),
         ("twist.scale", "topics.twist"),
     ],
 )

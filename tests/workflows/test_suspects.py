@@ -26,15 +26,21 @@ CONFIG = parse_config(
 
 
 def tried(
-    name: str, value: tuple[float, ...], sigma: tuple[float, ...], sigmas: float = 9.0
+    name: str,
+    value: tuple[float, ...],
+    sigma: tuple[float, ...],
+    sigmas: float = 9.0,
+    determined: tuple[bool, ...] = (),
 ) -> Trial | None:
     units = ("m",) * 3 + ("deg",) * 3
-    suspect = Suspect(name, value, sigma, value, units[: len(value)], 0.9, sigmas, sigmas)
+    units = units[: len(value)]
+    suspect = Suspect(name, value, sigma, value, units, 0.9, sigmas, sigmas, determined)
     return trial_of(make_calibration("front", "rear", suspects=(suspect,)), CONFIG)
 
 
 def test_a_lever_arm_takes_what_the_drive_tells_and_stays_uncertain() -> None:
-    trial = tried("gnss.lever_arm", (1.2, 0.31, -3.0), (0.02, 0.02, 2.0))
+    told = (True, True, False)
+    trial = tried("gnss.lever_arm", (1.2, 0.31, 0.9), (0.02, 0.02, 9.0), determined=told)
     assert trial is not None
     assert trial.config.gnss.lever_arm == (1.2, 0.31, 0.9)  # the height is as it was typed
     assert trial.config.gnss.arm_sigma() == 2.0

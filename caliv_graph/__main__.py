@@ -15,6 +15,9 @@ def _leave(*_: object) -> None:
 
 def main() -> None:
     """Entry point of `caliv-graph`."""
+    # Before numpy is: matrices are small, and threads of its library wait for each other, and for
+    # those of `common.cores`, at the full cost of a core. Whoever sets the variable decides.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     # While modules are imported, Python would answer with a traceback.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)

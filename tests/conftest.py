@@ -13,6 +13,7 @@ LONGEST = (
     "tests/cli/test_batch.py",
     "tests/test_raw_sensors.py",
     "tests/targets/search/test_find.py",
+    "tests/calibration/test_several_drives.py",
     "tests/robustness/test_outputs.py",
     "tests/workflows/test_survey.py",
     "tests/cli/test_main.py",
@@ -20,7 +21,9 @@ LONGEST = (
     "tests/robustness/test_spoiled_drives.py",
     "tests/calibration/test_staged.py",
     "tests/report/test_html.py",
-    "tests/calibration/test_several_drives.py",
+    "tests/targets/cloud/test_extract.py",
+    "tests/targets/cloud/test_constellation.py",
+    "tests/calibration/test_motion_suspects.py",
     "tests/simulation/test_recording.py",
     "tests/test_prior.py",
     "tests/test_memory.py",
@@ -33,6 +36,7 @@ LONGEST = (
     "tests/trajectory/test_smooth.py",
     "tests/scripts/test_paper.py",
     "tests/scripts/test_check_reproducible.py",
+    "tests/scripts/test_thinned.py",
 )
 """Files that take more than 10 s, the longest first: what begins last should be short, or one
 process works alone at the end."""

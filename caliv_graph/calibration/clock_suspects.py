@@ -2,7 +2,7 @@
 
 A score is the effect of the first milliseconds. Stamps that are 0.1 s late blur the shape, which
 follows them, and the linear change is half of the truth. Here some of the clouds are registered and
-solved again with their stamps moved by what is known so far (`README.md`, section 18).
+solved again with their stamps moved by what is known so far (`README.md`, section 19).
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from dataclasses import astuple, dataclass
 import gtsam
 import numpy as np
 import scipy.linalg
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.optimize import minimize, minimize_scalar
 
 from caliv_graph.calibration.graph import with_given_poses
@@ -223,19 +224,18 @@ class _RestrictedLikelihood:
     """The restricted likelihood of the noise levels of m clouds, with its prior.
 
     Attributes:
-        residuals: (6m,) of the clouds at the given poses.
-        design: (6m, p) their derivatives with respect to extrinsics, targets and time offsets.
-        known: (6m, 6m) covariance that smoothed poses bring, and the stated white errors.
-        parts: (6m, 6m) each, what the variances multiply: white rotation and position,
-            Gauss-Markov rotation and position, registration.
+        stacked: (6m, p + 1) derivatives of the residuals of the clouds with respect to extrinsics,
+            targets and time offsets, and the residuals at the given poses.
+        known: (36 m^2,) covariance (6m, 6m) that smoothed poses bring, and the stated white errors.
+        parts: (5, 36 m^2) what the variances multiply: white rotation and position, Gauss-Markov
+            rotation and position, registration.
         ridge: (p, p) weak information on what the design multiplies.
         prior: (5,) medians of the prior on the logarithms of the sigmas.
     """
 
-    residuals: Array
-    design: Array
+    stacked: Array
     known: Array
-    parts: tuple[Array, ...]
+    parts: Array
     ridge: Array
     prior: Array
 
@@ -254,29 +254,35 @@ class _RestrictedLikelihood:
         lines = linearise_clouds(problem, values)
         r, A, B = _stacked(problem, lines, measured, values, chosen)
         known, parts = pose_parts(problem, values, chosen, B, first)
+        of_clouds = scipy.linalg.block_diag(*np.linalg.inv(information[chosen]))
         return cls(
-            residuals=r,
-            design=A,
-            known=known,
-            parts=(*parts, scipy.linalg.block_diag(*np.linalg.inv(information[chosen]))),
+            stacked=np.asfortranarray(np.column_stack([A, r])),
+            known=known.ravel(),
+            parts=np.array([part.ravel() for part in (*parts, of_clouds)]),
             ridge=_ridge(problem, A.shape[1]),
             prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
         )
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(6m, 6m)."""
+        return len(self.stacked), len(self.stacked)
+
     def cost(self, logarithms: Array) -> float:
         """Minus the logarithm of likelihood times prior, of the logarithms (5,) of the sigmas."""
         scale = np.exp(2.0 * np.clip(logarithms, np.log(FLOORS), np.log(CEILINGS)))
-        V = self.known + sum(s * p for s, p in zip(scale, self.parts, strict=True))
-        try:
-            L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
-        except scipy.linalg.LinAlgError:
+        # LAPACK itself: this runs hundreds of times, and scipy's checks take as long. V is
+        # symmetric, and its transpose is in LAPACK's order.
+        L, failed = dpotrf((self.known + scale @ self.parts).reshape(self.shape).T, lower=1)
+        if failed:
             return 1e12
-        stacked = np.column_stack([self.design, self.residuals])
-        white = scipy.linalg.solve_triangular(L, stacked, lower=True, check_finite=False)
-        N = white[:, :-1].T @ white[:, :-1] + self.ridge
-        LN = scipy.linalg.cholesky(N, lower=True, check_finite=False)
-        y = scipy.linalg.solve_triangular(LN, white[:, :-1].T @ white[:, -1], lower=True)
-        misfit = white[:, -1] @ white[:, -1] - y @ y
+        white, _ = dtrtrs(L, self.stacked, lower=1)
+        A, r = white[:, :-1], white[:, -1]
+        LN, failed = dpotrf(A.T @ A + self.ridge, lower=1)
+        if failed:
+            return 1e12
+        y, _ = dtrtrs(LN, A.T @ r, lower=1)
+        misfit = r @ r - y @ y
         surprise = np.sum(((logarithms - self.prior) / LOG_SPREAD) ** 2)
         return float(
             np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)

@@ -15,6 +15,18 @@ from scipy.linalg import block_diag
 from caliv_graph.products import Array
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products of (..., 3); numpy's own takes several times as long."""
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
 def tangent_axes(directions: Array) -> Array:
     """Two unit vectors perpendicular to each unit vector and to each other.
 

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.common.cores import parts, share_out
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, sampling_order
 from caliv_graph.registration.heights import HeightNoise, HeightSums
@@ -20,7 +21,6 @@ from caliv_graph.registration.moments import (
     MOMENTS,
     SURFACE_MOMENTS,
     Responsibilities,
-    cross,
     mass_and_means,
     scatter_about,
     to_target,

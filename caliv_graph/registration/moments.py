@@ -143,15 +143,3 @@ def scatter_about(moments: Array, means: Array) -> Array:
     offset[:, :, 0] = -means
     offset[:, :, 1:] = np.eye(3)
     return np.asarray(offset @ full @ np.swapaxes(offset, 1, 2))
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Cross products of (..., 3); numpy's own takes several times as long."""
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from caliv_graph.common.cores import parts, share_out
-from caliv_graph.geometry.se3 import skew, tangent_axes
+from caliv_graph.geometry.se3 import cross, skew, tangent_axes
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.moments import (
@@ -27,7 +27,6 @@ from caliv_graph.registration.moments import (
     ROW,
     SURFACE_MOMENTS,
     Responsibilities,
-    cross,
     mass_and_means,
     scatter_about,
     to_target,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.geometry.se3 import stack, tangent_axes
+from caliv_graph.geometry.se3 import cross, stack, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture, Registration
 
 MOST_VIEWS = 24
@@ -187,7 +187,7 @@ class Shape:
             n = self.normals[to]
             off = np.einsum("ni,ni->n", self.means[to] - points[pair], n)
             # Tilts of the axis and shifts; the angle itself is held.
-            arm = np.cross(points[pair] - centre, n)
+            arm = cross(points[pair] - centre, n)
             J = np.column_stack([arm @ across.T, n])
             weight = (1.0 - np.minimum(distance[pair] / gate_m, 1.0) ** 2) ** 2
             # Undetermined directions stay small.

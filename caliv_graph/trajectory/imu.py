@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, ImuSamples, IntArray
 from caliv_graph.trajectory.noise import ImuNoise
 
@@ -196,7 +197,7 @@ class DeadReckoning:
         w_rate, f_rate = (self.gyro[k + 1] - w0) / dt, (self.force[k + 1] - f0) / dt
         turn = w0 * tau + 0.5 * w_rate * tau**2
         # f(s) = f0 + f_rate s, rotated by w s, to second order in the step.
-        bend = np.cross(w0 + 0.5 * w_rate * tau, f0 + 0.5 * f_rate * tau)
+        bend = cross(w0 + 0.5 * w_rate * tau, f0 + 0.5 * f_rate * tau)
         velocity = f0 * tau + (0.5 * f_rate + 0.5 * bend) * tau**2
         displacement = 0.5 * f0 * tau**2 + (f_rate + bend) * tau**3 / 6.0
         return exp_so3(turn), velocity, displacement

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, BoolArray, ImuSamples, IntArray, TwistSamples
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_so3
@@ -196,7 +197,7 @@ def velocities_at_nodes(
     R_imu_vehicle = T_imu_vehicle.rotation().matrix()
     arm = T_imu_vehicle.translation()
     rates = interpolate(stamps, dead.stamps_ns, dead.gyro)
-    at_imu = twist.velocity[usable] @ R_imu_vehicle.T - np.cross(rates, arm)
+    at_imu = twist.velocity[usable] @ R_imu_vehicle.T - cross(rates, arm)
     sample_s = float(np.median(np.diff(dead.stamps_ns))) * 1e-9
     arm_cross = np.cross(np.eye(3), arm)
     arm_cov = arm_cross.T @ (noise.gyro_density / sample_s) @ arm_cross

@@ -12,7 +12,7 @@ import scipy.sparse
 
 from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.geometry.se3 import stack
+from caliv_graph.geometry.se3 import cross, stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.correlated import CorrelatedError
@@ -230,7 +230,7 @@ class SmoothedTrajectory:
         rates = self._dead.rates(stamps, 50_000_000)
         R_vi = self.T_vehicle_imu.rotation().matrix()
         arm = self.T_vehicle_imu.inverse().translation()
-        at_origin = np.einsum("nji,nj->ni", R, v) + np.cross(rates, arm)
+        at_origin = np.einsum("nji,nj->ni", R, v) + cross(rates, arm)
         return at_origin @ R_vi.T, rates @ R_vi.T
 
     def bias_sigmas(self) -> tuple[Array, Array]:

@@ -7,11 +7,13 @@ import os
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
 
 from caliv_graph import __version__
+from caliv_graph.__main__ import main
 from caliv_graph.cli import streams
 from tests.cli.commands import ROOT, called, run, start, write_config, write_drive
 
@@ -307,3 +309,24 @@ def test_a_message_is_short_whatever_it_quotes(capsys: pytest.CaptureFixture[str
     assert len(said) < 1500
     assert said.startswith("error: /tmp/x: 'lidars.999")
     assert said.endswith("999' is missing. Add it\n")
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(
+    given: str | None, used: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the program is imported, and numpy with it: later it would not count."""
+    seen = []
+    # So that both are put back at the end.
+    monkeypatch.setenv("OMP_NUM_THREADS", "")
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    started = types.ModuleType("caliv_graph.cli.main")
+    started.__dict__["main"] = lambda: seen.append(os.environ["OMP_NUM_THREADS"])
+    monkeypatch.setitem(sys.modules, "caliv_graph.cli.main", started)
+
+    main()
+
+    assert seen == [used]

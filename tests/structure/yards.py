@@ -94,7 +94,7 @@ def draw_patches(
     out: dict[str, list] = {k: [] for k in ("scan", "moments", "normal", "scatter")}
     stamps, scan_lidar = [], []
     scan = 0
-    for number, (name, T) in enumerate(extrinsics.items()):
+    for number, T in enumerate(extrinsics.values()):
         bias = rng.standard_normal() * noise.bias_m
         for i, X in enumerate(T_map_vehicle):
             stamps.append(i * STEP_NS)

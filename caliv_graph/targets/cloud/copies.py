@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, IntArray, Recording
 
 SCANS = 5
@@ -163,7 +164,7 @@ def _decisive(points: Array) -> IntArray:
     """
     rng = np.random.default_rng(0)
     triples = points[rng.integers(0, len(points), (PLANES, 3))]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    normals = cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 0.0] / length[length > 0.0, None]
     offsets = np.sum(normals * triples[length > 0.0, 0], axis=1)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array
 
 TRIALS = 100
@@ -39,7 +40,7 @@ def fit_ground(points: Array, distance: float, max_tilt_rad: float = MAX_TILT_RA
         points = points[rng.choice(len(points), FITTED_POINTS, replace=False)]
     scored = points[rng.permutation(len(points))[:SCORED_POINTS]]
     triples = scored[rng.integers(0, len(scored), (TRIALS, 3))]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    normals = cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)
     usable = length > 1e-9
     normals = normals[usable] / length[usable, None]

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -177,7 +176,11 @@ def _beam_spacing(azimuth: Array, elevation: Array) -> Array:
     key = _direction_bin(elevation) * n + _direction_bin(azimuth)
     count = np.bincount(key, minlength=n * n).reshape(n, n).astype(np.float64)
     solid = np.cos((np.arange(n) + 0.5) * BIN_RAD - math.pi)[:, None]
-    density = maximum_filter(count / np.maximum(np.abs(solid), 0.1), size=3, mode="wrap")
+    density = count / np.maximum(np.abs(solid), 0.1)
+    # The largest of the nine about each bin; scipy.ndimage takes a fifth of a second to import.
+    for axis in (0, 1):
+        beside = np.roll(density, 1, axis), np.roll(density, -1, axis)
+        density = np.maximum(density, np.maximum(*beside))
     return np.asarray(BIN_RAD / np.sqrt(np.maximum(density, 0.25)))
 
 

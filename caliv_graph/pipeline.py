@@ -104,23 +104,11 @@ def prepare(
     check_clouds(recordings, config)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
-    findings = raw
-    rough: Sequence[VehicleTrajectory] = ()
-    no_target: TargetError | None = None
-    misplaced: tuple[str, ...] = ()
-    observations: tuple[TargetObservation, ...] = ()
-    try:
-        with progress.stage("smoothing the trajectory", None):
-            rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
-        findings += smoothed_findings(recordings, rough, motions, config, progress)
-        config, misplaced, observations = _targets(recordings, rough, config, progress)
-    except (TrajectoryError, TargetError) as error:
-        caused = _with_cause(error, rough, motions, config, (findings, raw))
-        if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
-            raise caused from error
-        no_target = caused
+    rough, findings, search = _searched(recordings, config, motions, raw, progress)
+    config, misplaced, observations, no_target = search
     patches = _patches(recordings, rough, config, progress)
-    if no_target is not None and not kept_stamps(patches):
+    kept = kept_stamps(patches)
+    if no_target is not None and not kept:
         raise no_target
     grounds, ground_warnings = measure_grounds(
         recordings,
@@ -129,7 +117,7 @@ def prepare(
         config,
         progress,
         others={patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)},
-        kept_ns=None if observations else kept_stamps(patches),
+        kept_ns=None if observations else kept,
     )
     with progress.stage("smoothing the trajectory at the target's scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
@@ -151,6 +139,39 @@ def prepare(
         patches,
         no_target,
     )
+
+
+Search = tuple[Config, tuple[str, ...], tuple[TargetObservation, ...], TargetError | None]
+"""The config with the guesses that the search had to replace; how they contradict what the LiDARs
+see, a sentence each; the targets' clouds; why there are none, if structure may replace them."""
+
+
+def _searched(
+    recordings: Sequence[Recording],
+    config: Config,
+    motions: Mapping[int, MotionData],
+    raw: tuple[Finding, ...],
+    progress: Progress,
+) -> tuple[Sequence[VehicleTrajectory], tuple[Finding, ...], Search]:
+    """The rough trajectories, all findings (`raw` first), and what the search for targets found.
+
+    Raises:
+        TrajectoryError: the motion data are unusable.
+        TargetError: no target was found, and the config does without structure or gives a region.
+    """
+    rough: Sequence[VehicleTrajectory] = ()
+    findings = raw
+    try:
+        with progress.stage("smoothing the trajectory", None):
+            rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
+        findings += smoothed_findings(recordings, rough, motions, config, progress)
+        found = _targets(recordings, rough, config, progress)
+    except (TrajectoryError, TargetError) as error:
+        caused = _with_cause(error, rough, motions, config, (findings, raw))
+        if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
+            raise caused from error
+        return rough, findings, (config, (), (), caused)
+    return rough, findings, (*found, None)
 
 
 def _uses(config: Config) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -91,7 +92,7 @@ def draw_patches(
 ) -> DrivePatches:
     """Patches of walls as seen from true poses, all LiDARs at all stamps."""
     cells = [rng.standard_normal((40, 10)) * noise.bump_m for _ in walls]
-    out: dict[str, list] = {k: [] for k in ("scan", "moments", "normal", "scatter")}
+    out: dict[str, list[Any]] = {k: [] for k in ("scan", "moments", "normal", "scatter")}
     stamps, scan_lidar = [], []
     scan = 0
     for number, T in enumerate(extrinsics.values()):

@@ -32,7 +32,7 @@ def tried(
     sigmas: float = 9.0,
     determined: tuple[bool, ...] = (),
 ) -> Trial | None:
-    units = ("m",) * 3 + ("deg",) * 3
+    units: tuple[str, ...] = ("m",) * 3 + ("deg",) * 3
     units = units[: len(value)]
     suspect = Suspect(name, value, sigma, value, units, 0.9, sigmas, sigmas, determined)
     return trial_of(make_calibration("front", "rear", suspects=(suspect,)), CONFIG)

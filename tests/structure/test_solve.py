@@ -1,0 +1,163 @@
+"""The solve of structure with known truth, and what it determines."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.products import Array, StructureTerm
+from caliv_graph.structure.noise import range_sigmas
+from caliv_graph.structure.solve import Problem, Solved, solve_structure
+from caliv_graph.structure.standing import Standing
+from caliv_graph.structure.term import term_of
+from tests.structure.yards import (
+    STEP_NS,
+    TRUE,
+    Noise,
+    Wall,
+    draw_patches,
+    draw_prior,
+    figure_eight,
+    poses,
+    yard,
+)
+
+NO_GROUND = Standing(None, 0.005, None, 0.005, 1e-3)
+NOISE = Noise()
+GUESS_SIGMAS = np.array([0.03] * 3 + [0.06] * 3)
+
+
+def problem_of(
+    walls: list[Wall], path: tuple[Array, Array], seed: int, noise: Noise = NOISE
+) -> Problem:
+    rng = np.random.default_rng(seed)
+    true_poses = poses(*path)
+    patches = draw_patches(walls, true_poses, rng, noise, patch_m=1.0)
+    off = [rng.uniform(-0.005, 0.005, 6) for _ in TRUE]
+    return Problem(
+        patches=patches,
+        prior=draw_prior(true_poses, rng),
+        pose_of_scan=patches.stamps_ns // STEP_NS,
+        relative=np.tile(np.eye(4), (len(patches.scan), 1, 1)),
+        twists=None,
+        offsets=(),
+        guesses=tuple(T.retract(d) for T, d in zip(TRUE.values(), off, strict=True)),
+        guess_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
+        range_sigma_m=0.01,
+        standing=NO_GROUND,
+    )
+
+
+def solve(problem: Problem) -> Solved:
+    found = solve_structure(problem, dict(zip(TRUE, problem.guesses, strict=True)))
+    assert found is not None
+    return found
+
+
+def information_of(term: StructureTerm, motion: Array) -> Array:
+    """(12, 12) of the extrinsics, vehicle axes, poses eliminated under the motion data."""
+    n = len(motion)
+    H = term.information.copy()
+    H[:n, :n] += motion
+    D = H[n:, n:] - H[n:, :n] @ np.linalg.solve(H[:n, :n], H[:n, n:])
+    inverse = np.linalg.inv(joint_right_to_vehicle_axes(term.T_vehicle_lidar.values()))
+    return np.asarray(inverse.T @ D @ inverse)
+
+
+def between(e: Array) -> Array:
+    """(6,) error of S2S, vehicle axes, from the errors (12,) of front and rear."""
+    d = TRUE["front"].translation() - TRUE["rear"].translation()
+    turn, shift = e[:3] - e[6:9], e[3:6] - e[9:]
+    return np.concatenate([turn, shift - np.cross(e[6:9], d)])
+
+
+@pytest.fixture(scope="module")
+def solved() -> Solved:
+    return solve(problem_of(yard(), figure_eight(24), 1))
+
+
+def test_a_yard_determines_all_but_the_height(solved: Solved) -> None:
+    error = np.concatenate(
+        [
+            vehicle_axes_difference(T, TRUE[name])
+            for T, name in zip(solved.state.T_vehicle_lidar, TRUE, strict=True)
+        ]
+    )
+    motion = solved.problem.prior.information
+    term = term_of(solved, np.arange(24))
+    cov = np.linalg.inv(information_of(term, motion) + np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)))
+    axes = np.array([between(column) for column in np.eye(12)]).T
+    cov_between = axes @ cov @ axes.T
+    found = between(error)
+    some = [0, 1, 2, 3, 4]
+    nees = found[some] @ np.linalg.solve(cov_between[np.ix_(some, some)], found[some])
+    assert nees < 20.5  # 5 degrees of freedom, one of 1000
+    sigma = np.sqrt(np.diag(cov_between))
+    assert sigma[:3].max() < 1e-3
+    assert sigma[3:5].max() < 2e-3
+    assert sigma[5] > 0.01  # walls alone do not tell the height
+
+
+def test_the_noise_of_sightings_is_estimated(solved: Solved) -> None:
+    sigma = np.median(solved.nuisances.sighting)
+    assert 0.5 * NOISE.sighting_m < sigma < 1.5 * NOISE.sighting_m
+    assert range_sigmas(solved.problem.patches, 0.03) == pytest.approx([0.01, 0.01], rel=0.15)
+
+
+def test_the_term_is_the_marginal_on_fewer_poses_too(solved: Solved) -> None:
+    """Extrinsics know the same whichever poses are kept."""
+    prior = solved.problem.prior
+    cov = np.linalg.inv(prior.information)
+    all_of = information_of(term_of(solved, np.arange(24)), prior.information)
+    few = np.array([2, 9, 20])
+    own = (6 * few[:, None] + np.arange(6)).ravel()
+    fewer = information_of(term_of(solved, few), np.linalg.inv(cov[np.ix_(own, own)]))
+    scale = np.sqrt(np.diag(all_of))
+    assert fewer / np.outer(scale, scale) == pytest.approx(
+        all_of / np.outer(scale, scale), abs=1e-5
+    )
+
+
+def test_a_term_says_nothing_against_itself(solved: Solved) -> None:
+    information = term_of(solved, np.arange(0, 24, 3)).information
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-12))
+    assert np.linalg.eigvalsh(information / np.outer(scale, scale)).min() > -1e-6
+
+
+def test_another_map_gives_the_same_extrinsics() -> None:
+    problem = problem_of(yard(), figure_eight(16), 2)
+    first = solve(problem)
+    turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([100.0, -40.0, 7.0]))
+    prior = replace(
+        problem.prior,
+        T_map_vehicle=tuple(turn.compose(T) for T in problem.prior.T_map_vehicle),
+    )
+    second = solve(replace(problem, prior=prior))
+    for a, b in zip(first.state.T_vehicle_lidar, second.state.T_vehicle_lidar, strict=True):
+        # Cells of the map fall elsewhere, so that the strips are others.
+        assert np.abs(vehicle_axes_difference(a, b))[[0, 1, 2, 3, 4]].max() < 2e-3
+
+
+def _straight(m: int) -> tuple[Array, Array]:
+    return np.stack([np.linspace(-12.0, 12.0, m), np.zeros(m), np.zeros(m)], axis=1), np.zeros(m)
+
+
+PARALLEL = [Wall((0.0, 7.0), -np.pi / 2, 30.0), Wall((0.0, -7.0), np.pi / 2, 30.0)]
+
+
+def test_between_parallel_walls_what_lies_along_them_is_unknown() -> None:
+    """Straight ahead between two fronts: no wall says where along the street a LiDAR is."""
+    found = solve(problem_of(PARALLEL, _straight(24), 3))
+    D = information_of(term_of(found, np.arange(24)), found.problem.prior.information)
+    along, across = np.zeros(12), np.zeros(12)
+    along[3], across[4] = 1.0, 1.0  # x and y of the front LiDAR alone
+    assert along @ D @ along < GUESS_SIGMAS[3] ** -2.0
+    assert across @ D @ across > 0.005**-2.0
+
+
+def test_nothing_to_see_is_said() -> None:
+    problem = problem_of(PARALLEL, _straight(24), 3)
+    few = problem.patches.part(np.arange(len(problem.patches.scan)) < 5)
+    assert solve_structure(replace(problem, patches=few), dict(TRUE)) is None

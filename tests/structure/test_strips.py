@@ -1,0 +1,76 @@
+"""Strips: what is taken for one piece of surface."""
+
+import numpy as np
+
+from caliv_graph.structure.strips import MIN_SCANS, find_strips
+
+EIGHT = np.arange(8, dtype=np.int64)
+
+
+def patch(centre: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Moments of 40 points on 0.5 m of a plane."""
+    p = rng.uniform(-0.25, 0.25, (40, 3))
+    p -= np.outer(p @ normal, normal)
+    h = np.column_stack([p + centre, np.ones(40)])
+    return h.T @ h
+
+
+def patches(
+    centres: np.ndarray, normals: np.ndarray, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    both = zip(centres, normals, strict=True)
+    return np.array([patch(c, n, rng) for c, n in both]), np.asarray(normals)
+
+
+def test_two_faces_of_a_thin_wall_are_two_strips() -> None:
+    along = np.linspace(0.3, 1.7, 8)
+    front = np.column_stack([np.full(8, 1.0), along, np.full(8, 1.0)])
+    back = front + np.array([0.1, 0.0, 0.0])
+    normals = np.array([[-1.0, 0.0, 0.0]] * 8 + [[1.0, 0.0, 0.0]] * 8)
+    strips = find_strips(*patches(np.vstack([front, back]), normals), np.tile(EIGHT, 2), 0.3)
+    assert strips.count == 2
+    assert set(strips.of_patch[:8]) & set(strips.of_patch[8:]) == set()
+
+
+def test_a_corner_is_two_strips_and_two_surfaces() -> None:
+    along = np.linspace(0.3, 1.7, 8)
+    one = np.column_stack([np.full(8, 0.2), along, np.full(8, 1.0)])
+    other = np.column_stack([along, np.full(8, 0.2), np.full(8, 1.0)])
+    normals = np.array([[1.0, 0.0, 0.0]] * 8 + [[0.0, 1.0, 0.0]] * 8)
+    strips = find_strips(*patches(np.vstack([one, other]), normals), np.tile(EIGHT, 2), 0.1)
+    assert strips.count == 2
+    assert len(set(strips.surface)) == 2
+
+
+def test_a_long_wall_is_one_surface_of_several_strips() -> None:
+    along = np.repeat(np.arange(0.5, 9.5, 1.0), 8)
+    centres = np.column_stack([np.full(72, 1.0), along, np.full(72, 1.0)])
+    normals = np.tile([1.0, 0.0, 0.0], (72, 1))
+    strips = find_strips(*patches(centres, normals), np.tile(EIGHT, 9), 0.1)
+    assert strips.count == 5  # 9 m in cells of 2 m
+    assert len(set(strips.surface)) == 1
+
+
+def test_what_few_scans_see_is_no_strip() -> None:
+    centres = np.column_stack([np.full(8, 1.0), np.linspace(0.3, 1.7, 8), np.full(8, 1.0)])
+    normals = np.tile([1.0, 0.0, 0.0], (8, 1))
+    few = np.minimum(EIGHT, MIN_SCANS - 2)
+    assert find_strips(*patches(centres, normals), few, 0.1).count == 0
+    assert find_strips(*patches(centres, normals), EIGHT, 0.1).count == 1
+
+
+def test_ground_is_a_surface_for_each_tile() -> None:
+    x, y = (g.ravel() for g in np.meshgrid(np.arange(1.0, 12.0, 2.0), np.arange(1.0, 6.0, 2.0)))
+    centres = np.repeat(np.column_stack([x, y, np.full(len(x), 0.5)]), 8, axis=0)
+    normals = np.tile([0.0, 0.0, 1.0], (len(centres), 1))
+    strips = find_strips(*patches(centres, normals), np.tile(EIGHT, len(x)), 0.1)
+    assert strips.count == 18
+    assert len(set(strips.surface)) == 2  # 12 m by 6 m
+    tile = np.floor(strips.centres_map[:, 0] / 6.0)
+    assert all(len(set(strips.surface[tile == k])) == 1 for k in (0, 1))
+
+
+def test_nothing_gives_nothing() -> None:
+    none = find_strips(np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0, np.int64), 0.1)
+    assert none.count == 0

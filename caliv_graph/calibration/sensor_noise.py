@@ -142,6 +142,11 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
     return replace(fitted, levels=_levels(fitted, noise, names))
 
 
+def heave_of(levels: Sequence[NoiseLevel]) -> float:
+    """1 sigma of the heave (m) among the figures of a result; the usual one if it is not there."""
+    return next((level.sigma for level in levels if level.name == "heave"), HEAVE_SIGMA_M)
+
+
 def with_noise(
     noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
 ) -> list[VehicleTrajectory]:

@@ -18,8 +18,8 @@ import scipy.linalg
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
-from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.score_tests import CloudParts
+from caliv_graph.calibration.sensor_noise import heave_of
 from caliv_graph.conventions import key_ground
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import skew, vehicle_axes_difference
@@ -105,8 +105,7 @@ def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _M
     ]
     gradient[given] = graph.sound_pose_gradient[:size][given]
     poses = list(solution.T_map_vehicle.values())
-    levels = {level.name: level.sigma for level in solution.sensor_noise}
-    heave_m = levels.get("heave", HEAVE_SIGMA_M)
+    heave_m = heave_of(solution.sensor_noise)
     for drive, part in parts.items():
         at = np.repeat(drives == drive, 6)
         W = poses_with_heave(part.information, heave_m)

@@ -12,7 +12,7 @@ def patch(centre: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> n
     p = rng.uniform(-0.25, 0.25, (40, 3))
     p -= np.outer(p @ normal, normal)
     h = np.column_stack([p + centre, np.ones(40)])
-    return h.T @ h
+    return np.asarray(h.T @ h)
 
 
 def patches(

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import nnls
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.sightings import BEAM_RAD, ROUGHNESS_M, Sightings
+from caliv_graph.structure.sightings import BEAM_RAD, Sightings
 from caliv_graph.structure.system import Geometry, Layout, Nuisances
 
 FIRST_SIGHTING_M = 0.01
@@ -19,6 +20,9 @@ rough extrinsics are still in it."""
 
 LEAST_M = 2e-4
 """Smallest sigma of an offset: what no LiDAR resolves."""
+
+INCIDENCES = 8
+"""Classes of incidence in which the scatter of patches is compared."""
 
 LEAST_RANGE_M = 1e-3
 """Smallest noise along the beam: no LiDAR for vehicles has less."""
@@ -40,20 +44,28 @@ MOST_FITTED = 0.9
 def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     """(L,) noise along the beam of each LiDAR, from the scatter of patches about their planes.
 
-    The median: patches of leaves scatter more. What is stated where there are too few patches.
+    The variance of a patch is `sigma_r^2 cos^2 + roughness^2` and the noise across the beam: noise
+    and roughness are told apart by the incidence. Medians, as patches of leaves scatter more. What
+    is stated where there are too few patches.
     """
     centres = patches.centres_lidar
     distance = np.linalg.norm(centres, axis=1)
     cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar)) / distance
-    points = np.maximum(patches.points, 4.0)
-    variance = patches.scatter_m**2 * points / (points - 3.0)
-    variance = variance - ROUGHNESS_M**2 - (BEAM_RAD * distance) ** 2 * (1.0 - cos**2)
+    free = np.maximum(patches.points - 3.0, 1.0)
+    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
+    mean = patches.scatter_m**2 * patches.points / free / (1.0 - 2.0 / (9.0 * free)) ** 3
+    variance = mean - (BEAM_RAD * distance) ** 2 * (1.0 - cos**2)
     out = np.full(len(patches.lidars), stated_m)
     for i in range(len(out)):
-        own = (patches.scan_lidar[patches.scan] == i) & (points >= 8.0) & (cos > 0.5)
-        if own.sum() >= 50:
-            found = float(np.median(variance[own] / cos[own] ** 2))
-            out[i] = math.sqrt(max(found, LEAST_RANGE_M**2))
+        own = (patches.scan_lidar[patches.scan] == i) & (patches.points >= 8.0)
+        if own.sum() >= 20 * INCIDENCES:
+            edges = np.quantile(cos[own], np.linspace(0.0, 1.0, INCIDENCES + 1))
+            bins = np.clip(np.searchsorted(edges, cos[own], "right") - 1, 0, INCIDENCES - 1)
+            of = [bins == k for k in range(INCIDENCES) if (bins == k).any()]
+            y = np.array([np.median(variance[own][k]) for k in of])
+            x = np.array([np.median(cos[own][k]) for k in of])
+            found, _ = nnls(np.column_stack([x**2, np.ones(len(x))]), np.maximum(y, 0.0))
+            out[i] = math.sqrt(max(float(found[0]), LEAST_RANGE_M**2))
     return out
 
 

@@ -65,9 +65,10 @@ MAX_BEND_M = 0.005
 """Greatest root mean square of bend and steps (second and third order) beyond what noise makes: a
 corner or a reveal of 3 cm within the patch makes more."""
 
-MIN_INCIDENCE_COS = math.cos(math.radians(75.0))
-"""Smallest cosine between beam and normal: the footprint of a flatter beam is long, and its range
-biased."""
+MIN_INCIDENCE_COS = math.cos(math.radians(80.0))
+"""Patches under a larger incidence are dropped. The normal of a patch is known to some 20 mrad:
+patches that are chosen by it lean towards the LiDAR where the limit is, by 10 mrad. So what is used
+is chosen by the normals of strips (`sightings.MIN_COS`)."""
 
 MAX_POINTS = 50_000
 """Points of a scan that are used; of denser clouds an even part. Patches of 0.5 m keep enough."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,10 @@ BEAM_RAD = 3e-4
 TILT_LENGTH_M = 1.0
 """Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
 fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
+
+
+MIN_COS = math.cos(math.radians(75.0))
+"""Smallest cosine of the incidence: beyond, footprints are metres long."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,9 @@ def sightings_of(
         range_sigma_m: (L,) noise along the beam of each LiDAR.
     """
     own = np.flatnonzero(strips.of_patch >= 0)
+    places = moments_at_stamp[own, :3, 3]
+    seen = np.abs(np.einsum("ni,ni->n", places, normals_at_stamp[own]))
+    own = own[seen > MIN_COS * np.linalg.norm(places, axis=1)]
     key = patches.scan[own] * max(strips.count, 1) + strips.of_patch[own]
     order = np.argsort(key, kind="stable")
     own, key = own[order], key[order]

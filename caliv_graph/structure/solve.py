@@ -8,6 +8,7 @@ from functools import partial
 
 import gtsam
 import numpy as np
+from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, IntArray
@@ -36,6 +37,7 @@ from caliv_graph.structure.system import (
     system_of,
     whitened,
 )
+from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 GATES_M = (0.3, 0.15, 0.08, 0.06, 0.06)
@@ -47,6 +49,11 @@ LAST_STEPS = 5
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
+
+SAME_VIEW_M = 0.02
+SAME_VIEW_RAD = 1e-3
+"""Scans from this near see the same: beams 20 mm apart fall on the same joints, and at 20 m a
+milliradian is as much."""
 
 BIAS_M = 0.005
 SURFACE_BIAS_M = 0.003
@@ -71,6 +78,7 @@ class Problem:
         guess_information: (6 n, 6 n) of them, vehicle axes.
         range_sigma_m: noise along the beam as stated.
         standing: what is known of how the vehicle stands on the ground.
+        repeated: (S,) how many scans of its LiDAR are from the place of each, itself included.
     """
 
     patches: DrivePatches
@@ -83,6 +91,7 @@ class Problem:
     guess_information: Array
     range_sigma_m: float
     standing: Standing
+    repeated: Array
 
 
 @dataclass(frozen=True)
@@ -119,6 +128,20 @@ def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Ar
     out[:, 3, 3] = 1.0
     still = patches.time_s == 0.0
     out[still] = np.eye(4)
+    return out
+
+
+def repeated_views(patches: DrivePatches, pose_of_scan: IntArray, prior: PosePrior) -> Array:
+    """(S,) how many scans of its LiDAR are from the place of each: their beams fall alike."""
+    R, t = stack(prior.T_map_vehicle)
+    turns = SAME_VIEW_M / SAME_VIEW_RAD * log_so3(np.swapaxes(R[:1], 1, 2) @ R)
+    places = np.concatenate([t, turns], axis=1)[pose_of_scan]
+    out = np.ones(len(places))
+    for lidar in range(len(patches.lidars)):
+        own = np.flatnonzero(patches.scan_lidar == lidar)
+        if len(own):
+            near = cKDTree(places[own]).query_ball_point(places[own], SAME_VIEW_M)
+            out[own] = [len(k) for k in near]
     return out
 
 
@@ -258,7 +281,8 @@ def _whitened(
     layout: Layout,
 ) -> tuple[Rows, System]:
     group = groups_of(sightings, strips)
-    rows = whitened(geometry, sightings, group, nuisances, weights, layout.size)
+    repeated = problem.repeated[sightings.scan]
+    rows = whitened(geometry, sightings, group, repeated, nuisances, weights, layout.size)
     stands = stands_of(state.t_map_vehicle, strips.centres_map, strips.normals_map)
     system = system_of(rows, state, layout, problem.prior, nuisances, problem.standing, stands)
     return rows, system

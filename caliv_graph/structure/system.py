@@ -21,6 +21,10 @@ PLACE_PRIOR_M = 10.0
 """Prior of a plane: a single ring of beams does not determine its tilt."""
 
 
+REPEATED_M = 0.003
+"""Least sigma of the own error of sightings from one place. Scans of a vehicle that stands repeat
+it: how much it is does not show in their differences."""
+
 MOST_NOISE = 0.5
 """Largest part of a strip's information on its tilt that may be noise of the points."""
 
@@ -240,15 +244,19 @@ def whitened(
     geometry: Geometry,
     sightings: Sightings,
     group: IntArray,
+    repeated: Array,
     nuisances: Nuisances,
     weights: Array,
     size: int,
 ) -> Rows:
     """Residuals by the noise of points and sightings, the latter eliminated.
 
-    `group` (Q,) numbers scan and surface of each, `weights` (Q,) are robust, `size` is D.
+    `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
+    view, whose errors are the same: their mean has the error of one. `weights` (Q,) are robust,
+    `size` is D.
     """
-    sigma_m = nuisances.sighting[sightings.strip]
+    own = np.where(repeated > 1.5, np.maximum(nuisances.sighting[sightings.strip], REPEATED_M), 0.0)
+    sigma_m = np.maximum(own, nuisances.sighting[sightings.strip]) * np.sqrt(repeated)
     S, noise = without_own_error(sightings, geometry.normals_lidar, sigma_m)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)
@@ -259,16 +267,17 @@ def whitened(
     column = np.broadcast_to(geometry.columns[:, None, :], data.shape)
     J = scipy.sparse.csr_array((data.ravel(), (row.ravel(), column.ravel())), shape=(4 * q, size))
     groups, number = np.unique(group, return_inverse=True)
-    by_offset = nuisances.shared * C[:, 3]
-    own = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
+    by_offset = (nuisances.shared * np.sqrt(repeated))[:, None] * C[:, 3]
+    own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
     shared = scipy.sparse.csr_array(
-        (by_offset.ravel(), (np.arange(4 * q), own.ravel())), shape=(4 * q, len(groups))
+        (by_offset.ravel(), (np.arange(4 * q), own_group.ravel())), shape=(4 * q, len(groups))
     )
     noise *= _bearable(geometry, S, noise, sightings.strip)[:, None, None]
     of_plane = np.einsum("qij,qj->qi", noise, geometry.plain)
     pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
     of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
-    of_groups = np.bincount(number.ravel(), nuisances.shared * of_plane[:, 3], len(groups))
+    of_offset = nuisances.shared * np.sqrt(repeated) * of_plane[:, 3]
+    of_groups = np.bincount(number.ravel(), of_offset, len(groups))
     r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
     return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups))
 

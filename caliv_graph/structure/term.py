@@ -16,7 +16,13 @@ from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.read import level
-from caliv_graph.structure.solve import Problem, Solved, relative_motions, solve_structure
+from caliv_graph.structure.solve import (
+    Problem,
+    Solved,
+    relative_motions,
+    repeated_views,
+    solve_structure,
+)
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
@@ -89,11 +95,12 @@ def problem_of(
     """What the solve of one drive is given."""
     offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)
     stamps = prior.stamps_ns.tolist()
+    pose_of_scan = np.searchsorted(prior.stamps_ns, patches.stamps_ns)
     lidars = [config.lidars[name] for name in patches.lidars]
     return Problem(
         patches=patches,
         prior=prior,
-        pose_of_scan=np.searchsorted(prior.stamps_ns, patches.stamps_ns),
+        pose_of_scan=pose_of_scan,
         relative=relative_motions(patches, trajectory),
         twists=twists_at(trajectory, stamps) if offsets else None,
         offsets=offsets,
@@ -103,6 +110,7 @@ def problem_of(
         ),
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
+        repeated=repeated_views(patches, pose_of_scan, prior),
     )
 
 

@@ -47,6 +47,7 @@ def problem_of(
         guess_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
         range_sigma_m=0.01,
         standing=NO_GROUND,
+        repeated=np.ones(len(patches.stamps_ns)),
     )
 
 

@@ -14,6 +14,7 @@ from caliv_graph.structure.elimination import Surfaces, eliminated
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.sightings import Sightings, without_own_error
 from caliv_graph.structure.standing import Standing, Stands, standing_rows
+from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.imu import exp_so3
 
 TILT_PRIOR_RAD = 0.5
@@ -345,9 +346,10 @@ def geometry_of(
     plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre)
     plain += np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
 
+    smooth = np.einsum("qji,qj->qi", R, smooth_normals(state.normals_map, layout)[strip])
     by_extrinsic = np.zeros((q, 6, 4))
-    by_extrinsic[:, :3, :3] = -skew(m)
-    by_extrinsic[:, 3:, 3] = m
+    by_extrinsic[:, :3, :3] = -skew(smooth)
+    by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
     B = tangent_axes(normal)
@@ -370,6 +372,19 @@ def geometry_of(
         parts.append(by_offset)
         columns.append(np.maximum(place[lidar], 0)[:, None])
     return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def smooth_normals(normals_map: Array, layout: Layout) -> Array:
+    """(K, 3) normals by which a motion of a LiDAR changes the distances from the strips.
+
+    Of level strips that of their tile: dents of the ground are no flat pieces, and which of them a
+    beam meets depends on where it falls. They tell height and tilt, a ramp tells more.
+    """
+    surface = np.array(layout.surface_of, dtype=np.int64)
+    level = normals_map[:, 2] > LEVEL
+    total = np.stack([np.bincount(surface, n, layout.surfaces) for n in normals_map.T], axis=1)
+    mean = total / np.linalg.norm(total, axis=1)[:, None]
+    return np.where(level[:, None], mean[surface], normals_map)
 
 
 def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:

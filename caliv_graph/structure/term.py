@@ -19,6 +19,11 @@ from caliv_graph.structure.read import level
 from caliv_graph.structure.solve import Problem, Solved, relative_motions, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
+from caliv_graph.structure.thickness import (
+    by_strip,
+    thickness_at_estimate,
+    thickness_at_guesses,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 HELD_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
@@ -201,9 +206,8 @@ def strips_of(found: Solved) -> tuple[Strip, ...]:
     lidar = patches.scan_lidar[sightings.scan]
     weight = found.weights * sightings.moments[:, 3, 3]
     out = []
-    order = np.argsort(sightings.strip, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(sightings.strip, minlength=strips.count))[:-1])
-    for k, own in enumerate(parts):
+    before_m, after_m = thickness_at_guesses(found), thickness_at_estimate(found)
+    for k, own in enumerate(by_strip(sightings, strips.count)):
         scans, residuals = {}, {}
         for i, name in enumerate(patches.lidars):
             of_lidar = own[lidar[own] == i]
@@ -219,8 +223,8 @@ def strips_of(found: Solved) -> tuple[Strip, ...]:
                 normal_map=found.state.normals_map[k],
                 scans=scans,
                 residuals_m=residuals,
-                scatter_m=float(found.nuisances.sighting[k]),
-                before_m=float("nan"),
+                scatter_m=float(after_m[k]),
+                before_m=float(before_m[k]),
                 weight=float(found.weights[own].mean()) if len(own) else 0.0,
             )
         )

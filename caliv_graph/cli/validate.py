@@ -104,5 +104,5 @@ def validate(
         streams.warn(found.verdict.sentences)
         raise typer.Exit(UNMET)
     if found.verdict.contradicts:
-        streams.warn([f"{calibration}: {found.verdict.sentences[1]}"])
+        streams.warn([f"{calibration}: {found.verdict.reason}"])
         raise typer.Exit(INCONSISTENT)

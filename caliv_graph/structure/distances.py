@@ -42,7 +42,7 @@ from caliv_graph.structure.system import (
     stepped,
     whitened,
 )
-from caliv_graph.structure.thickness import by_strip, thickness_m
+from caliv_graph.structure.thickness import thickness_m
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -112,9 +112,7 @@ class OtherStrips:
 def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     """The strips of the patches of `problem` at the estimate of `used`; None if there are none."""
     placed = placed_patches(problem, used.state)
-    strips = find_strips(
-        placed.moments_map, placed.normals_map, problem.patches.scan, GATES_M[-1]
-    )
+    strips = find_strips(placed.moments_map, placed.normals_map, problem.patches.scan, GATES_M[-1])
     if not strips.count:
         return None
     sigma = range_sigmas(problem.patches, problem.range_sigma_m)
@@ -129,9 +127,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     count = np.bincount(sightings.strip, minlength=strips.count)
     total = np.bincount(sightings.strip, spread, strips.count)
     least = 0.5 * usual
-    sighting = np.sqrt(
-        np.maximum((OWN_STRIP * usual**2 + total) / (OWN_STRIP + count), least**2)
-    )
+    sighting = np.sqrt(np.maximum((OWN_STRIP * usual**2 + total) / (OWN_STRIP + count), least**2))
     nuisances = replace(used.nuisances, sighting=sighting)
     weights = robust_weights(own, sightings, nuisances)
     scans = np.zeros((strips.count, layout.lidars), dtype=np.int64)

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -132,20 +132,8 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     Raises:
         SolveError: the system is singular.
     """
-    patches, prior = problem.patches, problem.prior
-    R, t = stack(prior.T_map_vehicle)
-    n = len(patches.lidars)
-    state = State(
-        R_map_vehicle=R,
-        t_map_vehicle=t,
-        moved=np.zeros(len(prior.gradient)),
-        T_vehicle_lidar=tuple(start[name] for name in patches.lidars),
-        offsets_s=np.zeros(n),
-        centres_map=np.zeros((0, 3)),
-        normals_map=np.zeros((0, 3)),
-        errors=np.zeros(0),
-    )
-    range_sigma = range_sigmas(patches, problem.range_sigma_m)
+    state = first_state(problem, start)
+    range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     found: Solved | None = None
     sigma_m = strip_m = shared_m = FIRST_SIGHTING_M
     for gate in GATES_M:
@@ -157,6 +145,27 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         strip_m, shared_m = found.nuisances.strip, found.nuisances.shared
         state = found.state
     return None if found is None else _settled(found, steps=LAST_STEPS)
+
+
+def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
+    """The poses of the motion data, some T_vehicle_lidar, and no strips yet."""
+    names = problem.patches.lidars
+    R, t = stack(problem.prior.T_map_vehicle)
+    return State(
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        moved=np.zeros(len(problem.prior.gradient)),
+        T_vehicle_lidar=tuple(start[name] for name in names),
+        offsets_s=np.zeros(len(names)),
+        centres_map=np.zeros((0, 3)),
+        normals_map=np.zeros((0, 3)),
+        errors=np.zeros(0),
+    )
+
+
+def part_of(problem: Problem, keep: BoolArray) -> Problem:
+    """The same drive with some of its patches (N,)."""
+    return replace(problem, patches=problem.patches.part(keep), relative=problem.relative[keep])
 
 
 def _round(
@@ -275,9 +284,7 @@ def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
     return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
 
 
-def geometry_at(
-    problem: Problem, state: State, sightings: Sightings, layout: Layout
-) -> Geometry:
+def geometry_at(problem: Problem, state: State, sightings: Sightings, layout: Layout) -> Geometry:
     """Residuals of the sightings at an estimate."""
     scan = sightings.scan
     return geometry_of(

@@ -56,14 +56,10 @@ def structure_terms(
     Raises:
         SolveError: a system is singular.
     """
-    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
-    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
-    aligned = align_patches(patches, trajectories, start, held).T_vehicle_lidar
+    aligned = aligned_start(patches, trajectories, start, config)
     out = []
     for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
-        used = own
-        if not config.ground.use:
-            used = own.part(~level(own, trajectory, aligned))
+        used = usable(own, trajectory, aligned, config)
         if not len(used.scan):
             continue
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
@@ -71,6 +67,30 @@ def structure_terms(
         if found is not None:
             out.append(term_of(found, np.searchsorted(prior.stamps_ns, kept)))
     return tuple(out)
+
+
+def aligned_start(
+    patches: Sequence[DrivePatches],
+    trajectories: Sequence[VehicleTrajectory],
+    start: Mapping[str, gtsam.Pose3],
+    config: Config,
+) -> Mapping[str, gtsam.Pose3]:
+    """T_vehicle_lidar at which the strips are found first, from rough ones; trusted ones stay."""
+    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
+    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
+    return align_patches(patches, trajectories, start, held).T_vehicle_lidar
+
+
+def usable(
+    patches: DrivePatches,
+    trajectory: VehicleTrajectory,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    config: Config,
+) -> DrivePatches:
+    """The patches without those of the ground where the config does without it."""
+    if config.ground.use:
+        return patches
+    return patches.part(~level(patches, trajectory, T_vehicle_lidar))
 
 
 GROUND_SIGHTINGS = 50

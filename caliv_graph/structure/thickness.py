@@ -40,7 +40,7 @@ def thickness_m(
         A = rows[own] * w[:, None]
         fitted = np.linalg.solve(rows[own].T @ A + RIDGE * np.eye(3), A.T @ r[own])
         squares[k] = w @ (r[own] - rows[own] @ fitted) ** 2 / w.sum()
-    return np.sqrt(squares).reshape(count, *offsets_m.shape[1:])
+    return np.asarray(np.sqrt(squares).reshape(count, *offsets_m.shape[1:]))
 
 
 def by_strip(sightings: Sightings, count: int) -> list[IntArray]:
@@ -73,6 +73,4 @@ def thickness_at_guesses(found: Solved) -> Array:
 def thickness_at_estimate(found: Solved) -> Array:
     """(K,) of the strips of a solve."""
     offsets = found.geometry.offsets_m(found.sightings)
-    return thickness_m(
-        found.geometry, found.sightings, found.weights, offsets, found.strips.count
-    )
+    return thickness_m(found.geometry, found.sightings, found.weights, offsets, found.strips.count)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from caliv_graph.report.layout import UNKNOWN, millimetres
-from caliv_graph.report.surfaces import MOST_ROWS, kind_of, place_text
+from caliv_graph.report.surfaces import kind_of, place_text
 from caliv_graph.validation.findings import AFTER, BEFORE, WITHOUT, HeldOutStructure, HeldStrip
 
 HELD_OUT_HEADS = (
@@ -25,7 +25,7 @@ HELD_OUT_HEADS = (
 
 
 def held_out_rows(found: HeldOutStructure) -> list[list[str]]:
-    """Cells of each held-out strip, in its order: `HELD_OUT_HEADS`."""
+    """Cells of each held-out strip, in the order of the result: `HELD_OUT_HEADS`."""
     return [_held_row(strip) for strip in found.strips]
 
 
@@ -49,7 +49,7 @@ def _lines(values: Mapping[tuple[str, str], float]) -> str:
 
 
 def held_out_tables(held: HeldOutStructure) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The tables of the held-out structure: all of it, and strip by strip."""
+    """The table of the held-out structure, all strips together."""
     rows = []
     for what, stage in (
         ("initial guess", BEFORE),
@@ -74,12 +74,7 @@ def held_out_tables(held: HeldOutStructure) -> list[tuple[str, list[str], list[l
         f"in {len(held.tiles_map_m)} of {held.tiles_of} tiles of {held.tile_m:.0f} m"
     )
     heads = ["", "apart\nmm", "expected\nmm", "chi2 /\ndof", "p", "thick\nmm", "expected\nmm"]
-    out = [(title, heads, rows)]
-    if held.strips:
-        shown = held_out_rows(held)[:MOST_ROWS]
-        title = f"The held-out strips, {len(shown)} of {len(held.strips)}"
-        out.append((title, list(HELD_OUT_HEADS), shown))
-    return out
+    return [(title, heads, rows)]
 
 
 def held_out_document(held: HeldOutStructure) -> dict[str, Any]:

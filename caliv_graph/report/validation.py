@@ -12,7 +12,12 @@ from rich.text import Text
 import caliv_graph
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
-from caliv_graph.report.held_out import held_out_document, held_out_tables
+from caliv_graph.report.held_out import (
+    HELD_OUT_HEADS,
+    held_out_document,
+    held_out_rows,
+    held_out_tables,
+)
 from caliv_graph.report.layout import UNKNOWN, millimetres, new_table, sentences, titled
 from caliv_graph.report.tables import STATUS_STYLES
 from caliv_graph.validation.findings import (
@@ -362,6 +367,8 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
         first_line=first_line(found),
         tables=tables(found),
         repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
+        held_out_heads=HELD_OUT_HEADS,
+        held_out_rows=held_out_rows(found.held_out) if found.held_out is not None else [],
         figures=figures,
         data={figure.name: script_data(figure) for figure in figures},
         plotlyjs=Markup(get_plotlyjs()),

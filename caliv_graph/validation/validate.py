@@ -104,10 +104,11 @@ def validate(
                 clouds,
                 (start, structure, best),
                 errors,
-                (*notes, *recording.warnings(), *trajectory.warnings, *no_target, *no_held),
+                (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
             )
     if held is None:
-        return found
+        sentences = (*found.verdict.sentences, *no_held)
+        return replace(found, verdict=replace(found.verdict, sentences=sentences))
     return replace(found, held_out=held, verdict=with_held_out(found.verdict, held))
 
 

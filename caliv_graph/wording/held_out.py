@@ -32,5 +32,5 @@ def nothing_shared_sentence() -> str:
 
 
 def no_held_out_sentence(why: str) -> str:
-    """The note of a validation without held-out structure."""
-    return f"no third of the structure was held out and measured: {why}"
+    """Why a validation has no held-out structure."""
+    return f"No third of the structure is held out and measured: {why}."

@@ -1,4 +1,4 @@
-"""Alignment before and after calibration, on structure that the solve did not use."""
+"""Alignment before and after calibration, on what stands around a drive."""
 
 from __future__ import annotations
 

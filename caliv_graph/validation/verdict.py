@@ -131,11 +131,13 @@ def with_held_out(verdict: Verdict, held: HeldOutStructure) -> Verdict:
     words_of_both: list[Word] = [_word(better, least)]
     if verdict.p_value is not None:
         words_of_both.append(verdict.word)
+    # Without walls, poles and objects there was nothing to say before.
+    said = verdict.sentences if verdict.better is not None else ()
     return replace(
         verdict,
         word=max(words_of_both, key=_SEVERITY.index),
         contradicts=verdict.contradicts or bool(contradicting),
-        sentences=(*verdict.sentences, *sentences),
+        sentences=(*said, *sentences),
         reason=verdict.reason or next(iter(contradicting), ""),
     )
 

@@ -27,7 +27,7 @@ HALF_M = 0.8
 PART = 0.95
 """Part of the strips within the range of the colours: a few outliers would make all others pale."""
 
-LEAST_MM = 0.01
+LEAST_MM = 0.1
 """Smallest value on a logarithmic axis."""
 
 THICK = [[0.0, "#E8F1F8"], [0.5, "#56B4E9"], [1.0, "#08306B"]]
@@ -169,7 +169,7 @@ def _squares(centres: Array, normals: Array, shades: Sequence[Shade]) -> go.Figu
         layout={
             "scene": {
                 "aspectmode": "data",
-                "camera": {"eye": {"x": -0.7, "y": -0.7, "z": 0.9}},
+                "camera": {"eye": {"x": -0.9, "y": -0.9, "z": 0.9}},
                 **spans,
             },
             "updatemenus": [

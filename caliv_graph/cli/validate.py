@@ -52,7 +52,8 @@ def validate(
     wall and pole, and the thickness of walls and poles for all LiDARs and for each LiDAR alone. It
     compares them with the values expected from noise, trajectory and the sigmas of the calibration.
     A third of the strips of walls and ground is held out, chosen by place: the drive is calibrated
-    without it, and both calibrations are measured on it. DIR contains validation.json and validation.html.
+    without it, and both calibrations are measured on it. DIR contains validation.json and
+    validation.html.
 
     Exit code 3: there is no structure to validate on. Exit code 4: distances or thicknesses exceed
     the expected values by more than 5 sigma.

@@ -112,8 +112,6 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
         shown = found.surfaces[:MOST_SHOWN]
         title = f"The {len(shown)} largest of {len(found.surfaces)} walls and poles"
         out.append((title, headings, [_surface_row(s) for s in shown]))
-    if found.held_out is not None:
-        out += held_out_tables(found.held_out)
     if found.things:
         headings = ["", "at x y\nm", "size\nm", "points", "apart\nbefore mm", "apart\nafter mm"]
         rows = [_thing_row(t) for t in found.things[:MOST_SHOWN]]
@@ -124,6 +122,8 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
                 rows,
             )
         )
+    if found.held_out is not None:
+        out += held_out_tables(found.held_out)
     return out
 
 

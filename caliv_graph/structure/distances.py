@@ -3,7 +3,8 @@
 The solve of the other strips determines poses, extrinsics and range biases to a joint covariance.
 On a strip that it did not use the sightings determine a plane and the distances of the other
 LiDARs from it, by least squares. These distances are linear in the errors of all that, and in
-those of the sightings themselves, so that their joint covariance is known (`caliv_graph/validation/README.md`).
+those of the sightings themselves, so that their joint covariance is known (README of
+`validation`).
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from caliv_graph.validation.findings import (
     HeldStrip,
     Validation,
     Verdict,
+    Word,
 )
 from caliv_graph.validation.verdict import with_held_out
 from tests.report.test_html import EVIL
@@ -67,7 +68,7 @@ def held_out(after_m: float = 0.002, p: tuple[float, float] = (0.4, 0.5)) -> Hel
 
 
 def verdict(p_value: float | None = 0.3) -> Verdict:
-    word = "unclear" if p_value is None else "good"
+    word: Word = "unclear" if p_value is None else "good"
     return Verdict(word, 10.0, "distance", 0.9, 3.0, 3, p_value, False, ("Walls fit.",))
 
 

@@ -321,8 +321,9 @@ class Strip:
         normal_map: (3,) unit, towards the side it was seen from.
         scans: LiDAR -> number of scans that see it.
         residuals_m: LiDAR -> weighted mean distance of its points from the strip.
-        scatter_m: standard deviation of its points along the normal, at the estimate.
-        before_m: the same at the initial guesses.
+        scatter_m: its thickness: root mean square distance of what single scans see of it from one
+            plane, at the estimate; NaN without weight.
+        before_m: the same at the initial guesses, fitted anew.
         weight: robust weight of the strip, 1 full and 0 dropped.
     """
 

@@ -26,6 +26,7 @@ from caliv_graph.products import Calibration, Direction, LidarResult, NoiseLevel
 from caliv_graph.report.numbers import SHOWN_AXES, fixed, pair_cells, pose_cells, two_digits
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weighted
+from caliv_graph.report.surfaces import MOST_ROWS, SURFACE_HEADS, surface_rows
 from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.pairs import pair_determined, sensor_pairs
@@ -82,6 +83,9 @@ def render_report(
         clouds=[_cloud_row(c, record) for c in clouds[:MOST_LISTED]],
         more_clouds=max(len(clouds) - MOST_LISTED, 0),
         weights=_weight_rows(solution),
+        surface_heads=SURFACE_HEADS,
+        surfaces=(surfaces := surface_rows(solution, record.drives))[:MOST_ROWS],
+        more_surfaces=max(len(surfaces) - MOST_ROWS, 0),
         registrations=solution.registrations,
         solution=solution,
         noise=_noise_rows(solution, record),

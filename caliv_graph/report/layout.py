@@ -49,3 +49,8 @@ def new_table(*columns: str) -> Table:
 def axis_headings(length: str, angle: str) -> list[str]:
     """Headings of the axes, with the units of lengths and angles."""
     return [f"{axis}\n{length if axis in 'xyz' else angle}" for axis in SHOWN_AXES]
+
+
+def millimetres(value_m: float | None) -> str:
+    """A length in millimetres."""
+    return UNKNOWN if value_m is None else f"{1e3 * value_m:.1f}"

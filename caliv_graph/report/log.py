@@ -56,6 +56,7 @@ def log_documents(
     if record is not None:
         yield from _trajectories(record)
     for term in solution.structure:
+        used = [strip for strip in term.strips if strip.weight > 0.0]
         yield {
             "structure": term.drive,
             "lidars": list(term.T_vehicle_lidar),
@@ -64,8 +65,8 @@ def log_documents(
             "dropped": sum(strip.weight == 0.0 for strip in term.strips),
             "surfaces": len({strip.surface for strip in term.strips}),
             "offset_m": rounded(term.offset_m),
-            "scatter_m": rounded(np.median([s.scatter_m for s in term.strips] or [0.0])),
-            "before_m": rounded(np.median([s.before_m for s in term.strips] or [0.0])),
+            "scatter_m": rounded(np.median([s.scatter_m for s in used] or [0.0])),
+            "before_m": rounded(np.median([s.before_m for s in used] or [0.0])),
         }
     for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
         clouds = registration.observation.clouds

@@ -12,7 +12,13 @@ from rich.text import Text
 import caliv_graph
 from caliv_graph.fusion.compare import Comparison
 from caliv_graph.report.comparison import comparison_document
-from caliv_graph.report.layout import UNKNOWN, new_table, sentences, titled
+from caliv_graph.report.held_out import (
+    HELD_OUT_HEADS,
+    held_out_document,
+    held_out_rows,
+    held_out_tables,
+)
+from caliv_graph.report.layout import UNKNOWN, millimetres, new_table, sentences, titled
 from caliv_graph.report.tables import STATUS_STYLES
 from caliv_graph.validation.findings import (
     AFTER,
@@ -73,9 +79,9 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
         rows = []
         for pair in found.pairs:
             a, b = pair.lidars
-            values = [_mm(pair.distance_m.get(stage)) for stage in STAGES]
-            expected = _mm(pair.expected_m if pair.surfaces else None)
-            clouds = [_mm(pair.cloud_m[stage]) for stage in (BEFORE, AFTER)]
+            values = [millimetres(pair.distance_m.get(stage)) for stage in STAGES]
+            expected = millimetres(pair.expected_m if pair.surfaces else None)
+            clouds = [millimetres(pair.cloud_m[stage]) for stage in (BEFORE, AFTER)]
             overlap = " / ".join(f"{100.0 * pair.overlap[s]:.0f}" for s in (BEFORE, AFTER))
             rows.append([f"{a} to {b}", str(pair.surfaces), *values, expected, *clouds, overlap])
         headings = ["", "walls,\npoles", "before\nmm", "after\nmm", "best\nmm", "expected\nmm"]
@@ -87,15 +93,15 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
         rows = [
             [
                 "merged",
-                *(_mm(found.thickness_m[stage]) for stage in STAGES),
-                _mm(found.expected_thickness_m),
+                *(millimetres(found.thickness_m[stage]) for stage in STAGES),
+                millimetres(found.expected_thickness_m),
             ]
         ]
         rows += [
             [
                 f"{name} alone",
-                *(_mm(found.alone_m[stage].get(name)) for stage in STAGES),
-                _mm(found.expected_alone_m.get(name)),
+                *(millimetres(found.alone_m[stage].get(name)) for stage in STAGES),
+                millimetres(found.expected_alone_m.get(name)),
             ]
             for name in found.lidars
         ]
@@ -116,6 +122,8 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
                 rows,
             )
         )
+    if found.held_out is not None:
+        out += held_out_tables(found.held_out)
     return out
 
 
@@ -220,6 +228,7 @@ def validation_document(
         },
         "surfaces": [_surface_document(surface) for surface in found.surfaces],
         "objects": [_thing_document(thing) for thing in found.things],
+        "held_out": None if found.held_out is None else held_out_document(found.held_out),
         "repeatability": None,
     }
     if repeated is not None:
@@ -309,30 +318,29 @@ def _place_cells(found: SurfaceResult | ThingResult, where: Wall | Pole | Thing)
 def _surface_row(found: SurfaceResult) -> list[str]:
     pairs = list(found.apart[AFTER])
     apart = [
-        _lines(_mm(found.apart[s][p].distance_m if p in found.apart[s] else None) for p in pairs)
+        _lines(
+            millimetres(found.apart[s][p].distance_m if p in found.apart[s] else None)
+            for p in pairs
+        )
         for s in (BEFORE, AFTER)
     ]
     return [
         *_place_cells(found, found.surface),
-        _mm(found.thickness[BEFORE].merged),
-        _mm(found.thickness[AFTER].merged),
+        millimetres(found.thickness[BEFORE].merged),
+        millimetres(found.thickness[AFTER].merged),
         *apart,
-        _lines(_mm(found.expected.distance_m.get(p)) for p in pairs),
+        _lines(millimetres(found.expected.distance_m.get(p)) for p in pairs),
     ]
 
 
 def _thing_row(found: ThingResult) -> list[str]:
     pairs = list(found.distance_m[AFTER])
-    apart = (_lines(_mm(found.distance_m[s].get(p)) for p in pairs) for s in STAGES)
+    apart = (_lines(millimetres(found.distance_m[s].get(p)) for p in pairs) for s in STAGES)
     return [*_place_cells(found, found.thing), *apart]
 
 
 def _lines(texts: Iterable[str]) -> str:
     return "\n".join(texts) or UNKNOWN
-
-
-def _mm(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{1e3 * value:.1f}"
 
 
 def render_validation(found: Validation, repeated: Repeatability | None, p_value: float) -> str:
@@ -344,11 +352,14 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     from plotly.offline import get_plotlyjs
 
     from caliv_graph.report.figures.drawing import without_template
+    from caliv_graph.report.figures.strips import held_out_figures
     from caliv_graph.report.figures.structure import validation_figures
     from caliv_graph.report.page import environment, script_data
 
     with without_template():
         figures = validation_figures(found)
+        if found.held_out is not None:
+            figures += held_out_figures(found.held_out)
     template = environment().get_template("validation.html.j2")
     return template.render(
         found=found,
@@ -356,6 +367,8 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
         first_line=first_line(found),
         tables=tables(found),
         repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
+        held_out_heads=HELD_OUT_HEADS,
+        held_out_rows=held_out_rows(found.held_out) if found.held_out is not None else [],
         figures=figures,
         data={figure.name: script_data(figure) for figure in figures},
         plotlyjs=Markup(get_plotlyjs()),

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -155,20 +155,8 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     Raises:
         SolveError: the system is singular.
     """
-    patches, prior = problem.patches, problem.prior
-    R, t = stack(prior.T_map_vehicle)
-    n = len(patches.lidars)
-    state = State(
-        R_map_vehicle=R,
-        t_map_vehicle=t,
-        moved=np.zeros(len(prior.gradient)),
-        T_vehicle_lidar=tuple(start[name] for name in patches.lidars),
-        offsets_s=np.zeros(n),
-        centres_map=np.zeros((0, 3)),
-        normals_map=np.zeros((0, 3)),
-        errors=np.zeros(0),
-    )
-    range_sigma = range_sigmas(patches, problem.range_sigma_m)
+    state = first_state(problem, start)
+    range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     found: Solved | None = None
     sigma_m = strip_m = shared_m = FIRST_SIGHTING_M
     for gate in GATES_M:
@@ -182,6 +170,27 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     return None if found is None else _settled(found, steps=LAST_STEPS)
 
 
+def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
+    """The poses of the motion data, some T_vehicle_lidar, and no strips yet."""
+    names = problem.patches.lidars
+    R, t = stack(problem.prior.T_map_vehicle)
+    return State(
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        moved=np.zeros(len(problem.prior.gradient)),
+        T_vehicle_lidar=tuple(start[name] for name in names),
+        offsets_s=np.zeros(len(names)),
+        centres_map=np.zeros((0, 3)),
+        normals_map=np.zeros((0, 3)),
+        errors=np.zeros(0),
+    )
+
+
+def part_of(problem: Problem, keep: BoolArray) -> Problem:
+    """The same drive with some of its patches (N,)."""
+    return replace(problem, patches=problem.patches.part(keep), relative=problem.relative[keep])
+
+
 def _round(
     problem: Problem,
     state: State,
@@ -192,26 +201,12 @@ def _round(
     shared_m: float,
 ) -> Solved | None:
     """New strips and sightings at an estimate."""
-    patches = problem.patches
-    lidar = patches.scan_lidar[patches.scan]
-    pose = problem.pose_of_scan[patches.scan]
-    at_stamp, normals = _at_stamp(problem, state, lidar)
-    R, t = lidar_poses(state, lidar, pose, problem.twists)
-    moments_map = moved_moments(at_stamp, R, t)
-    normals_map = np.einsum("nij,nj->ni", R, normals)
-    strips = find_strips(moments_map, normals_map, patches.scan, gate_m)
+    placed = placed_patches(problem, state)
+    strips = find_strips(placed.moments_map, placed.normals_map, problem.patches.scan, gate_m)
     if not strips.count:
         return None
-    own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
-    of_strip = np.einsum("nji,nj->ni", R, strips.normals_map[own])
-    sightings = sightings_of(patches, at_stamp, of_strip, strips, range_sigma)
-    layout = Layout(
-        poses=len(problem.prior.stamps_ns),
-        parameters=len(problem.prior.parameter_information),
-        offsets=problem.offsets,
-        lidars=len(patches.lidars),
-        surface_of=tuple(strips.surface.tolist()),
-    )
+    sightings = placed_sightings(problem, placed, strips, range_sigma)
+    layout = layout_of(problem, strips)
     errors = np.zeros(layout.size)
     # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.
     of_lidars = slice(layout.error, layout.plane)  # and of the vehicle's stand
@@ -228,12 +223,68 @@ def _round(
         shared=shared_m,
     )
     weights = np.ones(sightings.count)
-    geometry = _geometry(problem, state, strips, sightings, layout)
+    geometry = geometry_at(problem, state, sightings, layout)
     rows, system = _whitened(
         problem, state, geometry, strips, sightings, weights, nuisances, layout
     )
     return Solved(
         problem, state, strips, sightings, weights, nuisances, layout, geometry, rows, system, False
+    )
+
+
+@dataclass(frozen=True)
+class PlacedPatches:
+    """All N patches of a drive at an estimate.
+
+    Attributes:
+        moments_at_stamp: (N, 4, 4) in the lidar frame at the stamps of their scans.
+        normals_at_stamp: (N, 3) likewise.
+        R_map_lidar: (N, 3, 3) at these stamps.
+        t_map_lidar: (N, 3) metres.
+    """
+
+    moments_at_stamp: Array
+    normals_at_stamp: Array
+    R_map_lidar: Array
+    t_map_lidar: Array
+
+    @property
+    def moments_map(self) -> Array:
+        """(N, 4, 4)."""
+        return moved_moments(self.moments_at_stamp, self.R_map_lidar, self.t_map_lidar)
+
+    @property
+    def normals_map(self) -> Array:
+        """(N, 3)."""
+        return np.asarray(np.einsum("nij,nj->ni", self.R_map_lidar, self.normals_at_stamp))
+
+
+def placed_patches(problem: Problem, state: State) -> PlacedPatches:
+    """The patches of a drive at an estimate."""
+    scan = problem.patches.scan
+    lidar = problem.patches.scan_lidar[scan]
+    moments, normals = _at_stamp(problem, state, lidar)
+    R, t = lidar_poses(state, lidar, problem.pose_of_scan[scan], problem.twists)
+    return PlacedPatches(moments, normals, R, t)
+
+
+def placed_sightings(
+    problem: Problem, placed: PlacedPatches, strips: Strips, range_sigma_m: Array
+) -> Sightings:
+    """Sightings of strips; `range_sigma_m` (L,) is the noise along the beam of each LiDAR."""
+    own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
+    normals = np.einsum("nji,nj->ni", placed.R_map_lidar, strips.normals_map[own])
+    return sightings_of(problem.patches, placed.moments_at_stamp, normals, strips, range_sigma_m)
+
+
+def layout_of(problem: Problem, strips: Strips) -> Layout:
+    """The coordinates of a drive with some strips."""
+    return Layout(
+        poses=len(problem.prior.stamps_ns),
+        parameters=len(problem.prior.parameter_information),
+        offsets=problem.offsets,
+        lidars=len(problem.patches.lidars),
+        surface_of=tuple(strips.surface.tolist()),
     )
 
 
@@ -256,9 +307,8 @@ def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
     return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
 
 
-def _geometry(
-    problem: Problem, state: State, strips: Strips, sightings: Sightings, layout: Layout
-) -> Geometry:
+def geometry_at(problem: Problem, state: State, sightings: Sightings, layout: Layout) -> Geometry:
+    """Residuals of the sightings at an estimate."""
     scan = sightings.scan
     return geometry_of(
         state,
@@ -298,7 +348,7 @@ def _settled(found: Solved, steps: int) -> Solved:
         solve = partial(found.system.surfaces.solve, factor)
         d = found.system.surfaces.follow(solved(factor, b))
         state = stepped(found.state, layout, d)
-        geometry = _geometry(problem, state, found.strips, sightings, layout)
+        geometry = geometry_at(problem, state, sightings, layout)
         nuisances = fitted_noise(
             geometry,
             sightings,

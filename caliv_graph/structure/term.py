@@ -25,6 +25,11 @@ from caliv_graph.structure.solve import (
 )
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
+from caliv_graph.structure.thickness import (
+    by_strip,
+    thickness_at_estimate,
+    thickness_at_guesses,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 HELD_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
@@ -57,14 +62,10 @@ def structure_terms(
     Raises:
         SolveError: a system is singular.
     """
-    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
-    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
-    aligned = align_patches(patches, trajectories, start, held).T_vehicle_lidar
+    aligned = aligned_start(patches, trajectories, start, config)
     out = []
     for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
-        used = own
-        if not config.ground.use:
-            used = own.part(~level(own, trajectory, aligned))
+        used = usable(own, trajectory, aligned, config)
         if not len(used.scan):
             continue
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
@@ -72,6 +73,30 @@ def structure_terms(
         if found is not None:
             out.append(term_of(found, np.searchsorted(prior.stamps_ns, kept)))
     return tuple(out)
+
+
+def aligned_start(
+    patches: Sequence[DrivePatches],
+    trajectories: Sequence[VehicleTrajectory],
+    start: Mapping[str, gtsam.Pose3],
+    config: Config,
+) -> Mapping[str, gtsam.Pose3]:
+    """T_vehicle_lidar at which the strips are found first, from rough ones; trusted ones stay."""
+    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
+    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
+    return align_patches(patches, trajectories, start, held).T_vehicle_lidar
+
+
+def usable(
+    patches: DrivePatches,
+    trajectory: VehicleTrajectory,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    config: Config,
+) -> DrivePatches:
+    """The patches without those of the ground where the config does without it."""
+    if config.ground.use:
+        return patches
+    return patches.part(~level(patches, trajectory, T_vehicle_lidar))
 
 
 GROUND_SIGHTINGS = 50
@@ -209,9 +234,8 @@ def strips_of(found: Solved) -> tuple[Strip, ...]:
     lidar = patches.scan_lidar[sightings.scan]
     weight = found.weights * sightings.moments[:, 3, 3]
     out = []
-    order = np.argsort(sightings.strip, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(sightings.strip, minlength=strips.count))[:-1])
-    for k, own in enumerate(parts):
+    before_m, after_m = thickness_at_guesses(found), thickness_at_estimate(found)
+    for k, own in enumerate(by_strip(sightings, strips.count)):
         scans, residuals = {}, {}
         for i, name in enumerate(patches.lidars):
             of_lidar = own[lidar[own] == i]
@@ -227,8 +251,8 @@ def strips_of(found: Solved) -> tuple[Strip, ...]:
                 normal_map=found.state.normals_map[k],
                 scans=scans,
                 residuals_m=residuals,
-                scatter_m=float(found.nuisances.sighting[k]),
-                before_m=float("nan"),
+                scatter_m=float(after_m[k]),
+                before_m=float(before_m[k]),
                 weight=float(found.weights[own].mean()) if len(own) else 0.0,
             )
         )

@@ -1,4 +1,4 @@
-"""Validation of a calibration: alignment on structure that the solve did not use."""
+"""Validation of a calibration: alignment of the LiDARs on what stands around a drive."""
 
 from caliv_graph.validation.findings import Validation
 from caliv_graph.validation.validate import validate

@@ -47,12 +47,12 @@ def pose_covariance(
         information, _ = trajectory.joint_information(nodes_ns)
         cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
     else:
-        cov = given_pose_covariance(nodes_ns, _pose_noise(calibration, config))
+        cov = given_pose_covariance(nodes_ns, pose_noise(calibration, config))
     rows = (6 * at[:, None] + np.arange(6)).ravel()
     return np.asarray(0.5 * (cov + cov.T)[np.ix_(rows, rows)], dtype=np.float64)
 
 
-def _pose_noise(calibration: Calibration, config: Config) -> PoseNoise:
+def pose_noise(calibration: Calibration, config: Config) -> PoseNoise:
     """Error model of given poses: estimated by `calibrate`, or else from the config."""
     found = calibration.provenance.get("pose_noise")
     if isinstance(found, Mapping):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import gtsam
+import numpy as np
 
 from caliv_graph.products import Array
 from caliv_graph.validation.clouds import Clouds
@@ -15,6 +16,9 @@ from caliv_graph.validation.surfaces import Pole, Thing, Wall
 
 BEFORE, AFTER, BEST = "before", "after", "best"
 """The initial guesses, the calibration, and the extrinsics with the best alignment."""
+
+WITHOUT = "without"
+"""The calibration of the drive's structure without the third that is held out."""
 
 STAGES = (BEFORE, AFTER, BEST)
 
@@ -78,6 +82,91 @@ class PairResult:
     overlap: Mapping[str, float]
 
 
+@dataclass(frozen=True)
+class HeldStrip:
+    """A strip of surface that is held out.
+
+    Attributes:
+        name: its name, such as "strip 1".
+        surface: number of the surface (a wall) that it is a part of, among those held out.
+        centre_map: (3,) metres.
+        normal_map: (3,) unit, towards the side that is seen.
+        scans: LiDAR -> number of its scans that count.
+        tested: whether two LiDARs see it and it is no more irregular than others.
+        distance_m: by stage (`BEFORE`, `AFTER`, `WITHOUT`), per pair, signed distance of the second
+            LiDAR's surface from that of the first. The first is the one with most scans.
+        sigma_m: by stage except `BEFORE`, per pair, 1 sigma of it from known errors alone.
+        thickness_m: by stage, root mean square distance of what single scans see from one plane.
+        expected_thickness_m: by stage except `BEFORE`, from known errors alone.
+    """
+
+    name: str
+    surface: int
+    centre_map: Array
+    normal_map: Array
+    scans: Mapping[str, int]
+    tested: bool
+    distance_m: Mapping[str, Mapping[Pair, float]]
+    sigma_m: Mapping[str, Mapping[Pair, float]]
+    thickness_m: Mapping[str, float]
+    expected_thickness_m: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class HeldOutTest:
+    """The chi-square of all distances on held-out strips, with their joint covariance.
+
+    Attributes:
+        chi2: with the covariance of known errors.
+        dof: number of distances; 0: no two LiDARs see the same strip.
+        p_value: probability of a larger one if all stated covariances are right.
+        expected_m: root mean square of a distance from known errors alone.
+    """
+
+    chi2: float
+    dof: int
+    p_value: float | None
+    expected_m: float
+
+
+@dataclass(frozen=True)
+class HeldOutStructure:
+    """What the LiDARs differ by on the third of the structure that is held out.
+
+    Attributes:
+        tiles_map_m: (h, 2) lower corners, x and y in the map, of the tiles that are held out.
+        tile_m: their edge.
+        tiles_of: number of tiles that have structure.
+        strips: the strips in them, named.
+        tests: by stage, `AFTER` and `WITHOUT`.
+        distance_m: by stage, root mean square over the strips that are tested.
+    """
+
+    tiles_map_m: Array
+    tile_m: float
+    tiles_of: int
+    strips: tuple[HeldStrip, ...]
+    tests: Mapping[str, HeldOutTest]
+    distance_m: Mapping[str, float]
+
+    @property
+    def tested(self) -> tuple[HeldStrip, ...]:
+        """The strips of the tests."""
+        return tuple(strip for strip in self.strips if strip.tested)
+
+    def thickness_m(self, stage: str) -> float:
+        """Root mean square over the strips that are tested."""
+        return _rms([strip.thickness_m[stage] for strip in self.tested])
+
+    def expected_thickness_m(self, stage: str) -> float:
+        """Likewise, expected from known errors alone."""
+        return _rms([strip.expected_thickness_m[stage] for strip in self.tested])
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else 0.0
+
+
 Word = Literal["good", "contradicted", "worse", "unclear"]
 """The verdict in one word. `contradicted`: better than the guess, but beyond its sigmas (exit code
 4); `worse`: worse than the guess beyond its sigmas (exit code 4); `unclear`: nothing was tested
@@ -96,8 +185,9 @@ class Verdict:
         chi2: chi-square of all offsets between LiDARs with their joint covariance.
         dof: its degrees of freedom; 0: no test is possible.
         p_value: probability of a larger `chi2` if all stated covariances are right.
-        contradicts: whether the p-value is beyond 5 sigma.
+        contradicts: whether the p-value, or one of the held-out strips, is beyond 5 sigma.
         sentences: the verdict in words.
+        reason: the sentence that says why it contradicts; empty if it does not.
     """
 
     word: Word
@@ -109,6 +199,7 @@ class Verdict:
     p_value: float | None
     contradicts: bool
     sentences: tuple[str, ...]
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -123,6 +214,7 @@ class Validation:
         expected_thickness_m: after calibration, from known errors alone.
         expected_alone_m: likewise per LiDAR.
         best: extrinsics with the best alignment, in the order of `lidars`; no calibration.
+        held_out: the third of the strips that is held out; None: not measured.
     """
 
     drive: str
@@ -139,11 +231,13 @@ class Validation:
     clouds: Clouds
     best: tuple[gtsam.Pose3, ...]
     warnings: tuple[str, ...]
+    held_out: HeldOutStructure | None = None
 
     @property
     def has_structure(self) -> bool:
         """Whether any structure was found."""
-        return bool(self.surfaces or self.things)
+        tested = self.held_out is not None and self.held_out.tested
+        return bool(self.surfaces or self.things or tested)
 
     def points_map(self, stage: str) -> Array:
         """(N, 3) metres, all points under the extrinsics of a stage, map."""

@@ -1,8 +1,9 @@
-"""Alignment before and after calibration, on structure that the solve did not use."""
+"""Alignment before and after calibration, on what stands around a drive."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -35,6 +36,7 @@ from caliv_graph.validation.findings import (
     ThingResult,
     Validation,
 )
+from caliv_graph.validation.held_out import measure_held_out
 from caliv_graph.validation.measure import (
     Errors,
     SurfaceMeter,
@@ -44,7 +46,7 @@ from caliv_graph.validation.measure import (
 )
 from caliv_graph.validation.refine import align, sharper
 from caliv_graph.validation.surfaces import Structure, Thing, Wall
-from caliv_graph.validation.verdict import is_shared, judge
+from caliv_graph.validation.verdict import is_shared, judge, with_held_out
 
 Stages = Mapping[str, tuple[Placed, Sequence[gtsam.Pose3] | None]]
 
@@ -90,17 +92,24 @@ def validate(
             config.noise.lidar_range_m,
             HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
         )
+        held, no_held = measure_held_out(
+            recording, rough, motions, calibration, extrinsics[AFTER], config, progress
+        )
         sigmas = np.array([config.lidars[n].sigma.sigmas() for n in names])
         with progress.stage("measuring the alignment", None):
             start = sharper(clouds, (AFTER, BEFORE))
             structure, best = align(clouds, clouds.placed[start], sigmas, not config.ground.use)
-            return _measured(
+            found = _measured(
                 recording.name,
                 clouds,
                 (start, structure, best),
                 errors,
                 (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
             )
+    if held is None:
+        sentences = (*found.verdict.sentences, *no_held)
+        return replace(found, verdict=replace(found.verdict, sentences=sentences))
+    return replace(found, held_out=held, verdict=with_held_out(found.verdict, held))
 
 
 def _common_lidars(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -11,6 +12,8 @@ from caliv_graph.validation.findings import (
     AFTER,
     BEFORE,
     STAGES,
+    WITHOUT,
+    HeldOutStructure,
     Pair,
     PairResult,
     SurfaceResult,
@@ -24,6 +27,11 @@ from caliv_graph.validation.measure import (
     Errors,
     offset_covariance,
     rms,
+)
+from caliv_graph.wording.held_out import (
+    held_out_sentence,
+    nothing_shared_sentence,
+    stage_sentence,
 )
 
 UNSEEN = (
@@ -87,7 +95,51 @@ def judge(
         )
         sentences += (f"Thickness of {_kinds(surfaces)} by each LiDAR alone: {thick}.",)
     word = _word(better, p_value)
-    return Verdict(word, better, measure, of_expected, chi2, dof, p_value, contradicts, sentences)
+    reason = sentences[1] if contradicts else ""
+    return Verdict(
+        word, better, measure, of_expected, chi2, dof, p_value, contradicts, sentences, reason
+    )
+
+
+_SEVERITY: tuple[Word, ...] = ("good", "unclear", "contradicted", "worse")
+
+
+def with_held_out(verdict: Verdict, held: HeldOutStructure) -> Verdict:
+    """The verdict with the tests on held-out strips: the worse of the two words.
+
+    Both the calibration in the file and the one without these strips are tested. Where walls and
+    poles test nothing, the strips alone decide.
+    """
+    if not held.tested:
+        return replace(verdict, sentences=(*verdict.sentences, nothing_shared_sentence()))
+    values = {stage: 1e3 * held.distance_m[stage] for stage in (BEFORE, AFTER)}
+    better = values[BEFORE] / values[AFTER] if values[AFTER] > 0.0 else None
+    sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER])]
+    contradicting = []
+    for stage in (AFTER, WITHOUT):
+        test = held.tests[stage]
+        assert test.p_value is not None
+        words = "do not explain" if test.p_value < CONTRADICTION else "explain"
+        if CONTRADICTION <= test.p_value < POOR:
+            words = "explain poorly"
+        distance, expected = 1e3 * held.distance_m[stage], 1e3 * test.expected_m
+        tested = f"chi2 {test.chi2:.1f} of {test.dof} dof, p {test.p_value:.2g}"
+        sentences.append(stage_sentence(stage == AFTER, distance, expected, words, tested))
+        if test.p_value < CONTRADICTION:
+            contradicting.append(sentences[-1])
+    least = min(test.p_value or 0.0 for test in held.tests.values())
+    words_of_both: list[Word] = [_word(better, least)]
+    if verdict.p_value is not None:
+        words_of_both.append(verdict.word)
+    # Without walls, poles and objects there was nothing to say before.
+    said = verdict.sentences if verdict.better is not None else ()
+    return replace(
+        verdict,
+        word=max(words_of_both, key=_SEVERITY.index),
+        contradicts=verdict.contradicts or bool(contradicting),
+        sentences=(*said, *sentences),
+        reason=verdict.reason or next(iter(contradicting), ""),
+    )
 
 
 def _word(better: float | None, p_value: float | None) -> Word:

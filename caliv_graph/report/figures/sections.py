@@ -8,6 +8,7 @@ from caliv_graph.products import Calibration, Solution
 from caliv_graph.report.figures.alignment import scene_figure, target_figures
 from caliv_graph.report.figures.drawing import Figure, without_template
 from caliv_graph.report.figures.fit import convergence_figure, residual_figure, weight_figure
+from caliv_graph.report.figures.strips import strip_figure, thickness_figure
 from caliv_graph.report.figures.trajectory import correction_figure, motion_figure, path_figure
 from caliv_graph.report.figures.uncertainty import (
     correlation_figure,
@@ -36,6 +37,13 @@ def report_figures(
                 *_scenes(calibration, record),
             ],
             "residuals": [residual_figure(kind, n) for n, kind in enumerate(kinds, start=1)],
+            "structure": [
+                *(
+                    strip_figure(term, record.drives[term.drive])
+                    for term in solution.structure[:MOST_SOLID]
+                ),
+                thickness_figure(solution),
+            ],
             "weights": [weight_figure(solution, list(calibration.lidars))],
             "trajectory": _trajectories(calibration, solution, record),
             "convergence": [convergence_figure(solution)],

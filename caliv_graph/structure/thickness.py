@@ -1,0 +1,76 @@
+"""Thickness of strips: how far their sightings lie from one plane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.noise import range_sigmas
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.solve import Solved, geometry_at, placed_patches, placed_sightings
+from caliv_graph.structure.system import PLANE_ROWS, Geometry
+
+RIDGE = 1e-6
+"""Prior of a fitted plane, in sightings: what one LiDAR sees from afar determines no tilt."""
+
+
+def thickness_m(
+    geometry: Geometry, sightings: Sightings, weights: Array, offsets_m: Array, count: int
+) -> Array:
+    """(K, ...) root mean square distance of the sightings of each strip from a plane through them.
+
+    Args:
+        geometry: its derivatives by the plane are used.
+        sightings: Q of them.
+        weights: (Q,) robust.
+        offsets_m: (Q, ...) their distances from the plane at which `geometry` was computed.
+        count: K; a strip without weight is NaN.
+    """
+    middles = np.concatenate([sightings.centroids_lidar, np.ones((sightings.count, 1))], axis=1)
+    rows = np.einsum("qci,qi->qc", geometry.by[:, PLANE_ROWS], middles)
+    r = offsets_m.reshape(sightings.count, -1)
+    squares = np.full((count, r.shape[1]), np.nan)
+    for k, own in enumerate(by_strip(sightings, count)):
+        w = weights[own]
+        if not w.sum() > 0.0:
+            continue
+        A = rows[own] * w[:, None]
+        fitted = np.linalg.solve(rows[own].T @ A + RIDGE * np.eye(3), A.T @ r[own])
+        squares[k] = w @ (r[own] - rows[own] @ fitted) ** 2 / w.sum()
+    return np.asarray(np.sqrt(squares).reshape(count, *offsets_m.shape[1:]))
+
+
+def by_strip(sightings: Sightings, count: int) -> list[IntArray]:
+    """Indices of the sightings of each of K strips."""
+    order = np.argsort(sightings.strip, kind="stable")
+    ends = np.cumsum(np.bincount(sightings.strip, minlength=count))[:-1]
+    return list(np.split(order, ends))
+
+
+def thickness_at_guesses(found: Solved) -> Array:
+    """(K,) of the strips of a solve with the guesses of the extrinsics and the poses of motion."""
+    problem = found.problem
+    R, t = stack(problem.prior.T_map_vehicle)
+    state = replace(
+        found.state,
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        T_vehicle_lidar=problem.guesses,
+        offsets_s=np.zeros_like(found.state.offsets_s),
+        errors=np.zeros_like(found.state.errors),
+    )
+    sigma = range_sigmas(problem.patches, problem.range_sigma_m)
+    placed = placed_patches(problem, state)
+    sightings = placed_sightings(problem, placed, found.strips, sigma)
+    geometry = geometry_at(problem, state, sightings, found.layout)
+    offsets = geometry.offsets_m(sightings)
+    return thickness_m(geometry, sightings, found.weights, offsets, found.strips.count)
+
+
+def thickness_at_estimate(found: Solved) -> Array:
+    """(K,) of the strips of a solve."""
+    offsets = found.geometry.offsets_m(found.sightings)
+    return thickness_m(found.geometry, found.sightings, found.weights, offsets, found.strips.count)

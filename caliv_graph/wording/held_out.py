@@ -1,0 +1,36 @@
+"""Sentences about the third of the structure that a validation holds out."""
+
+from __future__ import annotations
+
+
+def held_out_sentence(strips: int, before_mm: float, after_mm: float) -> str:
+    """How far LiDARs are apart on held-out strips, with the guesses and with the calibration."""
+    return (
+        f"On {strips} held-out strips of structure the LiDARs are {after_mm:.1f} mm apart with the "
+        f"calibration, {before_mm:.1f} mm with the initial guesses (root mean square)."
+    )
+
+
+def stage_sentence(
+    file: bool, distance_mm: float, expected_mm: float, words: str, tested: str
+) -> str:
+    """What known errors say of it, for the calibration of the file or for that without the strips.
+
+    `words` are "explain", "explain poorly" or "do not explain"; `tested` are the numbers of the
+    test.
+    """
+    whose = "of the calibration" if file else "of a calibration of this drive without these strips"
+    return (
+        f"Noise, trajectory and sigmas {whose} give an expected distance of {expected_mm:.1f} mm "
+        f"there; the measured one is {distance_mm:.1f} mm. They {words} it ({tested})."
+    )
+
+
+def nothing_shared_sentence() -> str:
+    """Of held-out strips that test nothing."""
+    return "No two LiDARs see the same held-out strip of structure: it tests nothing."
+
+
+def no_held_out_sentence(why: str) -> str:
+    """Why a validation has no held-out structure."""
+    return f"No third of the structure is held out and measured: {why}."

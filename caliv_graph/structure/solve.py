@@ -170,6 +170,31 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     return None if found is None else _settled(found, steps=LAST_STEPS)
 
 
+def linearised(
+    problem: Problem,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    range_sigma_m: Array,
+    sighting_m: float,
+    strip_m: float,
+    shared_m: float,
+) -> Solved | None:
+    """The system at known extrinsics and poses with stated noise; None if there is no structure.
+
+    Args:
+        problem: the drive; its pose prior is at the known poses.
+        T_vehicle_lidar: per LiDAR.
+        range_sigma_m: (L,) noise along the beam of each LiDAR.
+        sighting_m: as `Nuisances.sighting`, of all strips.
+        strip_m: as `Nuisances.strip`.
+        shared_m: as `Nuisances.shared`.
+
+    Raises:
+        SolveError: the system is singular.
+    """
+    state = first_state(problem, T_vehicle_lidar)
+    return _round(problem, state, range_sigma_m, GATES_M[-1], sighting_m, strip_m, shared_m)
+
+
 def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
     """The poses of the motion data, some T_vehicle_lidar, and no strips yet."""
     names = problem.patches.lidars

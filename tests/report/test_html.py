@@ -387,7 +387,7 @@ def test_a_target_is_shown_upright_where_it_stands(bag: Ran) -> None:
     solution, calibration = bag.run.solution, bag.run.calibration
     solid, flat = target_figures(0, solution, calibration)
 
-    chair = [np.array([trace.x, trace.y, trace.z]).T for trace in solid.figure.data]
+    chair = [np.array([trace[axis] for axis in "xyz"]).T for trace in solid.figure.data]
     before, after = np.concatenate(chair[:2]), np.concatenate(chair[2:])
     # 0.7 m wide and a chair's height; the guesses of 3 degrees at 12 m tear it apart.
     extent = np.percentile(after, 99, axis=0) - np.percentile(after, 1, axis=0)

@@ -18,6 +18,7 @@ from caliv_graph.config.model import (
     LidarConfig,
     PoseConfig,
     RegistrationConfig,
+    StructureConfig,
 )
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
@@ -219,17 +220,24 @@ def paper_scenario(
     )
 
 
+def without_structure(config: Config) -> Config:
+    """For tests whose subject is something else: structure takes a part of every run's time."""
+    return config.model_copy(update={"structure": StructureConfig(use=False)})
+
+
 def simulated(scenario: Scenario, seed: int, folder: Path) -> ChairDrive:
     """Simulates a drive into a new folder, and reads it back.
 
-    The target's region is counted from the start of the drive, so that the map may be moved. The
-    ground is left out: what the target alone tells is what these drives are for.
+    The target's region is counted from the start of the drive, so that the map may be moved. Ground
+    and structure are left out: what the target alone tells is what these drives are for.
     """
     simulate_caliv(scenario, folder, seed, threads=1)
     config = load_config(folder / "config.yaml")
     assert config.target
     regions = tuple(r.model_copy(update={"frame": "start"}) for r in config.target)
-    config = config.model_copy(update={"target": regions, "ground": GroundConfig(use=False)})
+    config = without_structure(
+        config.model_copy(update={"target": regions, "ground": GroundConfig(use=False)})
+    )
     reader = open_recording(config)
     given = reader.motion().poses
     assert given is not None

@@ -24,6 +24,7 @@ from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 
 SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "moved_target.yaml"
@@ -76,7 +77,8 @@ def standing(*places: tuple[float, float, float], phase_s: float = 0.0, seed: in
     # The simulated ranges have no bias; one of some millimetres, which real ones may have, would
     # leave the yaw of LiDARs that stand still to 2 mrad.
     raw |= {"noise": {**raw.get("noise", {}), "lidar_range_bias_m": 0.001}}
-    return Standing(recording, parse_config(raw, "config.yaml", Path("/nowhere")))
+    config = parse_config(raw, "config.yaml", Path("/nowhere"))
+    return Standing(recording, without_structure(config))
 
 
 @cache

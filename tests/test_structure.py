@@ -47,7 +47,7 @@ def arc() -> ChairDrive:
             others={"right": paper_lidar(0.5, -90.0, y_m=-0.8, rate_hz=1.25)},
         )
         return simulated(scenario, 1, Path(folder)).asked(
-            registration=QUICK, ground=GroundConfig(use=True)
+            registration=QUICK, ground=GroundConfig(use=True), structure=StructureConfig()
         )
 
 
@@ -117,6 +117,8 @@ def check_files(run: CalibrationRun, drive: ChairDrive, folder: Path) -> None:
     lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     (said,) = [line for line in lines if "structure" in line]
     assert (said["strips"], said["dropped"], said["surfaces"]) == (4, 1, 3)
+    # Of the thickness before, one strip knows nothing.
+    assert (said["scatter_m"], said["before_m"]) == (0.004, 0.02)
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "all six axes" in page
     assert "no target seen" not in page

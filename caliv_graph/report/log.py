@@ -7,6 +7,7 @@ The first key of a line names its subject: `stage`, `recording`, `trajectory`, `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -65,8 +66,8 @@ def log_documents(
             "dropped": sum(strip.weight == 0.0 for strip in term.strips),
             "surfaces": len({strip.surface for strip in term.strips}),
             "offset_m": rounded(term.offset_m),
-            "scatter_m": rounded(np.median([s.scatter_m for s in used] or [0.0])),
-            "before_m": rounded(np.median([s.before_m for s in used] or [0.0])),
+            "scatter_m": _median([s.scatter_m for s in used]),
+            "before_m": _median([s.before_m for s in used]),
         }
     for registration, weights in zip(solution.registrations, solution.cloud_weights, strict=True):
         clouds = registration.observation.clouds
@@ -144,6 +145,12 @@ def log_documents(
     }
     for warning in warnings:
         yield {"warning": warning}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    """The median of those that are known; JSON has no NaN."""
+    known = [value for value in values if math.isfinite(value)]
+    return rounded(np.median(known)) if known else None
 
 
 def _trajectories(record: RunRecord) -> Iterator[dict[str, Any]]:

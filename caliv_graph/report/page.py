@@ -24,7 +24,5 @@ def environment() -> jinja2.Environment:
 
 def script_data(figure: Figure) -> Markup:
     """The JSON of a figure for a script element, escaped so that no text can end the element."""
-    from caliv_graph.report.figures.drawing import figure_json
-
-    text = figure_json(figure)
+    text = figure.figure.json()
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

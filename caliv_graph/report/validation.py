@@ -351,15 +351,13 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     # Imported here: the tables need no plotly.
     from plotly.offline import get_plotlyjs
 
-    from caliv_graph.report.figures.drawing import without_template
     from caliv_graph.report.figures.strips import held_out_figures
     from caliv_graph.report.figures.structure import validation_figures
     from caliv_graph.report.page import environment, script_data
 
-    with without_template():
-        figures = validation_figures(found)
-        if found.held_out is not None:
-            figures += held_out_figures(found.held_out)
+    figures = validation_figures(found)
+    if found.held_out is not None:
+        figures += held_out_figures(found.held_out)
     template = environment().get_template("validation.html.j2")
     return template.render(
         found=found,

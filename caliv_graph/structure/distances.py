@@ -276,7 +276,10 @@ def _measured(
     here = _on(state, strips, layout)
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
-    rows = whitened(geometry, sightings, group, other.nuisances, other.weights, layout.size)
+    repeated = problem.repeated[sightings.scan]
+    rows = whitened(
+        geometry, sightings, group, repeated, other.nuisances, other.weights, layout.size
+    )
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
     thickness = thickness_m(geometry, sightings, other.weights, offsets, strips.count)

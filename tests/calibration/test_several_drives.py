@@ -25,6 +25,7 @@ from caliv_graph.scenario.world_models import ChairModel, GroundModel, ObjectMod
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 
 MM, MRAD = 1e-3, 1e-3
@@ -96,7 +97,7 @@ def config(*recordings: SimulatedRecording, use: tuple[str, ...] = ()) -> Config
     raw["require"] = []
     if use:
         raw["lidars"] = {name: raw["lidars"][name] for name in use}
-    return parse_config(raw, "config.yaml", Path("/nowhere"))
+    return without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
 
 
 @cache

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, Strip, StructureTerm
-from caliv_graph.report.figures.drawing import figure_json, without_template
 from caliv_graph.report.figures.strips import strip_figure
 from caliv_graph.report.surfaces import kind_of
 from caliv_graph.report.validation import (
@@ -155,16 +154,15 @@ def test_strips_are_drawn_where_they_are_and_coloured_by_lidar() -> None:
         strips=tuple(strips),
         offset_m=0.001,
     )
-    with without_template():
-        figure = strip_figure(term, EVIL)
+    figure = strip_figure(term, EVIL)
     assert figure is not None
     thickness, front, other = figure.figure.data
-    assert [thickness.visible, front.visible, other.visible] == [True, False, False]
-    assert np.ptp(thickness.x) == pytest.approx(4.0 + 1.6)  # the dropped one is not drawn
-    assert np.ptp(thickness.y) == pytest.approx(0.0, abs=1e-6)
-    assert list(front.intensity) == pytest.approx([2.0] * 6)
-    assert list(other.intensity) == pytest.approx([-1.0] * 6)
-    assert "<script>alert" not in figure_json(figure)
+    assert [thickness["visible"], front["visible"], other["visible"]] == [True, False, False]
+    assert np.ptp(thickness["x"]) == pytest.approx(4.0 + 1.6)  # the dropped one is not drawn
+    assert np.ptp(thickness["y"]) == pytest.approx(0.0, abs=1e-6)
+    assert list(front["intensity"]) == pytest.approx([2.0] * 6)
+    assert list(other["intensity"]) == pytest.approx([-1.0] * 6)
+    assert "<script>alert" not in figure.figure.json()
 
 
 def strip(centre: Array, normal: Array, seen: dict[str, float], weight: float = 1.0) -> Strip:

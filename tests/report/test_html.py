@@ -42,7 +42,7 @@ from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.simulate import write_drive
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from tests.drives_with_chair import paper_scenario, simulated
+from tests.drives_with_chair import paper_scenario, simulated, without_structure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -87,7 +87,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
     slow = {n: m.model_copy(update={"rate_hz": 2.0}) for n, m in scenario.lidars.items()}
     write_drive(scenario.model_copy(update={"lidars": slow}), folder, 1, threads=1)
-    config = load_config(folder / "config.yaml")
+    config = without_structure(load_config(folder / "config.yaml"))
     blind = config.lidars["front"].model_copy(update={"min_range": 400.0, "max_range": 450.0})
     return ran(config.model_copy(update={"lidars": {**config.lidars, EVIL: blind}}))
 
@@ -387,7 +387,7 @@ def test_a_target_is_shown_upright_where_it_stands(bag: Ran) -> None:
     solution, calibration = bag.run.solution, bag.run.calibration
     solid, flat = target_figures(0, solution, calibration)
 
-    chair = [np.array([trace.x, trace.y, trace.z]).T for trace in solid.figure.data]
+    chair = [np.array([trace[axis] for axis in "xyz"]).T for trace in solid.figure.data]
     before, after = np.concatenate(chair[:2]), np.concatenate(chair[2:])
     # 0.7 m wide and a chair's height; the guesses of 3 degrees at 12 m tear it apart.
     extent = np.percentile(after, 99, axis=0) - np.percentile(after, 1, axis=0)

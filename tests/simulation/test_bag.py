@@ -363,13 +363,14 @@ def test_config_is_ready_to_run_on_the_bag(folder: Path) -> None:
 
 
 def test_target_is_left_out_where_it_is_to_be_searched_for(tmp_path: Path) -> None:
-    for name, scenario in (
-        ("search", changed(config_target="search")),
-        ("none", changed(world=WorldModel())),
-    ):
-        out = write_drive(scenario, tmp_path / name, SEED).folder
-        assert "target" not in yaml.safe_load((out / "config.yaml").read_text())
-        assert load_config(out / "config.yaml").target is None
+    out = write_drive(changed(config_target="search"), tmp_path / "search", SEED).folder
+    assert "target" not in yaml.safe_load((out / "config.yaml").read_text())
+    assert load_config(out / "config.yaml").target is None
+
+
+def test_none_is_searched_for_where_the_world_has_none(tmp_path: Path) -> None:
+    out = write_drive(changed(world=WorldModel()), tmp_path / "none", SEED).folder
+    assert load_config(out / "config.yaml").target is False
 
 
 def test_bias_walk_is_in_the_config_since_no_message_tells_it(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from caliv_graph.scenario.model import CropModel, Scenario
 from caliv_graph.scenario.world_models import ChairModel, CylinderModel
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.workflows.survey import Survey, survey, survey_observations
-from tests.drives_with_chair import paper_lidar, paper_scenario
+from tests.drives_with_chair import paper_lidar, paper_scenario, without_structure
 from tests.kept import KeptDrive
 
 HEIGHT = "height of all LiDARs together"
@@ -70,7 +70,7 @@ class Extracted:
 @functools.cache
 def extracted(name: str, seed: int = 1) -> Extracted:
     recording = KeptDrive(scenario_of(name), seed)
-    config = parse_config(config_of(recording, has_bag=True), name, Path())
+    config = without_structure(parse_config(config_of(recording, has_bag=True), name, Path()))
     prepared = prepare([recording], config, {0: recording.motion()}, SilentProgress())
     return Extracted(config, prepared)
 

@@ -7,8 +7,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
@@ -24,6 +22,7 @@ from caliv_graph.report.figures.drawing import (
     small,
     stamps_along,
 )
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -45,22 +44,18 @@ def target_figures(
         "(left) and with the solved ones (right). Metres from the target's centre, map axes."
     )
     solid = _pair_of_scenes(before, after, lidars, 2)
-    flat = make_subplots(
-        1,
-        4,
-        subplot_titles=("before, from above", "after", "before, from the side", "after"),
-        horizontal_spacing=0.05,
-    )
+    flat = Plot(("before, from above", "after", "before, from the side", "after"), spacing=0.05)
     colour, shown = colours(lidars), labels(lidars)
     reach = min(_reach(before.values()), 1.6 * _reach(after.values()))
-    for column, (points, pick) in enumerate(
+    for panel, (points, pick) in enumerate(
         ((before, (0, 1)), (after, (0, 1)), (before, (0, 2)), (after, (0, 2))), start=1
     ):
         for i, lidar in enumerate(lidars):
             if lidar not in points:
                 continue
             p = points[lidar][evenly(len(points[lidar]), 900)]
-            flat.add_scatter(
+            flat.add(
+                "scatter",
                 x=small(p[:, pick[0]]),
                 y=small(p[:, pick[1]]),
                 mode="markers",
@@ -72,18 +67,13 @@ def target_figures(
                 },
                 name=shown[lidar],
                 legendgroup=shown[lidar],
-                showlegend=column == 1,
+                showlegend=panel == 1,
                 hoverinfo="skip",
-                row=1,
-                col=column,
+                panel=panel,
             )
-        flat.update_xaxes(range=[-reach, reach], constrain="domain", row=1, col=column)
-        flat.update_yaxes(
-            range=[-reach, reach],
-            scaleanchor=f"x{column if column > 1 else ''}",
-            row=1,
-            col=column,
-        )
+        flat.x_axes(range=[-reach, reach], constrain="domain", panel=panel)
+        anchor = f"x{panel if panel > 1 else ''}"
+        flat.y_axes(range=[-reach, reach], scaleanchor=anchor, panel=panel)
     finish(flat, 340)
     return (
         Figure(f"target_{placement}", note, solid, solid=True),
@@ -170,21 +160,16 @@ def _pair_of_scenes(
     lidars: Sequence[str],
     size: float,
     path: Array | None = None,
-) -> go.Figure:
-    figure = make_subplots(
-        1,
-        2,
-        specs=[[{"type": "scene"}, {"type": "scene"}]],
-        subplot_titles=("before: initial guess", "after"),
-        horizontal_spacing=0.01,
-    )
+) -> Plot:
+    figure = Plot(("before: initial guess", "after"), solid=True, spacing=0.01)
     colour, shown = colours(lidars), labels(lidars)
-    for column, points in enumerate((before, after), start=1):
+    for panel, points in enumerate((before, after), start=1):
         for name in lidars:
             if name not in points:
                 continue
             x, y, z = small(points[name]).T
-            figure.add_scatter3d(
+            figure.add(
+                "scatter3d",
                 x=x,
                 y=y,
                 z=z,
@@ -192,14 +177,14 @@ def _pair_of_scenes(
                 marker={"color": colour[name], "size": size},
                 name=shown[name],
                 legendgroup=shown[name],
-                showlegend=column == 1,
+                showlegend=panel == 1,
                 hoverinfo="skip",
-                row=1,
-                col=column,
+                panel=panel,
             )
         if path is not None:
             x, y, z = small(path).T
-            figure.add_scatter3d(
+            figure.add(
+                "scatter3d",
                 x=x,
                 y=y,
                 z=z,
@@ -207,10 +192,9 @@ def _pair_of_scenes(
                 line={"color": BLACK, "width": 5},
                 name="vehicle",
                 legendgroup="vehicle",
-                showlegend=column == 1,
+                showlegend=panel == 1,
                 hoverinfo="skip",
-                row=1,
-                col=column,
+                panel=panel,
             )
     axis = {"title": {"text": ""}, "backgroundcolor": "#F7F7F7", "gridcolor": "#DDDDDD"}
     # A drive is flat and wide: the camera is higher, and the view larger.
@@ -225,9 +209,9 @@ def _pair_of_scenes(
     # The same box on both sides, to scale, but at least 0.1 m high: a flat box is hard to read.
     extent: Array = np.maximum(high - low, 0.1)
     aspect = dict(zip("xyz", (longest * extent / extent.max()).round(3).tolist(), strict=True))
-    figure.update_scenes(aspectmode="manual", aspectratio=aspect, camera=camera, **spans)
-    figure.update_layout(legend={"itemsizing": "constant"})
+    figure.scenes(aspectmode="manual", aspectratio=aspect, camera=camera, **spans)
     finish(figure, 480)
+    figure.layout["legend"]["itemsizing"] = "constant"
     return figure
 
 

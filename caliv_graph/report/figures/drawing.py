@@ -1,4 +1,4 @@
-"""What all figures share: colours, names, layout, thinning of data, and JSON for plotly.js.
+"""What all figures share: colours, names, layout and thinning of data.
 
 The colours are those of Okabe and Ito (2008), which colour-blind readers can tell apart. What
 matters differs in its marker or dash as well, for print.
@@ -6,21 +6,17 @@ matters differs in its marker or dash as well, for print.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from html import escape
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import plotly.graph_objects as go
-from plotly.io import templates
-from plotly.io.json import to_json_plotly
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import IntArray
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY = (
@@ -56,32 +52,8 @@ class Figure:
 
     name: str
     caption: str
-    figure: go.Figure
+    figure: Plot
     solid: bool = False
-
-
-@contextmanager
-def without_template() -> Iterator[None]:
-    """Creates figures without a template, which plotly would validate again at every step."""
-    before = templates.default
-    templates.default = None
-    try:
-        yield
-    finally:
-        templates.default = before
-
-
-def figure_json(figure: Figure) -> str:
-    """JSON for plotly.js: data, layout and template."""
-    document = figure.figure.to_plotly_json()
-    document["layout"]["template"] = _template()
-    return str(to_json_plotly(document))
-
-
-@cache
-def _template() -> Mapping[str, Any]:
-    found: Mapping[str, Any] = templates["plotly_white"].to_plotly_json()
-    return found
 
 
 def label(text: str) -> str:
@@ -106,18 +78,17 @@ def colours(lidars: Sequence[str]) -> dict[str, str]:
     return {name: LIDAR_COLOURS[i % len(LIDAR_COLOURS)] for i, name in enumerate(lidars)}
 
 
-def finish(figure: go.Figure, height: int) -> None:
+def finish(figure: Plot, height: int, *, legend: bool = True) -> None:
     """Sets size (the height in pixels), margins, font and legend of a figure in place."""
-    figure.update_layout(
-        width=WIDTH,
-        height=height,
-        margin={"l": 60, "r": 20, "t": 40, "b": 50},
-        font={"family": "system-ui, sans-serif", "size": 12, "color": "#1A1A1A"},
-        legend={"orientation": "h", "yanchor": "bottom", "y": 1.08, "x": 0.0},
-    )
-    if figure.layout.showlegend is not False:
-        figure.update_layout(margin={"t": 90})
-    figure.update_annotations(font={"size": 12})
+    figure.layout |= {
+        "width": WIDTH,
+        "height": height,
+        "margin": {"l": 60, "r": 20, "t": 90 if legend else 40, "b": 50},
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1A1A1A"},
+        "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.08, "x": 0.0},
+    }
+    if not legend:
+        figure.layout["showlegend"] = False
 
 
 def evenly(count: int, most: int) -> IntArray:

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from caliv_graph.calibration.refine import STEP_SIGMAS, STEP_TOLERANCE
 from caliv_graph.products import Solution
@@ -26,6 +24,7 @@ from caliv_graph.report.figures.drawing import (
     small,
     to_seconds,
 )
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.report.numbers import two_digits
 from caliv_graph.report.residuals import Residuals
 
@@ -35,41 +34,37 @@ def residual_figure(residuals: Residuals, number: int) -> Figure:
 
     The number makes the figure's name unique.
     """
-    count = 1 + len(residuals.physical)
     titles = ["whitened, all axes", *(f"{q} ({u})" for q, (u, _) in residuals.physical.items())]
-    figure = make_subplots(1, count, subplot_titles=titles)
+    figure = Plot(titles)
     edges = np.linspace(-5.0, 5.0, 41)
     white = np.clip(residuals.whitened.ravel(), -4.99, 4.99)
     density, _ = np.histogram(white, edges, density=True)
     middles = 0.5 * (edges[1:] + edges[:-1])
-    figure.add_bar(
-        x=small(middles), y=small(density), marker={"color": SKY}, name="whitened", row=1, col=1
-    )
+    figure.add("bar", x=small(middles), y=small(density), marker={"color": SKY}, name="whitened")
     x = np.linspace(-5.0, 5.0, 121)
-    figure.add_scatter(
+    figure.add(
+        "scatter",
         x=small(x),
         y=small(np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi)),
         mode="lines",
         line={"color": BLACK, "width": 2},
         name="N(0, 1)",
-        row=1,
-        col=1,
     )
-    for column, values in enumerate((v for _, v in residuals.physical.values()), start=2):
+    for panel, values in enumerate((v for _, v in residuals.physical.values()), start=2):
         # A cloud of one face of the target has no information along that face, so its residual
         # there can be any number. The outermost bars hold all values beyond the drawn range.
         reach = max(6.0 * float(np.median(np.abs(values))), 1e-6)
         heights, bounds = np.histogram(np.clip(values, -reach, reach), 40, (-reach, reach))
-        figure.add_bar(
+        figure.add(
+            "bar",
             x=small(0.5 * (bounds[1:] + bounds[:-1])),
             y=heights,
             marker={"color": GREEN},
             name="count",
-            row=1,
-            col=column,
+            panel=panel,
         )
-    figure.update_layout(bargap=0.05, showlegend=False)
-    finish(figure, 260)
+    figure.layout["bargap"] = 0.05
+    finish(figure, 260, legend=False)
     n, k = residuals.whitened.shape
     wide = " The residuals are wider than assumed: the noise is larger, or the model is incomplete."
     return Figure(
@@ -96,7 +91,7 @@ def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure | None:
     colour, shown = colours(lidars), labels(lidars)
     begin = first_stamp(c.stamp_ns for r in solution.registrations for c in r.observation.clouds)
     drives = len({c.drive for r in solution.registrations for c in r.observation.clouds})
-    figure = go.Figure()
+    figure = Plot()
     for i, name in enumerate(lidars):
         at: list[float] = []
         weight: list[float] = []
@@ -106,7 +101,8 @@ def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure | None:
                     at.append(to_seconds(cloud.stamp_ns - begin))
                     weight.append(float(w))
         if at:
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=small(np.array(at)),
                 y=small(np.array(weight)),
                 mode="markers",
@@ -114,8 +110,8 @@ def weight_figure(solution: Solution, lidars: Sequence[str]) -> Figure | None:
                 name=shown[name],
                 hovertemplate="%{x:.2f} s: weight %{y:.2f}",
             )
-    figure.update_yaxes(title="weight", range=[-0.05, 1.05])
-    figure.update_xaxes(title=f"seconds{' (drives overlaid by their stamps)' * (drives > 1)}")
+    figure.y_axes(title="weight", range=[-0.05, 1.05])
+    figure.x_axes(title=f"seconds{' (drives overlaid by their stamps)' * (drives > 1)}")
     finish(figure, 300)
     return Figure(
         "weights",
@@ -131,7 +127,7 @@ def convergence_figure(solution: Solution) -> Figure | None:
     if not solution.course:
         return None
     number = np.arange(1, len(solution.course) + 1)
-    figure = go.Figure()
+    figure = Plot()
     for what, values, colour, symbol, dash, limit in (
         (
             "rotation (mrad)",
@@ -158,7 +154,8 @@ def convergence_figure(solution: Solution) -> Figure | None:
             STEP_SIGMAS,
         ),
     ):
-        figure.add_scatter(
+        figure.add(
+            "scatter",
             x=number,
             y=small(np.maximum(values, 1e-9)),
             mode="lines+markers",
@@ -167,8 +164,8 @@ def convergence_figure(solution: Solution) -> Figure | None:
             name=f"step, {what}; converged below {limit:g}",
             hovertemplate="iteration %{x}: %{y:.3g}",
         )
-    figure.update_yaxes(type="log", title="largest step of an extrinsic", exponentformat="power")
-    figure.update_xaxes(title="iteration", dtick=1)
+    figure.y_axes(type="log", title="largest step of an extrinsic", exponentformat="power")
+    figure.x_axes(title="iteration", dtick=1)
     finish(figure, 340)
     return Figure(
         "convergence",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from caliv_graph.products import Calibration, Solution
 from caliv_graph.report.figures.alignment import scene_figure, target_figures
-from caliv_graph.report.figures.drawing import Figure, without_template
+from caliv_graph.report.figures.drawing import Figure
 from caliv_graph.report.figures.fit import convergence_figure, residual_figure, weight_figure
 from caliv_graph.report.figures.strips import strip_figure, thickness_figure
 from caliv_graph.report.figures.trajectory import correction_figure, motion_figure, path_figure
@@ -27,27 +27,26 @@ def report_figures(
     calibration: Calibration, solution: Solution, record: RunRecord
 ) -> dict[str, list[Figure]]:
     """Per section its figures, in the order of the page; a section may be empty."""
-    with without_template():
-        kinds = all_residuals(solution, record)
-        sections: dict[str, Sequence[Figure | None]] = {
-            "extrinsics": [sigma_figure(calibration)],
-            "observability": [spectrum_figure(solution), correlation_figure(calibration)],
-            "alignment": [
-                *_targets(calibration, solution),
-                *_scenes(calibration, record),
-            ],
-            "residuals": [residual_figure(kind, n) for n, kind in enumerate(kinds, start=1)],
-            "structure": [
-                *(
-                    strip_figure(term, record.drives[term.drive])
-                    for term in solution.structure[:MOST_SOLID]
-                ),
-                thickness_figure(solution),
-            ],
-            "weights": [weight_figure(solution, list(calibration.lidars))],
-            "trajectory": _trajectories(calibration, solution, record),
-            "convergence": [convergence_figure(solution)],
-        }
+    kinds = all_residuals(solution, record)
+    sections: dict[str, Sequence[Figure | None]] = {
+        "extrinsics": [sigma_figure(calibration)],
+        "observability": [spectrum_figure(solution), correlation_figure(calibration)],
+        "alignment": [
+            *_targets(calibration, solution),
+            *_scenes(calibration, record),
+        ],
+        "residuals": [residual_figure(kind, n) for n, kind in enumerate(kinds, start=1)],
+        "structure": [
+            *(
+                strip_figure(term, record.drives[term.drive])
+                for term in solution.structure[:MOST_SOLID]
+            ),
+            thickness_figure(solution),
+        ],
+        "weights": [weight_figure(solution, list(calibration.lidars))],
+        "trajectory": _trajectories(calibration, solution, record),
+        "convergence": [convergence_figure(solution)],
+    }
     return {name: [f for f in found if f is not None] for name, found in sections.items()}
 
 

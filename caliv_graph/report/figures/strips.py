@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, Solution, Strip, StructureTerm
@@ -19,6 +18,7 @@ from caliv_graph.report.figures.drawing import (
     label,
     small,
 )
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.validation.findings import AFTER, BEFORE, WITHOUT, HeldOutStructure
 
 HALF_M = 0.8
@@ -139,7 +139,7 @@ def _largest(distances: Mapping[Any, float]) -> float:
     return max(distances.values(), key=abs, default=float("nan"))
 
 
-def _squares(centres: Array, normals: Array, shades: Sequence[Shade]) -> go.Figure:
+def _squares(centres: Array, normals: Array, shades: Sequence[Shade]) -> Plot:
     """Squares in 3-D, a mesh per shade; buttons choose the one that is shown."""
     axes = HALF_M * tangent_axes(normals)
     corners = np.stack(
@@ -150,7 +150,6 @@ def _squares(centres: Array, normals: Array, shades: Sequence[Shade]) -> go.Figu
         axis=1,
     )
     corners -= centres.mean(axis=0)
-    meshes = [_mesh(corners, shade, shown=i == 0) for i, shade in enumerate(shades)]
     buttons = [
         {
             "label": label(shade.name),
@@ -164,32 +163,26 @@ def _squares(centres: Array, normals: Array, shades: Sequence[Shade]) -> go.Figu
         f"{axis}axis": {"title": {"text": ""}, "range": [float(a) - 1.0, float(b) + 1.0]}
         for axis, a, b in zip("xyz", low, high, strict=True)
     }
-    figure = go.Figure(
-        data=meshes,
-        layout={
-            "scene": {
-                "aspectmode": "data",
-                "camera": {"eye": {"x": -0.9, "y": -0.9, "z": 0.9}},
-                **spans,
-            },
-            "updatemenus": [
-                {
-                    "buttons": buttons,
-                    "type": "buttons",
-                    "direction": "right",
-                    "x": 0.0,
-                    "xanchor": "left",
-                    "y": 1.12,
-                }
-            ],
-            "showlegend": False,
-        },
-    )
-    finish(figure, 520)
+    figure = Plot(solid=True)
+    for i, shade in enumerate(shades):
+        figure.add("mesh3d", **_mesh(corners, shade, shown=i == 0))
+    figure.scenes(aspectmode="data", camera={"eye": {"x": -0.9, "y": -0.9, "z": 0.9}}, **spans)
+    finish(figure, 520, legend=False)
+    figure.layout["updatemenus"] = [
+        {
+            "buttons": buttons,
+            "type": "buttons",
+            "direction": "right",
+            "x": 0.0,
+            "xanchor": "left",
+            "y": 1.12,
+        }
+    ]
+    figure.layout["margin"] = {**figure.layout["margin"], "t": 90}
     return figure
 
 
-def _mesh(corners: Array, shade: Shade, shown: bool) -> go.Mesh3d:
+def _mesh(corners: Array, shade: Shade, shown: bool) -> dict[str, Any]:
     """The squares of which the value is known; corners (K, 4, 3) metres."""
     known = np.flatnonzero(np.isfinite(shade.values_mm))
     x, y, z = small(corners[known].reshape(-1, 3)).T
@@ -197,46 +190,40 @@ def _mesh(corners: Array, shade: Shade, shown: bool) -> go.Mesh3d:
     values = shade.values_mm[known]
     size = float(np.quantile(np.abs(values), PART)) if len(known) else 0.0
     size = max(size, 1e-3)
-    return go.Mesh3d(
-        x=x,
-        y=y,
-        z=z,
-        i=np.repeat(first, 2),
-        j=np.stack([first + 1, first + 2], axis=1).ravel(),
-        k=np.stack([first + 2, first + 3], axis=1).ravel(),
-        intensity=small(np.repeat(values, 2)),
-        intensitymode="cell",
-        colorscale=SIGNED if shade.signed else THICK,
-        cmin=-size if shade.signed else 0.0,
-        cmax=size,
-        colorbar={"title": {"text": "mm"}, "len": 0.8},
-        flatshading=True,
-        lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
-        hoverinfo="skip",
-        visible=shown,
-    )
+    return {
+        "x": x,
+        "y": y,
+        "z": z,
+        "i": np.repeat(first, 2),
+        "j": np.stack([first + 1, first + 2], axis=1).ravel(),
+        "k": np.stack([first + 2, first + 3], axis=1).ravel(),
+        "intensity": small(np.repeat(values, 2)),
+        "intensitymode": "cell",
+        "colorscale": SIGNED if shade.signed else THICK,
+        "cmin": -size if shade.signed else 0.0,
+        "cmax": size,
+        "colorbar": {"title": {"text": "mm"}, "len": 0.8},
+        "flatshading": True,
+        "lighting": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
+        "hoverinfo": "skip",
+        "visible": shown,
+    }
 
 
-def _shares(curves: Mapping[str, tuple[Sequence[float], str]]) -> go.Figure:
+def _shares(curves: Mapping[str, tuple[Sequence[float], str]]) -> Plot:
     """The share of values (metres) below each, over millimetres."""
-    lines = []
+    figure = Plot()
     for name, (values_m, colour) in curves.items():
         values = np.sort(1e3 * np.array([v for v in values_m if np.isfinite(v)]))
-        lines.append(
-            go.Scatter(
-                x=small(np.maximum(values, LEAST_MM)),
-                y=small(100.0 * np.arange(1, len(values) + 1) / max(len(values), 1)),
-                mode="lines",
-                line={"color": colour, "dash": "dot" if name.startswith("before") else "solid"},
-                name=name,
-            )
+        figure.add(
+            "scatter",
+            x=small(np.maximum(values, LEAST_MM)),
+            y=small(100.0 * np.arange(1, len(values) + 1) / max(len(values), 1)),
+            mode="lines",
+            line={"color": colour, "dash": "dot" if name.startswith("before") else "solid"},
+            name=name,
         )
-    figure = go.Figure(
-        data=lines,
-        layout={
-            "xaxis": {"type": "log", "title": {"text": "thickness (mm)"}},
-            "yaxis": {"title": {"text": "share of the strips (%)"}, "range": [0, 100]},
-        },
-    )
+    figure.x_axes(title="thickness (mm)", type="log")
+    figure.y_axes(title="share of the strips (%)", range=[0, 100])
     finish(figure, 320)
     return figure

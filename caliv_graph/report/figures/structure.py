@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.report.figures.drawing import SYMBOLS, Figure, colours, finish, label, small
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.validation.findings import AFTER, BEFORE, Validation
 
 MOST_POINTS = 2500
@@ -100,10 +99,10 @@ def _two(
     equal: bool,
     height: int,
     closer: bool = True,
-) -> go.Figure:
+) -> Plot:
     """Before and after side by side at one scale; closer: after at its own scale, too."""
     stages = {"before": BEFORE, "after": AFTER, **({"after, closer": AFTER} if closer else {})}
-    figure = make_subplots(1, len(stages), subplot_titles=tuple(stages))
+    figure = Plot(tuple(stages))
     lidar = found.clouds.lidar[members]
     colour = colours(found.lidars)
     for i, name in enumerate(found.lidars):
@@ -113,8 +112,9 @@ def _two(
         if len(own) > MOST_POINTS:
             rng = np.random.default_rng(0)
             own = own[np.sort(rng.choice(len(own), MOST_POINTS, replace=False))]
-        for column, stage in enumerate(stages.values(), start=1):
-            figure.add_scatter(
+        for panel, stage in enumerate(stages.values(), start=1):
+            figure.add(
+                "scatter",
                 x=small(views[stage][own, 0]),
                 y=small(views[stage][own, 1]),
                 mode="markers",
@@ -126,20 +126,20 @@ def _two(
                 },
                 name=label(name),
                 legendgroup=name,
-                showlegend=column == 1,
+                showlegend=panel == 1,
                 hovertemplate="%{x:.3f}, %{y:.3f}",
-                row=1,
-                col=column,
+                panel=panel,
             )
-    figure.update_xaxes(title=heads[0])
-    figure.update_yaxes(title=heads[1], col=1)
-    figure.update_layout(xaxis2_matches="x", yaxis2_matches="y")
+    figure.x_axes(title=heads[0])
+    figure.y_axes(title=heads[1], panel=1)
+    figure.x_axes(matches="x", panel=2)
+    figure.y_axes(matches="y", panel=2)
     if equal:
         # The second pair of axes follows the first.
-        figure.update_layout(yaxis_scaleanchor="x")
+        figure.y_axes(scaleanchor="x", panel=1)
         if closer:
-            figure.update_layout(yaxis3_scaleanchor="x3")
-        figure.update_xaxes(constrain="domain")
-        figure.update_yaxes(constrain="domain")
+            figure.y_axes(scaleanchor="x3", panel=3)
+        figure.x_axes(constrain="domain")
+        figure.y_axes(constrain="domain")
     finish(figure, height)
     return figure

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.geometry.se3 import stack
@@ -30,6 +28,7 @@ from caliv_graph.report.figures.drawing import (
     stamps_along,
     to_seconds,
 )
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.report.residuals import gnss_residuals
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -52,9 +51,9 @@ def path_figure(
     _, t = trajectory.poses_at(stamps_along(trajectory, 1500))
     origin = t[0]
     begin_ns, end_ns = trajectory.span_ns
-    figure = go.Figure()
+    figure = Plot()
     x, y, _ = small(t - origin).T
-    figure.add_scatter(x=x, y=y, mode="lines", line={"color": BLACK, "width": 1}, name="vehicle")
+    figure.add("scatter", x=x, y=y, mode="lines", line={"color": BLACK, "width": 1}, name="vehicle")
     if isinstance(trajectory, SmoothedTrajectory):
         fixes, residuals = gnss_residuals(trajectory)
         if len(fixes):
@@ -79,8 +78,8 @@ def path_figure(
         if any(c.drive == drive for c in r.observation.clouds):
             place = (r.observation.centre_map - origin)[None]
             _dots(figure, place, label(r.observation.name), PURPLE, "star", 15)
-    figure.update_yaxes(scaleanchor="x", title="m")
-    figure.update_xaxes(title="m, from the first pose, map axes", constrain="domain")
+    figure.y_axes(scaleanchor="x", title="m")
+    figure.x_axes(title="m, from the first pose, map axes", constrain="domain")
     finish(figure, 480)
     return Figure(
         f"path_{drive}",
@@ -99,18 +98,17 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
     titles = ["accelerometer bias (mm/s²)", "gyroscope bias (mrad/s)"]
     if len(fixes):
         titles.append("GNSS residual (mm)")
-    figure = make_subplots(
-        len(titles), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=0.09
-    )
+    figure = Plot(titles, stacked=True, spacing=0.09)
     force_sigma, gyro_sigma = trajectory.bias_sigmas()
     dashes, axes = ("solid", "dash", "dot"), "xyz"
     states = trajectory.states
-    for row, (values, sigma) in enumerate(
+    for panel, (values, sigma) in enumerate(
         ((states.force_bias, force_sigma), (states.gyro_bias, gyro_sigma)), start=1
     ):
         for axis, (colour, _) in enumerate(_AXIS_STYLES):
             value, spread = 1e3 * values[some, axis], 1e3 * sigma[some, axis]
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=np.concatenate([seconds, seconds[::-1]]),
                 y=small(np.concatenate([value + spread, (value - spread)[::-1]])),
                 fill="toself",
@@ -119,33 +117,32 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
                 mode="lines",
                 hoverinfo="skip",
                 showlegend=False,
-                row=row,
-                col=1,
+                panel=panel,
             )
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=seconds,
                 y=small(value),
                 mode="lines",
                 line={"color": colour, "dash": dashes[axis]},
                 name=f"{axes[axis]} of the IMU",
                 legendgroup=f"bias {axis}",
-                showlegend=row == 1,
-                row=row,
-                col=1,
+                showlegend=panel == 1,
+                panel=panel,
             )
     if len(fixes):
         few = evenly(len(fixes), MOST_SAMPLES // 3)
         for axis, (colour, symbol) in enumerate(_AXIS_STYLES):
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=to_seconds(fixes[few] - begin),
                 y=small(1e3 * r[few, axis]),
                 mode="markers",
                 marker={"color": colour, "symbol": symbol, "size": 4},
                 name=("east", "north", "up")[axis],
-                row=3,
-                col=1,
+                panel=3,
             )
-    figure.update_xaxes(title="seconds", row=len(titles), col=1)
+    figure.x_axes(title="seconds", panel=len(titles))
     finish(figure, 200 * len(titles) + 60)
     dropped = len(trajectory.gnss_rejected)
     return Figure(
@@ -171,28 +168,22 @@ def correction_figure(
     back = np.swapaxes(R, 1, 2)
     rotation = Rotation.from_matrix(back @ R_new).as_rotvec()
     translation = np.einsum("nij,nj->ni", back, t_new - t)
-    figure = make_subplots(
-        2,
-        1,
-        shared_xaxes=True,
-        vertical_spacing=0.14,
-        subplot_titles=("rotation (mrad)", "position (mm)"),
-    )
+    figure = Plot(("rotation (mrad)", "position (mm)"), stacked=True, spacing=0.14)
     seconds = to_seconds(stamps - first_stamp(stamps))
-    for row, values in enumerate((rotation, translation), start=1):
+    for panel, values in enumerate((rotation, translation), start=1):
         for axis, (colour, symbol) in enumerate(_AXIS_STYLES):
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=seconds,
                 y=small(1e3 * values[:, axis]),
                 mode="markers",
                 marker={"color": colour, "symbol": symbol, "size": 5},
                 name=f"{'xyz'[axis]} (vehicle axes)",
                 legendgroup=f"correction {axis}",
-                showlegend=row == 1,
-                row=row,
-                col=1,
+                showlegend=panel == 1,
+                panel=panel,
             )
-    figure.update_xaxes(title="seconds from the first scan used", row=2, col=1)
+    figure.x_axes(title="seconds from the first scan used", panel=2)
     finish(figure, 420)
     before = "smoothed" if isinstance(trajectory, SmoothedTrajectory) else "given"
     return Figure(
@@ -202,9 +193,10 @@ def correction_figure(
     )
 
 
-def _dots(figure: go.Figure, points: Array, name: str, colour: str, symbol: str, size: int) -> None:
+def _dots(figure: Plot, points: Array, name: str, colour: str, symbol: str, size: int) -> None:
     some = small(points[evenly(len(points), MOST_SAMPLES)])
-    figure.add_scatter(
+    figure.add(
+        "scatter",
         x=some[:, 0],
         y=some[:, 1],
         mode="markers",

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
@@ -20,13 +18,14 @@ from caliv_graph.report.figures.drawing import (
     labels,
     small,
 )
+from caliv_graph.report.figures.plot import Plot
 from caliv_graph.report.numbers import rounded
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO, WEAK_RATIO, spectrum
 
 
 def sigma_figure(calibration: Calibration) -> Figure | None:
     """Sigmas before and after the drive, per LiDAR and axis; None if all LiDARs are fixed."""
-    figure = make_subplots(1, 2, subplot_titles=("rotation (mrad)", "position (mm)"))
+    figure = Plot(("rotation (mrad)", "position (mm)"))
     shown = labels(calibration.lidars)
     prior: dict[int, list[tuple[str, float]]] = {1: [], 2: []}
     known: dict[int, list[tuple[str, float]]] = {1: [], 2: []}
@@ -36,10 +35,10 @@ def sigma_figure(calibration: Calibration) -> Figure | None:
             continue
         after = np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
         for i, axis in enumerate(AXES):
-            column, at = (1 if i < 3 else 2), f"{shown[name]} {axis}"
+            panel, at = (1 if i < 3 else 2), f"{shown[name]} {axis}"
             if lidar.guess is not None:
-                prior[column].append((at, 1e3 * float(lidar.guess.sigmas[i])))
-            (known if lidar.determined[axis] else held)[column].append((at, 1e3 * float(after[i])))
+                prior[panel].append((at, 1e3 * float(lidar.guess.sigmas[i])))
+            (known if lidar.determined[axis] else held)[panel].append((at, 1e3 * float(after[i])))
     if not any((*known.values(), *held.values())):
         return None
     order = {
@@ -56,27 +55,25 @@ def sigma_figure(calibration: Calibration) -> Figure | None:
         ),
     ):
         in_legend = False
-        for column in (1, 2):
-            if not kinds[column]:
+        for panel in (1, 2):
+            if not kinds[panel]:
                 continue
-            figure.add_scatter(
-                x=[at for at, _ in kinds[column]],
-                y=[rounded(sigma, 4) for _, sigma in kinds[column]],
+            figure.add(
+                "scatter",
+                x=[at for at, _ in kinds[panel]],
+                y=[rounded(sigma, 4) for _, sigma in kinds[panel]],
                 mode="markers",
                 marker=marker,
                 name=what,
                 legendgroup=what,
                 showlegend=not in_legend,
                 hovertemplate="%{x}: %{y:.3g}",
-                row=1,
-                col=column,
+                panel=panel,
             )
             in_legend = True
-    for column in (1, 2):
-        figure.update_xaxes(
-            categoryorder="array", categoryarray=order[column], tickangle=-50, row=1, col=column
-        )
-    figure.update_yaxes(type="log", dtick="D2")
+    for panel in (1, 2):
+        figure.x_axes(categoryorder="array", categoryarray=order[panel], tickangle=-50, panel=panel)
+    figure.y_axes(type="log", dtick="D2")
     finish(figure, 400)
     return Figure(
         "sigmas",
@@ -94,13 +91,14 @@ def spectrum_figure(solution: Solution) -> Figure:
     # Without information the sigma is infinite, or nearly so: it is drawn at the upper edge.
     top = 30.0 * float(prior.max())
     number = np.arange(1, len(data) + 1)
-    figure = go.Figure()
+    figure = Plot()
     for dash, ratio, what in (
         ("solid", 1.0, "initial guess"),
         ("dash", UNDETERMINED_RATIO, f"{UNDETERMINED_RATIO:g} of it: above, undetermined"),
         ("dot", WEAK_RATIO, f"{WEAK_RATIO:g} of it: above, weak"),
     ):
-        figure.add_scatter(
+        figure.add(
+            "scatter",
             x=number,
             y=small(ratio * prior),
             mode="lines",
@@ -116,7 +114,8 @@ def spectrum_figure(solution: Solution) -> Figure:
     for what, mask, colour, symbol in verdicts:
         if mask.any():
             beyond = data[mask] > top
-            figure.add_scatter(
+            figure.add(
+                "scatter",
                 x=number[mask],
                 y=small(np.minimum(data[mask], top)),
                 mode="markers",
@@ -128,8 +127,8 @@ def spectrum_figure(solution: Solution) -> Figure:
                 name=f"data: {what}",
                 hovertemplate="direction %{x}: %{y:.3g}",
             )
-    figure.update_yaxes(type="log", title="1 sigma (mrad; 1 mrad as 10 mm)", dtick=1)
-    figure.update_xaxes(title="direction, best determined first", dtick=1)
+    figure.y_axes(type="log", title="1 sigma (mrad; 1 mrad as 10 mm)", dtick=1)
+    figure.x_axes(title="direction, best determined first", dtick=1)
     finish(figure, 380)
     held = (
         f" Mode {solution.mode} holds {', '.join(solution.held)} at the initial guess."
@@ -162,22 +161,22 @@ def correlation_figure(calibration: Calibration) -> Figure:
         for name in names
         for axis in AXES
     ]
-    figure = go.Figure(
-        go.Heatmap(
-            z=np.round(cov / np.outer(sigma, sigma), 2),
-            x=ticks,
-            y=ticks,
-            zmin=-1.0,
-            zmax=1.0,
-            colorscale=[[0.0, BLUE], [0.5, "#FFFFFF"], [1.0, VERMILLION]],
-            colorbar={"title": {"text": "correlation"}},
-            hovertemplate="%{y}<br>%{x}<br>%{z:.2f}<extra></extra>",
-            xgap=1,
-            ygap=1,
-        )
+    figure = Plot()
+    figure.add(
+        "heatmap",
+        z=np.round(cov / np.outer(sigma, sigma), 2),
+        x=ticks,
+        y=ticks,
+        zmin=-1.0,
+        zmax=1.0,
+        colorscale=[[0.0, BLUE], [0.5, "#FFFFFF"], [1.0, VERMILLION]],
+        colorbar={"title": {"text": "correlation"}},
+        hovertemplate="%{y}<br>%{x}<br>%{z:.2f}<extra></extra>",
+        xgap=1,
+        ygap=1,
     )
-    figure.update_yaxes(autorange="reversed", scaleanchor="x", constrain="domain")
-    figure.update_xaxes(tickangle=-60, constrain="domain")
+    figure.y_axes(autorange="reversed", scaleanchor="x", constrain="domain")
+    figure.x_axes(tickangle=-60, constrain="domain")
     finish(figure, min(460 + 14 * len(ticks), 900))
     return Figure(
         "correlation",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,8 +40,8 @@ def _held_row(strip: HeldStrip) -> list[str]:
         "\n".join(f"{name} ({count})" for name, count in strip.scans.items()),
         *apart,
         _lines(strip.sigma_m[AFTER]),
-        *(f"{1e3 * strip.thickness_m[stage]:.1f}" for stage in (BEFORE, AFTER)),
-        f"{1e3 * strip.expected_thickness_m[AFTER]:.1f}",
+        *(_known(strip.thickness_m[stage]) for stage in (BEFORE, AFTER)),
+        _known(strip.expected_thickness_m[AFTER]),
     ]
 
 
@@ -118,3 +119,7 @@ def _held_document(strip: HeldStrip) -> dict[str, Any]:
             for a, b in strip.distance_m[AFTER]
         ],
     }
+
+
+def _known(value_m: float) -> str:
+    return millimetres(value_m if math.isfinite(value_m) else None)

@@ -34,6 +34,7 @@ from caliv_graph.structure.solve import (
 )
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
+    PLACE_PRIOR_M,
     TILT_PRIOR_RAD,
     Geometry,
     Layout,
@@ -43,7 +44,7 @@ from caliv_graph.structure.system import (
     stepped,
     whitened,
 )
-from caliv_graph.structure.thickness import thickness_m
+from caliv_graph.structure.thickness import thickness_m, weighted_alike
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -85,7 +86,8 @@ class OtherStrips:
         used: the solve, which did not use them.
         problem: the same drive with the patches of these strips.
         strips: K of them.
-        weights: (Q,) robust, of the sightings about their own LiDAR's mean on the strip.
+        sightings: Q of them, at the estimate of the solve.
+        weights: (Q,) robust, about the median of their own LiDAR on the strip.
         nuisances: noise levels.
         layout: the coordinates; the first `layout.plane` are those of the solve.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
@@ -99,6 +101,7 @@ class OtherStrips:
     used: Solved
     problem: Problem
     strips: Strips
+    sightings: Sightings
     weights: Array
     nuisances: Nuisances
     layout: Layout
@@ -141,6 +144,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
         used=used,
         problem=problem,
         strips=strips,
+        sightings=sightings,
         weights=weights,
         nuisances=nuisances,
         layout=layout,
@@ -272,21 +276,20 @@ def _measured(
     """
     problem, layout, strips = other.problem, other.layout, other.strips
     placed = placed_patches(problem, state)
-    sightings = placed_sightings(problem, placed, strips, other.range_sigma_m)
+    seen = placed_sightings(problem, placed, strips, other.range_sigma_m)
+    sightings, weights = weighted_alike(seen, other.sightings, other.weights)
     here = _on(state, strips, layout)
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.repeated[sightings.scan]
-    rows = whitened(
-        geometry, sightings, group, repeated, other.nuisances, other.weights, layout.size
-    )
+    rows = whitened(geometry, sightings, group, repeated, other.nuisances, weights, layout.size)
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
-    thickness = thickness_m(geometry, sightings, other.weights, offsets, strips.count)
+    thickness = thickness_m(geometry, sightings, weights, offsets, strips.count)
     if propagated is None or draws is None:
         return Measured(found.distances_m, None, thickness, None)
     drawn = _drawn_offsets(other, geometry, sightings, group, draws, rng)
-    each = thickness_m(geometry, sightings, other.weights, drawn, strips.count)
+    each = thickness_m(geometry, sightings, weights, drawn, strips.count)
     return Measured(
         found.distances_m,
         found.covariance(propagated(found.by_solve)),
@@ -335,7 +338,6 @@ class _Distances:
         self._noise = np.zeros((m, m))
         self._by_surface = np.zeros((m, layout.strip_error - layout.surface_error))
         by_shared = [scipy.sparse.csr_array((0, shared.shape[1]))]
-        tilt = np.diag([TILT_PRIOR_RAD**-2.0] * 2 + [0.0])
         surface = slice(layout.surface_error, layout.strip_error)
         for k in np.unique(other.strip_of):
             at = np.flatnonzero(other.strip_of == k)
@@ -344,7 +346,7 @@ class _Distances:
             columns = np.concatenate([plane, own])
             part = H[columns]
             A = part[:, columns].toarray()
-            A[:3, :3] += tilt
+            A += np.diag([TILT_PRIOR_RAD**-2.0] * 2 + [PLACE_PRIOR_M**-2.0] * (1 + len(at)))
             inverse = np.linalg.inv(A)
             gain = inverse[3:]
             self.distances_m[at] = -(gain @ right[columns])

@@ -50,6 +50,20 @@ def by_strip(sightings: Sightings, count: int) -> list[IntArray]:
     return list(np.split(order, ends))
 
 
+def weighted_alike(
+    sightings: Sightings, weighted: Sightings, weights: Array
+) -> tuple[Sightings, Array]:
+    """The sightings that others (R,) with weights have too, and these weights.
+
+    At other extrinsics a few more or less are at the limit of incidence.
+    """
+    first = max(int(of.strip.max(initial=0)) + 1 for of in (sightings, weighted))
+    here, there = (of.scan * first + of.strip for of in (sightings, weighted))
+    _, own, other = np.intersect1d(here, there, assume_unique=True, return_indices=True)
+    order = np.argsort(own)
+    return sightings.only(own[order]), weights[other[order]]
+
+
 def thickness_at_guesses(found: Solved) -> Array:
     """(K,) of the strips of a solve with the guesses of the extrinsics and the poses of motion."""
     problem = found.problem
@@ -64,10 +78,11 @@ def thickness_at_guesses(found: Solved) -> Array:
     )
     sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     placed = placed_patches(problem, state)
-    sightings = placed_sightings(problem, placed, found.strips, sigma)
+    seen = placed_sightings(problem, placed, found.strips, sigma)
+    sightings, weights = weighted_alike(seen, found.sightings, found.weights)
     geometry = geometry_at(problem, state, sightings, found.layout)
     offsets = geometry.offsets_m(sightings)
-    return thickness_m(geometry, sightings, found.weights, offsets, found.strips.count)
+    return thickness_m(geometry, sightings, weights, offsets, found.strips.count)
 
 
 def thickness_at_estimate(found: Solved) -> Array:

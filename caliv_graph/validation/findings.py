@@ -96,7 +96,8 @@ class HeldStrip:
         distance_m: by stage (`BEFORE`, `AFTER`, `WITHOUT`), per pair, signed distance of the second
             LiDAR's surface from that of the first. The first is the one with most scans.
         sigma_m: by stage except `BEFORE`, per pair, 1 sigma of it from known errors alone.
-        thickness_m: by stage, root mean square distance of what single scans see from one plane.
+        thickness_m: by stage, root mean square distance of what single scans see from one plane;
+            NaN where none of them is within the limit of incidence.
         expected_thickness_m: by stage except `BEFORE`, from known errors alone.
     """
 
@@ -164,7 +165,9 @@ class HeldOutStructure:
 
 
 def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else 0.0
+    """Of the finite ones; 0 of none."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
 
 
 Word = Literal["good", "contradicted", "worse", "unclear"]

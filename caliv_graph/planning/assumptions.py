@@ -32,6 +32,7 @@ class Assumptions:
         extraction: how many points and scans are used.
         ground_everywhere: whether the ground is measured at every scan. `calibrate` measures it
             only at scans that see a target.
+        structure: whether walls count, and the ground cell by cell with them.
         stride: for a quick prediction, only every n-th cloud is used, with n-fold weight.
     """
 
@@ -44,4 +45,5 @@ class Assumptions:
     time_offset: bool = False
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     ground_everywhere: bool = False
+    structure: bool = True
     stride: int = 1

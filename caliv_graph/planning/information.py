@@ -123,7 +123,7 @@ def drive_information(
             np.concatenate([scan_stamps(scenario, n, drive.duration_s) for n in scenario.lidars])
         )
     motion = plan_motion(
-        drive, scenario, stamps, _source(scenario, assumptions), NODE_NS * assumptions.stride
+        drive, scenario, stamps, source_of(scenario, assumptions), NODE_NS * assumptions.stride
     )
     columns = Columns(
         lidars,
@@ -149,20 +149,25 @@ def drive_information(
     rest = np.arange(columns.kept, k)
     corner[rest, rest] += RIDGE
     if assumptions.ground == "height":
-        sigma = assumptions.ground_height_sigma_m
-        sigma = scenario.suspension.height_sigma_m if sigma is None else sigma
-        corner[columns.height, columns.height] += max(sigma, 1e-5) ** -2.0
+        corner[columns.height, columns.height] += height_sigma_of(scenario, assumptions) ** -2.0
     last = Chain(diagonal, motion.coupling, border, corner).only(np.array([n - 1]))
     edge = last.border[0]
     common = last.corner - edge.T @ np.linalg.solve(last.diagonal[0], edge)
     return eliminated(common, columns.kept)
 
 
-def _source(scenario: Scenario, assumptions: Assumptions) -> Source:
+def source_of(scenario: Scenario, assumptions: Assumptions) -> Source:
+    """Where the vehicle's poses come from."""
     if assumptions.source is not None:
         return assumptions.source
     aided = scenario.gnss.enabled or scenario.velocity.enabled
     return "sensors" if scenario.imu.enabled and aided else "poses"
+
+
+def height_sigma_of(scenario: Scenario, assumptions: Assumptions) -> float:
+    """1 sigma of the vehicle's height above ground, metres, above zero."""
+    sigma = assumptions.ground_height_sigma_m
+    return max(scenario.suspension.height_sigma_m if sigma is None else sigma, 1e-5)
 
 
 def eliminated(H: Array, keep: int) -> Array:

@@ -18,10 +18,16 @@ from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
 from caliv_graph.config.model import ExtractionConfig, PoseSigmaConfig
 from caliv_graph.conventions import AXES
-from caliv_graph.errors import ConfigError, TargetError
+from caliv_graph.errors import CalivError, ConfigError, TargetError
 from caliv_graph.planning.assumptions import Assumptions
 from caliv_graph.planning.information import drive_information, eliminated
 from caliv_graph.planning.sightings import Sighting, placements, sight, thinned
+from caliv_graph.planning.structure import (
+    PlannedStructure,
+    SeenWalls,
+    information_with_structure,
+    plan_structure,
+)
 from caliv_graph.products import Array, Direction
 from caliv_graph.scenario.drives import Drive, make_drive
 from caliv_graph.scenario.model import UNIFORM_TO_SIGMA, Scenario
@@ -46,6 +52,7 @@ class Prediction:
         names: names of the drives.
         covariance: predicted sigmas, covariance and undetermined directions.
         sightings: clouds in which each LiDAR sees each target, per drive.
+        walls: what each LiDAR sees of the walls, per drive; None: there are none.
         space_m: sides of the rectangle along the map's axes around path and targets, the largest of
             each over the drives.
         duration_s: duration of all drives together.
@@ -55,6 +62,7 @@ class Prediction:
     names: tuple[str, ...]
     covariance: PredictedCovariance
     sightings: tuple[tuple[Sighting, ...], ...]
+    walls: tuple[SeenWalls | None, ...]
     space_m: tuple[float, float]
     duration_s: float
     warnings: tuple[str, ...]
@@ -88,8 +96,9 @@ def predict(
         assumptions: how it will be recorded and calibrated.
 
     Raises:
-        ConfigError: the scenario has no target, or the drives are not of the same vehicle.
-        TargetError: no LiDAR sees a target.
+        ConfigError: the scenario has neither target nor walls, or the drives are not of the same
+            vehicle.
+        TargetError: no LiDAR sees a target or a wall.
         TrajectoryError: its sensors do not determine the vehicle's motion.
     """
     assumptions = assumptions or Assumptions()
@@ -120,19 +129,23 @@ def predict_drives(
     """
     first = planned[0][0]
     seen = [_sightings(scenario, drive, assumptions) for scenario, drive in planned]
+    structures = [
+        plan_structure(scenario, drive, sightings, assumptions)
+        for (scenario, drive), sightings in zip(planned, seen, strict=True)
+    ]
+    by_structure = frozenset().union(*(s.lidars for s in structures if s is not None))
     lidars = tuple(
         name
         for name in first.lidars
-        if any(len(s.used) for of in seen for s in of if s.lidar == name)
+        if name in by_structure or any(len(s.used) for of in seen for s in of if s.lidar == name)
     )
     if not lidars:
-        raise TargetError(_nobody(planned, seen, assumptions.extraction))
+        raise _nobody(planned, seen, assumptions.extraction)
     n = len(lidars)
     size = (7 if assumptions.time_offset else 6) * n
     information = np.zeros((size, size))
-    for (scenario, drive), sightings in zip(planned, seen, strict=True):
-        if any(len(s.used) for s in sightings):
-            information += drive_information(scenario, drive, sightings, lidars, assumptions)
+    for (scenario, drive), sightings, structure in zip(planned, seen, structures, strict=True):
+        information += _information(scenario, drive, sightings, structure, lidars, assumptions)
     sigmas = _guess_sigmas(first)
     D, offsets_s = _without_offsets(information, lidars, np.diag(np.tile(sigmas, n) ** -2.0))
     covariance = predict_covariance(
@@ -143,11 +156,13 @@ def predict_drives(
         dict.fromkeys(first.lidars, sigmas),
         {name: sum(len(s.used) for of in seen for s in of if s.lidar == name) for name in lidars},
         offsets_s,
+        by_structure,
     )
     return Prediction(
         names=tuple(scenario.name for scenario, _ in planned),
         covariance=named_prediction(covariance),
         sightings=tuple(seen),
+        walls=tuple(None if s is None else s.walls for s in structures),
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
@@ -157,13 +172,30 @@ def predict_drives(
     )
 
 
+def _information(
+    scenario: Scenario,
+    drive: Drive,
+    sightings: Sequence[Sighting],
+    structure: PlannedStructure | None,
+    lidars: Sequence[str],
+    assumptions: Assumptions,
+) -> Array:
+    """As `drive_information`, with structure if there is any; zero if the drive tells nothing."""
+    n, per_lidar = len(lidars), 7 if assumptions.time_offset else 6
+    if structure is not None:
+        H = information_with_structure(scenario, drive, sightings, structure, assumptions)
+        names = list(scenario.lidars)
+        index = [names.index(name) for name in lidars]
+        own = [6 * i + axis for i in index for axis in range(6)]
+        own += [6 * len(names) + i for i in index if assumptions.time_offset]
+        return np.asarray(H[np.ix_(own, own)])
+    if any(len(s.used) for s in sightings):
+        return drive_information(scenario, drive, sightings, lidars, assumptions)
+    return np.zeros((per_lidar * n, per_lidar * n))
+
+
 def _sightings(scenario: Scenario, drive: Drive, assumptions: Assumptions) -> tuple[Sighting, ...]:
     """Clouds in which each LiDAR sees each placement, and which of them are used."""
-    if not scenario.world.targets:
-        raise ConfigError(
-            f"scenario '{scenario.name}': world.targets names no target to plan with: add an "
-            "object and its name there"
-        )
     extraction = assumptions.extraction
     out = []
     for placement in placements(scenario):
@@ -181,10 +213,15 @@ def _nobody(
     planned: Sequence[tuple[Scenario, Drive]],
     seen: Sequence[Sequence[Sighting]],
     extraction: ExtractionConfig,
-) -> str:
-    best = max((s for of in seen for s in of), key=lambda s: len(s.stamps_ns))
+) -> CalivError:
     names = ", ".join(f"'{scenario.name}'" for scenario, _ in planned)
-    return (
+    if not any(seen):
+        return ConfigError(
+            f"scenario {names}: there is nothing to plan with: world.targets names no target, and "
+            "no LiDAR sees a wall. Add an object and its name there, or walls"
+        )
+    best = max((s for of in seen for s in of), key=lambda s: len(s.stamps_ns))
+    return TargetError(
         f"scenario {names}: no LiDAR sees a target: '{best.lidar}' would have '{best.placement}' "
         f"in view in {len(best.stamps_ns)} of {best.scans} scans with {extraction.min_points} "
         f"points or more, and {extraction.min_scans} are needed. Move the target nearer to the "

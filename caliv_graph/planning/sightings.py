@@ -231,12 +231,12 @@ def sight(
     back = np.swapaxes(states.R_map_vehicle, 1, 2)
     in_vehicle = np.einsum("nij,nkj->nki", back, grid[None] - states.position_map[:, None])
     in_lidar = (in_vehicle - T.translation()) @ T.rotation().matrix()
-    whole, inside = _within(model, in_lidar)
+    whole, inside = within(model, in_lidar)
     towards = states.position_map + states.R_map_vehicle @ T.translation() - placement.centre_map
     range_m = np.linalg.norm(towards, axis=1)
     level = np.einsum("nij,nj->ni", back, -towards) @ T.rotation().matrix()
     elevation = np.arcsin(np.clip(level[:, 2] / range_m, -1.0, 1.0))
-    facing = placement.area_m2 * inside / (range_m**2 * _solid_angle(model, elevation))
+    facing = placement.area_m2 * inside / (range_m**2 * solid_angle(model, elevation))
     time_s = stamps / NANOSECONDS_PER_SECOND
     seen = whole & (SEEN_PART * facing >= extraction.min_points)
     seen &= (time_s >= placement.begin_s) & (time_s <= placement.end_s)
@@ -286,7 +286,7 @@ def sees_ground(model: LidarModel) -> bool:
     return bool(hit.sum() * columns / GROUND_COLUMNS >= GROUND_LEAST_POINTS)
 
 
-def _within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
+def within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
     """Visibility of m groups of k points (m, k, 3) for a LiDAR.
 
     Returns:
@@ -309,7 +309,7 @@ def _within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:
     return np.asarray(between.all(axis=-1)), np.asarray(inside.mean(axis=-1))
 
 
-def _solid_angle(model: LidarModel, elevation: Array) -> Array:
+def solid_angle(model: LidarModel, elevation: Array) -> Array:
     """(n,) solid angle of a beam in steradians, at elevations (n,) in radians."""
     elevations = np.radians(channel_elevations_deg(model))
     spacing = np.interp(elevation, 0.5 * (elevations[1:] + elevations[:-1]), np.diff(elevations))

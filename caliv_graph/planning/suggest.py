@@ -140,8 +140,10 @@ def suggest(
         assumptions: how drives will be recorded and calibrated.
 
     Returns:
-        None if no LiDAR sees the target in any of them.
+        None if no LiDAR sees the target in any of them, or if there is none to place.
     """
+    if not scenario.world.targets:
+        return None
     best: Suggestion | None = None
     tried = sorted(candidates(scenario, with_ramp=assumptions.ground != "height"), key=_cost)
     for manoeuvre, candidate in tried:

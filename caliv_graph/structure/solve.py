@@ -155,20 +155,8 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     Raises:
         SolveError: the system is singular.
     """
-    patches, prior = problem.patches, problem.prior
-    R, t = stack(prior.T_map_vehicle)
-    n = len(patches.lidars)
-    state = State(
-        R_map_vehicle=R,
-        t_map_vehicle=t,
-        moved=np.zeros(len(prior.gradient)),
-        T_vehicle_lidar=tuple(start[name] for name in patches.lidars),
-        offsets_s=np.zeros(n),
-        centres_map=np.zeros((0, 3)),
-        normals_map=np.zeros((0, 3)),
-        errors=np.zeros(0),
-    )
-    range_sigma = range_sigmas(patches, problem.range_sigma_m)
+    state = _first_state(problem, start)
+    range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     found: Solved | None = None
     sigma_m = strip_m = shared_m = FIRST_SIGHTING_M
     for gate in GATES_M:
@@ -180,6 +168,46 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         strip_m, shared_m = found.nuisances.strip, found.nuisances.shared
         state = found.state
     return None if found is None else _settled(found, steps=LAST_STEPS)
+
+
+def linearised(
+    problem: Problem,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    range_sigma_m: Array,
+    sighting_m: float,
+    strip_m: float,
+    shared_m: float,
+) -> Solved | None:
+    """The system at known extrinsics and poses with stated noise; None if there is no structure.
+
+    Args:
+        problem: the drive; its pose prior is at the known poses.
+        T_vehicle_lidar: per LiDAR.
+        range_sigma_m: (L,) noise along the beam of each LiDAR.
+        sighting_m: as `Nuisances.sighting`, of all strips.
+        strip_m: as `Nuisances.strip`.
+        shared_m: as `Nuisances.shared`.
+
+    Raises:
+        SolveError: the system is singular.
+    """
+    state = _first_state(problem, T_vehicle_lidar)
+    return _round(problem, state, range_sigma_m, GATES_M[-1], sighting_m, strip_m, shared_m)
+
+
+def _first_state(problem: Problem, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> State:
+    """The poses of the motion data, no strips yet."""
+    R, t = stack(problem.prior.T_map_vehicle)
+    return State(
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        moved=np.zeros(len(problem.prior.gradient)),
+        T_vehicle_lidar=tuple(T_vehicle_lidar[name] for name in problem.patches.lidars),
+        offsets_s=np.zeros(len(problem.patches.lidars)),
+        centres_map=np.zeros((0, 3)),
+        normals_map=np.zeros((0, 3)),
+        errors=np.zeros(0),
+    )
 
 
 def _round(

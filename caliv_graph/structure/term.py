@@ -164,11 +164,11 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         gradient=gradient,
         strips=strips_of(found),
         offset_m=float(np.median(found.nuisances.sighting)),
-        ground=_ground(found),
+        ground=lidars_with_ground(found),
     )
 
 
-def _ground(found: Solved) -> frozenset[str]:
+def lidars_with_ground(found: Solved) -> frozenset[str]:
     """LiDARs of which level strips determine the ground."""
     level_strips = found.state.normals_map[:, 2] > LEVEL
     own = level_strips[found.sightings.strip] & (found.weights > 0.0)

@@ -1,0 +1,249 @@
+"""What walls and ground of a planned drive determine, by the system that `calibrate` solves.
+
+It is linearised at the true poses and extrinsics, under the information of the planned motion.
+Clouds of targets are added on the same poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.calibration.heave import poses_with_heave
+from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, unstack
+from caliv_graph.planning.assumptions import Assumptions
+from caliv_graph.planning.faces import faces_of
+from caliv_graph.planning.information import (
+    RIDGE,
+    Columns,
+    add_clouds,
+    add_ground,
+    eliminated,
+    height_sigma_of,
+    source_of,
+)
+from caliv_graph.planning.motion import PlannedMotion, plan_motion
+from caliv_graph.planning.patches import planned_patches
+from caliv_graph.planning.sightings import Sighting, placements, sees_ground
+from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.drives import Drive
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.solve import Problem, Solved, linearised
+from caliv_graph.structure.standing import Standing
+from caliv_graph.structure.term import lidars_with_ground
+from caliv_graph.trajectory.chain import POSE, Chain
+
+SIGHTING_M = 0.002
+STRIP_M = 0.002
+SHARED_M = 0.002
+"""1 sigma of the offset of a strip from scan to scan, of a strip from LiDAR to LiDAR, and of a
+surface from scan to scan. A calibration estimates them, 0.2 to 0.4 mm in a simulated yard. Real
+walls have joints, paint and gloss: a fifth of the range noise of a usual LiDAR."""
+
+GROUND = -1
+"""Number of the ground among the objects."""
+
+
+@dataclass(frozen=True)
+class SeenWalls:
+    """The walls of one drive that its LiDARs see.
+
+    Attributes:
+        scans: (wall, LiDAR) -> number of scans that are used of it.
+        strips: (LiDAR, LiDAR) -> number of strips of walls that both see.
+        shared: (LiDAR, LiDAR) -> the walls that these strips are on.
+    """
+
+    scans: Mapping[tuple[str, str], int]
+    strips: Mapping[tuple[str, str], int]
+    shared: Mapping[tuple[str, str], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class PlannedStructure:
+    """The structure of one drive, linearised.
+
+    Attributes:
+        found: at the true poses.
+        motion: the planned motion.
+        nodes: (m,) nodes of the motion that the poses are.
+        walls: who sees what.
+    """
+
+    found: Solved
+    motion: PlannedMotion
+    nodes: IntArray
+    walls: SeenWalls
+
+    @property
+    def lidars(self) -> frozenset[str]:
+        """Names of the LiDARs that see any of it."""
+        patches = self.found.problem.patches
+        seen = np.unique(patches.scan_lidar[self.found.sightings.scan])
+        return frozenset(patches.lidars[i] for i in seen.tolist())
+
+
+def plan_structure(
+    scenario: Scenario, drive: Drive, sightings: Sequence[Sighting], assumptions: Assumptions
+) -> PlannedStructure | None:
+    """The structure of a drive; None if it passes no walls, or if none is to be used."""
+    faces = faces_of(scenario)
+    if not assumptions.structure or not faces.flat.any():
+        return None
+    patches, face = planned_patches(scenario, drive, faces, assumptions.ground != "none")
+    if not (face != GROUND).any():
+        return None
+    stamps = np.unique(
+        np.concatenate([patches.stamps_ns, *(s.stamps_ns[s.used] for s in sightings)])
+    )
+    motion = plan_motion(drive, scenario, stamps, source_of(scenario, assumptions))
+    nodes = np.unique(motion.nodes_of(stamps))
+    n = len(scenario.lidars)
+    problem = Problem(
+        patches=patches,
+        prior=_pose_prior(motion, nodes, assumptions.heave_sigma_m),
+        pose_of_scan=np.searchsorted(nodes, motion.nodes_of(patches.stamps_ns)),
+        relative=np.broadcast_to(np.eye(4), (len(face), 4, 4)),
+        twists=motion.twist[nodes] if assumptions.time_offset else None,
+        offsets=tuple(range(n)) if assumptions.time_offset else (),
+        guesses=tuple(m.mounting.pose() for m in scenario.lidars.values()),
+        guess_information=np.zeros((6 * n, 6 * n)),
+        range_sigma_m=0.0,
+        standing=Standing(
+            height_m=0.0 if assumptions.ground == "height" else None,
+            height_sigma_m=height_sigma_of(scenario, assumptions),
+            tilt_sigma_rad=None,
+            heave_m=assumptions.heave_sigma_m,
+            sway_rad=0.0,
+        ),
+    )
+    found = linearised(
+        problem,
+        {name: model.mounting.pose() for name, model in scenario.lidars.items()},
+        np.array([model.range_sigma_m for model in scenario.lidars.values()]),
+        SIGHTING_M,
+        STRIP_M,
+        SHARED_M,
+    )
+    if found is None:
+        return None
+    return PlannedStructure(found, motion, nodes, _seen_walls(found, face, faces.names))
+
+
+def _pose_prior(motion: PlannedMotion, nodes: IntArray, heave_m: float) -> PosePrior:
+    """The planned motion's information on some poses, heave included."""
+    n, width = motion.diagonal.shape[:2]
+    chain = Chain(motion.diagonal, motion.coupling, np.zeros((n, width, 0)), np.zeros((0, 0)))
+    m = len(nodes)
+    back = np.linalg.inv(motion.to_vehicle)
+    information = chain.pose_information(nodes).reshape(m, POSE, m, POSE)
+    information = np.einsum("ab,ibjc,cd->iajd", back.T, information, back, optimize=True)
+    information = information.reshape(POSE * m, POSE * m)
+    if heave_m > 0.0:
+        information = poses_with_heave(information, heave_m)
+    return PosePrior(
+        stamps_ns=motion.nodes_ns[nodes],
+        T_map_vehicle=unstack(motion.R_map_vehicle[nodes], motion.position_map[nodes]),
+        parameters={},
+        information=information,
+        gradient=np.zeros(POSE * m),
+        parameter_information=np.zeros((0, 0)),
+        parameter_offset=np.zeros(0),
+    )
+
+
+def information_with_structure(
+    scenario: Scenario,
+    drive: Drive,
+    sightings: Sequence[Sighting],
+    structure: PlannedStructure,
+    assumptions: Assumptions,
+) -> Array:
+    """Information of one drive on extrinsics and time offsets; everything else is eliminated.
+
+    Returns:
+        As `information.drive_information`, of all LiDARs of the scenario in its order.
+    """
+    used = [s for s in sightings if len(s.used)]
+    system, layout, nodes = structure.found.system, structure.found.layout, structure.nodes
+    names = list(scenario.lidars)
+    with_planes = assumptions.ground != "none" and not {
+        name for name, model in scenario.lidars.items() if sees_ground(model)
+    } <= lidars_with_ground(structure.found)
+    columns = Columns(
+        names,
+        assumptions.time_offset,
+        list(dict.fromkeys(s.placement for s in used)),
+        assumptions.ground if with_planes else "none",
+    )
+    k, m = columns.size, len(nodes)
+    H = np.zeros((len(structure.motion.nodes_ns), POSE + k, POSE + k))
+    by_name = {p.name: p for p in placements(scenario)}
+    for sighting in used:
+        placement = by_name[sighting.placement]
+        add_clouds(H, structure.motion, scenario, sighting, placement, columns)
+    if with_planes and used:
+        stamps = np.unique(np.concatenate([s.stamps_ns[s.used] for s in used]))
+        add_ground(H, structure.motion, scenario, drive, stamps, columns, assumptions)
+    H = H[nodes]
+    # Coordinates: those of `columns`, then poses, then errors of LiDARs and of the vehicle's stand.
+    errors = layout.plane - layout.error
+    total = np.zeros((k + POSE * m + errors,) * 2)
+    total[:k, :k] = H[:, POSE:, POSE:].sum(axis=0)
+    each = k + POSE * np.arange(m)[:, None] + np.arange(POSE)
+    total[each[:, :, None], each[:, None]] += H[:, :POSE, :POSE]
+    total[each, :k] += H[:, :POSE, POSE:]
+    total[:k, k : k + POSE * m] = total[k : k + POSE * m, :k].T
+    rest = np.arange(columns.kept, k)
+    total[rest, rest] += RIDGE
+    if columns.ground == "height":
+        total[columns.height, columns.height] += height_sigma_of(scenario, assumptions) ** -2.0
+    own = np.concatenate(
+        [
+            k + np.arange(POSE * m),
+            6 * len(names) + np.arange(len(layout.offsets)),
+            np.arange(6 * len(names)),
+            k + POSE * m + np.arange(errors),
+        ]
+    )
+    total[np.ix_(own, own)] += _in_vehicle_axes(structure.found)
+    return eliminated(total, columns.kept)
+
+
+def _in_vehicle_axes(found: Solved) -> Array:
+    """The system's matrix with the extrinsics in vehicle axes."""
+    H = found.system.H.copy()
+    own = slice(found.layout.extrinsic, found.layout.error)
+    back = np.linalg.inv(joint_right_to_vehicle_axes(found.state.T_vehicle_lidar))
+    H[:, own] = H[:, own] @ back
+    H[own] = back.T @ H[own]
+    return H
+
+
+def _seen_walls(found: Solved, face: IntArray, names: Sequence[str]) -> SeenWalls:
+    """Who sees which wall, from the sightings of strips; `face` (N,) of each patch."""
+    patches, strips, sightings = found.problem.patches, found.strips, found.sightings
+    on = strips.of_patch >= 0
+    of_strip = np.full(strips.count, GROUND)
+    of_strip[strips.of_patch[on]] = face[on]
+    lidar = patches.scan_lidar[sightings.scan]
+    wall = of_strip[sightings.strip]
+    scans: dict[tuple[str, str], int] = {}
+    seen: dict[str, set[int]] = {}
+    for i, name in enumerate(patches.lidars):
+        own = (lidar == i) & (wall != GROUND)
+        seen[name] = set(sightings.strip[own].tolist())
+        for what in dict.fromkeys(names[f] for f in np.unique(wall[own]).tolist()):
+            at = own & np.isin(wall, [f for f, n in enumerate(names) if n == what])
+            scans[what, name] = len(np.unique(sightings.scan[at]))
+    strips_of, shared = {}, {}
+    for i, a in enumerate(patches.lidars):
+        for b in patches.lidars[i + 1 :]:
+            both = sorted(seen[a] & seen[b])
+            strips_of[a, b] = len(both)
+            shared[a, b] = tuple(dict.fromkeys(sorted(names[of_strip[k]] for k in both)))
+    return SeenWalls(scans, strips_of, shared)

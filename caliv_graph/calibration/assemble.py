@@ -30,6 +30,7 @@ from caliv_graph.products import (
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess, limited_axes
 from caliv_graph.wording.directions import named, same_as_parameters
+from caliv_graph.wording.remedies import Evidence
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -53,6 +54,7 @@ def assemble(
             solution.held,
         ),
         solution.T_vehicle_lidar,
+        _evidence(solution),
     )
     uncertainty = same_as_parameters(
         uncertainty, solution.information_data, solution.information_knowing
@@ -79,6 +81,13 @@ def assemble(
         structure=structure_summary(solution.structure, tuple(guesses)),
     )
     return unmet_requirements(result, config)
+
+
+def _evidence(solution: Solution) -> Evidence:
+    """What the LiDARs of a solution saw."""
+    if not lidars_with_structure(solution.structure):
+        return "target"
+    return "both" if solution.registrations else "structure"
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:

@@ -17,8 +17,8 @@ def plan(
         list[Path],
         typer.Argument(
             metavar="SCENARIO.yaml",
-            help="The drive: vehicle, LiDARs, target. Several: drives of one vehicle, solved "
-            "together.",
+            help="The drive: vehicle, LiDARs, target, walls. Several: drives of one vehicle, "
+            "solved together.",
         ),
     ],
     sigma: Annotated[
@@ -47,6 +47,13 @@ def plan(
     time_offset: Annotated[
         bool, typer.Option("--time-offset", help="Also estimate a time offset of each LiDAR.")
     ] = False,
+    structure: Annotated[
+        bool,
+        typer.Option(
+            "--structure/--no-structure",
+            help="Whether walls are used, and the ground cell by cell with them.",
+        ),
+    ] = True,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write the suggested drive as a scenario."),
@@ -56,12 +63,13 @@ def plan(
 ) -> None:
     """Predict the accuracy of a planned drive: sigma per LiDAR and axis, undetermined directions.
 
-    The prediction uses geometry and noise levels only: it simulates no clouds and ignores
-    occluders. The command also tries other manoeuvres (arc, S-curve, figure-eight, with a ramp
-    unless the ground has a known height) and target placements, and names the one that keeps all
-    limits in the least space.
+    The prediction uses geometry and noise levels only: it simulates no clouds. What hides a target
+    is ignored; walls hide what is behind them. The command names the walls that each LiDAR sees and
+    that two LiDARs both see. It also tries other manoeuvres (arc, S-curve, figure-eight, with a
+    ramp unless the ground has a known height) and target placements without walls, and names the
+    one that keeps all limits in the least space.
 
-    Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target.
+    Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target or a wall.
 
     Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
     """
@@ -78,16 +86,20 @@ def plan(
         check_output_file(out, force)
     first, *others = [load_scenario(path) for path in scenarios]
     assumptions = Assumptions(
-        ground=ground, source="poses" if poses else None, time_offset=time_offset
+        ground=ground,
+        source="poses" if poses else None,
+        time_offset=time_offset,
+        structure=structure,
     )
     prediction = predict(first, others, assumptions)
     met = is_met(shortfall(prediction, goals), goals)
     suggestion = suggest(first, goals, assumptions)
     if out is not None:
         if suggestion is None:
-            raise OutputError(
-                f"{out}: not written: no LiDAR sees the target in any of the manoeuvres tried"
-            )
+            why = "no LiDAR sees the target in any of the manoeuvres tried"
+            if not first.world.targets:
+                why = "the scenario has no target to place: name one in world.targets"
+            raise OutputError(f"{out}: not written: {why}")
         atomic_write(out, dump_scenario(suggestion.scenario), force)
     if as_json:
         streams.show_json(plan_document(prediction, goals, met, suggestion))

@@ -18,6 +18,7 @@ from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_d
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.observability import assess
 from caliv_graph.wording.directions import named
+from caliv_graph.wording.remedies import evidence_of
 
 _SAME_GUESS = 1e-6
 """Largest difference of two equal guesses that were rounded, rad and m."""
@@ -230,7 +231,11 @@ def _assembled(
     to_right = np.ascontiguousarray(joint_right_to_vehicle_axes(poses.values()).T)
     cov = to_right @ fused.cov @ to_right.T
     information = to_right @ data.information @ to_right.T
-    uncertainty = named(assess(fused.information + fused.trusted, fused.prior, poses), poses)
+    uncertainty = named(
+        assess(fused.information + fused.trusted, fused.prior, poses),
+        poses,
+        evidence_of(results.values()),
+    )
     lidars = {}
     for i, (name, result) in enumerate(results.items()):
         block = slice(6 * i, 6 * i + 6)

@@ -35,6 +35,9 @@ CAR_HULL_M = (0.2, 0.85)
 CAR_END_PART = 0.85
 """Width of a car's front and back as a part of its width."""
 
+NEARLY = 0.999
+"""Part of the way to a place up to which a face hides it: not the face that it is on."""
+
 
 @dataclass(frozen=True)
 class Faces:
@@ -81,10 +84,6 @@ class Faces:
         return hidden
 
 
-NEARLY = 0.999
-"""Part of the way to a place at which a face still hides it: not the face it is on."""
-
-
 @dataclass(frozen=True)
 class Places:
     """N pieces of surface, of which each scan sees some.
@@ -92,9 +91,8 @@ class Places:
     Attributes:
         centres_map: (N, 3) metres.
         normals_map: (N, 3) unit, outwards.
-        half_m: (N, 2) half of their sides, along `tangent_axes` of the normal for level ones, along
-            the face and upwards for upright ones.
-        axes_map: (N, 2, 3) the directions of these sides.
+        half_m: (N, 2) half of their sides.
+        axes_map: (N, 2, 3) the directions of these sides, unit vectors.
         face: (N,) the face that each is on; -1: the ground.
     """
 
@@ -110,7 +108,7 @@ def faces_of(scenario: Scenario) -> Faces:
     terrain = make_terrain(scenario.world.ground)
     found = []
     for name, model in scenario.world.objects.items():
-        if name in scenario.world.targets or getattr(model, "moves", ()):
+        if name in scenario.world.targets or model.moves:
             continue
         ground_m = scenario.world.ground.height_m
         if terrain is not None:

@@ -56,7 +56,7 @@ def planned_patches(
         used.append(ground_places(scenario, every, reach_m))
     all_stamps: list[IntArray] = []
     of_lidar: list[IntArray] = []
-    parts: list[tuple[Array, ...]] = []
+    parts: list[tuple[Array, Array, IntArray, IntArray]] = []
     scan = 0
     for k, (name, own) in enumerate(zip(names, stamps, strict=True)):
         R, t = path.poses_at(own)
@@ -64,24 +64,28 @@ def planned_patches(
         eyes, turns = t + R @ T.translation(), R @ T.rotation().matrix()
         for eye, turn in zip(eyes, turns, strict=True):
             for places in used:
-                seen = _seen(scenario.lidars[name], faces, places, eye, turn)
-                parts.append((*seen[:2], places.face[seen[2]], np.full(len(seen[2]), scan)))
+                own_moments, own_normals, which = _seen(
+                    scenario.lidars[name], faces, places, eye, turn
+                )
+                of_scan = np.full(len(which), scan, dtype=np.int64)
+                parts.append((own_moments, own_normals, places.face[which], of_scan))
             scan += 1
         all_stamps.append(own)
         of_lidar.append(np.full(len(own), k))
-    moments, normals, face, of_scan = (np.concatenate(c) for c in zip(*parts, strict=True))
+    moments, normals, faces_seen, scans = zip(*parts, strict=True)
+    of_patch = np.concatenate(scans)
     patches = DrivePatches(
         drive=0,
         lidars=names,
         stamps_ns=np.concatenate(all_stamps),
         scan_lidar=np.concatenate(of_lidar),
-        scan=of_scan.astype(np.int64),
-        time_s=np.zeros(len(of_scan)),
-        moments=moments,
-        normal_lidar=normals,
-        scatter_m=np.zeros(len(of_scan)),
+        scan=of_patch,
+        time_s=np.zeros(len(of_patch)),
+        moments=np.concatenate(moments),
+        normal_lidar=np.concatenate(normals),
+        scatter_m=np.zeros(len(of_patch)),
     )
-    return patches, face.astype(np.int64)
+    return patches, np.concatenate(faces_seen)
 
 
 def _path(scenario: Scenario, drive: Drive) -> GivenTrajectory:
@@ -124,4 +128,3 @@ def _used_part(model: LidarModel) -> float:
     low, high = model.horizontal_fov_deg
     beams = len(channel_elevations_deg(model)) * (high - low) / model.horizontal_resolution_deg
     return min(1.0, MAX_POINTS / beams)
-

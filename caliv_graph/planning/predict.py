@@ -237,7 +237,10 @@ def _warnings(
 ) -> Iterable[str]:
     for name in planned[0][0].lidars:
         if name not in lidars:
-            yield f"lidar '{name}' never sees a target often enough: it keeps its initial guess"
+            yield (
+                f"lidar '{name}' never sees a target or a wall often enough: it keeps its initial "
+                "guess"
+            )
     for scenario, _ in planned:
         for placement in placements(scenario):
             if placement.is_round:

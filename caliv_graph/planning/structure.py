@@ -30,7 +30,6 @@ from caliv_graph.planning.sightings import Sighting, placements, sees_ground
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.scenario.model import Scenario
-from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.solve import Problem, Solved, linearised
 from caliv_graph.structure.standing import Standing
@@ -169,7 +168,7 @@ def information_with_structure(
         As `information.drive_information`, of all LiDARs of the scenario in its order.
     """
     used = [s for s in sightings if len(s.used)]
-    system, layout, nodes = structure.found.system, structure.found.layout, structure.nodes
+    layout, nodes = structure.found.layout, structure.nodes
     names = list(scenario.lidars)
     with_planes = assumptions.ground != "none" and not {
         name for name, model in scenario.lidars.items() if sees_ground(model)
@@ -232,14 +231,17 @@ def _seen_walls(found: Solved, face: IntArray, names: Sequence[str]) -> SeenWall
     of_strip[strips.of_patch[on]] = face[on]
     lidar = patches.scan_lidar[sightings.scan]
     wall = of_strip[sightings.strip]
+    seen = {
+        name: set(sightings.strip[(lidar == i) & (wall != GROUND)].tolist())
+        for i, name in enumerate(patches.lidars)
+    }
     scans: dict[tuple[str, str], int] = {}
-    seen: dict[str, set[int]] = {}
-    for i, name in enumerate(patches.lidars):
-        own = (lidar == i) & (wall != GROUND)
-        seen[name] = set(sightings.strip[own].tolist())
-        for what in dict.fromkeys(names[f] for f in np.unique(wall[own]).tolist()):
-            at = own & np.isin(wall, [f for f, n in enumerate(names) if n == what])
-            scans[what, name] = len(np.unique(sightings.scan[at]))
+    for what in dict.fromkeys(names):
+        at = np.isin(wall, [f for f, name in enumerate(names) if name == what])
+        for i, name in enumerate(patches.lidars):
+            count = len(np.unique(sightings.scan[at & (lidar == i)]))
+            if count:
+                scans[what, name] = count
     strips_of, shared = {}, {}
     for i, a in enumerate(patches.lidars):
         for b in patches.lidars[i + 1 :]:

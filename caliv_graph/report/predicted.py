@@ -16,6 +16,7 @@ from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
 from caliv_graph.report.layout import axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import SHOWN_AXES, rounded
+from caliv_graph.report.planned_walls import wall_document, wall_parts
 from caliv_graph.report.tables import direction_texts
 from caliv_graph.results.calibration_file import calibration_document
 
@@ -76,7 +77,8 @@ def plan_table(
             f": {', '.join(prediction.names)}, {prediction.duration_s:.0f} s, {x:.0f} x {y:.0f} m",
         ),
         *_sigma_parts(predicted, "Predicted"),
-        *titled("When each LiDAR sees the target", _sightings(prediction)),
+        *_sighting_parts(prediction),
+        *wall_parts(prediction),
         *_direction_parts(predicted),
     ]
     if goals:
@@ -111,6 +113,7 @@ def _prediction_document(prediction: Prediction) -> dict[str, Any]:
             for drive, sightings in zip(prediction.names, prediction.sightings, strict=True)
             for sighting in sightings
         ],
+        **wall_document(prediction),
     }
 
 
@@ -142,6 +145,12 @@ def _sighting_document(sighting: Sighting) -> dict[str, Any]:
         else None,
         "points": [int(sighting.points.min()), int(sighting.points.max())] if seen else None,
     }
+
+
+def _sighting_parts(prediction: Prediction) -> list[RenderableType]:
+    if not any(prediction.sightings):
+        return []
+    return titled("When each LiDAR sees the target", _sightings(prediction))
 
 
 def _sightings(prediction: Prediction) -> Table:
@@ -258,7 +267,7 @@ def _direction_parts(predicted: PredictedCovariance) -> list[RenderableType]:
     lost: Sequence[str] = [
         *direction_texts(predicted.undetermined),
         *(
-            f"LiDAR '{name}' never sees a target: its extrinsic is not determined"
+            f"LiDAR '{name}' never sees a target or a wall: its extrinsic is not determined"
             for name in predicted.unseeing
         ),
     ]

@@ -16,9 +16,11 @@ from caliv_graph.structure.sightings import Sightings, without_own_error
 from caliv_graph.structure.standing import Standing, Stands, standing_rows
 from caliv_graph.trajectory.imu import exp_so3
 
-TILT_PRIOR_RAD = 0.5
-PLACE_PRIOR_M = 10.0
-"""Prior of a plane: a single ring of beams does not determine its tilt."""
+TILT_PRIOR_RAD = 5.0
+PLACE_PRIOR_M = 1000.0
+"""Prior of a plane: a single ring of beams does not determine its tilt. A thousand planes together
+must say next to nothing of what turns and shifts all of them, such as the roll of all LiDARs on a
+straight drive: 5 rad / sqrt(1000) is five times the guess's 30 mrad."""
 
 
 REPEATED_M = 0.003

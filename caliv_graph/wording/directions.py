@@ -17,43 +17,14 @@ from caliv_graph.uncertainty.observability import (
     undetermined_twists,
 )
 from caliv_graph.uncertainty.predicted import PredictedCovariance
+from caliv_graph.wording.remedies import REMEDIES, Evidence, evidence_of
 
 NOTABLE = 0.2
 """Fraction of a direction's largest coordinate from which an axis is named."""
 
 STATIONARY_TWISTS = 5
 """Undetermined motions of all LiDARs together from which the vehicle did not move: driving straight
-ahead leaves four undetermined."""
-
-REMEDY_STATIONARY = (
-    "drive past the target on a path whose curvature changes, such as a figure-eight"
-)
-REMEDY_HEIGHT = (
-    "measure the height of the vehicle frame above the ground and set ground.vehicle_height and "
-    "ground.sigma, or cross a ramp while the target is in view"
-)
-REMEDY_TURN_CENTRE = (
-    "change the curvature while the target is in view: drive an S-curve or a figure-eight, or add "
-    "a drive that turns the other way"
-)
-REMEDY_STRAIGHT = (
-    "turn while the target is in view: an arc determines y and roll, an S-curve or a figure-eight "
-    "also x"
-)
-REMEDY_TILT = "turn while the target is in view, so that the heading changes, and use the ground"
-REMEDY_APART = (
-    "let these LiDARs see the same side of the target, at any time: pass it in both directions, "
-    "as in a figure-eight, or add a second target"
-)
-REMEDY_MORE = (
-    "pass the target again, closer and at other places, so that each LiDAR sees it in more scans; "
-    "better vehicle poses (IMU, GNSS) help too"
-)
-REMEDY_SYMMETRY = (
-    "use a target without rotational symmetry, such as a chair, and let these LiDARs see the same "
-    "side of it: pass it in both directions, or add a second target"
-)
-
+ahead leaves four undetermined, and five past walls without ground, the yaw being determined."""
 
 PARAMETER_KEYS = {"lever_arm": "gnss.lever_arm", "imu_rotation": "imu.T_vehicle_imu"}
 """What was measured by hand on the vehicle -> its key in the config."""
@@ -84,22 +55,30 @@ def same_as_parameters(
     return replace(uncertainty, undetermined=tuple(undetermined))
 
 
-def named(uncertainty: Uncertainty, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> Uncertainty:
-    """The same findings, each direction with its text and its remedy, at the given extrinsics."""
+def named(
+    uncertainty: Uncertainty,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    evidence: Evidence = "target",
+) -> Uncertainty:
+    """The same findings, each direction with its text and its remedy, at the given extrinsics.
+
+    `evidence` is what the LiDARs saw: a remedy speaks of it.
+    """
     stationary = stationary_text(uncertainty.undetermined, T_vehicle_lidar)
     undetermined = []
-    for direction in _each_named(uncertainty.undetermined, T_vehicle_lidar, weak=False):
+    for direction in _each_named(uncertainty.undetermined, T_vehicle_lidar, False, evidence):
         if stationary and direction.together:
-            direction = replace(direction, text=stationary, remedy=REMEDY_STATIONARY)
+            direction = replace(direction, text=stationary, remedy=REMEDIES[evidence].stationary)
         undetermined.append(direction)
-    weak = _each_named(uncertainty.weak, T_vehicle_lidar, weak=True)
+    weak = _each_named(uncertainty.weak, T_vehicle_lidar, True, evidence)
     return replace(uncertainty, undetermined=tuple(undetermined), weak=tuple(weak))
 
 
 def named_prediction(predicted: PredictedCovariance) -> PredictedCovariance:
     """The same prediction, each direction with its text and its remedy."""
     poses = {n: predicted.calibration.lidars[n].T_vehicle_lidar for n in predicted.lidars}
-    uncertainty = named(predicted.uncertainty, poses)
+    evidence = evidence_of(predicted.calibration.lidars.values())
+    uncertainty = named(predicted.uncertainty, poses, evidence)
     calibration = replace(
         predicted.calibration, undetermined=uncertainty.undetermined, weak=uncertainty.weak
     )
@@ -107,13 +86,16 @@ def named_prediction(predicted: PredictedCovariance) -> PredictedCovariance:
 
 
 def _each_named(
-    directions: Iterable[Direction], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool
+    directions: Iterable[Direction],
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    weak: bool,
+    evidence: Evidence,
 ) -> Iterable[Direction]:
     for direction in directions:
         yield replace(
             direction,
             text=describe(direction.vector, T_vehicle_lidar),
-            remedy=remedy(direction.vector, T_vehicle_lidar, weak),
+            remedy=remedy(direction.vector, T_vehicle_lidar, weak, evidence),
         )
 
 
@@ -128,23 +110,26 @@ def describe(parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pos
 
 
 def remedy(
-    parts: Mapping[str, Array], T_vehicle_lidar: Mapping[str, gtsam.Pose3], weak: bool = False
+    parts: Mapping[str, Array],
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    weak: bool = False,
+    evidence: Evidence = "target",
 ) -> str:
     """What would determine a direction (as in `describe`): a manoeuvre, or a setting."""
     twist = rigid_twist(parts, T_vehicle_lidar)
-    if twist is None and weak:
-        return REMEDY_MORE
+    known = REMEDIES[evidence]
     if twist is None:
         size = np.max([np.abs(part / UNIT) for part in parts.values()], axis=0)
-        return REMEDY_SYMMETRY if size.argmax() == AXES.index("yaw") else REMEDY_APART
+        by_axis = {"yaw": known.apart_yaw, "z": known.apart_z}
+        return known.more if weak else by_axis.get(AXES[size.argmax()], known.apart)
     notable = set(_notable(twist))
     if notable == {"z"}:
-        return REMEDY_HEIGHT
+        return known.height
     if "yaw" in notable and notable <= {"yaw", "x", "y"}:
-        return REMEDY_TURN_CENTRE
+        return known.turn_centre
     if notable & {"x", "y"}:
-        return REMEDY_STRAIGHT
-    return REMEDY_TILT if notable <= {"roll", "pitch"} else REMEDY_STATIONARY
+        return known.straight
+    return known.tilt if notable <= {"roll", "pitch"} else known.stationary
 
 
 def stationary_text(
@@ -156,9 +141,13 @@ def stationary_text(
         return ""
     if lost == len(AXES):
         return "all S2V axes: the vehicle did not move"
-    # The one motion that is determined: the ground determines the height.
-    height = np.abs(best / UNIT).argmax() == AXES.index("z")
-    return f"all S2V axes but {'the height' if height else 'one'}: the vehicle did not move"
+    # The one motion that is determined. The ground determines the height; of a vehicle that drove
+    # straight ahead past walls, without ground, the yaw is determined.
+    axis = AXES[int(np.abs(best / UNIT).argmax())]
+    if axis == "yaw":
+        return ""
+    but = "the height" if axis == "z" else "one"
+    return f"all S2V axes but {but}: the vehicle did not move"
 
 
 def _notable(twist: Array) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 def no_target_sentence(what: str) -> str:
     """The warning of a run without a target; `what` says why there is none."""
@@ -11,3 +13,13 @@ def no_target_sentence(what: str) -> str:
 def nothing_sentence(what: str, structure: str) -> str:
     """The error where neither target nor structure tells anything; why, of each."""
     return f"{what}. Structure does not replace it: {structure}"
+
+
+def shared_walls_sentence(a: str, b: str, strips: int, walls: Sequence[str]) -> str:
+    """Which walls two LiDARs both see, and what follows if there are none."""
+    if not strips:
+        return (
+            f"LiDARs '{a}' and '{b}' see no piece of a wall that the other sees, at any time: "
+            "walls do not tie them to each other"
+        )
+    return f"LiDARs '{a}' and '{b}' both see {strips} pieces of {', '.join(walls)}"

@@ -18,20 +18,13 @@ from caliv_graph.results.calibration_file import read_calibration, write_calibra
 from caliv_graph.uncertainty.observability import UNIT, assess, limited_axes, scaling
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import (
-    REMEDY_APART,
-    REMEDY_HEIGHT,
-    REMEDY_MORE,
-    REMEDY_STATIONARY,
-    REMEDY_STRAIGHT,
-    REMEDY_SYMMETRY,
-    REMEDY_TILT,
-    REMEDY_TURN_CENTRE,
     describe,
     named,
     named_prediction,
     remedy,
     same_as_parameters,
 )
+from caliv_graph.wording.remedies import OF_BOTH, OF_STRUCTURE, OF_TARGET
 from caliv_graph.wording.vehicle import vehicle_text
 from tests.drives_with_chair import RADIUS_M
 from tests.samples import MOUNTINGS, pose, turn_about, twist_of_all
@@ -127,14 +120,14 @@ def test_a_single_lidar_is_named_instead_of_all() -> None:
 @pytest.mark.parametrize(
     ("twist", "expected"),
     [
-        ([0, 0, 0, 0, 0, 1], REMEDY_HEIGHT),
-        ([0, 0, 1, -9.16, 0, 0], REMEDY_TURN_CENTRE),
-        ([0, 0, 1, 9.16, 1.0, 0], REMEDY_TURN_CENTRE),
-        ([0, 0, 0, 1, 0, 0], REMEDY_STRAIGHT),
-        ([0, 0, 0, 0, 1, 0], REMEDY_STRAIGHT),
-        ([1, 0, 0, 0, 3, 0], REMEDY_STRAIGHT),
-        ([1, 0, 0, 0, 0, 0], REMEDY_TILT),
-        ([0, 1, 0, 0, 0, 0], REMEDY_TILT),
+        ([0, 0, 0, 0, 0, 1], OF_TARGET.height),
+        ([0, 0, 1, -9.16, 0, 0], OF_TARGET.turn_centre),
+        ([0, 0, 1, 9.16, 1.0, 0], OF_TARGET.turn_centre),
+        ([0, 0, 0, 1, 0, 0], OF_TARGET.straight),
+        ([0, 0, 0, 0, 1, 0], OF_TARGET.straight),
+        ([1, 0, 0, 0, 3, 0], OF_TARGET.straight),
+        ([1, 0, 0, 0, 0, 0], OF_TARGET.tilt),
+        ([0, 1, 0, 0, 0, 0], OF_TARGET.tilt),
     ],
 )
 def test_every_direction_has_a_manoeuvre_that_fixes_it(twist: list[float], expected: str) -> None:
@@ -143,13 +136,15 @@ def test_every_direction_has_a_manoeuvre_that_fixes_it(twist: list[float], expec
         assert remedy(parts, LIDARS) == expected
 
 
-@pytest.mark.parametrize(("axis", "expected"), [("x", REMEDY_APART), ("yaw", REMEDY_SYMMETRY)])
+@pytest.mark.parametrize(
+    ("axis", "expected"), [("x", OF_TARGET.apart), ("yaw", OF_TARGET.apart_yaw)]
+)
 def test_lidars_that_move_apart_have_to_see_the_same_side(axis: str, expected: str) -> None:
     parts = {"front": np.eye(6)[AXES.index(axis)] * UNIT, "rear": np.zeros(6)}
 
     assert remedy(parts, LIDARS) == expected
     # Where they do see it, what helps is to see it more often.
-    assert remedy(parts, LIDARS, weak=True) == REMEDY_MORE
+    assert remedy(parts, LIDARS, weak=True) == OF_TARGET.more
 
 
 def rigid_loss(*lost: int) -> Array:
@@ -195,7 +190,7 @@ def test_a_vehicle_that_did_not_move_is_named_as_the_cause(lost: Iterable[int], 
     found = predicted(*lost)
 
     assert [d.text for d in found.undetermined] == [text] * len(list(lost))
-    assert {d.remedy for d in found.undetermined} == {REMEDY_STATIONARY}
+    assert {d.remedy for d in found.undetermined} == {OF_TARGET.stationary}
     assert [d.text for d in found.calibration.undetermined] == [text] * len(list(lost))
     # The pair is determined all the same.
     assert set(found.determined_s2s) == {("front", "rear")}
@@ -207,8 +202,8 @@ def test_remedies_are_in_the_file_and_are_read_back(tmp_path: Path) -> None:
     write_calibration(predicted(5).calibration, file)
 
     written = yaml.safe_load(file.read_text())["observability"]["undetermined"]
-    assert [entry["remedy"] for entry in written] == [REMEDY_HEIGHT]
-    assert [d.remedy for d in read_calibration(file).undetermined] == [REMEDY_HEIGHT]
+    assert [entry["remedy"] for entry in written] == [OF_TARGET.height]
+    assert [d.remedy for d in read_calibration(file).undetermined] == [OF_TARGET.height]
 
 
 def test_four_lost_motions_are_named_one_by_one() -> None:
@@ -229,9 +224,9 @@ def test_names_do_not_change_the_numbers() -> None:
 
     assert [d.text for d in plain.undetermined + plain.weak] == ["", ""]
     assert [d.text for d in found.undetermined] == ["z of lidar 'rear'"]
-    assert [d.remedy for d in found.undetermined] == [REMEDY_APART]
+    assert [d.remedy for d in found.undetermined] == [OF_TARGET.apart]
     assert [d.text for d in found.weak] == ["pitch of lidar 'rear'"]
-    assert [d.remedy for d in found.weak] == [REMEDY_MORE]
+    assert [d.remedy for d in found.weak] == [OF_TARGET.more]
     for before, after in zip(
         plain.undetermined + plain.weak, found.undetermined + found.weak, strict=True
     ):
@@ -273,3 +268,33 @@ def test_a_measured_figure_comes_with_what_it_limits() -> None:
         "imu.T_vehicle_imu: (90.00, 0.00, 2.00) degrees, sigma (0.100, 0.100, 0.100) degrees; the "
         "drive adds nothing"
     )
+
+
+# ------------------------------------------------------------------ walls instead of a target
+
+
+@pytest.mark.parametrize(
+    ("axis", "part"), [("x", "not parallel"), ("pitch", "not parallel"), ("z", "ground.use")]
+)
+def test_lidars_apart_are_told_which_walls_they_lack(axis: str, part: str) -> None:
+    parts = {"front": np.eye(6)[AXES.index(axis)] * UNIT, "rear": np.zeros(6)}
+
+    text = remedy(parts, LIDARS, evidence="structure")
+
+    assert part in text
+    assert "target" not in text
+    assert remedy(parts, LIDARS, evidence="both").startswith(text)
+
+
+def test_no_remedy_of_walls_speaks_of_a_target() -> None:
+    assert not any("target" in text for text in vars(OF_STRUCTURE).values())
+    assert all("wall" in text or "ground" in text for text in vars(OF_STRUCTURE).values())
+    assert all("target" in text or "ground" in text for text in vars(OF_BOTH).values())
+
+
+def test_straight_past_walls_without_ground_is_no_standstill() -> None:
+    # Five motions are lost as at standstill on ground; here the yaw is left.
+    texts = {d.text for d in predicted(0, 1, 3, 4, 5).undetermined}
+
+    assert len(texts) == 5
+    assert not any("did not move" in text for text in texts)

@@ -1,0 +1,131 @@
+"""What would determine a direction that the data do not determine, by what the drive passes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from caliv_graph.products import LidarResult
+
+Evidence = Literal["target", "structure", "both"]
+"""What the LiDARs see: a target, walls and other structure, or both."""
+
+
+@dataclass(frozen=True)
+class Remedies:
+    """A sentence for each kind of direction.
+
+    Attributes:
+        stationary: the vehicle did not move.
+        height: the height of all LiDARs together.
+        turn_centre: rotation of all LiDARs about the turn centre.
+        straight: shift of all LiDARs along or across a straight way.
+        tilt: roll and pitch of all LiDARs together.
+        apart: LiDARs move apart, mostly in another axis than those that follow.
+        apart_z: mostly in z.
+        apart_yaw: mostly in yaw.
+        more: weakly determined.
+    """
+
+    stationary: str
+    height: str
+    turn_centre: str
+    straight: str
+    tilt: str
+    apart: str
+    apart_z: str
+    apart_yaw: str
+    more: str
+
+
+def _remedies(
+    *, passed: str, in_view: str, apart: str, apart_z: str, apart_yaw: str, more: str
+) -> Remedies:
+    return Remedies(
+        stationary=(
+            f"drive past {passed} on a path whose curvature changes, such as a figure-eight"
+        ),
+        height=(
+            "measure the height of the vehicle frame above the ground and set "
+            f"ground.vehicle_height and ground.sigma, or cross a ramp while {in_view} in view"
+        ),
+        turn_centre=(
+            f"change the curvature while {in_view} in view: drive an S-curve or a figure-eight, "
+            "or add a drive that turns the other way"
+        ),
+        straight=(
+            f"turn while {in_view} in view: an arc determines y and roll, an S-curve or a "
+            "figure-eight also x"
+        ),
+        tilt=(f"turn while {in_view} in view, so that the heading changes, and use the ground"),
+        apart=apart,
+        apart_z=apart_z,
+        apart_yaw=apart_yaw,
+        more=f"{more}; better vehicle poses (IMU, GNSS) help too",
+    )
+
+
+_SAME_SIDE = (
+    "let these LiDARs see the same side of the target, at any time: pass it in both directions, "
+    "as in a figure-eight, or add a second target"
+)
+_SAME_WALLS = (
+    "drive past walls that are not parallel, each seen by all of these LiDARs, at any time: turn, "
+    "or pass them in both directions"
+)
+_SAME_GROUND = (
+    "use the ground (ground.use), if all of these LiDARs see it: upright walls do not determine z"
+)
+
+OF_TARGET = _remedies(
+    passed="the target",
+    in_view="the target is",
+    apart=_SAME_SIDE,
+    apart_z=_SAME_SIDE,
+    apart_yaw=(
+        "use a target without rotational symmetry, such as a chair, and let these LiDARs see the "
+        "same side of it: pass it in both directions, or add a second target"
+    ),
+    more=(
+        "pass the target again, closer and at other places, so that each LiDAR sees it in more "
+        "scans"
+    ),
+)
+
+OF_STRUCTURE = _remedies(
+    passed="walls that are not parallel",
+    in_view="walls are",
+    apart=_SAME_WALLS,
+    apart_z=_SAME_GROUND,
+    apart_yaw=_SAME_WALLS,
+    more="drive longer, closer to walls that are not parallel and that each LiDAR sees",
+)
+
+OF_BOTH = _remedies(
+    passed="the target and walls that are not parallel",
+    in_view="the target or walls are",
+    apart=f"{_SAME_WALLS}. Or {_SAME_SIDE}",
+    apart_z=f"{_SAME_GROUND}. Or {_SAME_SIDE}",
+    apart_yaw=f"{_SAME_WALLS}. Or {_SAME_SIDE}",
+    more=(
+        "pass the target again, closer and at other places, and walls that are not parallel and "
+        "that each LiDAR sees"
+    ),
+)
+
+REMEDIES: dict[Evidence, Remedies] = {
+    "target": OF_TARGET,
+    "structure": OF_STRUCTURE,
+    "both": OF_BOTH,
+}
+
+
+def evidence_of(lidars: Iterable[LidarResult]) -> Evidence:
+    """What the LiDARs of a calibration saw, all of them together."""
+    results = tuple(lidars)
+    target = any(lidar.saw_target for lidar in results)
+    structure = any(lidar.saw_structure for lidar in results)
+    if structure:
+        return "both" if target else "structure"
+    return "target"

@@ -1,0 +1,318 @@
+"""Walls in a plan: the table of null directions, what hides what, and who sees what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caliv_graph.conventions import AXES
+from caliv_graph.errors import ConfigError
+from caliv_graph.planning import Assumptions, Prediction, predict
+from caliv_graph.planning.assumptions import Ground
+from caliv_graph.planning.faces import faces_of
+from caliv_graph.planning.patches import planned_patches
+from caliv_graph.products import Array
+from caliv_graph.scenario.drive_models import (
+    ArcDrive,
+    DriveModel,
+    FigureEightDrive,
+    SCurveDrive,
+    StraightDrive,
+)
+from caliv_graph.scenario.drives import make_drive
+from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel
+from caliv_graph.scenario.world_models import (
+    BoxModel,
+    CarModel,
+    ChairModel,
+    ObjectModel,
+    WallModel,
+    WorldModel,
+)
+from caliv_graph.uncertainty.observability import UNIT
+from tests.drives_with_chair import RADIUS_M, paper_lidar
+from tests.samples import turn_about, twist_of_all
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
+
+
+def wall(x_m: float, y_m: float, yaw_deg: float, length_m: float = 10.0) -> WallModel:
+    return WallModel(xy_m=(x_m, y_m), yaw_deg=yaw_deg, length_m=length_m)
+
+
+def coarse(x_m: float, yaw_deg: float) -> LidarModel:
+    return paper_lidar(x_m, yaw_deg, rate_hz=2.0).model_copy(
+        update={"channels": 40, "horizontal_resolution_deg": 1.0}
+    )
+
+
+AHEAD = {"front": coarse(2.0, 0.0), "rear": coarse(-0.4, 180.0)}
+ASIDE = {"front": coarse(2.0, 52.0), "rear": coarse(-0.4, -52.0)}
+"""To the left and to the right: ahead, both see the same ground, and no wall."""
+
+
+def drive_past(
+    drive: DriveModel, objects: Mapping[str, ObjectModel], lidars: dict[str, LidarModel] = AHEAD
+) -> Scenario:
+    """With poses that are the truth."""
+    return Scenario(
+        name="walls",
+        drive=drive,
+        lidars=lidars,
+        world=WorldModel(objects=dict(objects)),
+        poses=PoseNoiseModel(position_sigma_m=0.0, rotation_sigma_rad=0.0),
+    )
+
+
+def numbered(*walls: ObjectModel) -> dict[str, ObjectModel]:
+    return {f"wall_{i}": one for i, one in enumerate(walls)}
+
+
+def ring(x_m: float, y_m: float, radius_m: float, count: int) -> dict[str, ObjectModel]:
+    """Walls around a place, none parallel to another."""
+    at = 2.0 * math.pi * np.arange(count) / count
+    return numbered(
+        *(
+            wall(
+                x_m + radius_m * math.cos(a),
+                y_m + radius_m * math.sin(a),
+                math.degrees(a) + 90.0 + 15.0 * math.sin(3.0 * a + 0.4),
+            )
+            for a in at.tolist()
+        )
+    )
+
+
+STRAIGHT = StraightDrive(duration_s=12.0, standstill_s=0.0)
+OBLIQUE = numbered(wall(4, 9, 20), wall(14, 10, -25), wall(6, -9, -15), wall(16, -9, 30))
+PARALLEL = numbered(wall(10, 8, 0, 30.0), wall(10, -8, 0, 30.0))
+
+DRIVES = {
+    "straight, oblique": drive_past(STRAIGHT, OBLIQUE),
+    "straight, parallel": drive_past(STRAIGHT, PARALLEL),
+    "straight, none shared": drive_past(STRAIGHT, OBLIQUE, ASIDE),
+    "arc": drive_past(ArcDrive(duration_s=17.0, standstill_s=0.0), ring(0.0, -9.0, 18.0, 8)),
+    "S-curve": drive_past(
+        SCurveDrive(duration_s=20.0, standstill_s=0.0), ring(12.0, -12.0, 24.0, 12)
+    ),
+    "figure-eight": drive_past(FigureEightDrive(standstill_s=0.0), ring(0.0, 0.0, 24.0, 10)),
+}
+
+STRAIGHT_WALLS = {"c x", "c y", "c z", "c roll", "c pitch", "d z"}
+
+TABLE: dict[str, tuple[set[str], set[str], set[str]]] = {
+    "straight, oblique": (
+        STRAIGHT_WALLS,
+        {"c x", "c y", "c z", "c roll"},
+        {"c x", "c y", "c roll"},
+    ),
+    "straight, parallel": (
+        STRAIGHT_WALLS | {"d x", "d pitch"},
+        {"c x", "c y", "c z", "c roll", "d x"},
+        {"c x", "c y", "c roll", "d x"},
+    ),
+    # Nothing ties what one LiDAR sees to what the other sees: not y and roll either.
+    "straight, none shared": (
+        STRAIGHT_WALLS | {"d x", "d pitch", "d y", "d roll"},
+        {"c x", "c y", "c z", "c roll", "d x", "d y"},
+        {"c x", "c y", "c roll", "d x", "d y"},
+    ),
+    "arc": ({"c turn", "c z", "d z"}, {"c turn", "c z"}, {"c turn"}),
+    "S-curve": ({"c z", "d z"}, {"c z"}, set()),
+    "figure-eight": ({"c z", "d z"}, {"c z"}, set()),
+}
+GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
+
+
+@cache
+def planned(name: str, ground: Ground) -> Prediction:
+    return predict(
+        DRIVES[name], assumptions=Assumptions(ground=ground, source="poses", heave_sigma_m=0.0)
+    )
+
+
+def direction(text: str) -> Array:
+    """(12,) scaled unit vector; c: all LiDARs together, d: the front one alone."""
+    kind, axis = text.split()
+    mounts = {name: model.mounting.pose() for name, model in AHEAD.items()}
+    if kind == "d":
+        parts = {"front": np.eye(6)[AXES.index(axis)], "rear": np.zeros(6)}
+    elif axis == "turn":
+        parts = twist_of_all(turn_about((0.0, -RADIUS_M)), mounts)
+    else:
+        parts = twist_of_all(np.eye(6)[AXES.index(axis)].tolist(), mounts)
+    vector = np.concatenate([part / UNIT for part in parts.values()])
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+@pytest.mark.parametrize("name", list(TABLE))
+def test_the_table_of_what_walls_leave_open(name: str, ground: Ground) -> None:
+    lost = TABLE[name][GROUNDS.index(ground)]
+
+    prediction = planned(name, ground)
+
+    # What walls tell they tell to a millimetre; what they do not tell stays 500 times worse.
+    sigma = prediction.covariance.uncertainty.spectrum
+    assert (sigma > 400.0).sum() == len(lost)
+    assert (sigma < 1.5).sum() == 12 - len(lost)
+    unit = np.tile(UNIT, 2)
+    D = prediction.covariance.information_data * np.outer(unit, unit)
+    basis = np.array([direction(text) for text in sorted(lost)]).reshape(-1, 12)
+    for text, vector in zip(sorted(lost), basis, strict=True):
+        assert vector @ D @ vector < 1e-5, text
+    # They are as many as they are counted.
+    assert np.linalg.matrix_rank(basis, tol=1e-3) == len(lost)
+    assert len(prediction.undetermined) == len(lost)
+    for found in prediction.undetermined:
+        assert found.text
+        assert "did not move" not in found.text
+        assert "target" not in found.remedy
+
+
+def test_what_is_missing_is_named_with_its_remedy() -> None:
+    parallel = {d.text: d.remedy for d in planned("straight, parallel", "height").undetermined}
+    assert "not parallel" in parallel["x of lidar 'front'"]
+    assert "not parallel" in parallel["x of lidar 'rear'"]
+    assert not planned("straight, parallel", "height").covariance.determined_s2s["front", "rear"][
+        "x"
+    ]
+
+    walls_only = {d.text: d.remedy for d in planned("figure-eight", "none").undetermined}
+    assert set(walls_only) == {"z of lidar 'front'", "z of lidar 'rear'"}
+    assert all("ground.use" in remedy for remedy in walls_only.values())
+
+    arc = {d.text: d.remedy for d in planned("arc", "height").undetermined}
+    (text,) = arc
+    assert text.startswith("rotation of all LiDARs about the turn centre: x and yaw together, 9.16")
+    assert "figure-eight" in arc[text]
+
+
+def test_who_shares_which_wall() -> None:
+    (shared,) = planned("straight, oblique", "none").walls
+    (apart,) = planned("straight, none shared", "none").walls
+    assert shared is not None
+    assert apart is not None
+
+    assert shared.strips["front", "rear"] > 10
+    assert shared.shared["front", "rear"] == ("wall_0", "wall_1", "wall_2", "wall_3")
+    assert apart.strips == {("front", "rear"): 0}
+    assert apart.shared == {("front", "rear"): ()}
+    # The left one sees the walls on the left.
+    assert {what for what, lidar in apart.scans if lidar == "front"} == {"wall_0", "wall_1"}
+    assert {what for what, lidar in apart.scans if lidar == "rear"} == {"wall_2", "wall_3"}
+
+
+def test_a_wall_hides_what_is_behind_it() -> None:
+    behind = wall(10.0, 12.0, 0.0, 6.0)
+    scans = []
+    for screen in (wall(10.0, 6.0, 0.0, 40.0), wall(10.0, -6.0, 0.0, 40.0)):
+        scenario = drive_past(STRAIGHT, {"behind": behind, "screen": screen})
+        (seen,) = predict(scenario, assumptions=Assumptions(source="poses")).walls
+        assert seen is not None
+        scans.append({what for what, _ in seen.scans})
+    assert scans == [{"screen"}, {"behind", "screen"}]
+
+
+def test_points_of_a_patch_follow_from_the_beams() -> None:
+    """A wall across the view at 10 m: 0.25 m^2 of a 1 degree by 0.64 degree grid."""
+    still = drive_past(
+        StraightDrive(duration_s=4.0, standstill_s=3.0),
+        {"ahead": BoxModel(size_m=(0.5, 8, 3), xy_m=(12.25, 0.0))},
+    )
+    faces = faces_of(still)
+    patches, face = planned_patches(still, make_drive(still.drive), faces, ground=False)
+
+    first = patches.scan == 0
+    centres = patches.centres_lidar[first]
+    # The LiDAR is 2 m up and 2 m ahead of the origin, nose down by 10 degrees.
+    in_vehicle = AHEAD["front"].mounting.pose().transformFrom(centres.T).T
+    assert in_vehicle[:, 0] == pytest.approx(12.0)
+    assert {faces.names[f] for f in face[first].tolist()} == {"ahead"}
+    middle = np.abs(in_vehicle - [12.0, 0.25, 1.75]).max(axis=1).argmin()
+    beams = 0.25 / (10.0 * math.radians(1.0) * 10.0 * math.radians(25.0 / 39.0))
+    assert patches.points[first][middle] == pytest.approx(beams, rel=0.02)
+    moments = patches.moments[first][middle]
+    spread = moments[:3, :3] / moments[3, 3] - np.outer(centres[middle], centres[middle])
+    assert np.linalg.eigvalsh(spread) == pytest.approx([0.0, 0.25 / 12, 0.25 / 12], abs=1e-9)
+
+
+def test_what_is_flat_counts_and_what_is_not_does_not() -> None:
+    world = {
+        "car": CarModel(xy_m=(10.0, 5.0)),
+        "chair": ChairModel(xy_m=(5.0, 5.0)),
+        "crate": BoxModel(size_m=(0.4, 0.4, 0.4), xy_m=(5.0, -5.0)),
+        "wall": wall(0.0, 9.0, 0.0),
+    }
+    faces = faces_of(drive_past(STRAIGHT, world))
+
+    flat = [name for name, yes in zip(faces.names, faces.flat, strict=True) if yes]
+    # Front and back of the car, both faces of the wall and not its ends.
+    assert flat == ["car", "car", "wall", "wall"]
+    assert "chair" not in faces.names
+
+
+def test_walls_make_a_target_unnecessary_and_help_beside_one() -> None:
+    yard = load_scenario(SCENARIOS / "yard.yaml")
+    few = {
+        name: lidar.model_copy(update={"rate_hz": 1.0, "channels": 40})
+        for name, lidar in yard.lidars.items()
+    }
+    yard = yard.model_copy(update={"lidars": few})
+    with_chair = yard.model_copy(
+        update={"world": yard.world.model_copy(update={"targets": ("chair",)})}
+    )
+    alone, both = predict(yard), predict(with_chair)
+    chair = predict(with_chair, assumptions=Assumptions(structure=False))
+
+    assert alone.undetermined == both.undetermined == ()
+    assert chair.walls == (None,)
+    for name in ("front", "rear"):
+        assert (both.sigma_s2v[name] < 1.02 * chair.sigma_s2v[name]).all()
+        assert (both.sigma_s2v[name] < 1.02 * alone.sigma_s2v[name]).all()
+        # Height: what is known of the vehicle's own.
+        assert alone.sigma_s2v[name][5] == pytest.approx(0.005, rel=0.15)
+    pair = ("front", "rear")
+    assert (alone.sigma_s2s[pair][[2, 3, 4]] < 0.5 * chair.sigma_s2s[pair][[2, 3, 4]]).all()
+    assert not alone.covariance.calibration.lidars["front"].saw_target
+    assert alone.covariance.calibration.lidars["front"].saw_structure
+
+
+def test_a_clock_beside_walls() -> None:
+    timed = predict(
+        DRIVES["figure-eight"], assumptions=Assumptions(source="poses", time_offset=True)
+    )
+
+    assert set(timed.covariance.offsets_s) == {"front", "rear"}
+    assert max(timed.covariance.offsets_s.values()) < 0.002
+    assert timed.undetermined == ()
+
+
+def test_two_drives_past_walls_tell_more_than_either() -> None:
+    right = DRIVES["arc"]
+    left = drive_past(
+        ArcDrive(duration_s=17.0, standstill_s=0.0, turn="left"), ring(0.0, 9.0, 18.0, 8)
+    )
+
+    assert predict(right, [left]).undetermined == ()
+    assert len(predict(right).undetermined) == 1
+
+
+def test_nothing_to_plan_with_is_said() -> None:
+    empty = drive_past(STRAIGHT, {})
+
+    with pytest.raises(ConfigError, match="walls"):
+        predict(empty)
+    with pytest.raises(ConfigError, match="walls"):
+        predict(replace_objects(empty, OBLIQUE), assumptions=Assumptions(structure=False))
+
+
+def replace_objects(scenario: Scenario, objects: Mapping[str, ObjectModel]) -> Scenario:
+    world = scenario.world.model_copy(update={"objects": dict(objects)})
+    return scenario.model_copy(update={"world": world})

@@ -11,7 +11,7 @@ from caliv_graph.planning.sightings import scan_stamps, solid_angle, within
 from caliv_graph.products import Array, BoolArray, IntArray, Trajectory
 from caliv_graph.scenario.beams import channel_elevations_deg
 from caliv_graph.scenario.drives import Drive
-from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.model import CropModel, Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.planar import (
@@ -60,13 +60,12 @@ def planned_patches(
     scan = 0
     for k, (name, own) in enumerate(zip(names, stamps, strict=True)):
         R, t = path.poses_at(own)
-        T = scenario.lidars[name].mounting.pose()
+        model = scenario.lidars[name]
+        T, part = model.mounting.pose(), _used_part(model, scenario.crop)
         eyes, turns = t + R @ T.translation(), R @ T.rotation().matrix()
         for eye, turn in zip(eyes, turns, strict=True):
             for places in used:
-                own_moments, own_normals, which = _seen(
-                    scenario.lidars[name], faces, places, eye, turn
-                )
+                own_moments, own_normals, which = _seen(model, part, faces, places, eye, turn)
                 of_scan = np.full(len(which), scan, dtype=np.int64)
                 parts.append((own_moments, own_normals, places.face[which], of_scan))
             scan += 1
@@ -96,7 +95,12 @@ def _path(scenario: Scenario, drive: Drive) -> GivenTrajectory:
 
 
 def _seen(
-    model: LidarModel, faces: Faces, places: Places, eye_map: Array, R_map_lidar: Array
+    model: LidarModel,
+    used_part: float,
+    faces: Faces,
+    places: Places,
+    eye_map: Array,
+    R_map_lidar: Array,
 ) -> tuple[Array, Array, IntArray]:
     """Moments (n, 4, 4) and normals (n, 3), lidar frame, of the places that are seen; which."""
     away = places.centres_map - eye_map
@@ -106,7 +110,7 @@ def _seen(
     local = away[kept] @ R_map_lidar
     _, inside = within(model, local[:, None])
     elevation = np.arcsin(local[:, 2] / distance[kept])
-    density = _used_part(model) * cos[kept]
+    density = used_part * cos[kept]
     density /= distance[kept] ** 2 * solid_angle(model, elevation)
     good: BoolArray = (inside > 0.0) & (density * MAX_PATCH_M**2 >= MIN_POINTS)
     kept, local, density = kept[good], local[good], density[good]
@@ -123,8 +127,11 @@ def _seen(
     return count[:, None, None] * moments, places.normals_map[kept] @ R_map_lidar, kept
 
 
-def _used_part(model: LidarModel) -> float:
-    """Part of the points that are used: of dense clouds an even part."""
+def _used_part(model: LidarModel, crop: CropModel | None) -> float:
+    """Part of the beams that are used: of dense clouds an even part; those that are cropped not."""
     low, high = model.horizontal_fov_deg
     beams = len(channel_elevations_deg(model)) * (high - low) / model.horizontal_resolution_deg
-    return min(1.0, MAX_POINTS / beams)
+    kept = 1.0
+    if crop is not None:
+        kept = crop.elsewhere_stride**-2.0 if crop.elsewhere_stride else 0.0
+    return min(kept, MAX_POINTS / beams)

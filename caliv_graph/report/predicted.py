@@ -16,8 +16,13 @@ from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
 from caliv_graph.report.layout import axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import SHOWN_AXES, rounded
-from caliv_graph.report.planned_walls import wall_document, wall_parts
 from caliv_graph.report.tables import direction_texts
+from caliv_graph.report.walls import (
+    surveyed_wall_document,
+    surveyed_wall_parts,
+    wall_document,
+    wall_parts,
+)
 from caliv_graph.results.calibration_file import calibration_document
 
 if TYPE_CHECKING:
@@ -38,10 +43,12 @@ def survey_table(survey: Survey) -> RenderableType:
         Text.assemble(("Expected accuracy", "bold"), f": {', '.join(survey.names)}"),
         *_sigma_parts(predicted, "Expected"),
     ]
-    seen = new_table("target", "LiDAR", "scans\nused")
-    for (target, lidar), count in survey.scans.items():
-        seen.add_row(Text(target), Text(lidar), str(count))
-    parts += titled("Scans that see the target", seen)
+    if survey.scans:
+        seen = new_table("target", "LiDAR", "scans\nused")
+        for (target, lidar), count in survey.scans.items():
+            seen.add_row(Text(target), Text(lidar), str(count))
+        parts += titled("Scans that see the target", seen)
+    parts += surveyed_wall_parts(survey)
     parts += _direction_parts(predicted)
     parts += sentences("Required by the config, but not expected to be reached:", survey.unmet)
     return Group(*parts)
@@ -56,6 +63,7 @@ def survey_document(survey: Survey) -> dict[str, Any]:
             {"target": target, "lidar": lidar, "scans": count}
             for (target, lidar), count in survey.scans.items()
         ],
+        **surveyed_wall_document(survey),
         "unmet": list(survey.unmet),
         "warnings": list(survey.warnings),
     }

@@ -15,11 +15,11 @@ def nothing_sentence(what: str, structure: str) -> str:
     return f"{what}. Structure does not replace it: {structure}"
 
 
-def shared_walls_sentence(a: str, b: str, strips: int, walls: Sequence[str]) -> str:
-    """Which walls two LiDARs both see, and what follows if there are none."""
+def shared_walls_sentence(a: str, b: str, strips: int, walls: Sequence[str] = ()) -> str:
+    """How many strips of walls two LiDARs both see, and what follows if there are none."""
     if not strips:
         return (
             f"LiDARs '{a}' and '{b}' see no piece of a wall that the other sees, at any time: "
             "walls do not tie them to each other"
         )
-    return f"LiDARs '{a}' and '{b}' both see {strips} pieces of {', '.join(walls)}"
+    return f"LiDARs '{a}' and '{b}' both see {strips} pieces of {', '.join(walls) or 'walls'}"

@@ -6,6 +6,7 @@ extrinsics are not refined together, which is what takes the time.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,7 +29,14 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
 from caliv_graph.pipeline import prepare, structure_evidence, without_anything
-from caliv_graph.products import Array, GroundObservation, Recording, TargetObservation
+from caliv_graph.products import (
+    Array,
+    GroundObservation,
+    Recording,
+    StructureTerm,
+    TargetObservation,
+)
+from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
 from caliv_graph.wording.directions import named_prediction
@@ -45,6 +53,9 @@ class Survey:
         names: of the recordings.
         covariance: predicted sigmas and directions; extrinsics are rough estimates.
         scans: (target, LiDAR) -> number of clouds that count.
+        wall_sightings: LiDAR -> number of pairs of a strip of wall and a scan that sees it; empty:
+            no structure was used.
+        shared_walls: (LiDAR, LiDAR) -> number of strips of walls that both see.
         unmet: what `require` and `limits` of the config ask for and will not get, a sentence each.
         warnings: what a person should know, a line each.
     """
@@ -52,6 +63,8 @@ class Survey:
     names: tuple[str, ...]
     covariance: PredictedCovariance
     scans: Mapping[tuple[str, str], int]
+    wall_sightings: Mapping[str, int]
+    shared_walls: Mapping[tuple[str, str], int]
     unmet: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -162,4 +175,24 @@ def _verdict(
         lidars_with_structure(state.structure),
     )
     unmet = unmet_requirements(covariance.calibration, config).unmet
-    return Survey((), named_prediction(covariance), scans, unmet, tuple(warnings))
+    sightings, shared = _walls(state.structure, tuple(config.lidars))
+    return Survey(
+        (), named_prediction(covariance), scans, sightings, shared, unmet, tuple(warnings)
+    )
+
+
+def _walls(
+    terms: Sequence[StructureTerm], lidars: Sequence[str]
+) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
+    """Sightings of walls per LiDAR, and strips of walls that two LiDARs see."""
+    if not terms:
+        return {}, {}
+    walls = [
+        strip
+        for term in terms
+        for strip in term.strips
+        if strip.weight > 0.0 and abs(strip.normal_map[2]) < LEVEL
+    ]
+    sightings = {name: sum(strip.scans.get(name, 0) for strip in walls) for name in lidars}
+    pairs = itertools.combinations(lidars, 2)
+    return sightings, {pair: sum(set(pair) <= set(s.scans) for s in walls) for pair in pairs}

@@ -1,4 +1,4 @@
-"""The walls that the LiDARs of a planned drive see, as a table and as plain values."""
+"""The walls that LiDARs see on a planned or a recorded drive: tables and plain values."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from caliv_graph.wording.structure import shared_walls_sentence
 
 if TYPE_CHECKING:
     from caliv_graph.planning.predict import Prediction
+    from caliv_graph.workflows.survey import Survey
+
+SHARED = "Walls that two LiDARs see:"
 
 
 def wall_parts(prediction: Prediction) -> list[RenderableType]:
@@ -33,7 +36,7 @@ def wall_parts(prediction: Prediction) -> list[RenderableType]:
         return []
     return [
         *titled("Scans in which each LiDAR sees a wall", table),
-        *sentences("Walls that two LiDARs see:", lines),
+        *sentences(SHARED, lines),
     ]
 
 
@@ -56,5 +59,28 @@ def wall_document(prediction: Prediction) -> dict[str, Any]:
             {"drive": drive, "lidars": [a, b], "strips": strips, "walls": list(walls.shared[a, b])}
             for drive, walls in seen
             for (a, b), strips in walls.strips.items()
+        ],
+    }
+
+
+def surveyed_wall_parts(survey: Survey) -> list[RenderableType]:
+    """Sightings of walls per LiDAR, and what LiDARs share; nothing without structure."""
+    if not survey.wall_sightings:
+        return []
+    table = new_table("LiDAR", "pieces of wall x scans")
+    for name, count in survey.wall_sightings.items():
+        table.add_row(Text(name), str(count))
+    lines = [shared_walls_sentence(a, b, n) for (a, b), n in survey.shared_walls.items()]
+    return [*titled("Walls that each LiDAR sees", table), *sentences(SHARED, lines)]
+
+
+def surveyed_wall_document(survey: Survey) -> dict[str, Any]:
+    """The same as plain values; no keys without structure."""
+    if not survey.wall_sightings:
+        return {}
+    return {
+        "wall_sightings": dict(survey.wall_sightings),
+        "shared_walls": [
+            {"lidars": list(pair), "strips": strips} for pair, strips in survey.shared_walls.items()
         ],
     }

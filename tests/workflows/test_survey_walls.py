@@ -1,0 +1,118 @@
+"""What drives past walls alone determine, as `observability` and `calibrate` say it."""
+
+from __future__ import annotations
+
+import io
+from functools import cache
+from pathlib import Path
+
+from rich.console import Console
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config, GroundConfig
+from caliv_graph.pipeline import Prepared, calibrate, prepare, structure_evidence
+from caliv_graph.report.predicted import survey_document, survey_table
+from caliv_graph.scenario.drive_models import StraightDrive
+from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.world_models import WallModel, WorldModel
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.workflows.survey import Survey, survey_observations
+from tests.drives_with_chair import paper_lidar, paper_scenario
+from tests.kept import KeptDrive
+
+STRAIGHT = StraightDrive(duration_s=11.0)
+
+
+def wall(x_m: float, y_m: float, yaw_deg: float, length_m: float, seed: int) -> WallModel:
+    return WallModel(xy_m=(x_m, y_m), yaw_deg=yaw_deg, length_m=length_m, seed=seed)
+
+
+PARALLEL = {"left": wall(6, 7, 0, 18.0, 1), "right": wall(6, -7, 0, 18.0, 2)}
+OBLIQUE = {"left": wall(8, 8, 25, 8.0, 1), "right": wall(8, -8, 30, 8.0, 2)}
+
+
+def coarse(x_m: float, yaw_deg: float) -> LidarModel:
+    return paper_lidar(x_m, yaw_deg, rate_hz=1.6).model_copy(
+        update={"channels": 50, "horizontal_resolution_deg": 0.6}
+    )
+
+
+AHEAD = {"front": coarse(2.0, 0.0), "rear": coarse(-0.4, 180.0)}
+ASIDE = {"front": coarse(2.0, 65.0), "rear": coarse(-0.4, -65.0)}
+
+
+def scenario_of(objects: dict[str, WallModel], lidars: dict[str, LidarModel]) -> Scenario:
+    return paper_scenario(STRAIGHT).model_copy(
+        update={
+            "lidars": lidars,
+            "crop": None,
+            "world": WorldModel(objects=dict(objects)),
+        }
+    )
+
+
+CASES = {
+    "parallel": (PARALLEL, AHEAD),
+    "not shared": (OBLIQUE, ASIDE),
+}
+
+
+@cache
+def prepared(name: str) -> tuple[KeptDrive, Config, Prepared]:
+    recording = KeptDrive(scenario_of(*CASES[name]), 1)
+    config = parse_config(config_of(recording, has_bag=True), name, Path())
+    config = config.model_copy(update={"target": False, "ground": GroundConfig(use=True)})
+    return (
+        recording,
+        config,
+        prepare([recording], config, {0: recording.motion()}, SilentProgress()),
+    )
+
+
+def surveyed(name: str) -> Survey:
+    _, _, found = prepared(name)
+    return survey_observations(
+        found.observations,
+        found.trajectories,
+        found.grounds,
+        found.config,
+        SilentProgress(),
+        structure_evidence(found),
+    )
+
+
+def test_parallel_walls_leave_open_what_lies_along_them() -> None:
+    """Straight ahead between two fronts, in the result of `calibrate`."""
+    recording, config, _ = prepared("parallel")
+
+    run = calibrate([recording], config, SilentProgress())
+
+    lost = {d.text: d.remedy for d in run.calibration.undetermined}
+    assert {"x of lidar 'front'", "x of lidar 'rear'"} < set(lost)
+    assert "walls that are not parallel" in lost["x of lidar 'front'"]
+    assert "target" not in " ".join(lost.values())
+    determined = pair_determined(run.calibration, "front", "rear")
+    assert [axis for axis, known in determined.items() if not known] == ["x"]
+    assert run.calibration.status == "partial"
+    assert any("front" in line for line in run.calibration.unmet)
+
+
+def test_walls_that_are_not_shared_are_named() -> None:
+    found = surveyed("not shared")
+
+    lost = {d.text: d.remedy for d in found.covariance.undetermined}
+    assert found.shared_walls == {("front", "rear"): 0}
+    assert min(found.wall_sightings.values()) > 50
+    for name in ("front", "rear"):
+        assert "each seen by all of these LiDARs" in lost[f"y of lidar '{name}'"]
+        assert "each seen by all of these LiDARs" in lost[f"x of lidar '{name}'"]
+    assert found.unmet
+    words = Console(width=200, file=io.StringIO())
+    words.print(survey_table(found))
+    text = words.file.getvalue()  # type: ignore[attr-defined]
+    assert "see no piece of a wall that the other sees" in text
+    assert "Scans that see the target" not in text
+    assert survey_document(found)["shared_walls"] == [{"lidars": ["front", "rear"], "strips": 0}]

@@ -15,7 +15,9 @@ SIGMAS = np.array([2e-4] * 3 + [2e-3] * 3)
 """Of what it says, rad and m."""
 
 
-def patches_of(recordings: Sequence[Recording], *_: object) -> tuple[DrivePatches, ...]:
+def patches_of(
+    recordings: Sequence[Recording], *_: object, keep_level: bool = False
+) -> tuple[DrivePatches, ...]:
     """A patch in every third scan: what counts is when they were taken."""
     out = []
     for drive, recording in enumerate(recordings):

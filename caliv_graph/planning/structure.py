@@ -31,7 +31,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.solve import Problem, Solved, linearised
+from caliv_graph.structure.solve import Problem, Solved, linearised, repeated_views
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import lidars_with_ground
 from caliv_graph.trajectory.chain import POSE, Chain
@@ -102,10 +102,12 @@ def plan_structure(
     motion = plan_motion(drive, scenario, stamps, source_of(scenario, assumptions))
     nodes = np.unique(motion.nodes_of(stamps))
     n = len(scenario.lidars)
+    prior = _pose_prior(motion, nodes, assumptions.heave_sigma_m)
+    pose_of_scan = np.searchsorted(nodes, motion.nodes_of(patches.stamps_ns))
     problem = Problem(
         patches=patches,
-        prior=_pose_prior(motion, nodes, assumptions.heave_sigma_m),
-        pose_of_scan=np.searchsorted(nodes, motion.nodes_of(patches.stamps_ns)),
+        prior=prior,
+        pose_of_scan=pose_of_scan,
         relative=np.broadcast_to(np.eye(4), (len(face), 4, 4)),
         twists=motion.twist[nodes] if assumptions.time_offset else None,
         offsets=tuple(range(n)) if assumptions.time_offset else (),
@@ -119,6 +121,7 @@ def plan_structure(
             heave_m=assumptions.heave_sigma_m,
             sway_rad=0.0,
         ),
+        repeated=repeated_views(patches, pose_of_scan, prior),
     )
     found = linearised(
         problem,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,10 +16,9 @@ SIGMAS = np.array([2e-4] * 3 + [2e-3] * 3)
 
 
 def patches_of(
-    recordings: Sequence[Recording], *_: object, keep_level: bool
+    recordings: Sequence[Recording], *_: object, keep_level: bool = False
 ) -> tuple[DrivePatches, ...]:
     """A patch in every third scan: what counts is when they were taken."""
-    assert keep_level, "the ground is a part of structure"
     out = []
     for drive, recording in enumerate(recordings):
         stamps = [np.array(recording.scan_stamps_ns(n)[1:-1:3], np.int64) for n in recording.lidars]
@@ -113,11 +111,11 @@ class Structure:
         every = dict.fromkeys(self.truth, 12)
         one = {next(iter(self.truth)): 5}
         return tuple(
-            Strip(drive, surface, np.zeros(3), np.eye(3)[0], scans, {}, 0.004, before_m, weight)
-            for surface, scans, before_m, weight in (
-                (0, every, 0.02, 1.0),
-                (0, every, 0.02, 0.5),
-                (1, one, math.nan, 1.0),
-                (2, every, 0.02, 0.0),
+            Strip(drive, surface, np.zeros(3), np.eye(3)[0], scans, {}, 0.004, 0.02, weight)
+            for surface, scans, weight in (
+                (0, every, 1.0),
+                (0, every, 0.5),
+                (1, one, 1.0),
+                (2, every, 0.0),
             )
         )

@@ -17,10 +17,10 @@ from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.planar import (
     MAX_PATCH_M,
     MAX_POINTS,
-    MIN_INCIDENCE_COS,
     MIN_POINTS,
 )
 from caliv_graph.structure.read import chosen_scans
+from caliv_graph.structure.sightings import MIN_COS
 from caliv_graph.trajectory.select import GivenTrajectory
 
 PATH_NS = 50_000_000
@@ -47,7 +47,7 @@ def planned_patches(
     walls = face_places(faces)
     used = [walls]
     reach_m = max(
-        m.mounting.pose().translation()[2] * math.tan(math.acos(MIN_INCIDENCE_COS))
+        m.mounting.pose().translation()[2] * math.tan(math.acos(MIN_COS))
         + float(np.linalg.norm(m.mounting.pose().translation()[:2]))
         for m in scenario.lidars.values()
     )
@@ -106,7 +106,7 @@ def _seen(
     away = places.centres_map - eye_map
     distance = np.linalg.norm(away, axis=1)
     cos = -np.einsum("ki,ki->k", places.normals_map, away) / distance
-    kept = np.flatnonzero(cos > MIN_INCIDENCE_COS)
+    kept = np.flatnonzero(cos > MIN_COS)
     local = away[kept] @ R_map_lidar
     _, inside = within(model, local[:, None])
     elevation = np.arcsin(local[:, 2] / distance[kept])

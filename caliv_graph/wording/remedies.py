@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from caliv_graph.products import LidarResult
@@ -102,17 +102,13 @@ OF_STRUCTURE = _remedies(
     more="drive longer, closer to walls that are not parallel and that each LiDAR sees",
 )
 
-OF_BOTH = _remedies(
-    passed="the target and walls that are not parallel",
-    in_view="the target or walls are",
-    apart=f"{_SAME_WALLS}. Or {_SAME_SIDE}",
-    apart_z=f"{_SAME_GROUND}. Or {_SAME_SIDE}",
-    apart_yaw=f"{_SAME_WALLS}. Or {_SAME_SIDE}",
-    more=(
-        "pass the target again, closer and at other places, and walls that are not parallel and "
-        "that each LiDAR sees"
-    ),
+OF_BOTH = replace(
+    OF_TARGET,
+    apart=f"{_SAME_SIDE}; or {_SAME_WALLS}",
+    apart_z=f"{_SAME_SIDE}; or {_SAME_GROUND}",
+    apart_yaw=f"{OF_TARGET.apart_yaw}; or {_SAME_WALLS}",
 )
+"""Structure may be no more than the ground: a manoeuvre past the target is what is sure to help."""
 
 REMEDIES: dict[Evidence, Remedies] = {
     "target": OF_TARGET,

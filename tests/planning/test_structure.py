@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
@@ -18,6 +20,7 @@ from caliv_graph.planning.assumptions import Ground
 from caliv_graph.planning.faces import faces_of
 from caliv_graph.planning.patches import planned_patches
 from caliv_graph.products import Array
+from caliv_graph.report.predicted import plan_document, plan_table
 from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
@@ -214,6 +217,29 @@ def test_who_shares_which_wall() -> None:
     # The left one sees the walls on the left.
     assert {what for what, lidar in apart.scans if lidar == "front"} == {"wall_0", "wall_1"}
     assert {what for what, lidar in apart.scans if lidar == "rear"} == {"wall_2", "wall_3"}
+
+
+def test_the_document_and_the_words_name_what_is_shared() -> None:
+    for name, part in (
+        ("straight, oblique", "both see "),
+        ("straight, none shared", "see no piece of a wall that the other sees"),
+    ):
+        prediction = planned(name, "none")
+        (seen,) = prediction.walls
+        assert seen is not None
+
+        document = plan_document(prediction, {}, False, None)
+        words = io.StringIO()
+        Console(width=300, file=words).print(plan_table(prediction, {}, False, None))
+
+        (shared,) = document["shared_walls"]
+        assert shared["lidars"] == ["front", "rear"]
+        assert shared["strips"] == seen.strips["front", "rear"]
+        assert {w["wall"]: w["scans"] for w in document["walls"] if w["lidar"] == "front"} == {
+            wall: scans for (wall, lidar), scans in seen.scans.items() if lidar == "front"
+        }
+        assert part in words.getvalue()
+        assert "sees the target" not in words.getvalue()
 
 
 def test_a_wall_hides_what_is_behind_it() -> None:

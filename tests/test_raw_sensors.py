@@ -30,6 +30,7 @@ from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
+from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
@@ -101,6 +102,7 @@ def test_without_its_height_above_ground_height_alone_is_not_determined() -> Non
     ground = drive().config.ground.model_copy(update={"vehicle_height": None})
     few = drive().config.extraction.model_copy(update={"max_scans": 16})
     config = drive().config.model_copy(update={"ground": ground, "extraction": few})
+    config = without_structure(config)
     calibration = calibrate([drive().recording], config, SilentProgress()).calibration
     assert calibration.status == "partial"
     for lidar in calibration.lidars.values():

@@ -281,17 +281,17 @@ def test_a_job_that_kills_its_worker_twice_has_failed(fleet: Path) -> None:
 
 @pytest.fixture
 def scheduler(tmp_path: Path) -> Iterator[str]:
-    """A Dask scheduler and two workers, as an administrator would start them."""
+    """A Dask scheduler and a worker, as an administrator would start them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     dask = (sys.executable, "-m", "dask")
     local = ("--no-dashboard", "--host", "127.0.0.1")
-    # Without the process beside each worker that would start it again.
+    # Without the process beside the worker that would start it again.
     worker = (*dask, "worker", address, *local, "--nthreads", "1", "--no-nanny")
     commands = [
         (*dask, "scheduler", *local, "--port", address.rpartition(":")[2]),
-        *[(*worker, "--local-directory", tmp_path) for _ in range(2)],
+        (*worker, "--local-directory", tmp_path),
     ]
     processes = [
         subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

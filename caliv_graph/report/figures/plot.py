@@ -1,6 +1,6 @@
 """Figures as plotly.js takes them: plain dictionaries of traces and layout.
 
-plotly's own figures check and copy every value at every step, which takes a second per report.
+plotly's own figures check and copy every value at every step, which takes 0.3 s of CPU per report.
 The keys are those of https://plotly.com/javascript/reference.
 """
 

@@ -21,6 +21,10 @@ UNEVEN_RAD = 0.005
 strip."""
 
 
+STEP_M = 0.05
+"""Largest difference of a height above a strip from the median: kerbs are higher."""
+
+
 @dataclass(frozen=True)
 class Standing:
     """What is known of how the vehicle stands.
@@ -62,8 +66,13 @@ def stands_of(t_map_vehicle: Array, centres_map: Array, normals_map: Array) -> S
         return Stands(none, none)
     found = cKDTree(centres_map[level, :2]).query(t_map_vehicle[:, :2])
     apart, nearest = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
-    below = apart < 0.5 * np.sqrt(2.0) * CELL_M
-    return Stands(np.flatnonzero(below), level[nearest[below]])
+    below = np.flatnonzero(apart < 0.5 * np.sqrt(2.0) * CELL_M)
+    strip = level[nearest[below]]
+    away = t_map_vehicle[below] - centres_map[strip]
+    height = np.einsum("si,si->s", normals_map[strip], away)
+    # The nearest strip may be a kerb beside the wheels.
+    usual = np.abs(height - np.median(height)) < STEP_M if len(height) else below > 0
+    return Stands(below[usual], strip[usual])
 
 
 def standing_rows(

@@ -15,9 +15,13 @@ from caliv_graph.products import Array, BoolArray, IntArray
 CELL_M = 2.0
 """Edge of the cells of the map that strips are found in: walls are not flat beyond 2 m."""
 
-MAX_ANGLE_RAD = math.radians(25.0)
-"""Largest angle between the normal of a patch and that of its strip. A patch of 16 rings, 0.5 m
-wide, knows its normal to some 10 degrees."""
+WIDE_ANGLE_RAD = math.radians(25.0)
+WIDE_GATE_M = 0.3
+NARROW_ANGLE_RAD = math.radians(6.0)
+"""Largest angle between the normal of a patch and that of its strip: at a gate of `WIDE_GATE_M`,
+where extrinsics are degrees off, and at the narrowest. A patch knows its normal to 30 mrad. Patches
+that straddle a kerb lean towards the LiDAR, and pull the pitch of LiDARs that look ahead and behind
+apart."""
 
 STRIPS_OF_A_CELL = 4
 """Most strips of a cell: the two faces of each of two walls that meet."""
@@ -139,7 +143,8 @@ def _on_plane(
     positions: Array, normals: Array, centre: Array, normal: Array, gate_m: float
 ) -> BoolArray:
     near = np.abs((positions - centre) @ normal) < gate_m
-    return np.asarray(near & (normals @ normal > math.cos(MAX_ANGLE_RAD)))
+    angle = min(max(WIDE_ANGLE_RAD * gate_m / WIDE_GATE_M, NARROW_ANGLE_RAD), WIDE_ANGLE_RAD)
+    return np.asarray(near & (normals @ normal > math.cos(angle)))
 
 
 def plane_of_moments(moments: Array, towards: Array) -> tuple[Array, Array]:

@@ -167,7 +167,27 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         sigma_m = float(np.median(found.nuisances.sighting))
         strip_m, shared_m = found.nuisances.strip, found.nuisances.shared
         state = found.state
-    return None if found is None else _settled(found, steps=LAST_STEPS)
+    return None if found is None else _without_dents(_settled(found, steps=LAST_STEPS))
+
+
+def _without_dents(found: Solved) -> Solved:
+    """The same estimate, its information without what dents of the ground tell.
+
+    The steps use them: derivatives that are not those of the residuals do not lead to the estimate.
+    """
+    problem, state, sightings = found.problem, found.state, found.sightings
+    geometry = geometry_at(problem, state, sightings, found.layout, dents=False)
+    rows, system = _whitened(
+        problem,
+        state,
+        geometry,
+        found.strips,
+        sightings,
+        found.weights,
+        found.nuisances,
+        found.layout,
+    )
+    return replace(found, rows=rows, system=replace(system, b=found.system.b))
 
 
 def linearised(
@@ -192,7 +212,8 @@ def linearised(
         SolveError: the system is singular.
     """
     state = first_state(problem, T_vehicle_lidar)
-    return _round(problem, state, range_sigma_m, GATES_M[-1], sighting_m, strip_m, shared_m)
+    found = _round(problem, state, range_sigma_m, GATES_M[-1], sighting_m, strip_m, shared_m)
+    return None if found is None else _without_dents(found)
 
 
 def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
@@ -332,7 +353,9 @@ def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
     return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
 
 
-def geometry_at(problem: Problem, state: State, sightings: Sightings, layout: Layout) -> Geometry:
+def geometry_at(
+    problem: Problem, state: State, sightings: Sightings, layout: Layout, dents: bool = True
+) -> Geometry:
     """Residuals of the sightings at an estimate."""
     scan = sightings.scan
     return geometry_of(
@@ -342,6 +365,7 @@ def geometry_at(problem: Problem, state: State, sightings: Sightings, layout: La
         problem.patches.scan_lidar[scan],
         problem.pose_of_scan[scan],
         problem.twists,
+        dents,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -23,6 +24,10 @@ PLACE_PRIOR_M = 1000.0
 must say next to nothing of what turns and shifts all of them, such as the roll of all LiDARs on a
 straight drive: 5 rad / sqrt(1000) is five times the guess's 30 mrad."""
 
+
+DENT_RAD = 0.05
+"""Largest angle of a strip to its tile that is a dent of the ground. What is steeper, a bonnet, is a
+surface of its own."""
 
 REPEATED_M = 0.003
 """Least sigma of the own error of sightings from one place. Scans of a vehicle that stands repeat
@@ -322,6 +327,7 @@ def geometry_of(
     lidar: IntArray,
     pose: IntArray,
     twists: Array | None,
+    dents: bool = True,
 ) -> Geometry:
     """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
 
@@ -348,7 +354,8 @@ def geometry_of(
     plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre)
     plain += np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
 
-    smooth = np.einsum("qji,qj->qi", R, smooth_normals(state.normals_map, layout)[strip])
+    normals = state.normals_map if dents else smooth_normals(state.normals_map, layout)
+    smooth = np.einsum("qji,qj->qi", R, normals[strip])
     by_extrinsic = np.zeros((q, 6, 4))
     by_extrinsic[:, :3, :3] = -skew(smooth)
     by_extrinsic[:, 3:, 3] = smooth
@@ -386,7 +393,8 @@ def smooth_normals(normals_map: Array, layout: Layout) -> Array:
     level = normals_map[:, 2] > LEVEL
     total = np.stack([np.bincount(surface, n, layout.surfaces) for n in normals_map.T], axis=1)
     mean = total / np.linalg.norm(total, axis=1)[:, None]
-    return np.where(level[:, None], mean[surface], normals_map)
+    dent = level & (np.einsum("ki,ki->k", mean[surface], normals_map) > math.cos(DENT_RAD))
+    return np.where(dent[:, None], mean[surface], normals_map)
 
 
 def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:

@@ -26,8 +26,8 @@ straight drive: 5 rad / sqrt(1000) is five times the guess's 30 mrad."""
 
 
 DENT_RAD = 0.05
-"""Largest angle of a strip to its tile that is a dent of the ground. What is steeper, a bonnet, is a
-surface of its own."""
+"""Largest angle of a strip to its tile that is a dent of the ground. What is steeper, such as a
+bonnet, is a surface of its own."""
 
 REPEATED_M = 0.003
 """Least sigma of the own error of sightings from one place. Scans of a vehicle that stands repeat
@@ -339,6 +339,7 @@ def geometry_of(
         pose: (Q,) index of the pose of each.
         twists: (M, 6) velocity at each pose, right perturbation per second; None: no offset is
             free.
+        dents: whether dents of the ground tell where a LiDAR is (`smooth_normals`).
     """
     q = sightings.count
     strip = sightings.strip

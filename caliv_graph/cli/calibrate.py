@@ -42,8 +42,9 @@ def calibrate(
     result, self-contained) and log.jsonl (all stages, for programs).
 
     Exit code 3: the result is written, but something that 'require' or 'limits' in the config asks
-    for was not reached, or a LiDAR never saw the target. Exit code 4: the result is written, but
-    the data contradict each other, the initial guess, or the calibration given with '--prior'.
+    for was not reached, or a LiDAR saw neither target nor structure. Exit code 4: the result is
+    written, but the data contradict each other, the initial guess, or the calibration given with
+    '--prior'.
 
     With '--try-suspects', where one input explains a contradiction by more than 5 sigma, the run is
     repeated with that input freed or set to the value that it would take; DIR/suspect/ has the

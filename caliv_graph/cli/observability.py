@@ -21,7 +21,7 @@ def observability(
     'calibrate' and needs the same data.
 
     Exit code 3: something that 'require' or 'limits' in the config asks for will not be reached, or
-    a LiDAR never saw the target.
+    a LiDAR saw neither target nor structure.
 
     Example: caliv-graph observability config.yaml --data drive/
     """

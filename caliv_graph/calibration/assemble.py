@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 import caliv_graph
-from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure import lidars_with_structure
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import vehicle_axes_difference

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.guesses import configured_guess
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference

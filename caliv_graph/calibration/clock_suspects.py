@@ -15,10 +15,10 @@ import numpy as np
 
 from caliv_graph.calibration.choose import late_stamps
 from caliv_graph.calibration.estimate import estimate
-from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.score_tests import MIN_CLOUDS
 from caliv_graph.calibration.suspects import suspect_scores
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS, TRUSTED_SIGMAS
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
@@ -19,6 +18,7 @@ from caliv_graph.calibration.vehicle_parameters import (
     motion_term,
     parameter_priors,
 )
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
@@ -293,9 +293,7 @@ def pose_problem(
         lidars=lidars,
         reference=reference,
         guesses={n: config.lidars[n].initial.pose() for n in lidars},
-        prior_sigmas={
-            n: TRUSTED_SIGMAS if n in fixed else config.lidars[n].sigma.sigmas() for n in lidars
-        },
+        prior_sigmas={n: configured_guess(config, n).sigmas for n in lidars},
         fixed=fixed,
         poses=poses,
         T_map_vehicle=tuple(

@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.clock_suspects import clock_solved_again, is_lidar_clock
-from caliv_graph.calibration.guesses import configured_guess
 from caliv_graph.calibration.motion_suspects import motion_scores
 from caliv_graph.calibration.suspects import DRIFT_WAVES, suspect_scores
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import retract_vehicle_axes

@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.calibration.heave import with_heave
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE

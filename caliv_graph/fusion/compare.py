@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc, ndtr
 
-from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.terms import arranged, guess_of, own_term
 from caliv_graph.geometry.covariance import relative_jacobian

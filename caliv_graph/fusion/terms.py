@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.assemble import DRIVES
-from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
     joint_right_to_vehicle_axes,

@@ -263,8 +263,8 @@ def whitened(
     view, whose errors are the same: their mean has the error of one. `weights` (Q,) are robust,
     `size` is D.
     """
-    own = np.where(repeated > 1.5, np.maximum(nuisances.sighting[sightings.strip], REPEATED_M), 0.0)
-    sigma_m = np.maximum(own, nuisances.sighting[sightings.strip]) * np.sqrt(repeated)
+    least = np.where(repeated > 1.5, REPEATED_M, 0.0)
+    sigma_m = np.maximum(nuisances.sighting[sightings.strip], least) * np.sqrt(repeated)
     S, noise = without_own_error(sightings, geometry.normals_lidar, sigma_m)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)

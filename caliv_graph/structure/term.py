@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
@@ -31,9 +32,6 @@ from caliv_graph.structure.thickness import (
     thickness_at_guesses,
 )
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
-
-HELD_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
-"""Sigmas of an extrinsic that the user trusts: 0.01 mrad and 0.1 mm."""
 
 
 def structure_terms(
@@ -82,7 +80,7 @@ def aligned_start(
     config: Config,
 ) -> Mapping[str, gtsam.Pose3]:
     """T_vehicle_lidar at which the strips are found first, from rough ones; trusted ones stay."""
-    sigmas = {name: _guess_sigmas(config, name) for name in config.lidars}
+    sigmas = {name: configured_guess(config, name).sigmas for name in config.lidars}
     held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
     return align_patches(patches, trajectories, start, held).T_vehicle_lidar
 
@@ -103,12 +101,6 @@ GROUND_SIGHTINGS = 50
 """Fewest sightings of level strips with which they stand for the ground planes of a LiDAR."""
 
 
-def _guess_sigmas(config: Config, name: str) -> Array:
-    """(6,) of the guess of a LiDAR, vehicle axes; of a trusted one next to nothing."""
-    lidar = config.lidars[name]
-    return HELD_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
-
-
 def problem_of(
     patches: DrivePatches,
     prior: PosePrior,
@@ -121,7 +113,7 @@ def problem_of(
     offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)
     stamps = prior.stamps_ns.tolist()
     pose_of_scan = np.searchsorted(prior.stamps_ns, patches.stamps_ns)
-    lidars = [config.lidars[name] for name in patches.lidars]
+    guesses = [configured_guess(config, name) for name in patches.lidars]
     return Problem(
         patches=patches,
         prior=prior,
@@ -129,10 +121,8 @@ def problem_of(
         relative=relative_motions(patches, trajectory),
         twists=twists_at(trajectory, stamps) if offsets else None,
         offsets=offsets,
-        guesses=tuple(lidar.initial.pose() for lidar in lidars),
-        guess_information=np.diag(
-            np.concatenate([_guess_sigmas(config, name) for name in patches.lidars]) ** -2.0
-        ),
+        guesses=tuple(guess.T_vehicle_lidar for guess in guesses),
+        guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
         repeated=repeated_views(patches, pose_of_scan, prior),

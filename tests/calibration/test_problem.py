@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.guesses import TRUSTED_SIGMAS
 from caliv_graph.calibration.linear import retract
 from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.config.model import Config, LidarConfig, PoseConfig, PoseSigmaConfig
 from caliv_graph.conventions import key_extrinsic, key_sensor, key_target, key_vehicle
 from caliv_graph.errors import SolveError

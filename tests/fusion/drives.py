@@ -10,7 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.terms import fuse
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.guesses import TRUSTED_SIGMAS
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, GroundConfig, RegistrationConfig
 from caliv_graph.pipeline import Prepared, prepare

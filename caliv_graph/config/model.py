@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 SolveMode = Literal["auto", "staged", "joint"]
 RobustKernel = Literal["huber", "tls", "trimmed", "none"]
 Requirement = Literal["s2s", "s2v_rotation", "s2v"]
+StampSetting = Literal["start", "end", "auto"]
 
 Lidar = TypeVar("Lidar")
 
@@ -109,6 +110,10 @@ class LidarConfig(Section):
         1.0, description="metres; nearer returns are dropped (the vehicle's own body)"
     )
     max_range: Positive = Field(200.0, description="metres; farther returns are dropped")
+    stamp: StampSetting = Field(
+        "auto",
+        description="what the header's stamp marks, start or end of the sweep; auto: by the data",
+    )
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> LidarConfig:

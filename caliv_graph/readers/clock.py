@@ -50,6 +50,11 @@ class Clock:
     duplicates: int
     offset_s: tuple[float, float, float] | None
 
+    @property
+    def period_s(self) -> float | None:
+        """The median interval; None if there are fewer than two different stamps."""
+        return None if self.rate_hz is None else 1.0 / self.rate_hz
+
 
 def effective_stamps(header_ns: IntArray, record_ns: IntArray) -> IntArray:
     """Header stamps (n,), or the record time where a header has none."""

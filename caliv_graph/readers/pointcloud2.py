@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
 from caliv_graph.readers.bag import DamagedMessageError
+from caliv_graph.readers.packet_times import continued_times
 from caliv_graph.readers.returns import is_return
 
 POINTCLOUD2 = "sensor_msgs/msg/PointCloud2"
@@ -68,20 +69,28 @@ class DecodedCloud:
         times_s: (N,) seconds after the stamp, or None.
         time_field: the source of `times_s`; None: the cloud has no times.
         time_problem: why the times of the cloud are not used; empty: they are, or it has none.
+        packets: packets with which the times start anew, and over which they were continued; 0:
+            they ran through the cloud.
     """
 
     points_lidar: Array
     times_s: Array | None
     time_field: TimeField | None = None
     time_problem: str = ""
+    packets: int = 0
 
 
 def decode_pointcloud2(
-    message: Any, stamp_ns: int, min_range: float, max_range: float
+    message: Any,
+    stamp_ns: int,
+    min_range: float,
+    max_range: float,
+    period_s: float | None = None,
 ) -> DecodedCloud:
     """Decodes a `sensor_msgs/PointCloud2`: any order of fields, padding and endianness.
 
-    Times are related to `stamp_ns`; returns outside the ranges (metres) are dropped.
+    Times are related to `stamp_ns`; returns outside the ranges (metres) are dropped. With the usual
+    time between two clouds, `period_s`, times that start anew with every packet are continued.
 
     Raises:
         DamagedMessageError: the data do not fit the fields.
@@ -96,12 +105,46 @@ def decode_pointcloud2(
     columns = [_column(message, fields[axis]) for axis in "xyz"]
     points = np.stack(columns, axis=1).astype(np.float64, order="C")
     kept = is_return(points, min_range, max_range)
-    times = [
-        (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name])[kept])
+    times = [(field, column[kept]) for field, column in _time_columns(message)]
+    cloud = _with_times(points[kept], times, stamp_ns)
+    return cloud if period_s is None else _with_continued_times(cloud, period_s)
+
+
+def sweep_times(message: Any, stamp_ns: int, period_s: float | None) -> DecodedCloud:
+    """The times of a `sensor_msgs/PointCloud2`, of beams without a return as well.
+
+    A sweep begins and ends where it does also where its beams hit nothing. Raises as
+    `decode_pointcloud2`.
+    """
+    cloud = decode_pointcloud2(message, stamp_ns, 0.0, np.inf, period_s)
+    times = [(field, column[np.isfinite(column)]) for field, column in _time_columns(message)]
+    count = len(times[0][1]) if times else 0
+    whole = _with_times(np.empty((count, 3)), times, stamp_ns)
+    # Drivers may leave zeros as the absolute times of beams without a return.
+    return cloud if cloud.packets or whole.times_s is None else whole
+
+
+def _time_columns(message: Any) -> list[tuple[TimeField, npt.NDArray[Any]]]:
+    """Fields that may hold the times of the points, and their values (N,)."""
+    fields = {field.name: field for field in reversed(message.fields)}
+    return [
+        (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name]))
         for name in _TIME_FIELDS
         if name in fields and fields[name].datatype in _TYPES
     ]
-    return _with_times(points[kept], times, stamp_ns)
+
+
+def _with_continued_times(cloud: DecodedCloud, period_s: float) -> DecodedCloud:
+    """Times that start anew with every packet, continued; or the reason why they cannot be."""
+    if cloud.times_s is None or cloud.time_field is None:
+        return cloud
+    continued = continued_times(cloud.points_lidar, cloud.times_s, period_s)
+    if continued is None:
+        return cloud
+    if continued.times_s is None:
+        problem = f"field '{cloud.time_field.name}': {continued.problem}"
+        return DecodedCloud(cloud.points_lidar, None, time_problem=problem)
+    return replace(cloud, times_s=continued.times_s, packets=continued.packets)
 
 
 def decode_livox(

@@ -37,14 +37,15 @@ from caliv_graph.readers.motion import (
     TwistCollector,
     check_imu,
 )
-from caliv_graph.readers.pointcloud2 import (
-    CLOUD_TYPES,
-    LIVOX_TYPES,
-    DecodedCloud,
-    TimeField,
-    UnusableCloudsError,
-    decode_livox,
-    decode_pointcloud2,
+from caliv_graph.readers.pointcloud2 import CLOUD_TYPES, DecodedCloud, UnusableCloudsError
+from caliv_graph.readers.stamps import StampMark
+from caliv_graph.readers.sweeps import (
+    Sample,
+    TimesSeen,
+    decode_cloud,
+    is_sampled,
+    mark_of,
+    times_warnings,
 )
 
 _KINDS = {"imu": "IMU", "gnss": "GNSS receiver", "twist": "velocity", "pose": "pose of the vehicle"}
@@ -68,31 +69,11 @@ drifts."""
 
 
 @dataclass(frozen=True)
-class TimesSeen:
-    """The times of the points of one LiDAR, over the clouds decoded so far.
-
-    Attributes:
-        field: their source; None: there are none.
-        first_s: earliest, seconds after the stamp.
-        last_s: latest, seconds after the stamp.
-        clouds: clouds that have them.
-        problems: clouds whose times are not used.
-        problem: the reason, of the first such cloud.
-    """
-
-    field: TimeField | None = None
-    first_s: float = 0.0
-    last_s: float = 0.0
-    clouds: int = 0
-    problems: int = 0
-    problem: str = ""
-
-
-@dataclass(frozen=True)
 class _Index:
     """The result of the first pass over the bag; `scans` has per LiDAR the record time by stamp.
 
-    `collectors` are by kind and topic; `damaged` counts messages that do not decode, by topic.
+    `collectors` are by kind and topic; `damaged` counts messages that do not decode, by topic;
+    `marks` are what the stamps of each LiDAR mark.
     """
 
     clocks: Mapping[str, Clock]
@@ -100,6 +81,7 @@ class _Index:
     scans: Mapping[str, Mapping[int, int]]
     collectors: Mapping[tuple[str, str], Collector]
     damaged: Mapping[str, int]
+    marks: Mapping[str, StampMark]
 
 
 class RosbagRecording:
@@ -183,6 +165,10 @@ class RosbagRecording:
     def times_seen(self, lidar: str) -> TimesSeen:
         """The times of the points in the clouds decoded so far."""
         return self._times[lidar]
+
+    def stamp_mark(self, lidar: str) -> StampMark:
+        """What the stamps of a LiDAR mark."""
+        return self._index.marks[lidar]
 
     def imu_checks(self) -> Mapping[str, ImuCheck]:
         """The units of each IMU that has samples, by topic."""
@@ -290,7 +276,9 @@ class RosbagRecording:
         taking: dict[str, list[Collector]] = {}
         for (_, topic), collector in collectors.items():
             taking.setdefault(topic, []).append(collector)
-        topics = dict.fromkeys([*(topic.name for topic in self._topics.values()), *taking])
+        lidar_topics = {topic.name for topic in self._topics.values()}
+        topics = dict.fromkeys([*lidar_topics, *taking])
+        samples: dict[str, list[Sample]] = {topic: [] for topic in lidar_topics}
         trees = [c for c in collectors.values() if isinstance(c, TfCollector)]
         header_ns = {topic: array("q") for topic in topics}
         records_ns = {topic: array("q") for topic in topics}
@@ -310,6 +298,8 @@ class RosbagRecording:
                 if topic not in topics:
                     continue
             frame_ids.setdefault(topic, clean_frame(header.frame_id))
+            if topic in samples and is_sampled(len(header_ns[topic])):
+                samples[topic].append(Sample(header.stamp_ns or record_ns, bytes(raw)))
             header_ns[topic].append(header.stamp_ns)
             records_ns[topic].append(record_ns)
             for collector in taking.get(topic, ()):
@@ -318,12 +308,24 @@ class RosbagRecording:
             topic: (np.array(header_ns[topic], np.int64), np.array(records_ns[topic], np.int64))
             for topic in topics
         }
+        clocks = {topic: read_clock(*both) for topic, both in stamps.items()}
         index = _Index(
-            clocks={topic: read_clock(*both) for topic, both in stamps.items()},
+            clocks=clocks,
             frame_ids=frame_ids,
             scans={name: _by_stamp(*stamps[topic.name]) for name, topic in self._topics.items()},
             collectors=collectors,
             damaged=damaged,
+            marks={
+                name: mark_of(
+                    self._bag,
+                    topic,
+                    self._lidars[name].stamp,
+                    samples[topic.name],
+                    stamps[topic.name],
+                    clocks[topic.name].period_s,
+                )
+                for name, topic in self._topics.items()
+            },
         )
         self._warnings += [
             f"{self._bag.name}: {topic} should have {self._bag.topics[topic].messages} messages, "
@@ -332,8 +334,8 @@ class RosbagRecording:
             if len(stamps[topic][0]) + damaged[topic] != self._bag.topics[topic].messages
         ]
         # A message of /tf has no stamp of its own, and its senders keep no common order.
-        clocks = {t: c for t, c in index.clocks.items() if self._bag.topics[t].type not in TF_TYPES}
-        self._warnings += clock_warnings(self._bag.name, clocks)
+        own = {t: c for t, c in clocks.items() if self._bag.topics[t].type not in TF_TYPES}
+        self._warnings += clock_warnings(self._bag.name, own)
         self._warnings += [
             f"{self._bag.name}: {count} messages of {topic} are damaged and not used"
             for topic, count in damaged.items()
@@ -389,11 +391,10 @@ class RosbagRecording:
         lidar, stamp_ns, raw = found
         config = self._lidars[lidar]
         topic = self._topics[lidar]
-        limits = (stamp_ns, config.min_range, config.max_range)
+        ranges = (config.min_range, config.max_range)
+        period_s = self._index.clocks[topic.name].period_s
         try:
-            if topic.type in LIVOX_TYPES:
-                return stamp_ns, decode_livox(raw, self._bag.is_ros1, *limits)
-            return stamp_ns, decode_pointcloud2(self._bag.decode(topic.name, raw), *limits)
+            cloud = decode_cloud(self._bag, topic, raw, stamp_ns, ranges, period_s)
         except UnusableCloudsError as e:
             raise RecordingError(
                 f"{self._bag.name}: clouds of {self._source(lidar, stamp_ns)}: {e}. Set "
@@ -401,6 +402,10 @@ class RosbagRecording:
             ) from None
         except DamagedMessageError as e:
             return stamp_ns, str(e)
+        if cloud.times_s is not None:
+            shift_s = self._index.marks[lidar].shift_s
+            cloud = replace(cloud, times_s=cloud.times_s + shift_s)
+        return stamp_ns, cloud
 
     def _source(self, lidar: str, stamp_ns: int) -> str:
         return f"{self._topics[lidar].name} at {_seconds(stamp_ns)} s"
@@ -414,7 +419,7 @@ class RosbagRecording:
             return None
         if stamp_ns not in self._looked_at[lidar]:
             self._looked_at[lidar].add(stamp_ns)
-            self._times[lidar] = _also_seen(self._times[lidar], cloud)
+            self._times[lidar] = self._times[lidar].with_cloud(cloud)
         return LidarScan(
             lidar=lidar,
             stamp_ns=stamp_ns,
@@ -432,17 +437,10 @@ class RosbagRecording:
                     f"not used; {self._damage}"
                 )
         for lidar, times in self._times.items():
-            where = f"{self._bag.name}: LiDAR '{lidar}'"
-            if times.problems:
-                lines.append(
-                    f"{where}: the times of the points of {times.problems} clouds are not used: "
-                    f"{times.problem}"
-                )
-            elif times.field and times.first_s == times.last_s == 0.0:
-                lines.append(
-                    f"{where}: field '{times.field.name}' is 0 for all points: its clouds carry no "
-                    "times"
-                )
+            if times.clouds or times.problems:
+                period_s = self._index.clocks[self._topics[lidar].name].period_s
+                where = f"{self._bag.name}: LiDAR '{lidar}'"
+                lines += times_warnings(where, times, self._index.marks[lidar], period_s)
         return lines
 
 
@@ -481,20 +479,6 @@ def _windows(records_ns: Iterable[int]) -> list[tuple[int, int]]:
     breaks = np.flatnonzero(np.diff(times) > _JOIN_NS)
     starts, stops = times[np.r_[0, breaks + 1]], times[np.r_[breaks, len(times) - 1]]
     return [(int(a), int(b) + 1) for a, b in zip(starts, stops, strict=True)]
-
-
-def _also_seen(seen: TimesSeen, cloud: DecodedCloud) -> TimesSeen:
-    times_s = cloud.times_s
-    if cloud.time_problem:
-        problem = seen.problem or cloud.time_problem
-        return replace(seen, problems=seen.problems + 1, problem=problem)
-    if times_s is None or cloud.time_field is None or not len(times_s):
-        return seen
-    first_s, last_s = float(times_s.min()), float(times_s.max())
-    if seen.field is not None:
-        first_s, last_s = min(first_s, seen.first_s), max(last_s, seen.last_s)
-    clouds = seen.clouds + 1
-    return replace(seen, field=cloud.time_field, first_s=first_s, last_s=last_s, clouds=clouds)
 
 
 def _seconds(stamp_ns: int) -> str:

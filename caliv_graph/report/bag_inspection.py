@@ -95,6 +95,10 @@ class BagLidarSummary:
             no cloud could be read.
         times: times of the points; None if there are no valid times.
         times_problem: why the times are not valid; empty: no problem.
+        stamp_marks: start or end of the sweep, which the stamps mark.
+        stamp_told_by: what tells it: config, times (by their sign), records (the record times),
+            nothing (it is assumed); empty: the clouds are of one instant.
+        stamp_shift_s: seconds by which the times were shifted for it.
     """
 
     topic: str
@@ -105,6 +109,9 @@ class BagLidarSummary:
     points: Points | None
     times: PointTimes | None
     times_problem: str
+    stamp_marks: str
+    stamp_told_by: str
+    stamp_shift_s: float
 
 
 @dataclass(frozen=True)
@@ -291,7 +298,7 @@ def _summarise_lidar(
     recording: RosbagRecording, lidar: str, counts: list[int], topics: dict[str, TopicSummary]
 ) -> BagLidarSummary:
     name = recording.lidar_topic(lidar)
-    seen = recording.times_seen(lidar)
+    seen, mark = recording.times_seen(lidar), recording.stamp_mark(lidar)
     times = None
     if seen.field is not None:
         field = seen.field
@@ -305,6 +312,9 @@ def _summarise_lidar(
         points=summarise_points(counts) if counts else None,
         times=times,
         times_problem=seen.problem,
+        stamp_marks=mark.marks,
+        stamp_told_by=mark.told_by,
+        stamp_shift_s=mark.shift_s,
     )
 
 

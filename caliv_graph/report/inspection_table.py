@@ -15,6 +15,15 @@ if TYPE_CHECKING:
     from caliv_graph.report.bag_inspection import BagInspection, BagLidarSummary, TopicSummary
 
 
+_TOLD_BY = {
+    "config": "by the config",
+    "times": "by the times",
+    "records": "by the record times",
+    "nothing": "assumed",
+}
+"""What tells which end of the sweep the stamps mark."""
+
+
 def inspection_table(inspection: Inspection | BagInspection) -> RenderableType:
     """The content of a recording, and per target which LiDAR sees it when."""
     if not isinstance(inspection, Inspection):
@@ -144,6 +153,8 @@ def _bag_lidar_cells(lidar: BagLidarSummary) -> list[Text | str]:
             f"{times.field} ({times.type}): {times.unit}, {times.first_s:+.4f} to "
             f"{times.last_s:+.4f} s"
         )
+    if lidar.stamp_told_by:
+        shown += f"; stamp: {lidar.stamp_marks} ({_TOLD_BY[lidar.stamp_told_by]})"
     return [
         Text(lidar.frame_id or UNKNOWN),
         str(lidar.clouds),

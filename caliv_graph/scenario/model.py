@@ -48,6 +48,9 @@ class BagModel(Section):
         1_750_000_000, description="seconds since 1970, stamp of the drive's start"
     )
     compression: Literal["none", "zstd"] = Field("none", description="of the MCAP's chunks")
+    transport_s: NonNegative = Field(
+        0.0, description="seconds from the end of a sweep to the recording of its cloud"
+    )
     covariances: Literal["stated", "unknown"] = Field(
         "stated",
         description="covariances in the messages: those of the white noise, or zeros, which "

@@ -33,6 +33,16 @@ class SweepModel(Section):
     stamp_at: Literal["start", "end"] = Field(
         "start", description="which end of the sweep the stamp of the cloud marks"
     )
+    times_from: Literal["stamp", "start"] = Field(
+        "stamp",
+        description="what the times of points in the bag count from: the stamp, or the start of "
+        "the sweep even if the stamp marks its end, as of an Ouster that is stamped on arrival",
+    )
+    packet_s: Positive | None = Field(
+        None,
+        description="seconds; the times of points start anew with every packet of this duration, "
+        "as of old Velodyne drivers; absent: they run through the sweep",
+    )
     time_field: TimeField = Field(
         "t",
         description="per-point time in the bag: t (uint32 ns after the stamp, Ouster), time "
@@ -42,10 +52,16 @@ class SweepModel(Section):
 
     @model_validator(mode="after")
     def _unsigned_times_count_from_the_start(self) -> SweepModel:
-        if self.stamp_at == "end" and self.time_field in ("t", "time_stamp"):
+        counts_back = self.stamp_at == "end" and self.times_from == "stamp"
+        if counts_back and self.time_field in ("t", "time_stamp"):
             raise ValueError(
                 f"time_field '{self.time_field}' is unsigned and cannot count back from the end "
-                "of the sweep: take 'time' or 'timestamp', or stamp_at: start"
+                "of the sweep: take 'time' or 'timestamp', times_from: start or stamp_at: start"
+            )
+        if self.time_field == "timestamp" and (self.packet_s or self.times_from == "start"):
+            raise ValueError(
+                "time_field 'timestamp' is absolute: packet_s and times_from: start need a time "
+                "that is relative"
             )
         return self
 

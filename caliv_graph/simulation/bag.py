@@ -81,14 +81,25 @@ def cloud_bytes(scan: LidarScan, model: LidarModel) -> npt.NDArray[np.uint8]:
         cloud[name] = scan.points_lidar[:, axis]
     if model.sweep is not None and scan.point_times_s is not None:
         field = model.sweep.time_field
-        after_ns = np.rint(scan.point_times_s * NANOSECONDS_PER_SECOND).astype(np.int64)
-        if field == "time":
-            cloud[field] = scan.point_times_s
-        elif field == "timestamp":
+        if field == "timestamp":
+            after_ns = np.rint(scan.point_times_s * NANOSECONDS_PER_SECOND).astype(np.int64)
             cloud[field] = (scan.stamp_ns + after_ns) / NANOSECONDS_PER_SECOND
         else:
-            cloud[field] = after_ns
+            times_s = _written_times(scan.point_times_s, model)
+            cloud[field] = times_s if field == "time" else np.rint(times_s * NANOSECONDS_PER_SECOND)
+        if model.sweep.packet_s is not None:
+            cloud = cloud[np.argsort(scan.point_times_s, kind="stable")]
     return cloud.view(np.uint8).reshape(-1)
+
+
+def _written_times(times_s: Array, model: LidarModel) -> Array:
+    """Times (n,) after the stamp as the driver counts them."""
+    sweep = model.sweep
+    assert sweep is not None
+    from_start_s = times_s if model.stamps_at_start else times_s + model.sweep_s
+    if sweep.packet_s is not None:
+        return np.asarray(np.mod(np.round(from_start_s, 9), sweep.packet_s))
+    return from_start_s if sweep.times_from == "start" else times_s
 
 
 class BagWriter:
@@ -139,7 +150,8 @@ class BagWriter:
     def write(self, scan: LidarScan) -> None:
         """Writes a cloud that is complete no earlier than those before, and what came before it."""
         model = self._scenario.lidars[scan.lidar]
-        record_ns = self._recording.complete_ns(scan)
+        transport_ns = round(self._scenario.bag.transport_s * NANOSECONDS_PER_SECOND)
+        record_ns = self._recording.complete_ns(scan) + transport_ns
         self._write_others(record_ns)
         types = self._store.types
         layout, fields = cloud_layout(model)

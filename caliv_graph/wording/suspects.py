@@ -106,7 +106,10 @@ _REMEDIES = {
 """What to check or to set, by the name of the input; drifts of one of several drives likewise."""
 
 _REMEDIES_OF_LIDAR = {
-    "time_offset": "Correct the clock of lidar '{lidar}', or set solve.time_offset",
+    "time_offset": (
+        "Correct the clock of lidar '{lidar}', or set solve.time_offset; if it is off by a sweep, "
+        "set lidars.{lidar}.stamp: start or end"
+    ),
     "initial": (
         "Check the initial guess of lidar '{lidar}' (metres, degrees, signs, T_vehicle_lidar and "
         "not its inverse) and that the topic is its"

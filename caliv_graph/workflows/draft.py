@@ -409,7 +409,8 @@ _LIDAR_TEMPLATE = """\
       xyz: 0.058\t# metres; 0.058 is anything up to +-0.1 m
       rpy_deg: 1.73\t# degrees; 1.73 is anything up to +-3 degrees
     min_range: 1.0\t# metres; nearer returns (the vehicle's own body) are dropped
-    max_range: 200.0\t# metres; farther returns are dropped"""
+    max_range: 200.0\t# metres; farther returns are dropped
+    stamp: auto\t# what a cloud's stamp marks: start or end of its sweep; auto: by the data"""
 
 _TARGET_TEMPLATE = """\
 target:\t# a box around the target, with nothing else above the ground in it

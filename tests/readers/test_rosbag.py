@@ -82,7 +82,7 @@ def test_a_drive_in_every_kind_of_bag(tmp_path: Path, kind: str) -> None:
             "topics": {"imu": "/imu/data", "gnss": "/gnss/fix", "twist": "/vehicle/twist"},
             "lidars": {
                 "rear": {"topic": REAR, "initial": {"xyz": [0, 0, 0]}},
-                "front": {"topic": FRONT, "initial": {"xyz": [0, 0, 0]}},
+                "front": {"topic": FRONT, "initial": {"xyz": [0, 0, 0]}, "stamp": "start"},
             },
         },
         "config.yaml",

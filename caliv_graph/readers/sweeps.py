@@ -1,0 +1,164 @@
+"""Clouds of a bag, whatever their type, and what is known of the times of their points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caliv_graph.config.model import StampSetting
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import IntArray
+from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic
+from caliv_graph.readers.pointcloud2 import (
+    LIVOX_TYPES,
+    DecodedCloud,
+    TimeField,
+    UnusableCloudsError,
+    decode_livox,
+    decode_pointcloud2,
+    sweep_times,
+)
+from caliv_graph.readers.stamps import StampMark, stamp_mark, sweep_span
+
+_ANY_RANGE_M = 1e6
+"""Farther than any return."""
+
+
+@dataclass(frozen=True)
+class TimesSeen:
+    """The times of the points of one LiDAR, over the clouds decoded so far.
+
+    Attributes:
+        field: their source; None: there are none.
+        first_s: earliest, seconds after the stamp.
+        last_s: latest, seconds after the stamp.
+        clouds: clouds that have them.
+        problems: clouds whose times are not used.
+        problem: the reason, of the first such cloud.
+        packets: most packets of a cloud with which its times start anew; 0: they do not.
+    """
+
+    field: TimeField | None = None
+    first_s: float = 0.0
+    last_s: float = 0.0
+    clouds: int = 0
+    problems: int = 0
+    problem: str = ""
+    packets: int = 0
+
+    def with_cloud(self, cloud: DecodedCloud) -> TimesSeen:
+        """With those of one more cloud."""
+        times_s = cloud.times_s
+        if cloud.time_problem:
+            problem = self.problem or cloud.time_problem
+            return replace(self, problems=self.problems + 1, problem=problem)
+        if times_s is None or cloud.time_field is None or not len(times_s):
+            return self
+        first_s, last_s = float(times_s.min()), float(times_s.max())
+        if self.field is not None:
+            first_s, last_s = min(first_s, self.first_s), max(last_s, self.last_s)
+        return replace(
+            self,
+            field=cloud.time_field,
+            first_s=first_s,
+            last_s=last_s,
+            clouds=self.clouds + 1,
+            packets=max(self.packets, cloud.packets),
+        )
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A cloud that the first pass over the bag keeps, to look at its times."""
+
+    stamp_ns: int
+    raw: bytes
+
+
+def is_sampled(number: int) -> bool:
+    """Whether the first pass keeps the cloud of this number, from 0: 0, 1, 4, 16, 64, ...
+
+    The number of clouds is not known before the pass ends, and a few are enough.
+    """
+    return number == 0 or (number & (number - 1) == 0 and number.bit_length() % 2 == 1)
+
+
+def decode_cloud(
+    bag: Bag,
+    topic: Topic,
+    raw: bytes,
+    stamp_ns: int,
+    ranges: tuple[float, float],
+    period_s: float | None,
+) -> DecodedCloud:
+    """The returns within the ranges (metres, least and most) of a cloud of any type.
+
+    `period_s` is the usual time between two clouds; None: not known.
+
+    Raises:
+        DamagedMessageError: the message is damaged.
+        UnusableCloudsError: the clouds have no x, y, z.
+    """
+    if topic.type in LIVOX_TYPES:
+        return decode_livox(raw, bag.is_ros1, stamp_ns, *ranges)
+    return decode_pointcloud2(bag.decode(topic.name, raw), stamp_ns, *ranges, period_s)
+
+
+def mark_of(
+    bag: Bag,
+    topic: Topic,
+    setting: StampSetting,
+    samples: Sequence[Sample],
+    stamps: tuple[IntArray, IntArray],
+    period_s: float | None,
+) -> StampMark:
+    """What the stamps of a LiDAR mark, by some of its clouds and by all record times.
+
+    `stamps` are header stamps and record times (n,), nanoseconds; a stamp is 0 where it is not set.
+    """
+    spans, is_absolute = [], False
+    for sample in samples:
+        try:
+            cloud = _times(bag, topic, sample, period_s)
+        except (DamagedMessageError, UnusableCloudsError):
+            continue  # reported where clouds are decoded
+        if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
+            spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
+            is_absolute = cloud.time_field.unit.endswith("absolute")
+    header_ns, record_ns = stamps
+    is_set = header_ns != 0
+    delays_s = (record_ns[is_set] - header_ns[is_set]) / NANOSECONDS_PER_SECOND
+    return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, np.asarray(delays_s))
+
+
+def _times(bag: Bag, topic: Topic, sample: Sample, period_s: float | None) -> DecodedCloud:
+    if topic.type in LIVOX_TYPES:
+        return decode_cloud(bag, topic, sample.raw, sample.stamp_ns, (0.0, _ANY_RANGE_M), period_s)
+    return sweep_times(bag.decode(topic.name, sample.raw), sample.stamp_ns, period_s)
+
+
+def times_warnings(
+    where: str, times: TimesSeen, mark: StampMark, period_s: float | None
+) -> list[str]:
+    """Warnings about the times of one LiDAR, `where` being its bag and name, a line each."""
+    lines = []
+    if times.problems:
+        lines.append(
+            f"{where}: the times of the points of {times.problems} clouds are not used: "
+            f"{times.problem}"
+        )
+    elif times.field and times.first_s == times.last_s == 0.0:
+        lines.append(
+            f"{where}: field '{times.field.name}' is 0 for all points: its clouds carry no times"
+        )
+    if times.packets and times.field and period_s:
+        lines.append(
+            f"{where}: field '{times.field.name}' starts anew with every packet, "
+            f"{times.packets} times a cloud. The times are continued by azimuth, at "
+            f"{1.0 / period_s:.3g} turns per second"
+        )
+    if mark.note:
+        lines.append(f"{where}: {mark.note}")
+    return lines

@@ -69,10 +69,9 @@ def parse_config(raw: Any, source: str, base: Path) -> Config:
     """
     expected = "configuration: expected keys such as 'lidars'"
     config = validated(Config, raw, source, expected)
-    if config.data.path is None:
-        return config
-    data = config.data.model_copy(update={"path": (base / config.data.path).absolute()})
-    return config.model_copy(update={"data": data})
+    named = {"path": config.data.path, "poses": config.data.poses}
+    paths = {key: (base / path).absolute() for key, path in named.items() if path is not None}
+    return config.model_copy(update={"data": config.data.model_copy(update=paths)})
 
 
 def load_config(path: Path) -> Config:

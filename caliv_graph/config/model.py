@@ -99,10 +99,30 @@ class PoseSigmaConfig(Section):
         return np.array([*self.rpy_rad(), *self.xyz_m()])
 
 
+def _bin_field(text: str) -> str:
+    name, _, kind = text.partition(" ")
+    if not name or kind not in BIN_TYPES:
+        raise ValueError(
+            f"'{text[:40]}' is not a name and one of {', '.join(BIN_TYPES)}, such as 'x f4'"
+        )
+    return text
+
+
+BIN_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8")
+"""Types of a field in .bin files: letter and bytes, as numpy names them, little-endian."""
+
+BinField = Annotated[str, AfterValidator(_bin_field)]
+
+
 class LidarConfig(Section):
     """One LiDAR, by the user's name for it."""
 
     topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
+    bin_fields: Annotated[tuple[BinField, ...], Field(min_length=3)] | None = Field(
+        None,
+        description="fields of a point in .bin files, each a name and a type, such as x f4; "
+        "absent: x, y, z, intensity and perhaps a ring, all f4",
+    )
     initial: PoseConfig = Field(description="initial guess of T_vehicle_lidar")
     sigma: PoseSigmaConfig = PoseSigmaConfig()
     fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
@@ -127,8 +147,17 @@ class LidarConfig(Section):
 class DataConfig(Section):
     """Where the recording is."""
 
-    format: Literal["rosbag", "caliv"] = "rosbag"
+    format: Literal["rosbag", "caliv", "clouds"] = "rosbag"
     path: Path | None = Field(None, description="folder or file, relative to the config")
+    poses: Path | None = Field(
+        None, description="file with the vehicle's poses, instead of topics.pose, relative likewise"
+    )
+
+    @model_validator(mode="after")
+    def _poses_of_its_own(self) -> DataConfig:
+        if self.format == "caliv" and self.poses is not None:
+            raise ValueError("poses: a CaLiV folder has its own, in input/ego_poses.yaml")
+        return self
 
 
 class TopicsConfig(Section):
@@ -416,6 +445,12 @@ class Config(Section):
                 "target: false leaves structure alone, which 'solve.mode: staged' does not use: "
                 "set it to auto or joint"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _poses_of_one_source(self) -> Config:
+        if self.data.poses is not None and self.topics.pose is not None:
+            raise ValueError("give data.poses or topics.pose, not both")
         return self
 
     @field_validator("limits")

@@ -26,5 +26,9 @@ def open_recording(config: Config, path: Path | None = None) -> Recording:
         # Here, because a CaLiV folder does not need the libraries for bags.
         from caliv_graph.readers.rosbag import RosbagRecording
 
-        return RosbagRecording(path, config.lidars, config.topics)
+        return RosbagRecording(path, config.lidars, config.topics, poses=config.data.poses)
+    if config.data.format == "clouds":
+        from caliv_graph.readers.cloud_folder import CloudFolder
+
+        return CloudFolder(path, config.lidars, config.data.poses)
     return CalivFolder(path, config.lidars)

@@ -95,6 +95,15 @@ def is_recorded_bag(path: Path) -> bool:
         raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
 
 
+def folders_of_clouds(path: Path) -> tuple[str, ...]:
+    """The folders of .bin clouds in a folder that is neither a bag nor a CaLiV folder."""
+    from caliv_graph.readers.cloud_folder import cloud_folders
+
+    if not path.is_dir() or any((path / f / POSES_FILE).is_file() for f in (".", "input")):
+        return ()
+    return cloud_folders(path)
+
+
 def open_all(path: Path) -> Recording:
     """Opens a drive with all its LiDARs, each by its own name, and all ranges.
 
@@ -104,6 +113,12 @@ def open_all(path: Path) -> Recording:
         RecordingError: the path is missing, no recording, or incomplete.
     """
     if not is_recorded_bag(path):
+        folders = folders_of_clouds(path)
+        if folders:
+            from caliv_graph.readers.cloud_folder import CloudFolder
+
+            names = lidar_names(folders)
+            return CloudFolder(path, {name: _any_lidar(topic) for name, topic in names.items()})
         return CalivFolder(path, {sensor: _any_lidar(sensor) for sensor in recorded_sensors(path)})
     from caliv_graph.readers.bag import Bag
     from caliv_graph.readers.motion import MOTION_TYPES

@@ -113,7 +113,8 @@ def _read_header(data: bytes) -> _Header:
     width = _whole_number(entries, "WIDTH")
     height = _whole_number(entries, "HEIGHT") if "HEIGHT" in entries else 1
     points = _whole_number(entries, "POINTS") if "POINTS" in entries else width * height
-    if points != width * height:
+    # Some writers leave WIDTH and HEIGHT at 0. The size of the body is held against POINTS below.
+    if points != width * height and (width or height):
         raise _Unreadable(
             f"the header is damaged: POINTS is {points}, but WIDTH {width} x HEIGHT {height} is "
             f"{width * height}"

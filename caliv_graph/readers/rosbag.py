@@ -38,6 +38,7 @@ from caliv_graph.readers.motion import (
     check_imu,
 )
 from caliv_graph.readers.pointcloud2 import CLOUD_TYPES, DecodedCloud, UnusableCloudsError
+from caliv_graph.readers.pose_file import check_overlap, read_poses
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
     Sample,
@@ -93,10 +94,12 @@ class RosbagRecording:
         lidars: Mapping[str, LidarConfig],
         topics: TopicsConfig,
         also: Iterable[str] = (),
+        poses: Path | None = None,
     ) -> None:
         """Opens the bag and checks that it has the topics; reads its index only.
 
-        `also` names further topics of motion data to look at, which `motion` does not use.
+        `also` names further topics of motion data to look at, which `motion` does not use; `poses`
+        a file with the vehicle's poses.
 
         Raises:
             RecordingError: the bag is missing or damaged; a topic is missing, of the wrong type, or
@@ -124,6 +127,7 @@ class RosbagRecording:
             for kind, types in MOTION_TYPES.items():
                 if self._bag.topics[name].type in types:
                     self._motion_topics.setdefault((kind, name))
+        self._poses = poses
         self._motion: MotionData | None = None
         self._times: dict[str, TimesSeen] = {name: TimesSeen() for name in self._lidars}
         self._damaged_clouds: dict[str, set[int]] = {name: set() for name in self._lidars}
@@ -235,7 +239,7 @@ class RosbagRecording:
 
         Raises:
             RecordingError: the bag is damaged; the specific force of the IMU is not in m/s^2, or
-                gravity was removed from it.
+                gravity was removed from it; the file of poses is damaged or of another time.
         """
         if self._motion is None:
             self._motion = self._read_motion()
@@ -368,6 +372,9 @@ class RosbagRecording:
                 )
             if found[kind] is None:
                 self._warnings.append(f"{where}: holds nothing that can be used")
+        if self._poses is not None:
+            found["pose"] = read_poses(self._poses)
+            check_overlap(found["pose"], self._poses, self.span_ns, self._bag.name)
         motion = MotionData(
             self._bag.name,
             poses=found.get("pose"),

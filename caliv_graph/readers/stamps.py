@@ -128,7 +128,7 @@ def _told_by_records(last_s: float, delays_s: Array) -> StampMark:
 
 def _assumed(least_s: float, delays_s: Array) -> str:
     if np.ptp(delays_s) + abs(least_s) <= _COPIED_S:
-        why = "the record times are copies of the stamps"
+        why = "the clouds have no time of recording but their stamps"
     elif abs(least_s) > _FAR_S:
         why = f"the record times are {least_s:.1f} s from the stamps"
     else:

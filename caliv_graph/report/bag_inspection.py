@@ -14,6 +14,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Finding, Recording, TargetObservation
 from caliv_graph.readers.clock import Clock
+from caliv_graph.readers.cloud_folder import CloudFolder
 from caliv_graph.readers.motion import ImuCheck
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.report.inspection import (
@@ -40,6 +41,10 @@ _GAPS_SHOWN = 20
 
 _RUN_FACTOR = 1.75
 """Largest number of scan intervals between two scans of one run."""
+
+
+Bagged = RosbagRecording | CloudFolder
+"""Recordings with topics and stamps."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +173,7 @@ def inspect_any(
         RecordingError: the recording is damaged.
         TrajectoryError: a CaLiV folder has no vehicle poses.
     """
-    if isinstance(recording, RosbagRecording):
+    if isinstance(recording, Bagged):
         return inspect_bag(recording, progress, config)
     return inspect_recording(recording, progress)
 
@@ -196,7 +201,7 @@ def add_any_targets(
 
 
 def inspect_bag(
-    recording: RosbagRecording, progress: Progress, config: Config | None = None
+    recording: Bagged, progress: Progress, config: Config | None = None
 ) -> BagInspection:
     """Reads a bag once, and some clouds of each LiDAR.
 
@@ -256,15 +261,17 @@ def _summarise_imu(check: ImuCheck, config: Config | None) -> ImuSummary:
     )
 
 
-def _drive(recording: RosbagRecording) -> DriveSummary | None:
+def _drive(recording: Bagged) -> DriveSummary | None:
     try:
         poses = recording.motion().poses
     except RecordingError:
+        if isinstance(recording, CloudFolder):
+            raise
         return None  # wrong IMU units, which the inspection reports
     return None if poses is None else summarise_drive(poses)
 
 
-def _sample(recording: RosbagRecording, lidar: str) -> frozenset[int]:
+def _sample(recording: Bagged, lidar: str) -> frozenset[int]:
     stamps = recording.scan_stamps_ns(lidar)
     count = min(_SAMPLED_CLOUDS, len(stamps))
     steps = max(count - 1, 1)
@@ -272,7 +279,7 @@ def _sample(recording: RosbagRecording, lidar: str) -> frozenset[int]:
 
 
 def _summarise_topic(
-    recording: RosbagRecording, name: str, clock: Clock | None, start_ns: int, duration_s: float
+    recording: Bagged, name: str, clock: Clock | None, start_ns: int, duration_s: float
 ) -> TopicSummary:
     topic = recording.topics[name]
     if clock is None:
@@ -295,7 +302,7 @@ def _summarise_topic(
 
 
 def _summarise_lidar(
-    recording: RosbagRecording, lidar: str, counts: list[int], topics: dict[str, TopicSummary]
+    recording: Bagged, lidar: str, counts: list[int], topics: dict[str, TopicSummary]
 ) -> BagLidarSummary:
     name = recording.lidar_topic(lidar)
     seen, mark = recording.times_seen(lidar), recording.stamp_mark(lidar)

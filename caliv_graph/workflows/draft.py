@@ -20,13 +20,16 @@ from caliv_graph.config.sections import Finite, Triple
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import rpy
 from caliv_graph.readers.bag import Bag, DamagedMessageError
+from caliv_graph.readers.cloud_folder import poses_file
 from caliv_graph.readers.discover import (
     MotionTopics,
     choose_lidar_topics,
     choose_motion_topics,
     drive_folder,
     first_frame,
+    folders_of_clouds,
     is_recorded_bag,
+    lidar_names,
     recorded_sensors,
 )
 from caliv_graph.readers.frames import (
@@ -94,6 +97,7 @@ def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
     Of a bag: LiDARs and motion data by the types of the topics, initial guesses from
     `/tf_static` or a URDF. Of a CaLiV folder: initial guesses and the target's region from a config
     of the CaLiV authors' program (`transform_sensor_N`, `min_bound`, `max_bound`) beside the data.
+    Of folders of clouds: the folders, and a file of poses beside them.
 
     Raises:
         RecordingError: the drive is missing, no recording, or has no clouds.
@@ -105,6 +109,8 @@ def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
         raise ConfigError(
             f"{data}: is not a bag: its clouds name no frame of {urdf}. Leave out --urdf"
         )
+    elif folders := folders_of_clouds(data):
+        draft = _draft_of_clouds(data, config, folders)
     else:
         draft = _draft_of_folder(data, config)
     # A draft that does not load is a defect of this module, not of the data.
@@ -143,6 +149,32 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
     )
     taken = f"Initial guesses and target taken from {original.path}" if original else ""
     return Draft(text, sensors, tuple(unknown), taken)
+
+
+def _draft_of_clouds(data: Path, config: Path, folders: Sequence[str]) -> Draft:
+    names = lidar_names(folders)
+    poses = poses_file(data)
+    path = _scalar(_relative(data, config))
+    if poses is None:
+        path += "\n  # TODO: poses: FILE\t# of the vehicle: TUM, CSV, KITTI or ego_pose.json"
+    else:
+        path += f"\n  poses: {_scalar(_relative(poses, config))}\t# of the vehicle in the map"
+    lidars = [
+        _lidar_text(name, folder, "its folder of clouds", *_NO_GUESS, _origin(""))
+        for name, folder in names.items()
+    ]
+    text = _align(
+        _TEMPLATE.format(
+            format="clouds\t# folders of .bin or .pcd clouds, their times in the names",
+            path=path,
+            motion="",
+            lidars="\n".join(lidars),
+            reference=_scalar(next(iter(names))),
+            target=_SEARCHED_TARGET_TEMPLATE,
+        )
+    )
+    unknown = ["data.poses"] * (poses is None) + [f"lidars.{name}.initial" for name in names]
+    return Draft(text, tuple(names), tuple(unknown), "")
 
 
 def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:

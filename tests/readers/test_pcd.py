@@ -153,6 +153,15 @@ def test_organised_cloud_is_a_list_of_points(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_pcd(path), POINTS.astype("<f4"))
 
 
+def test_a_width_and_height_of_zero_leave_the_points_to_points(tmp_path: Path) -> None:
+    plain = read_pcd(write(tmp_path, header(), binary_body()))
+    path = write(tmp_path, header(WIDTH="0", HEIGHT="0"), binary_body())
+
+    np.testing.assert_array_equal(read_pcd(path), plain)
+    error_of(write(tmp_path, header(WIDTH="0", HEIGHT="0", POINTS="5"), binary_body()))
+    error_of(write(tmp_path, header(WIDTH="0", HEIGHT="1"), binary_body()))
+
+
 def test_header_of_an_old_writer(tmp_path: Path) -> None:
     """No VERSION, COUNT, VIEWPOINT, HEIGHT, POINTS; Windows line ends, a comment, a blank line."""
     old = header(VERSION=None, COUNT=None, VIEWPOINT=None, HEIGHT=None, POINTS=None)

@@ -10,7 +10,7 @@ import pytest
 
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
-from caliv_graph.errors import RecordingError
+from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.rosbag import RosbagRecording
@@ -472,3 +472,23 @@ def test_a_bag_that_breaks_off_is_one_line(tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match=r"drive\.mcap: the bag is cut off.* 'mcap recover'"):
         opened(path)
+
+
+def test_poses_in_a_file_beside_the_bag(tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive(4))
+    rows = [f"{stamp_of(k) / 1e9:.9f} {k} 0 0 0 0 0 1" for k in range(4)]
+    (tmp_path / "poses.tum").write_text("\n".join(rows))
+    raw: dict[str, Any] = {
+        "data": {"path": "drive", "poses": "poses.tum"},
+        "topics": {"imu": "/imu/data"},
+        "lidars": {"front": {"topic": FRONT, "initial": {"xyz": [0, 0, 0]}}},
+    }
+
+    motion = open_recording(parse_config(raw, "config.yaml", tmp_path)).motion()
+
+    assert motion.imu is not None
+    assert motion.poses is not None
+    assert [pose.x() for pose in motion.poses.T_map_vehicle] == [0, 1, 2, 3]
+    raw["topics"] = {"pose": "/odom"}
+    with pytest.raises(ConfigError, match=r"give data\.poses or topics\.pose, not both"):
+        parse_config(raw, "config.yaml", tmp_path)

@@ -42,7 +42,7 @@ def test_record_times_that_are_copies_of_the_stamps_tell_nothing() -> None:
 
     assert (mark.marks, mark.told_by, mark.shift_s) == ("start", "nothing", 0.0)
     assert "assumed to mark the start" in mark.note
-    assert "copies of the stamps" in mark.note
+    assert "no time of recording but their stamps" in mark.note
 
 
 def test_clouds_without_a_stamp_are_recorded_after_their_end() -> None:

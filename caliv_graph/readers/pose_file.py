@@ -1,0 +1,266 @@
+"""Vehicle poses in a file: TUM, CSV, KITTI's rows of 12 numbers, nuScenes' ego_pose.json.
+
+| file | a row |
+|---|---|
+| TUM (.txt, .tum) | `timestamp x y z qx qy qz qw`, blanks between; seconds |
+| CSV | the same with commas; or a header that names its columns, in any order |
+| KITTI | 12 numbers, a 3 x 4 matrix row by row, without a time: one row per cloud |
+| nuScenes | JSON: a list of `timestamp` (us), `translation`, `rotation` (w, x, y, z) |
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.common.inputs import read_input
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import RecordingError
+from caliv_graph.products import Array, GivenPoses, IntArray
+
+_MOST_BYTES = 1_000_000_000
+"""ego_pose.json of all of nuScenes has half of it."""
+
+_MOST_M = 1e8
+_NORM_TOLERANCE = 1e-2
+"""Of a quaternion: rounding to two decimals is off by less."""
+
+_TUM = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+_MATRIX_TOLERANCE = 1e-3
+"""By which a rotation matrix may differ from one: rounding to four decimals."""
+
+_LEAST_TRAVEL_M = 1.0
+"""Of the way from which the axis of travel is told."""
+
+R_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Vehicle axes (x forward, y left, z up) from those of a camera (x right, y down, z forward)."""
+
+_UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))
+"""Least absolute time since 1970 that is written in ns, us and ms, and nanoseconds of each."""
+
+
+def stamp_of(text: str) -> int | None:
+    """Nanoseconds of a time in seconds, milliseconds, microseconds or nanoseconds, by its size.
+
+    Seconds with nine decimals are more than a float holds. None: it is no time.
+    """
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        return None
+    if not value.is_finite() or not 0 <= value < 2**62:
+        return None
+    scale = next((ns for least, ns in _UNITS if value >= least), NANOSECONDS_PER_SECOND)
+    stamp_ns = int(value * scale)
+    return stamp_ns if stamp_ns < 2**62 else None
+
+
+def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> GivenPoses:
+    """Reads the poses `T_map_vehicle` of a drive.
+
+    Args:
+        path: the file.
+        cloud_stamps_ns: stamps of clouds, ascending. A file without times has one pose for each.
+            None: such a file is refused.
+
+    Raises:
+        RecordingError: the file is missing or none of the formats; a pose is damaged; a file
+            without times has not as many poses as there are clouds.
+    """
+    try:
+        text = read_input(path, _MOST_BYTES).decode("utf-8-sig")
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file. Set data.poses to the poses' file") from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not text in UTF-8, as files of poses are") from None
+    except OSError as e:
+        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+    if text.lstrip().startswith("["):
+        return _given(*_json_rows(text, path), path)
+    names, lines = _table(text)
+    if not lines:
+        raise RecordingError(f"{path}: holds no poses. Expected TUM, CSV or KITTI poses")
+    if not names and len(lines[0][1]) == 12:
+        return _kitti(lines, path, cloud_stamps_ns)
+    columns = _columns(names, path) if names else dict(zip(_TUM, range(8), strict=True))
+    rows = np.empty((len(lines), 7))
+    stamps = np.empty(len(lines), np.int64)
+    for i, (number, values) in enumerate(lines):
+        where = f"{path}, line {number}"
+        if len(values) <= max(columns.values()) or (not names and len(values) != 8):
+            raise RecordingError(
+                f"{where}: {len(values)} values, expected timestamp x y z qx qy qz qw (TUM), or a "
+                "header line that names the columns (CSV)"
+            )
+        stamp_ns = stamp_of(values[columns["time"]])
+        if stamp_ns is None:
+            raise RecordingError(f"{where}: {values[columns['time']][:40]!r} is not a time")
+        if "nanoseconds" in columns:
+            stamp_ns += int(_number(values[columns["nanoseconds"]], where))
+        stamps[i] = stamp_ns
+        rows[i] = [_number(values[columns[name]], where) for name in _TUM[1:]]
+    return _given(stamps, rows, path)
+
+
+def _table(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Names of the columns (none without a header), and number and values of each line."""
+    names: list[str] = []
+    lines: list[tuple[int, list[str]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        bare = line.strip()
+        comment = bare.startswith(("#", "%"))
+        values = [v.strip() for v in re.split(r"[,;]" if re.search("[,;]", bare) else r"\s+", bare)]
+        values = values[:-1] if values and not values[-1] else values  # a comma ends the line
+        if not bare:
+            continue
+        if comment or not re.fullmatch(r"[-+.\deE]+|nan", values[0]):
+            # A comment of a TUM file may name its columns, too, but in the order that it has.
+            if not lines and (not comment or re.search("[,;]", bare)):
+                names = [v.lstrip("#% ") for v in values]
+            elif not comment:
+                lines.append((number, values))
+            continue
+        lines.append((number, values))
+    return names, lines
+
+
+def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
+    """Index of each value of a pose by the header of a CSV."""
+    found: dict[str, int] = {}
+    for index, name in enumerate(names):
+        plain = re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
+        meaning = _meaning(plain)
+        if meaning is not None:
+            found.setdefault(meaning, index)
+    missing = [name for name in _TUM if name not in found]
+    if missing:
+        raise RecordingError(
+            f"{path}: its header names no column for {', '.join(missing)}: "
+            f"{', '.join(names)[:200]}. Name them timestamp, x, y, z, qx, qy, qz, qw"
+        )
+    return found
+
+
+def _meaning(plain: str) -> str | None:
+    """The value that a column of this name holds: one of `_TUM`, or `nanoseconds`."""
+    if re.search(r"nsec|nanosec", plain):
+        return "nanoseconds"
+    if plain in ("t", "sec", "secs") or re.search(r"time|stamp|\bsecs?$", plain):
+        return "time"
+    match = re.fullmatch(r"(.*?)[._ ]?([xyzw])", plain)
+    if match is None:
+        return None
+    before, axis = match.groups()
+    if re.search(r"vel|acc|gyr|omega|twist|cov|std|sigma|rate|bias|\bv$|\ba$|^[vawb]_", before):
+        return None
+    if re.search(r"^q|quat|orient|rot", before):
+        return f"q{axis}"
+    return axis if axis != "w" and re.fullmatch(r"|[pt]|[pt]_.*|.*(pos|trans).*", before) else None
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise RecordingError(f"{where}: {text[:40]!r} is not a number") from None
+
+
+def _json_rows(text: str, path: Path) -> tuple[IntArray, Array]:
+    try:
+        entries: Any = json.loads(text)
+        table = {
+            int(e["timestamp"]): [*e["translation"], *e["rotation"][1:], e["rotation"][0]]
+            for e in entries
+        }
+        stamps = np.array(sorted(table), np.int64) * 1000
+        rows = np.array([table[key] for key in sorted(table)], np.float64)
+        if rows.shape != (len(stamps), 7) or not len(rows):
+            raise ValueError
+    except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
+        raise RecordingError(
+            f"{path}: is JSON, but not a list of poses with timestamp (us), translation and "
+            "rotation (w, x, y, z), as ego_pose.json of nuScenes"
+        ) from None
+    return stamps, rows
+
+
+def _kitti(
+    lines: Sequence[tuple[int, list[str]]], path: Path, cloud_stamps_ns: Sequence[int] | None
+) -> GivenPoses:
+    """Poses of KITTI's odometry: of a camera, or of whatever moves along its x axis."""
+    if cloud_stamps_ns is None or len(cloud_stamps_ns) != len(lines):
+        clouds = "the clouds of a bag" if cloud_stamps_ns is None else len(cloud_stamps_ns)
+        raise RecordingError(
+            f"{path}: {len(lines)} poses of 12 numbers have no times, and cannot be those of "
+            f"{clouds} {'clouds' if cloud_stamps_ns is not None else ''}".rstrip()
+            + ". Write them as TUM: timestamp x y z qx qy qz qw"
+        )
+    M = np.empty((len(lines), 3, 4))
+    for i, (number, values) in enumerate(lines):
+        where = f"{path}, line {number}"
+        if len(values) != 12:
+            raise RecordingError(f"{where}: {len(values)} values, expected 12 as in line 1")
+        M[i] = np.reshape([_number(v, where) for v in values], (3, 4))
+    R, t = M[:, :, :3], M[:, :, 3]
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    if not (np.isfinite(M).all() and off.max() <= _MATRIX_TOLERANCE):
+        raise RecordingError(f"{path}: line {lines[int(off.argmax())][0]} holds no rotation")
+    if _moves_along_z(R, t, path):
+        R = R_CAMERA @ R @ R_CAMERA.T
+        t = t @ R_CAMERA.T
+    poses = tuple(gtsam.Pose3(gtsam.Rot3(a), b) for a, b in zip(R, t, strict=True))
+    return GivenPoses(np.array(cloud_stamps_ns, np.int64), poses)
+
+
+def _moves_along_z(R: Array, t: Array, path: Path) -> bool:
+    """Whether the way is along the z axis of the poses, as a camera's, rather than along x."""
+    steps = np.einsum("nji,nj->ni", R[:-1], np.diff(t, axis=0))
+    travelled = np.abs(steps).sum(axis=0)
+    if max(travelled[0], travelled[2]) < _LEAST_TRAVEL_M:
+        raise RecordingError(
+            f"{path}: the poses move by less than {_LEAST_TRAVEL_M:g} m, and it cannot be told "
+            "whether their axes are a camera's. Write them as TUM, with x forward"
+        )
+    return bool(travelled[2] > travelled[0])
+
+
+def _given(stamps_ns: IntArray, rows: Array, path: Path) -> GivenPoses:
+    """Poses by time from rows (n, 7) of x y z qx qy qz qw; of two with one time the first."""
+    norms = np.linalg.norm(rows[:, 3:], axis=1)
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(norms - 1.0) <= _NORM_TOLERANCE) & (np.abs(rows[:, :3]) <= _MOST_M).all(1)
+    if not good.all():
+        worst = int(np.flatnonzero(~good)[0])
+        raise RecordingError(
+            f"{path}: pose {worst + 1} is {rows[worst].tolist()}: expected x y z in metres and "
+            "qx qy qz qw, a unit quaternion. Mend or remove it"
+        )
+    order = np.argsort(stamps_ns, kind="stable")
+    stamps_ns, rows = stamps_ns[order], rows[order]
+    keep = np.concatenate([[True], np.diff(stamps_ns) > 0])
+    stamps_ns, rows = stamps_ns[keep], rows[keep]
+    q = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    poses = tuple(
+        gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), t)
+        for t, (x, y, z, w) in zip(rows[:, :3], q, strict=True)
+    )
+    return GivenPoses(stamps_ns, poses)
+
+
+def check_overlap(poses: GivenPoses, path: Path, span_ns: tuple[int, int], what: str) -> None:
+    """Raises RecordingError if the poses are of another time than the recording `what`."""
+    first, last = int(poses.stamps_ns[0]), int(poses.stamps_ns[-1])
+    if last < span_ns[0] or first > span_ns[1]:
+        raise RecordingError(
+            f"{path}: its poses are of {first / 1e9:.3f} to {last / 1e9:.3f} s, {what} is of "
+            f"{span_ns[0] / 1e9:.3f} to {span_ns[1] / 1e9:.3f} s. Give the times of the poses in "
+            "the clock of the clouds"
+        )

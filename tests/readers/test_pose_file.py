@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caliv_graph.errors import RecordingError
+from caliv_graph.readers.pose_file import check_overlap, read_poses, stamp_of
+
+T = 1_700_000_000_123_456_789
+HALF = "0.7071067811865476"
+
+
+def written(tmp_path: Path, text: str, name: str = "poses.txt") -> Path:
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("1700000000.123456789", T),
+        ("1700000000123456789", T),
+        ("1700000000123456", T // 1000 * 1000),
+        ("1700000000123", T // 10**6 * 10**6),
+        ("1.7e9", 1_700_000_000 * 10**9),
+        ("0.1036", 103_600_000),  # KITTI counts from the start
+        ("-1", None),
+        ("nan", None),
+        ("x", None),
+        ("1e40", None),
+    ],
+)
+def test_times_of_all_units_to_the_nanosecond(text: str, stamp_ns: int | None) -> None:
+    assert stamp_of(text) == stamp_ns
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"# timestamp tx ty tz qx qy qz qw\n1700000000.123456789 1 2 3 0 0 {HALF} {HALF}\n",
+        f"1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        f"num,t,x,y,z,qx,qy,qz,qw\n0,1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+        "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1]\n"
+        f"{T},1,2,3,{HALF},0,0,{HALF},9,9\n",
+        "%time,field.header.seq,field.pose.pose.position.x,field.pose.pose.position.y,"
+        "field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
+        "field.pose.pose.orientation.z,field.pose.pose.orientation.w,"
+        f"field.twist.twist.linear.x\n{T},7,1,2,3,0,0,{HALF},{HALF},9\n",
+        f"sec;nsec;x;y;z;qx;qy;qz;qw;\n1700000000;123456789;1;2;3;0;0;{HALF};{HALF};\n",
+        json.dumps(
+            [
+                {
+                    "token": "a",
+                    "timestamp": 1_700_000_000_123_456,
+                    "rotation": [float(HALF), 0, 0, float(HALF)],
+                    "translation": [1, 2, 3],
+                }
+            ]
+        ),
+    ],
+)
+def test_a_pose_of_every_format(tmp_path: Path, text: str) -> None:
+    poses = read_poses(written(tmp_path, text))
+
+    assert poses.stamps_ns.tolist() in ([T], [T // 1000 * 1000])
+    (pose,) = poses.T_map_vehicle
+    np.testing.assert_allclose(pose.translation(), [1, 2, 3])
+    # The vehicle looks north: its x axis is the map's y.
+    np.testing.assert_allclose(pose.rotation().matrix()[:, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_rows_are_sorted_by_time_and_each_counts_once(tmp_path: Path) -> None:
+    text = "2 2 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 9 0 0 0 0 0 1\n"
+
+    poses = read_poses(written(tmp_path, text))
+
+    assert poses.stamps_ns.tolist() == [10**9, 2 * 10**9]
+    assert [pose.x() for pose in poses.T_map_vehicle] == [1.0, 2.0]
+
+
+def kitti(camera: bool) -> str:
+    """A quarter turn to the left over 10 m forward, as seen by a camera or by the vehicle."""
+    lines = []
+    for a in np.linspace(0.0, np.pi / 2, 5):
+        c, s = np.cos(a), np.sin(a)
+        if camera:  # x right, y down, z forward: left is -x, the turn is about -y
+            M = np.array([[c, 0, -s, -10 * (1 - c)], [0, 1, 0, 0.5], [s, 0, c, 10 * s]])
+        else:
+            M = np.array([[c, -s, 0, 10 * s], [s, c, 0, 10 * (1 - c)], [0, 0, 1, -0.5]])
+        lines.append(" ".join(f"{v:.9e}" for v in M.ravel()))
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_poses_of_a_camera_are_turned_into_those_of_a_vehicle(tmp_path: Path, camera: bool) -> None:
+    poses = read_poses(written(tmp_path, kitti(camera)), [0, 1, 2, 3, 4])
+
+    assert poses.stamps_ns.tolist() == [0, 1, 2, 3, 4]
+    last = poses.T_map_vehicle[-1]
+    np.testing.assert_allclose(last.translation(), [10, 10, -0.5], atol=1e-6)
+    np.testing.assert_allclose(last.rotation().xyz(), [0, 0, np.pi / 2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no poses"),
+        ("1 2 3\n", "line 1: 3 values, expected timestamp x y z qx qy qz qw"),
+        ("1 0 0 0 0 0 0 2\n", "a unit quaternion"),
+        ("1 nan 0 0 0 0 0 1\n", "pose 1 is"),
+        ("1 0 0 0 0 0 0 1\nx 0 0 0 0 0 0 1\n", "line 2: 'x' is not a time"),
+        ("1 0 0 o 0 0 0 1\n", "line 1: 'o' is not a number"),
+        ("t,x,y,z,roll\n1,0,0,0,0\n", "no column for qx, qy, qz, qw"),
+        ("[1, 2]", "is JSON, but not a list of poses"),
+        (kitti(True), "5 poses of 12 numbers have no times"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(RecordingError, match=message):
+        read_poses(written(tmp_path, text))
+
+
+def test_poses_of_another_time_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    poses = read_poses(path)
+
+    check_overlap(poses, path, (10**9, 5 * 10**9), "bag")
+    with pytest.raises(RecordingError, match=r"of 1\.000 to 2\.000 s, bag is of 7\.000"):
+        check_overlap(poses, path, (7 * 10**9, 8 * 10**9), "bag")

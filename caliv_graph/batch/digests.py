@@ -160,10 +160,13 @@ def job_inputs(
     out = None if out is None else out.resolve()
     drives = []
     for path in data or ([config.data.path] if config.data.path else []):
-        find = _bag_files if config.data.format == "rosbag" else _caliv_files
+        # Folders of clouds, too: of those, all files below.
+        find = _caliv_files if config.data.format == "caliv" else _bag_files
         files = dict(find(path, config, out))
         if not files:
             return None
+        if config.data.poses is not None:
+            files["data.poses"] = config.data.poses
         drives.append(files)
     return Inputs(tuple(drives), prior) if drives else None
 
@@ -176,8 +179,9 @@ def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
     Raises:
         OSError: a file cannot be read.
     """
-    # The path of the drive does not change the result.
-    pathless = config.model_copy(update={"data": config.data.model_copy(update={"path": None})})
+    # The path of the drive and of its poses does not change the result.
+    nowhere = config.data.model_copy(update={"path": None, "poses": None})
+    pathless = config.model_copy(update={"data": nowhere})
     return _sha256(
         {
             "schema": JOB_SCHEMA,

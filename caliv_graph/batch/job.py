@@ -120,9 +120,14 @@ def _unused_keys(config: Config) -> list[str]:
     """A line per section that is set and has no effect."""
     if config.data.format == "rosbag":
         return []
+    what = (
+        "a CaLiV folder contains the vehicle poses"
+        if config.data.format == "caliv"
+        else "folders of clouds have no topics but data.poses"
+    )
     sections = {"topics": config.topics, "imu": config.imu, "gnss": config.gnss}
     return [
-        f"{name}: has no effect, since a CaLiV folder contains the vehicle poses"
+        f"{name}: has no effect, since {what}"
         for name, section in sections.items()
         if section != type(section)()
     ]

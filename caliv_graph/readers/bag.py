@@ -25,12 +25,16 @@ from rosbags.typesys.store import Typestore
 from caliv_graph.config.load import read_yaml
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
+from caliv_graph.readers.definitions import DEFINITIONS
 
 _Reader = Reader1 | Reader2
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 _METADATA = "metadata.yaml"
+
+WITHOUT_HEADER = ("ublox_msgs/msg/NavPVT", "novatel_msgs/msg/INSPVAX")
+"""Types of motion data that do not begin with a `std_msgs/Header`."""
 
 _LATEST_NS = 2**62
 """Of a record time: the year 2116. The difference of two such times fits 64 bits."""
@@ -236,6 +240,11 @@ class Bag:
             return store
         if type_name in standard.fielddefs:
             return standard
+        if type_name in DEFINITIONS:
+            store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+            for name, text in DEFINITIONS.items():
+                store.register(get_types_from_msg(text, name))
+            return store
         raise RecordingError(f"{self._path}: holds no definition of the type {type_name}")
 
     @contextmanager

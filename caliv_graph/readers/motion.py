@@ -34,6 +34,15 @@ from caliv_graph.readers.frames import (
     message_transforms,
 )
 
+INSPVAX_TYPES = (
+    "novatel_oem7_msgs/msg/INSPVAX",
+    "novatel_msgs/msg/INSPVAX",
+    "novatel_gps_msgs/msg/Inspvax",
+)
+NAVPVT = "ublox_msgs/msg/NavPVT"
+PVT_GEODETIC = "septentrio_gnss_driver/msg/PVTGeodetic"
+POSITION_TYPES = ("geometry_msgs/msg/PointStamped", "geometry_msgs/msg/PoseStamped")
+
 _IMU = "sensor_msgs/msg/Imu"
 _NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _ODOMETRY = "nav_msgs/msg/Odometry"
@@ -44,11 +53,14 @@ _POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 MOTION_TYPES: Mapping[str, tuple[str, ...]] = {
     "imu": (_IMU,),
-    "gnss": (_NAVSATFIX,),
+    "gnss": (_NAVSATFIX, NAVPVT, PVT_GEODETIC),
     "twist": (_TWIST_WITH_COVARIANCE, _TWIST, _ODOMETRY),
-    "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES),
+    "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES, *INSPVAX_TYPES),
 }
 """Types that fit each key of `topics`, the most informative first."""
+
+ON_REQUEST: Mapping[str, tuple[str, ...]] = {"gnss": POSITION_TYPES}
+"""Types that fit a key as well, if the config says so: mostly they are something else."""
 
 _NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision is off by less."""
@@ -69,6 +81,9 @@ _MOST_ALTITUDE_M = 1e5
 _MOST_M = 1e8
 """Beyond the range of any sensor on a vehicle, and the width of any map: such values are invalid,
 and their squares may overflow."""
+
+_SIDEWAYS_M = 1.0
+"""Of a vehicle that always looks along x: poses that move farther along y hold no orientation."""
 
 _FIXED_AXES = ("map", "odom", "world", "earth", "enu", "utm")
 """Frames whose axes do not turn with the vehicle: a velocity stated in them is not in its axes."""
@@ -173,7 +188,7 @@ class _Losses:
         return [f"of {total} messages not used: {', '.join(lost)}"] * bool(lost) + self._others
 
 
-class _RowCollector:
+class RowCollector:
     """Keeps a row of numbers of each message."""
 
     _WIDTH: ClassVar[int]
@@ -196,7 +211,7 @@ class _RowCollector:
         return self._losses.notes(len(self._rows))
 
 
-class ImuCollector(_RowCollector):
+class ImuCollector(RowCollector):
     """`sensor_msgs/Imu`."""
 
     _WIDTH = 10
@@ -272,7 +287,7 @@ class ImuCollector(_RowCollector):
         return q, _or_none(cov)
 
 
-class GnssCollector(_RowCollector):
+class GnssCollector(RowCollector):
     """`sensor_msgs/NavSatFix`."""
 
     _WIDTH = 14
@@ -315,7 +330,7 @@ class GnssCollector(_RowCollector):
         return 0 if found is None else len(found.stamps_ns)
 
 
-class TwistCollector(_RowCollector):
+class TwistCollector(RowCollector):
     """`TwistStamped`, `TwistWithCovarianceStamped`, or the twist of an `Odometry`.
 
     The twist of an odometry is in its child frame, which is taken for the vehicle's, as is the
@@ -356,7 +371,7 @@ class TwistCollector(_RowCollector):
         return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
 
 
-class PoseCollector(_RowCollector):
+class PoseCollector(RowCollector):
     """`Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`: the vehicle in the map.
 
     The header's frame is taken for the map, the child frame of an odometry for the vehicle.
@@ -385,6 +400,12 @@ class PoseCollector(_RowCollector):
         )
         if not len(stamps):
             return None
+        if (rows[:, 3:6] == 0.0).all() and np.ptp(rows[:, 1]) > _SIDEWAYS_M:
+            self._losses.say(
+                "the orientation is the identity in all messages, but the position moves sideways: "
+                "if these are positions, as of a total station, set topics.gnss to the topic "
+                "instead and gnss.lever_arm to the place of the prism"
+            )
         poses = _poses(rows[:, :3], rows[:, 3:7])
         cov = _or_none(_covariances(rows[:, 7:]))
         if cov is not None:

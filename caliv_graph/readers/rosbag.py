@@ -23,11 +23,12 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead
-from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
+from caliv_graph.readers.bag import WITHOUT_HEADER, Bag, DamagedMessageError, Header, Topic
 from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
 from caliv_graph.readers.frames import TF_TYPES, clean_frame
 from caliv_graph.readers.motion import (
     MOTION_TYPES,
+    ON_REQUEST,
     Collector,
     GnssCollector,
     ImuCheck,
@@ -37,6 +38,7 @@ from caliv_graph.readers.motion import (
     TwistCollector,
     check_imu,
 )
+from caliv_graph.readers.navigation import COLLECTORS, own_stamp_ns
 from caliv_graph.readers.pointcloud2 import CLOUD_TYPES, DecodedCloud, UnusableCloudsError
 from caliv_graph.readers.pose_file import check_overlap, read_poses
 from caliv_graph.readers.stamps import StampMark
@@ -118,7 +120,12 @@ class RosbagRecording:
                 )
             self._topics[name] = topic
         self._used: dict[str, str] = {
-            kind: self._topic(topic, f"topics.{kind}", _KINDS[kind], MOTION_TYPES[kind]).name
+            kind: self._topic(
+                topic,
+                f"topics.{kind}",
+                _KINDS[kind],
+                (*MOTION_TYPES[kind], *ON_REQUEST.get(kind, ())),
+            ).name
             for kind, topic in topics.model_dump().items()
             if topic is not None
         }
@@ -272,9 +279,7 @@ class RosbagRecording:
     @cached_property
     def _index(self) -> _Index:
         collectors = {
-            (kind, topic): TfCollector()
-            if self._bag.topics[topic].type in TF_TYPES
-            else _COLLECTORS[kind]()
+            (kind, topic): _collector(kind, self._bag.topics[topic].type)
             for kind, topic in self._motion_topics
         }
         taking: dict[str, list[Collector]] = {}
@@ -292,7 +297,7 @@ class RosbagRecording:
         for topic, record_ns, raw in self._bag.messages({*topics, *also}):
             try:
                 message = self._bag.decode(topic, raw) if topic in taking or topic in also else None
-                header = self._header(topic, raw, message)
+                header = self._header(topic, record_ns, raw, message)
             except DamagedMessageError:
                 damaged[topic] += 1
                 continue
@@ -346,7 +351,9 @@ class RosbagRecording:
         ]
         return index
 
-    def _header(self, topic: str, raw: bytes, message: Any) -> Header:
+    def _header(self, topic: str, record_ns: int, raw: bytes, message: Any) -> Header:
+        if self._bag.topics[topic].type in WITHOUT_HEADER:
+            return Header(own_stamp_ns(message, record_ns), "")
         if self._bag.topics[topic].type not in TF_TYPES:
             return self._bag.header(raw)
         if not message.transforms:
@@ -470,6 +477,12 @@ class _Queue:
         while self._next is not None and self._next in self._early:
             turn, self._next = self._next, next(self._order, None)
             yield turn, self._early.pop(turn)
+
+
+def _collector(kind: str, type_name: str) -> Collector:
+    if type_name in TF_TYPES:
+        return TfCollector()
+    return COLLECTORS.get((kind, type_name), _COLLECTORS[kind])()
 
 
 def _by_stamp(header_ns: Any, record_ns: Any) -> dict[int, int]:

@@ -13,6 +13,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from caliv_graph.readers.definitions import DEFINITIONS
+
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 
@@ -50,6 +52,10 @@ for _store in _STORES.values():
 _STORES[True].register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
 )
+
+for _store in _STORES.values():
+    for _name, _text in DEFINITIONS.items():
+        _store.register(get_types_from_msg(_text, _name))
 
 Message = dict[str, Any]
 """A message as nested dictionaries; `_type` names the type at the top."""

@@ -99,6 +99,8 @@ int32 head_veh
 int16 mag_dec
 uint16 mag_acc
 """,
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
+    "velodyne_msgs/msg/VelodyneScan": _HEADER + "VelodynePacket[] packets\n",
     "septentrio_gnss_driver/msg/BlockHeader": """
 uint8 sync_1
 uint8 sync_2

@@ -162,7 +162,7 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
     Raises:
         RecordingError: the bag is damaged, or has no clouds.
     """
-    from caliv_graph.readers.pointcloud2 import CLOUD_TYPES
+    from caliv_graph.readers.pointcloud2 import CLOUD_TYPES, POINTCLOUD2, VELODYNE, packets_hint
 
     frames: dict[str, str] = {}
     for topic in bag.topics.values():
@@ -171,6 +171,9 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
             frames[topic.name] = frame
     if not frames:
         shown = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values())
+        for topic in bag.topics.values():
+            if hint := packets_hint(topic.type):
+                raise RecordingError(f"{bag.name}: topic '{topic.name}': {hint}")
         raise RecordingError(
             f"{bag.name}: has no clouds ({', '.join(CLOUD_TYPES)}). It has: {shown or 'nothing'}"
         )
@@ -179,6 +182,12 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
     others.update({topic: "by its name made from others" for topic in frames if topic not in own})
     if not own:
         own, others = list(frames), {}
+    # Packets beside the cloud that was made from them. An unknown frame tells nothing.
+    made = {frames[name] for name in own if bag.topics[name].type == POINTCLOUD2} - {""}
+    for name in own:
+        if bag.topics[name].type == VELODYNE and frames[name] in made:
+            others[name] = "packets of a cloud that is there"
+    own = [name for name in own if name not in others]
     # /points_without_body repeats /points if the frame is the same. An equal frame alone proves
     # nothing: drivers are often started twice with the same frame.
     for name in list(own):

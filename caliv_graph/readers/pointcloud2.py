@@ -6,6 +6,7 @@ the cloud's stamp are not used, whatever their name.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,39 @@ POINTCLOUD2 = "sensor_msgs/msg/PointCloud2"
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
-CLOUD_TYPES = (POINTCLOUD2, *LIVOX_TYPES)
+VELODYNE = "velodyne_msgs/msg/VelodyneScan"
+
+CLOUD_TYPES = (POINTCLOUD2, *LIVOX_TYPES, VELODYNE)
+
+_DECODED_BY = (
+    (
+        r"(?i)hesai|pandar",
+        "'hesai_ros_driver_node' (source_type: packets of a bag), 'hesai_lidar_node' (data_type: "
+        "rosbag) or Nebula's 'hesai_ros_wrapper_node' (launch_hw: false)",
+    ),
+    (
+        r"(?i)robosense|rslidar",
+        "'rslidar_sdk_node' (msg_source: 2) or Nebula's 'robosense_ros_wrapper_node' (launch_hw: "
+        "false)",
+    ),
+    (r"(?i)ouster.*PacketMsg", "'os_cloud' of ouster_ros"),
+    (r"NebulaPackets?$", "Nebula's wrapper node of the LiDAR (launch_hw: false)"),
+    (r"(?i)blickfeld|velodyne|livox", "the driver's own node"),
+)
+"""Packets that only their driver decodes: pattern of the type, and the node."""
+
+
+def packets_hint(type_name: str) -> str:
+    """What decodes packets of a type, as a sentence; empty: they are no known packets."""
+    packets = re.search(r"Scan$|Packets?$|PacketMsg$|UdpFrame$|rslidarScan$", type_name)
+    node = next((node for pattern, node in _DECODED_BY if re.search(pattern, type_name)), None)
+    if packets is None or node is None or type_name in CLOUD_TYPES:
+        return ""
+    return (
+        f"{type_name} holds packets, not points. Play the bag through {node}, record the "
+        "PointCloud2 topic with the others, and give that bag"
+    )
+
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of the types of `sensor_msgs/PointField`."""

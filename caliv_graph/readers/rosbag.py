@@ -39,7 +39,12 @@ from caliv_graph.readers.motion import (
     check_imu,
 )
 from caliv_graph.readers.navigation import COLLECTORS, own_stamp_ns
-from caliv_graph.readers.pointcloud2 import CLOUD_TYPES, DecodedCloud, UnusableCloudsError
+from caliv_graph.readers.pointcloud2 import (
+    CLOUD_TYPES,
+    DecodedCloud,
+    UnusableCloudsError,
+    packets_hint,
+)
 from caliv_graph.readers.pose_file import check_overlap, read_poses
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
@@ -269,6 +274,9 @@ class RosbagRecording:
             raise RecordingError(
                 f"{self._bag.name}: has no topic '{name}' ({key}). {hint}{will_do}"
             )
+        hint = packets_hint(topic.type)
+        if hint and topic.type not in types:
+            raise RecordingError(f"{self._bag.name}: topic '{name}' ({key}): {hint}. {will_do}")
         if topic.type not in types:
             raise RecordingError(
                 f"{self._bag.name}: topic '{name}' ({key}) is of type {topic.type}; for "

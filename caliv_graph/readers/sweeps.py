@@ -13,6 +13,8 @@ from caliv_graph.products import IntArray
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic
 from caliv_graph.readers.pointcloud2 import (
     LIVOX_TYPES,
+    POINTCLOUD2,
+    VELODYNE,
     DecodedCloud,
     TimeField,
     UnusableCloudsError,
@@ -21,6 +23,7 @@ from caliv_graph.readers.pointcloud2 import (
     sweep_times,
 )
 from caliv_graph.readers.stamps import StampMark, stamp_mark, sweep_span
+from caliv_graph.readers.velodyne_packets import decode_velodyne
 
 _ANY_RANGE_M = 1e6
 """Farther than any return."""
@@ -103,6 +106,8 @@ def decode_cloud(
     """
     if topic.type in LIVOX_TYPES:
         return decode_livox(raw, bag.is_ros1, stamp_ns, *ranges)
+    if topic.type == VELODYNE:
+        return decode_velodyne(bag.decode(topic.name, raw), stamp_ns, *ranges)
     return decode_pointcloud2(bag.decode(topic.name, raw), stamp_ns, *ranges, period_s)
 
 
@@ -134,7 +139,7 @@ def mark_of(
 
 
 def _times(bag: Bag, topic: Topic, sample: Sample, period_s: float | None) -> DecodedCloud:
-    if topic.type in LIVOX_TYPES:
+    if topic.type != POINTCLOUD2:
         return decode_cloud(bag, topic, sample.raw, sample.stamp_ns, (0.0, _ANY_RANGE_M), period_s)
     return sweep_times(bag.decode(topic.name, sample.raw), sample.stamp_ns, period_s)
 

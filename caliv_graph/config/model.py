@@ -35,6 +35,7 @@ SolveMode = Literal["auto", "staged", "joint"]
 RobustKernel = Literal["huber", "tls", "trimmed", "none"]
 Requirement = Literal["s2s", "s2v_rotation", "s2v"]
 StampSetting = Literal["start", "end", "auto"]
+PoseAxes = Literal["flu", "frd", "ned"]
 
 Lidar = TypeVar("Lidar")
 
@@ -151,6 +152,11 @@ class DataConfig(Section):
     path: Path | None = Field(None, description="folder or file, relative to the config")
     poses: Path | None = Field(
         None, description="file with the vehicle's poses, instead of topics.pose, relative likewise"
+    )
+    pose_axes: PoseAxes = Field(
+        "flu",
+        description="axes of given poses: flu: vehicle x forward, y left, z up; frd: x forward, y "
+        "right, z down, in a map with z up; ned: the same in a map of north, east, down",
     )
 
     @model_validator(mode="after")

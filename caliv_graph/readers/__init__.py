@@ -26,9 +26,15 @@ def open_recording(config: Config, path: Path | None = None) -> Recording:
         # Here, because a CaLiV folder does not need the libraries for bags.
         from caliv_graph.readers.rosbag import RosbagRecording
 
-        return RosbagRecording(path, config.lidars, config.topics, poses=config.data.poses)
+        return RosbagRecording(
+            path,
+            config.lidars,
+            config.topics,
+            poses=config.data.poses,
+            pose_axes=config.data.pose_axes,
+        )
     if config.data.format == "clouds":
         from caliv_graph.readers.cloud_folder import CloudFolder
 
-        return CloudFolder(path, config.lidars, config.data.poses)
+        return CloudFolder(path, config.lidars, config.data.poses, config.data.pose_axes)
     return CalivFolder(path, config.lidars)

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from caliv_graph.common.inputs import read_input
-from caliv_graph.config.model import LidarConfig
+from caliv_graph.config.model import LidarConfig, PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import GivenPoses, LidarScan, MotionData
@@ -31,7 +31,7 @@ from caliv_graph.readers.clock import Clock, read_clock
 from caliv_graph.readers.motion import ImuCheck
 from caliv_graph.readers.pcd import read_pcd
 from caliv_graph.readers.pointcloud2 import DecodedCloud
-from caliv_graph.readers.pose_file import check_overlap, read_poses, stamp_of
+from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of
 from caliv_graph.readers.returns import is_return
 from caliv_graph.readers.stamps import StampMark, stamp_mark, sweep_span
 from caliv_graph.readers.sweeps import TimesSeen, is_sampled, times_warnings
@@ -54,7 +54,11 @@ class CloudFolder:
     """A drive in folders of clouds (products.Recording). Opening it lists the clouds."""
 
     def __init__(
-        self, path: Path, lidars: Mapping[str, LidarConfig], poses: Path | None = None
+        self,
+        path: Path,
+        lidars: Mapping[str, LidarConfig],
+        poses: Path | None = None,
+        pose_axes: PoseAxes = "flu",
     ) -> None:
         """Opens the folder; the `topic` of a LiDAR is its folder of clouds in it.
 
@@ -76,6 +80,7 @@ class CloudFolder:
         self._times = {name: TimesSeen() for name in lidars}
         self._looked_at: dict[str, set[int]] = {name: set() for name in lidars}
         self._poses_path = poses or poses_file(path)
+        self._pose_axes = pose_axes
 
     @property
     def name(self) -> str:
@@ -191,7 +196,7 @@ class CloudFolder:
         stamps = list(next(iter(self._clouds.values()), {})) if self._clouds else None
         poses = read_poses(self._poses_path, stamps)
         check_overlap(poses, self._poses_path, self.span_ns, str(self._path))
-        return poses
+        return in_vehicle_axes(poses, self._pose_axes)
 
     @cached_property
     def _marks(self) -> dict[str, StampMark]:

@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.common.inputs import read_input
+from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Array, GivenPoses, IntArray
@@ -253,6 +254,21 @@ def _given(stamps_ns: IntArray, rows: Array, path: Path) -> GivenPoses:
         for t, (x, y, z, w) in zip(rows[:, :3], q, strict=True)
     )
     return GivenPoses(stamps_ns, poses)
+
+
+def in_vehicle_axes(poses: GivenPoses, axes: PoseAxes) -> GivenPoses:
+    """Poses of a vehicle with x forward, y left, z up, in a map with z up, from those in `axes`.
+
+    Half a turn about x: with `frd`, T_map_flu = T_map_frd C; with `ned`, also of the map, C T C.
+    Right perturbations of the result are those of the old axes turned by C.
+    """
+    if axes == "flu":
+        return poses
+    C = gtsam.Pose3(gtsam.Rot3(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+    turned = tuple((C.compose(T) if axes == "ned" else T).compose(C) for T in poses.T_map_vehicle)
+    signs = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+    cov = None if poses.cov is None else poses.cov * np.outer(signs, signs)
+    return GivenPoses(poses.stamps_ns, turned, cov)
 
 
 def check_overlap(poses: GivenPoses, path: Path, span_ns: tuple[int, int], what: str) -> None:

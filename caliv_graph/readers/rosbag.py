@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config.model import LidarConfig, TopicsConfig
+from caliv_graph.config.model import LidarConfig, PoseAxes, TopicsConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData
@@ -45,7 +45,7 @@ from caliv_graph.readers.pointcloud2 import (
     UnusableCloudsError,
     packets_hint,
 )
-from caliv_graph.readers.pose_file import check_overlap, read_poses
+from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
     Sample,
@@ -102,11 +102,12 @@ class RosbagRecording:
         topics: TopicsConfig,
         also: Iterable[str] = (),
         poses: Path | None = None,
+        pose_axes: PoseAxes = "flu",
     ) -> None:
         """Opens the bag and checks that it has the topics; reads its index only.
 
         `also` names further topics of motion data to look at, which `motion` does not use; `poses`
-        a file with the vehicle's poses.
+        a file with the vehicle's poses; `pose_axes` are the axes of poses.
 
         Raises:
             RecordingError: the bag is missing or damaged; a topic is missing, of the wrong type, or
@@ -139,7 +140,7 @@ class RosbagRecording:
             for kind, types in MOTION_TYPES.items():
                 if self._bag.topics[name].type in types:
                     self._motion_topics.setdefault((kind, name))
-        self._poses = poses
+        self._poses, self._pose_axes = poses, pose_axes
         self._motion: MotionData | None = None
         self._times: dict[str, TimesSeen] = {name: TimesSeen() for name in self._lidars}
         self._damaged_clouds: dict[str, set[int]] = {name: set() for name in self._lidars}
@@ -390,6 +391,8 @@ class RosbagRecording:
         if self._poses is not None:
             found["pose"] = read_poses(self._poses)
             check_overlap(found["pose"], self._poses, self.span_ns, self._bag.name)
+        if found.get("pose") is not None:
+            found["pose"] = in_vehicle_axes(found["pose"], self._pose_axes)
         motion = MotionData(
             self._bag.name,
             poses=found.get("pose"),

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.errors import RecordingError
-from caliv_graph.readers.pose_file import check_overlap, read_poses, stamp_of
+from caliv_graph.products import GivenPoses
+from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of
 
 T = 1_700_000_000_123_456_789
 HALF = "0.7071067811865476"
@@ -123,6 +126,32 @@ def test_poses_of_a_camera_are_turned_into_those_of_a_vehicle(tmp_path: Path, ca
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(RecordingError, match=message):
         read_poses(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("axes", ["frd", "ned"])
+def test_poses_with_z_down(tmp_path: Path, axes: Any) -> None:
+    # 1 m north, 2 m east, 3 m down, heading 30 degrees clockwise, nose 10 degrees up.
+    R_ned_frd = gtsam.Rot3.RzRyRx(0.0, np.radians(10.0), np.radians(30.0))
+    T = gtsam.Pose3(R_ned_frd, np.array([1.0, 2.0, 3.0]))
+    if axes == "frd":  # the same in a map of north, west, up
+        T = gtsam.Pose3(gtsam.Rot3(np.diag([1.0, -1.0, -1.0])), np.zeros(3)).compose(T)
+    cov = np.diag(np.arange(1.0, 7.0))[None].copy()
+    cov[0, 1, 4] = cov[0, 4, 1] = 0.5  # y of rotation and of translation: both change sign
+    cov[0, 0, 5] = cov[0, 5, 0] = 0.25  # only one of the two does
+
+    turned = in_vehicle_axes(GivenPoses(np.array([0]), (T,), cov), axes)
+
+    pose = turned.T_map_vehicle[0]
+    np.testing.assert_allclose(pose.translation(), [1.0, -2.0, -3.0], atol=1e-12)
+    np.testing.assert_allclose(np.degrees(pose.rotation().rpy()), [0.0, -10.0, -30.0], atol=1e-9)
+    assert turned.cov is not None
+    assert turned.cov[0, 1, 4] == 0.5
+    assert turned.cov[0, 0, 5] == -0.25
+    # A right perturbation of the old pose is that of the new one, turned.
+    step = np.array([1e-3, 2e-3, -1e-3, 0.01, 0.02, -0.03])
+    C = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+    moved = in_vehicle_axes(GivenPoses(np.array([0]), (T.retract(step),)), axes)
+    np.testing.assert_allclose(pose.localCoordinates(moved.T_map_vehicle[0]), C * step, atol=1e-12)
 
 
 def test_poses_of_another_time_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,10 @@ from caliv_graph.cli.options import AsJson
 
 def inspect(
     data: Annotated[
-        Path, typer.Argument(metavar="DATA", help="The drive: a bag or a CaLiV folder.")
+        Path,
+        typer.Argument(
+            metavar="DATA", help="The drive: a bag, a CaLiV folder or folders of clouds."
+        ),
     ],
     config: Annotated[
         Path | None,

@@ -13,7 +13,7 @@ import numpy as np
 
 from caliv_graph.products import Array, IntArray
 
-_PACKET_PART = 0.25
+PACKET_PART = 0.25
 """Of the time between two clouds: a packet is shorter. The longest, of a 16-channel LiDAR, takes
 1.33 ms."""
 
@@ -59,7 +59,7 @@ def continued_times(points_lidar: Array, times_s: Array, period_s: float) -> Con
         return None
     span_s = float(np.ptp(times_s))
     starts = 1 + np.flatnonzero(np.diff(times_s) < -0.5 * span_s)
-    if len(starts) < _LEAST_RESTARTS or span_s > _PACKET_PART * period_s:
+    if len(starts) < _LEAST_RESTARTS or span_s > PACKET_PART * period_s:
         return None
     azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
     packet = np.zeros(len(times_s), np.int64)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
 from caliv_graph.readers.bag import DamagedMessageError
-from caliv_graph.readers.packet_times import continued_times
+from caliv_graph.readers.packet_times import PACKET_PART, continued_times
 from caliv_graph.readers.returns import is_return
 
 POINTCLOUD2 = "sensor_msgs/msg/PointCloud2"
@@ -149,11 +149,14 @@ def sweep_times(message: Any, stamp_ns: int, period_s: float | None) -> DecodedC
     A sweep begins and ends where it does also where its beams hit nothing. Raises as
     `decode_pointcloud2`.
     """
-    cloud = decode_pointcloud2(message, stamp_ns, 0.0, np.inf, period_s)
     times = [(field, column[np.isfinite(column)]) for field, column in _time_columns(message)]
     count = len(times[0][1]) if times else 0
     whole = _with_times(np.empty((count, 3)), times, stamp_ns)
+    known_s = np.empty(0) if whole.times_s is None else whole.times_s
+    if period_s is not None and len(known_s) and np.ptp(known_s) > PACKET_PART * period_s:
+        return whole  # of a whole sweep: no need to look at the points
     # Drivers may leave zeros as the absolute times of beams without a return.
+    cloud = decode_pointcloud2(message, stamp_ns, 0.0, np.inf, period_s)
     return cloud if cloud.packets or whole.times_s is None else whole
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -16,7 +15,9 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.config.mounting import PoseConfig as PoseConfig
 from caliv_graph.config.sections import (
+    FilePath,
     Finite,
+    Name,
     NonNegative,
     Positive,
     PositiveTriple,
@@ -101,7 +102,9 @@ class PoseSigmaConfig(Section):
 class LidarConfig(Section):
     """One LiDAR, by the user's name for it."""
 
-    topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
+    topic: Name = Field(
+        description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ..."
+    )
     initial: PoseConfig = Field(description="initial guess of T_vehicle_lidar")
     sigma: PoseSigmaConfig = PoseSigmaConfig()
     fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
@@ -123,7 +126,7 @@ class DataConfig(Section):
     """Where the recording is."""
 
     format: Literal["rosbag", "caliv"] = "rosbag"
-    path: Path | None = Field(None, description="folder or file, relative to the config")
+    path: FilePath | None = Field(None, description="folder or file, relative to the config")
 
 
 class TopicsConfig(Section):
@@ -338,8 +341,8 @@ class Config(Section):
 
     data: DataConfig = DataConfig()
     topics: TopicsConfig = TopicsConfig()
-    lidars: Annotated[dict[str, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
-    reference: str = Field("", description="reference LiDAR; empty: the first")
+    lidars: Annotated[dict[Name, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
+    reference: Name = Field("", description="reference LiDAR; empty: the first")
     target: Annotated[tuple[TargetRegion, ...], Field(min_length=1)] | Literal[False] | None = (
         Field(
             None,

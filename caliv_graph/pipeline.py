@@ -43,6 +43,7 @@ from caliv_graph.products import (
     Recording,
     TargetObservation,
 )
+from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.patches import DrivePatches
@@ -102,6 +103,7 @@ def prepare(
         CalivError: something is wrong with the input; the message says what to do.
     """
     check_clouds(recordings, config)
+    recordings = [with_common_stamps(recording) for recording in recordings]
     raw = raw_findings(motions, config)
     raise_fatal(raw)
     rough, findings, search = _searched(recordings, config, motions, raw, progress)
@@ -119,7 +121,7 @@ def prepare(
         others={patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)},
         kept_ns=None if observations else kept,
     )
-    with progress.stage("smoothing the trajectory at the target's scans", None):
+    with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
         del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(recordings, config, stamps, motions)
@@ -327,8 +329,9 @@ def _calibrate(
     """One statement per stage; see `calibrate`."""
     # The report shows the scans as they are read; nothing is read for it.
     recordings = sampled = [SampledRecording(recording) for recording in recordings]
-    motions = {i: recording.motion() for i, recording in enumerate(recordings)}
-    digests = [drive_digest(motion) for motion in motions.values()]
+    with progress.stage("reading the motion data", None):
+        motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+        digests = [drive_digest(motion) for motion in motions.values()]
     guessed = config if prior is None else starting_from(config, prior, digests)
 
     prepared = prepare(recordings, guessed, motions, progress)
@@ -343,20 +346,21 @@ def _calibrate(
         )
     except TargetError as error:
         raise without_anything(prepared, error) from error
-    calibration = assemble(solution, config, recordings, digests)
-    calibration, doubts = check(
-        calibration,
-        solution,
-        recordings,
-        prepared.trajectories,
-        motions,
-        prepared.config,
-        displaced=bool(prepared.contradictions),
-    )
-    calibration = contradicted(
-        calibration, prepared.contradictions, contradictions_of(prepared.findings)
-    )
-    calibration, conflicts = with_prior(calibration, prior, config)
+    with progress.stage("checking the result", None):
+        calibration = assemble(solution, config, recordings, digests)
+        calibration, doubts = check(
+            calibration,
+            solution,
+            recordings,
+            prepared.trajectories,
+            motions,
+            prepared.config,
+            displaced=bool(prepared.contradictions),
+        )
+        calibration = contradicted(
+            calibration, prepared.contradictions, contradictions_of(prepared.findings)
+        )
+        calibration, conflicts = with_prior(calibration, prior, config)
 
     warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)
     record = RunRecord(

@@ -70,20 +70,32 @@ def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
     return [open_recording(config, path) for path in data or (None,)]
 
 
+def guess_problem(config: Config, path: Path) -> str:
+    """A sentence on a draft of `init`, read from `path`, whose guesses are still zeros; or nothing.
+
+    Two LiDARs have the zeros that `init` writes for unknown guesses.
+    """
+    unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
+    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
+    if len(zeros) < 2:
+        return ""
+    fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
+    return (
+        f"{path}: {fields} are all zeros, but two LiDARs cannot be in the same place. Enter xyz in "
+        "metres and rpy_deg in degrees from a tape measure or a drawing: errors of 0.1 m and 3 "
+        "degrees are fine"
+    )
+
+
 def check_guesses(config: Config, path: Path) -> None:
     """Refuses a draft of `init`, read from `path`, whose initial guesses are still zeros.
 
     Raises:
-        ConfigError: two LiDARs have the zeros that `init` writes for unknown guesses.
+        ConfigError: see `guess_problem`.
     """
-    unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
-    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
-    if len(zeros) > 1:
-        fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
-        raise ConfigError(
-            f"{path}: {fields} are all zeros, but two LiDARs cannot be in the same place. Measure "
-            "their positions, or take them from a drawing"
-        )
+    problem = guess_problem(config, path)
+    if problem:
+        raise ConfigError(problem)
 
 
 def run_job(

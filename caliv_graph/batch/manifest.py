@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from caliv_graph.config.load import parse_config, read_yaml, validated
 from caliv_graph.config.model import Config, Requirement, SolveMode, check_limit_keys
-from caliv_graph.config.sections import Positive, Section
+from caliv_graph.config.sections import FilePath, Positive, Section, as_written
 from caliv_graph.errors import ConfigError
 
 MOST_CHARACTERS = 80
@@ -51,9 +51,9 @@ class Job:
 class _Settings(Section):
     """The settings of a job, or the defaults of all jobs."""
 
-    config: Path | None = Field(None, description="the config, relative to the manifest")
+    config: FilePath | None = Field(None, description="the config, relative to the manifest")
     vehicle: str | None = Field(None, description="jobs of one vehicle are compared")
-    prior: Path | None = Field(None, description="earlier calibration.yaml of the vehicle")
+    prior: FilePath | None = Field(None, description="earlier calibration.yaml of the vehicle")
     mode: SolveMode | None = Field(None, description="instead of solve.mode of the config")
     require: tuple[Requirement, ...] | None = Field(None, description="instead of the config's")
     limits: dict[str, Positive] | None = Field(None, description="instead of the config's")
@@ -79,7 +79,7 @@ class _JobEntry(_Settings):
     """One job as it is written."""
 
     name: str = Field(description="of the job, and of its folder")
-    data: tuple[Path, ...] = Field((), description="drives, instead of the config's")
+    data: tuple[FilePath, ...] = Field((), description="drives, instead of the config's")
 
     @field_validator("name", mode="before")
     @classmethod
@@ -94,7 +94,7 @@ class _JobEntry(_Settings):
     def _one_or_many_drives(cls, raw: Any) -> Any:
         if raw is None:
             return ()
-        return [raw] if isinstance(raw, str) else raw
+        return [raw] if isinstance(raw, str | int) else raw
 
 
 class _Manifest(Section):
@@ -193,6 +193,7 @@ def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> J
 
 def _plain(raw: Any, pattern: re.Pattern[str], also: str) -> str:
     """A name that is safe as a folder, in a table and on a page."""
+    raw = as_written(raw)
     if not isinstance(raw, str):
         raise ValueError("is not text in YAML: write it in quotes")
     # One spelling of what looks the same.

@@ -27,9 +27,11 @@ def init(
     """Write a commented config for a drive.
 
     The config names the LiDARs and, for a bag, the topics of the vehicle's motion. Initial guesses
-    come from /tf_static or a URDF. For a CaLiV folder, initial guesses and the region of the target
-    come from a config of the CaLiV authors' program (transform_sensor_N, min_bound, max_bound) in
-    the same folder. Values to fill in are marked TODO.
+    come from /tf_static or a URDF, by the frames of the messages or by similar names; the height of
+    the vehicle frame from base_footprint. For a CaLiV folder, initial guesses and the region of the
+    target come from a config of the CaLiV or GMMCalib authors' program (transform_sensor_N,
+    min_bound, max_bound) in the same folder or in its folder config. Values to fill in are marked
+    TODO.
 
     Example: caliv-graph init drive/ --urdf vehicle.urdf --out config.yaml
     """

@@ -34,6 +34,7 @@ def inspect(
     """
     from dataclasses import replace
 
+    from caliv_graph.batch.job import guess_problem
     from caliv_graph.config.load import load_config
     from caliv_graph.errors import RecordingError
     from caliv_graph.readers import open_recording
@@ -52,9 +53,12 @@ def inspect(
             # Its topics can still be shown, if it is a recording at all.
             recording, settings = open_all(data), None
             warnings.append(str(error))
+    problem = "" if settings is None or config is None else guess_problem(settings, config)
+    if problem:
+        warnings.append(f"{problem}. The target is not searched for without them")
     with streams.progress_on_stdout(as_json) as progress:
         inspection = inspect_any(recording, progress, settings)
-        if settings is not None:
+        if settings is not None and not problem:
             from caliv_graph.pipeline import look
 
             seen = look(recording, settings, progress)

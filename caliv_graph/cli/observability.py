@@ -25,12 +25,13 @@ def observability(
 
     Example: caliv-graph observability config.yaml --data drive/
     """
-    from caliv_graph.batch.job import open_recordings
+    from caliv_graph.batch.job import check_guesses, open_recordings
     from caliv_graph.config.load import load_config
     from caliv_graph.report.predicted import survey_document, survey_table
     from caliv_graph.workflows.survey import survey
 
     settings = load_config(config)
+    check_guesses(settings, config)
     recordings = open_recordings(settings, data or ())
     with streams.progress_on_stdout(as_json) as progress:
         found = survey(recordings, settings, progress)

@@ -1,5 +1,8 @@
 """YAML from outside: safe tags only, each key once, limited depth and size.
 
+A folder is often named 0001, 2024_05_01 or 2024-05-01. YAML 1.1 makes the numbers 1 and 20240501
+and a date of them. Here they stay text: a whole number is one as YAML 1.2 and JSON write it.
+
 A few hundred bytes of aliases can expand to gigabytes, and nested brackets overflow the stack of
 the parser's C code, which ends the program. Both are checked in the parser's events: this needs no
 stack and a tenth of the time of reading.
@@ -7,6 +10,7 @@ stack and a tenth of the time of reading.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -23,6 +27,12 @@ MOST_DIGITS = 400
 
 _MOST_CHARACTERS = 200
 """Of a message of the parser, which quotes tags and keys whole."""
+
+
+_INT, _TIMESTAMP = "tag:yaml.org,2002:int", "tag:yaml.org,2002:timestamp"
+
+_WHOLE_NUMBER = re.compile(r"^[-+]?(0|[1-9][0-9]*)$")
+"""Without the leading zeros, underscores, colons and bases of YAML 1.1."""
 
 
 class YamlProblemError(Exception):
@@ -58,7 +68,12 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return super().construct_yaml_int(node)
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_Loader.add_constructor(_INT, _Loader.construct_yaml_int)
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in known if tag not in (_INT, _TIMESTAMP)]
+    for first, known in _Loader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(_INT, _WHOLE_NUMBER, list("-+0123456789"))
 
 
 def parse_yaml(text: str) -> Any:

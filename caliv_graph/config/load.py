@@ -80,6 +80,18 @@ def load_config(path: Path) -> Config:
     Raises:
         ConfigError: the file is missing, not YAML, or not valid.
     """
+    inside = path / "config.yaml"
+    if path.is_dir() and inside.is_file():
+        raise ConfigError(f"{path}: is a folder. Give {inside}")
+    if not path.is_file() and not path.exists():
+        raise ConfigError(
+            f"{path}: no such file. 'caliv-graph init DRIVE --out {path}' drafts it for a drive"
+        )
+    if path.is_dir():
+        raise ConfigError(
+            f"{path}: is a folder, expected a YAML file. 'caliv-graph init {path} --out "
+            "config.yaml' drafts one, if this is a drive"
+        )
     return parse_config(read_yaml(path), str(path), path.parent)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -16,7 +15,9 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.config.mounting import PoseConfig as PoseConfig
 from caliv_graph.config.sections import (
+    FilePath,
     Finite,
+    Name,
     NonNegative,
     Positive,
     PositiveTriple,
@@ -118,7 +119,9 @@ BinField = Annotated[str, AfterValidator(_bin_field)]
 class LidarConfig(Section):
     """One LiDAR, by the user's name for it."""
 
-    topic: str = Field(description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ...")
+    topic: Name = Field(
+        description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ..."
+    )
     bin_fields: Annotated[tuple[BinField, ...], Field(min_length=3)] | None = Field(
         None,
         description="fields of a point in .bin files, each a name and a type, such as x f4; "
@@ -149,8 +152,8 @@ class DataConfig(Section):
     """Where the recording is."""
 
     format: Literal["rosbag", "caliv", "clouds"] = "rosbag"
-    path: Path | None = Field(None, description="folder or file, relative to the config")
-    poses: Path | None = Field(
+    path: FilePath | None = Field(None, description="folder or file, relative to the config")
+    poses: FilePath | None = Field(
         None, description="file with the vehicle's poses, instead of topics.pose, relative likewise"
     )
     pose_axes: PoseAxes = Field(
@@ -378,8 +381,8 @@ class Config(Section):
 
     data: DataConfig = DataConfig()
     topics: TopicsConfig = TopicsConfig()
-    lidars: Annotated[dict[str, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
-    reference: str = Field("", description="reference LiDAR; empty: the first")
+    lidars: Annotated[dict[Name, LidarConfig], Field(min_length=1), AfterValidator(checked_names)]
+    reference: Name = Field("", description="reference LiDAR; empty: the first")
     target: Annotated[tuple[TargetRegion, ...], Field(min_length=1)] | Literal[False] | None = (
         Field(
             None,

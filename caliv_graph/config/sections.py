@@ -5,9 +5,17 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+)
 
 _LEAST, _MOST = 1e-12, 1e12
 """Bounds of a quantity in its unit, far beyond any use: squares and their inverses stay finite."""
@@ -24,6 +32,8 @@ _SENTENCES = {
     "tuple_type": "must be a list",
     "bool_type": "must be true or false",
     "bool_parsing": "must be true or false",
+    "string_type": "is not text in YAML: write it in quotes",
+    "path_type": "is not text in YAML: write it in quotes",
     "too_short": "must have {min_length} or more items, has {actual_length}",
     "too_long": "must have {max_length} or fewer items, has {actual_length}",
 }
@@ -53,6 +63,14 @@ def _on_a_vehicle(xyz: tuple[float, float, float]) -> tuple[float, float, float]
     return xyz
 
 
+def as_written(value: Any) -> Any:
+    """A number as the text that it was: a folder may be called 2024, and a LiDAR 1."""
+    # YAML reads a whole number only where its digits are all there is (`yaml_text`).
+    return str(value) if type(value) is int else value
+
+
+Name = Annotated[str, BeforeValidator(as_written)]
+FilePath = Annotated[Path, BeforeValidator(as_written)]
 Finite = Annotated[float, AfterValidator(_finite)]
 Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0.0), AfterValidator(_finite)]

@@ -66,7 +66,9 @@ def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
         result = request.calibration.lidars[name]
         axes = undetermined_axes(result)
         if not result.has_data:
-            lines.append(f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess")
+            lines.append(
+                f"LiDAR '{name}' saw neither target nor structure: it keeps the initial guess"
+            )
         elif axes:
             lines.append(
                 f"LiDAR '{name}': {', '.join(axes)} (vehicle axes) not determined by the drive: "

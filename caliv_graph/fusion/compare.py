@@ -98,6 +98,9 @@ class Comparison:
         conclusion: the verdict in words.
         not_compared: LiDARs left out, with the reason.
         undetermined: directions that the first and the second drive do not determine, in words.
+        shared: recordings whose data are in both. The test takes the two as independent: with
+            common errors a difference is smaller than its sigma says, so that it rather misses a
+            movement than invents one.
     """
 
     lidars: Mapping[str, Movement]
@@ -109,6 +112,7 @@ class Comparison:
     conclusion: str
     not_compared: Mapping[str, str]
     undetermined: tuple[tuple[str, ...], tuple[str, ...]]
+    shared: tuple[str, ...] = ()
 
     @property
     def movements(self) -> tuple[Movement, ...]:
@@ -151,22 +155,21 @@ def compare(
         p_value: probability of a false alarm over all tests.
 
     Raises:
-        ConfigError: they come from the same drive, or have no LiDAR in common.
+        ConfigError: they have no LiDAR in common.
     """
     terms = own_term(first, labels[0]), own_term(second, labels[1])
-    shared = set(terms[0].sources) & set(terms[1].sources)
-    if shared:
-        raise ConfigError(
-            f"{labels[1]}: stems from the same drive as {labels[0]}, so it is no independent "
-            "measurement. Compare calibrations of two drives"
-        )
     if not set(first.lidars) & set(second.lidars):
         raise ConfigError(
             f"{labels[1]}: has none of the LiDARs of {labels[0]} ({', '.join(first.lidars)}), but "
             f"{', '.join(second.lidars)}. Give them the same names"
         )
     before, after = ({n: guess_of(c, n) for n in c.lidars} for c in (first, second))
-    return compare_terms(terms, (before, after), first.reference, p_value)
+    found = compare_terms(terms, (before, after), first.reference, p_value)
+    shared = tuple(source for source in terms[0].sources if source in terms[1].sources)
+    if not shared:
+        return found
+    same = set(terms[0].sources) == set(terms[1].sources)
+    return replace(found, shared=shared, conclusion=shared_conclusion(found, same))
 
 
 def compare_terms(
@@ -253,7 +256,7 @@ def _comparable(terms: tuple[DataTerm, DataTerm]) -> tuple[list[str], dict[str, 
         if absent:
             left_out[name] = f"the {absent[0]} calibration does not have it"
         elif blind:
-            left_out[name] = f"it saw no target in the {' and the '.join(blind)} calibration"
+            left_out[name] = f"it saw nothing in the {' and the '.join(blind)} calibration"
         else:
             names.append(name)
     return names, left_out
@@ -388,6 +391,27 @@ def _test(difference: Array, parts: Sequence[tuple[Array, _Drive]]) -> tuple[flo
 
 def _squared(root: Array) -> Array:
     return np.asarray(root @ root.T)
+
+
+def shared_conclusion(found: Comparison, same: bool) -> str:
+    """The verdict on two calibrations with common data; `same`: they have no other data."""
+    if not same:
+        return (
+            f"{found.conclusion} The two share data of a drive: their errors are partly the same, "
+            "and a small movement may be missed."
+        )
+    differ = [name for name, m in found.lidars.items() if m.moved]
+    differ += [f"{m.lidars[0]}' against '{m.lidars[1]}" for m in found.pairs if m.moved]
+    if not differ:
+        return (
+            "Both are results of one drive, and they agree. Whether a mount has moved needs a "
+            "second drive."
+        )
+    names = ", ".join(f"'{name}'" for name in differ)
+    return (
+        f"Both are results of one drive, and they differ by more than their sigmas: {names}. No "
+        "mount has moved between them: the settings differ, or a sigma is too small."
+    )
 
 
 def _conclusion(lidars: Mapping[str, Movement], pairs: Sequence[Movement]) -> str:

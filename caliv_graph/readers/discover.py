@@ -86,13 +86,52 @@ def recorded_sensors(path: Path) -> tuple[str, ...]:
 
 
 def is_recorded_bag(path: Path) -> bool:
-    """Whether a path is a bag rather than a CaLiV folder."""
+    """Whether a drive is a bag rather than a CaLiV folder.
+
+    Raises:
+        RecordingError: it is neither, or missing.
+    """
     from caliv_graph.readers.bag import is_bag
 
     try:
-        return is_bag(path)
-    except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+        if path.exists() and is_bag(path):
+            return True
+        if _is_caliv_folder(path):
+            return False
+        raise RecordingError(f"{path}: {_no_drive(path)}")
+    except (OSError, ValueError) as e:
+        said = getattr(e, "strerror", None) or e
+        raise RecordingError(f"{path}: cannot be read: {said}") from None
+
+
+def _is_caliv_folder(path: Path) -> bool:
+    return (path / "input" / POSES_FILE).is_file() or (path / POSES_FILE).is_file()
+
+
+def _no_drive(path: Path) -> str:
+    """Why a path is no drive, and what to give instead."""
+    from caliv_graph.readers.bag import BAG_SUFFIXES, is_bag
+
+    bag = f"a bag ({', '.join(BAG_SUFFIXES)}, or the folder of one)"
+    if not path.exists():
+        return f"no such file or folder. Give {bag}, or a CaLiV folder with input/{POSES_FILE}"
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        return (
+            "is a YAML file, not a drive. Give the drive itself, which data.path of a config names"
+        )
+    if not path.is_dir():
+        return f"is not {bag}. Unpack it first if it is packed"
+    inside = [
+        entry
+        for entry in sorted(path.iterdir())
+        if entry.is_dir() and (is_bag(entry) or _is_caliv_folder(entry))
+    ]
+    if inside:
+        return f"is not a drive, but holds drives. Give {' or '.join(map(str, inside[:3]))}"
+    return (
+        f"holds neither {bag} nor input/{POSES_FILE}, the vehicle's pose of each cloud of a CaLiV "
+        "folder. Give the folder of a drive"
+    )
 
 
 def folders_of_clouds(path: Path) -> tuple[str, ...]:

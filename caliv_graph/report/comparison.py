@@ -104,6 +104,7 @@ def comparison_document(
             for label, texts in zip(("first", "second"), comparison.undetermined, strict=True)
         },
         "not_compared": dict(comparison.not_compared),
+        "shared_data": list(comparison.shared),
     }
 
 

@@ -23,7 +23,14 @@ from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Calibration, Direction, LidarResult, NoiseLevel, Solution
-from caliv_graph.report.numbers import SHOWN_AXES, fixed, pair_cells, pose_cells, two_digits
+from caliv_graph.report.numbers import (
+    SHOWN_AXES,
+    fixed,
+    pair_cells,
+    pose_cells,
+    scans_text,
+    two_digits,
+)
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weighted
 from caliv_graph.report.surfaces import MOST_ROWS, SURFACE_HEADS, surface_rows
@@ -108,7 +115,7 @@ def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
         if lidar.guess is not None and lidar.guess.fixed:
             out.append((name, "", "not estimated: 'fixed' in the config"))
         elif not lidar.has_data:
-            out.append((name, "", "all six axes: no target seen, the extrinsic is the guess"))
+            out.append((name, "", "all six axes: nothing seen, the extrinsic is the guess"))
         else:
             out.append((f"{name} to the vehicle", *_axes_texts(lidar.determined)))
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):
@@ -174,7 +181,7 @@ def extrinsic_row(result: LidarResult) -> dict[str, Any]:
     offset = result.time_offset
     return {
         "cells": pose_cells(result.T_vehicle_lidar, result.cov, result.determined),
-        "scans": str(result.scans_used) if result.saw_target else "no target",
+        "scans": scans_text(result),
         "offset": None if offset is None else f"{1e3 * offset[0]:+.2f} ± {1e3 * offset[1]:.2f} ms",
         "estimated": not (result.guess is not None and result.guess.fixed),
     }

@@ -12,7 +12,7 @@ import numpy as np
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
-from caliv_graph.products import Array, Calibration
+from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
 SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -86,6 +86,13 @@ def pair_cells(calibration: Calibration) -> list[PairCells]:
         cells = pose_cells(T_to_from, cov, pair_determined(calibration, source, to))
         out.append(PairCells(source, to, cells))
     return out
+
+
+def scans_text(result: LidarResult) -> str:
+    """Scans of a target that were used, or what the extrinsic rests on without them."""
+    if result.saw_target:
+        return str(result.scans_used)
+    return "structure" if result.saw_structure else "none"
 
 
 def value_and_sigma(value: float, sigma: float) -> str:

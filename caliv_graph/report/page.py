@@ -13,13 +13,22 @@ if TYPE_CHECKING:
 
 def environment() -> jinja2.Environment:
     """The template environment; a name that is missing in a template raises an error."""
-    return jinja2.Environment(
+    pages = jinja2.Environment(
         loader=jinja2.PackageLoader("caliv_graph.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    pages.globals["first_picture"] = _first_picture
+    return pages
+
+
+def _first_picture(figure: Figure) -> Markup:
+    # Imported here: a page without figures needs no drawing.
+    from caliv_graph.report.figures.still import still
+
+    return still(figure)
 
 
 def script_data(figure: Figure) -> Markup:

@@ -13,7 +13,14 @@ from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
-from caliv_graph.report.numbers import SHOWN_AXES, Cell, fixed, pair_cells, pose_cells
+from caliv_graph.report.numbers import (
+    SHOWN_AXES,
+    Cell,
+    fixed,
+    pair_cells,
+    pose_cells,
+    scans_text,
+)
 from caliv_graph.wording.suspects import suspect_row
 from caliv_graph.wording.vehicle import vehicle_text
 
@@ -61,7 +68,7 @@ def calibration_table(
     measured = [vehicle_text(name, found) for name, found in calibration.vehicle.items()]
     parts += sentences("Measured by hand, as the drive sees it:", measured)
     unseen = [
-        f"LiDAR '{name}' never saw a target: its extrinsic is the initial guess"
+        f"LiDAR '{name}' saw neither target nor structure: it keeps the initial guess"
         for name, result in calibration.lidars.items()
         if not result.has_data
     ]
@@ -111,8 +118,8 @@ def _extrinsics(calibration: Calibration) -> Table:
     table = new_table("LiDAR", *axis_headings("m", "deg"), "scans\nused")
     for name, result in calibration.lidars.items():
         cells = pose_cells(result.T_vehicle_lidar, result.cov, result.determined)
-        no_target = Text("no\ntarget", style="bold yellow")
-        scans = Text(str(result.scans_used)) if result.saw_target else no_target
+        known = result.has_data
+        scans = Text(scans_text(result), style="" if known else "bold yellow")
         table.add_row(Text(name), *map(_text, cells), scans)
     return table
 
@@ -152,6 +159,8 @@ def _times(stages: Sequence[StageRecord], seconds: float) -> Table:
     for stage in stages:
         taken = UNKNOWN if stage.seconds is None else f"{stage.seconds:.2f}"
         table.add_row(Text(f"{'  ' * stage.depth}{stage.name}"), taken, count_text(stage))
+    known = sum(round(s.seconds, 2) for s in stages if s.seconds is not None and s.depth == 0)
+    table.add_row("reading the config, writing the result", f"{seconds - known:.2f}", "")
     table.add_row("all", f"{seconds:.2f}", "", style="bold")
     return table
 

@@ -362,7 +362,7 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     return template.render(
         found=found,
         status=validation_status(found),
-        first_line=first_line(found),
+        unseen=UNSEEN,
         tables=tables(found),
         repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
         held_out_heads=HELD_OUT_HEADS,

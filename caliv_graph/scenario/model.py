@@ -7,6 +7,7 @@ determines, and `simulation` draws measurements.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,7 @@ from pydantic import Field, model_validator
 
 from caliv_graph.config.load import read_yaml, validated
 from caliv_graph.config.sections import NonNegative, Positive, Section
+from caliv_graph.errors import ConfigError
 from caliv_graph.scenario.drive_models import DriveModel
 from caliv_graph.scenario.sensor_models import (
     GnssModel,
@@ -139,7 +141,14 @@ def load_scenario(path: Path) -> Scenario:
     Raises:
         ConfigError: the file is missing, not YAML, or not valid.
     """
-    return parse_scenario(read_yaml(path), str(path))
+    raw = read_yaml(path)
+    if isinstance(raw, Mapping) and "lidars" in raw and not {"drive", "world"} & raw.keys():
+        raise ConfigError(
+            f"{path}: is a config of a recorded drive: it has neither 'drive' nor 'world', which a "
+            f"scenario has. 'caliv-graph observability {path}' tells what the recorded drive "
+            "determines. For a drive to come give a scenario, such as one of configs/scenarios"
+        )
+    return parse_scenario(raw, str(path))
 
 
 def dump_scenario(scenario: Scenario) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.products import IntArray
+from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import (
@@ -19,7 +20,6 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
-from caliv_graph.trajectory.smoothed import MERGE_NS
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -46,12 +46,13 @@ class NodeMeasurements:
 def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
     """Stamps (n,) of the nodes.
 
-    A node is at every `wanted` stamp (m,) (ascending, within the samples), at both ends, and at the
-    ends of gaps; further nodes lie evenly between them.
+    A node is at every `wanted` stamp (m,) (ascending, more than `MERGE_NS` apart, within the
+    samples) or within `MERGE_NS` of it, at both ends, and at the ends of gaps; further nodes lie
+    evenly between them.
     """
     begin, end = inertial.begin_ns, inertial.end_ns
     fixed = np.unique(np.concatenate([wanted, [begin, end], inertial.gaps_ns.ravel()]))
-    fixed = fixed[np.concatenate([[True], np.diff(fixed) > MERGE_NS])]
+    fixed = without_neighbours(fixed, MERGE_NS)
     if end - fixed[-1] <= MERGE_NS:
         fixed[-1] = end  # the span must not end before a stamp that lies within it
     duration_s = (end - begin) * 1e-9

@@ -14,15 +14,13 @@ from caliv_graph.conventions import key_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import cross, stack
 from caliv_graph.products import Array, IntArray, Trajectory
+from caliv_graph.readers.common_stamps import MERGE_NS
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
-
-MERGE_NS = 1_000
-"""Stamps closer than this share a node: at 50 m/s a vehicle moves by 0.05 mm."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
+from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.select import smooth_trajectories
-from caliv_graph.trajectory.smoothed import MERGE_NS, SmoothedTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
     Extrinsics,
@@ -156,11 +157,7 @@ def _nodes(
     """Times of the scans, ascending; times that share a node appear once."""
     taken = [extrinsics.true_ns(name, stamps) for name, stamps in chosen.items()]
     stamps = np.unique(np.clip(np.concatenate([*taken, np.zeros(0, dtype=np.int64)]), *span_ns))
-    out: list[int] = []
-    for stamp in stamps.tolist():
-        if not out or stamp - out[-1] > 2 * MERGE_NS:
-            out.append(stamp)
-    return np.array(out, dtype=np.int64)
+    return without_neighbours(stamps, 2 * MERGE_NS)
 
 
 def _measured(

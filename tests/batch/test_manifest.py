@@ -83,6 +83,16 @@ def test_plain_names_are_taken(tmp_path: Path, name: str) -> None:
     assert load(tmp_path, {"jobs": [{"name": name, "config": "c.yaml"}]})[0].name == name
 
 
+def test_a_name_of_digits_needs_no_quotes(tmp_path: Path) -> None:
+    text = "jobs: [{name: 2026-11-20, config: c}, {name: 0012, config: 7, data: [0001, 3]}]"
+
+    dated, numbered = load(tmp_path, text)
+
+    assert (dated.name, numbered.name) == ("2026-11-20", "0012")
+    assert numbered.config == tmp_path / "7"
+    assert numbered.data == (tmp_path / "0001", tmp_path / "3")
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -93,11 +103,7 @@ def test_plain_names_are_taken(tmp_path: Path, name: str) -> None:
         ("jobs: []", "'jobs': "),
         ("jobs: [{config: c.yaml}]", "'jobs.0.name' is missing"),
         ("jobs: [{name: mon}]", "job 'mon' has no config: give it 'config'"),
-        (
-            "jobs: [{name: 2026-11-20, config: c}]",
-            "'jobs.0.name': is not text in YAML: write it in",
-        ),
-        ("jobs: [{name: 12, config: c}]", "'jobs.0.name': is not text in YAML: write it in quotes"),
+        ("jobs: [{name: 1.5, config: c}]", "'jobs.0.name': is not text in YAML: write it in quote"),
         ("jobs: [{name: a, config: c}, {name: a, config: d}]", "job name 'a' is used twice"),
         ("jobs: [{name: a, config: c}, {name: A, config: d}]", "job name 'A' is used beside 'a'"),
         ("jobs: [{name: Summary.json, config: c}]", "'jobs.0.name': is the name of a file of the"),

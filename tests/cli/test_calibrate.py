@@ -164,7 +164,7 @@ def test_a_lidar_that_never_saw_the_target_is_exit_3(pipeline: Pipeline, config:
     result = calibrate(config, "--out", config.parent / "out")
 
     assert result.exit_code == 3
-    assert "never saw a target" in result.stdout
+    assert "saw neither target nor structure" in result.stdout
     front = read_calibration(config.parent / "out/calibration.yaml").lidars["front"]
     assert not any(front.determined.values())
 

@@ -12,7 +12,6 @@ from typer.testing import CliRunner, Result
 from caliv_graph.cli.main import app
 from caliv_graph.errors import ConfigError
 from caliv_graph.results.calibration_file import write_calibration
-from tests.cli.commands import run
 from tests.fusion.drives import arc_information, drive, information, shift
 
 NAMES = ("front", "rear")
@@ -106,14 +105,15 @@ def test_a_file_of_another_program(files: tuple[Path, Path]) -> None:
     assert document["conclusion"] == "LiDAR 'front' has moved."
 
 
-def test_what_cannot_be_compared(files: tuple[Path, Path], tmp_path: Path) -> None:
-    result = run("compare", files[0], files[0])
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == (
-        f"error: {files[0]}: stems from the same drive as {files[0]}, so it is no independent "
-        "measurement. Compare calibrations of two drives\n"
-    )
+def test_two_results_of_one_drive(files: tuple[Path, Path]) -> None:
+    result = compare(files[0], files[0])
 
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "results of one drive, and they agree" in " ".join(result.stdout.split())
+    assert len(json.loads(compare(files[0], files[0], "--json").stdout)["shared_data"]) == 1
+
+
+def test_what_cannot_be_compared(files: tuple[Path, Path], tmp_path: Path) -> None:
     files[1].write_text(files[1].read_text().replace("data_gradient: [", "data_gradient: [7.0, "))
     refused = compare(*files)
     assert isinstance(refused.exception, ConfigError)

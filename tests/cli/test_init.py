@@ -12,8 +12,9 @@ from caliv_graph.cli.main import app
 from caliv_graph.config.load import load_config
 from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.readers import open_recording
+from caliv_graph.workflows.caliv_config import are_radians
 from tests.cli.commands import write_drive
-from tests.readers.bags import START, cloud, fix, imu, livox, odometry, tf, write_bag
+from tests.readers.bags import START, cloud, fix, header, imu, livox, odometry, tf, write_bag
 
 ORIGINAL = """\
 number_of_sensors: 2
@@ -42,8 +43,9 @@ def test_guesses_of_a_caliv_config_beside_the_data(drive: Path, tmp_path: Path) 
 
     result = init(drive, "--out", out)
 
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert f"taken from {drive / 'original_config.yaml'}" in result.stdout
+    warning = f"warning: {out}: fill in before you calibrate: ground.vehicle_height\n"
+    assert (result.exit_code, result.stderr) == (0, warning)
+    assert f"taken from {drive / 'original_config.yaml'}\n" in result.stdout
     config = load_config(out)
     assert list(config.lidars) == ["sensor_1", "sensor_2"]
     assert config.lidars["sensor_1"].initial.xyz == (2.259, 0.0, 1.938)
@@ -53,7 +55,7 @@ def test_guesses_of_a_caliv_config_beside_the_data(drive: Path, tmp_path: Path) 
     assert config.target
     assert config.target[0].min == (10.0, -14.0, -5.0)
     assert config.target[0].max == (20.0, -4.0, 5.0)
-    assert "TODO" not in out.read_text()
+    assert out.read_text().count("TODO") == 1
     # The path in it leads from the config to the data.
     assert open_recording(config).lidars == ("sensor_1", "sensor_2")
 
@@ -66,13 +68,53 @@ def test_what_is_not_known_is_left_to_a_person(drive: Path, tmp_path: Path) -> N
     assert result.exit_code == 0
     assert result.stderr == (
         f"warning: {out}: fill in before you calibrate: lidars.sensor_1.initial, "
-        "lidars.sensor_2.initial, target\n"
+        "lidars.sensor_2.initial, target, ground.vehicle_height\n"
     )
     text = out.read_text()
-    assert text.count("TODO") == 3
+    assert text.count("TODO") == 4
     config = load_config(out)
     assert config.target is None
     assert config.lidars["sensor_1"].initial.xyz == (0.0, 0.0, 0.0)
+
+
+GMMCALIB = """\
+transform_sensor_1:
+  - [-0.3461248, 0.0165291, -0.0162606, 2.31205, 0.581505, 1.610277] #[roll, pitch, yaw, x, y z]
+transform_sensor_2:
+  - [0.3551248, 0.0165291, 3.1415927, 2.311906, -0.664888, 1.612698]
+"""
+
+
+def test_angles_in_radians_in_the_folder_of_configs(drive: Path, tmp_path: Path) -> None:
+    """As GMMCalib has them; CaLiV's keys are the same, its angles degrees."""
+    (drive / "config").mkdir()
+    (drive / "config/config.yaml").write_text(GMMCALIB)
+    out = tmp_path / "config.yaml"
+
+    result = init(drive, "--out", out)
+
+    assert "config.yaml, whose angles are radians by their size" in result.stdout
+    first, second = (load_config(out).lidars[f"sensor_{n}"].initial for n in (1, 2))
+    # 0.3461248 * 180 / pi and so on.
+    assert first.rpy_deg == pytest.approx((-19.831491, 0.947048, -0.931664), abs=1e-5)
+    assert first.xyz == (2.31205, 0.581505, 1.610277)
+    assert second.rpy_deg == pytest.approx((20.347153, 0.947048, 180.0), abs=1e-5)
+    assert "angles in radians there by their size: check them" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("angles", "radians"),
+    [
+        ([(0.0, 10.0, 0.0), (0.0, 10.0, 180.0)], False),
+        ([(0.0, 0.1745, 0.0), (0.0, 0.1745, 3.1416)], True),
+        ([(-0.346, 0.0165, -0.0163), (0.355, 0.0165, 0.0061)], True),
+        # Radians of pitch end at 1.57.
+        ([(0.0, 2.0, 0.0), (0.0, 1.5, 0.0)], False),
+        ([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)], False),
+    ],
+)
+def test_the_unit_of_angles_by_their_size(angles: list[Any], radians: bool) -> None:
+    assert are_radians(angles) is radians
 
 
 def test_every_key_is_commented(drive: Path, tmp_path: Path) -> None:
@@ -182,6 +224,8 @@ def test_a_config_of_a_bag(tmp_path: Path, kind: str) -> None:
     assert (topics.imu, topics.gnss, topics.twist) == ("/imu/data", "/fix", "/odom")
     assert topics.pose is None
     assert config.imu.T_vehicle_imu.xyz == (0.5, 0.0, 0.25)
+    # base_footprint is the point of the ground below the vehicle (REP-120).
+    assert (config.ground.vehicle_height, config.ground.sigma) == (0.5, 0.005)
     text = out.read_text()
     assert text.count("TODO") == 1
     assert "  # imu: /livox/imu" in text
@@ -219,7 +263,7 @@ def test_extrinsics_from_a_urdf(tmp_path: Path) -> None:
 
     assert result.exit_code == 0
     assert "Initial guesses of front taken from car.urdf" in result.stdout
-    assert "lidars.rear.initial, imu.T_vehicle_imu, gnss.lever_arm" in result.stderr
+    assert "lidars.rear.initial, imu.T_vehicle_imu, gnss.lever_arm, ground" in result.stderr
     front = load_config(out).lidars["front"].initial
     assert (front.xyz, front.rpy_deg) == ((1.5, 0.0, 2.0), (0.0, 0.0, 90.0))
     assert "car.urdf does not lead from chassis to lidar_rear" in out.read_text()
@@ -249,6 +293,79 @@ def test_a_bag_without_extrinsics(tmp_path: Path) -> None:
     assert "lidars.front.initial, lidars.rear.initial, imu.T_vehicle_imu, gnss" in result.stderr
     assert load_config(out).lidars["front"].initial.xyz == (0.0, 0.0, 0.0)
     assert "(the bag, which has no /tf_static, has no frame base_link)" in out.read_text()
+    # Zeros would say that the IMU's axes are the vehicle's; what is not known is estimated.
+    assert load_config(out).imu.T_vehicle_imu.rpy_deg is None
+    assert load_config(out).gnss.lever_arm is None
+    assert load_config(out).ground.vehicle_height is None
+
+
+def test_an_imu_in_the_frame_of_the_vehicle_is_there_already(tmp_path: Path) -> None:
+    messages = [
+        ("/points", START, cloud(START, [[1, 2, 3]], frame_id="os_sensor")),
+        ("/imu/data", START, imu(START, frame_id="base_link")),
+        ("/fix", START, fix(START) | {"header": header(START, "/base_link")}),
+    ]
+    out = tmp_path / "config.yaml"
+
+    result = init(write_bag(tmp_path / "drive", messages), "--out", out)
+
+    assert "calibrate: lidars.lidar.initial, ground.vehicle_height\n" in result.stderr
+    config = load_config(out)
+    assert config.imu.T_vehicle_imu.rpy_deg == (0.0, 0.0, 0.0)
+    assert config.gnss.lever_arm == (0.0, 0.0, 0.0)
+    assert "its frame base_link is that of the vehicle" in out.read_text()
+
+
+def test_frames_are_matched_by_their_names_as_export_does(tmp_path: Path) -> None:
+    """Clouds in `front` and `rear`, of which the tree knows `lidar_front_link` and two rears."""
+    links = tf(
+        ("base_link", "lidar_front_link", (2.0, 0.0, 1.8), PITCHED),
+        ("base_link", "rear_left_link", (-1.0, 0.5, 1.8), NONE),
+        ("base_link", "rear_right_link", (-1.0, -0.5, 1.8), NONE),
+        ("base_footprint", "base_link", (0, 0, 0.31), NONE),
+    )
+    messages = [
+        ("/tf_static", START, links),
+        ("/front/points", START, cloud(START, [[1, 2, 3]], frame_id="front")),
+        ("/rear/points", START, cloud(START, [[1, 2, 3]], frame_id="rear")),
+        ("/odom", START, odometry(START, (0, 0, 0))),
+    ]
+    out = tmp_path / "config.yaml"
+
+    result = init(write_bag(tmp_path / "drive", messages), "--out", out)
+
+    assert "Initial guesses of front taken from /tf_static" in result.stdout
+    assert "calibrate: lidars.rear.initial\n" in result.stderr
+    front = load_config(out).lidars["front"].initial
+    assert (front.xyz, front.rpy_deg) == ((2.0, 0.0, 1.8), (0.0, 10.0, 0.0))
+    assert "base_link to lidar_front_link (by its name that of front)" in out.read_text()
+    assert load_config(out).ground.vehicle_height == 0.31
+
+
+@pytest.mark.parametrize(
+    ("link", "height"),
+    [
+        (("base_footprint", "base_link", (0, 0, 0.4), NONE), 0.4),
+        (("base_link", "base_footprint", (0.1, 0, -0.4), NONE), 0.4),
+        (("base_link", "base_footprint", (0, 0, -0.4), PITCHED), None),
+        (("base_link", "ground", (0, 0, -0.35), NONE), 0.35),
+        (("base_footprint", "base_link", (0, 0, 40.0), NONE), None),
+        (("base_footprint", "mast", (0, 0, 1.0), NONE), 0.0),
+        (("base_link", "mast", (0, 0, 1.0), NONE), None),
+    ],
+)
+def test_the_height_of_the_vehicle_frame_from_frames_on_the_ground(
+    tmp_path: Path, link: Any, height: float | None
+) -> None:
+    messages = [
+        ("/tf_static", START, tf(link)),
+        ("/points", START, cloud(START, [[1, 2, 3]], frame_id="base_link")),
+    ]
+    out = tmp_path / "config.yaml"
+
+    init(write_bag(tmp_path / "drive", messages), "--out", out)
+
+    assert load_config(out).ground.vehicle_height == height
 
 
 def test_extrinsics_repeated_on_tf(tmp_path: Path) -> None:

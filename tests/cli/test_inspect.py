@@ -52,6 +52,23 @@ def test_the_folder_itself_or_the_one_around_it(tmp_path: Path) -> None:
     assert outer["lidars"] == inner["lidars"]
 
 
+def test_guesses_that_nobody_filled_in(tmp_path: Path) -> None:
+    """The drive is shown, and the target is not searched for with the zeros of a draft."""
+    zeros = {"initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 0]}}
+    lidars = {name: {"topic": f"sensor_{n}", **zeros} for n, name in ((1, "left"), (2, "right"))}
+    config = write_config(tmp_path / "config.yaml", lidars=lidars)
+
+    result = inspect(write_drive(tmp_path / "drive"), "--config", config, "--json")
+
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["targets"] is None
+    assert result.stderr.startswith(
+        f"warning: {config}: lidars.left.initial and lidars.right.initial are all zeros"
+    )
+    assert "errors of 0.1 m and 3 degrees are fine" in result.stderr
+    assert "not searched for" in result.stderr
+
+
 def test_a_table(tmp_path: Path) -> None:
     result = inspect(write_drive(tmp_path / "drive"))
 

@@ -159,10 +159,13 @@ def test_version() -> None:
         (["calibrate", "a.yaml", "--out"], "error: Option '--out' requires an argument"),
         (["evaluate", "a", "b", "c"], "error: Got unexpected extra argument"),
         (["evaluate", "nowhere.yaml", "b"], "error: nowhere.yaml: no such file\n"),
-        (["inspect", "nowhere"], "error: nowhere: no such folder"),
+        (["inspect", "nowhere"], "error: nowhere: no such file or folder. Give a bag (.bag, "),
         (["inspect", "drive.mcap"], "error: drive.mcap: no such file or folder"),
-        (["init", "nowhere", "--out", "c.yaml"], "error: nowhere: no such folder"),
-        (["calibrate", "nowhere.yaml", "--out", "o"], "error: nowhere.yaml: no such file\n"),
+        (["init", "nowhere", "--out", "c.yaml"], "error: nowhere: no such file or folder. Give a "),
+        (
+            ["calibrate", "nowhere.yaml", "--out", "o"],
+            "error: nowhere.yaml: no such file. 'caliv-graph init DRIVE --out nowhere.yaml' drafts",
+        ),
     ],
 )
 def test_bad_usage_is_one_line(

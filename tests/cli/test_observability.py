@@ -86,6 +86,16 @@ def test_the_same_drive_twice_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFi
     assert "given twice" in capsys.readouterr().err
 
 
+def test_guesses_that_nobody_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive = write_drive(tmp_path / "drive")
+
+    assert run(["init", str(drive), "--out", str(tmp_path / "config.yaml")]) == 0
+    capsys.readouterr()
+
+    assert run(["observability", str(tmp_path / "config.yaml")]) == 2
+    assert "lidars.sensor_1.initial and lidars.sensor_2.initial" in capsys.readouterr().err
+
+
 def test_a_missing_config_is_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["observability", "nowhere.yaml"]) == 2
     assert "nowhere.yaml: no such file" in capsys.readouterr().err

@@ -35,13 +35,11 @@ def bomb(levels: int) -> str:
         (bomb(12), "aliases expand to"),
         ("a: &a {b: *a}\n", "'*a' contains itself"),
         ("a: &a [*a]\n", "'*a' contains itself"),
-        ("a: 0x" + "f" * 5000, "a number of 5002 digits"),
         ("a: " + "9" * 5000, "a number of 5000 digits"),
-        ("a: 1" + ":59" * 2000, "a number of 6001 digits"),
         ("a: !!int ''", "does not fit its type"),
         ("a: !!timestamp now", "does not fit its type"),
         ("a: !!map x", "expected a mapping node"),
-        ("a: 2001-99-99", "month must be in 1..12"),
+        ("a: !!timestamp 2001-99-99", "month must be in 1..12"),
         ("a: !!python/object/apply:os.system [exit]", "could not determine a constructor"),
         ("? [a]\n: 1", "unhashable"),
         ("? &a [*a]\n: 1", "contains itself"),
@@ -78,6 +76,19 @@ def test_what_people_and_programs_write_is_read() -> None:
     assert parse_yaml("") is None
 
 
+@pytest.mark.parametrize(
+    "name", ["0001", "2024_05_01", "2024-05-01", "2024-05-01 12:30:00", "12:30:00", "0x1F", "0o17"]
+)
+def test_names_of_folders_stay_text(name: str) -> None:
+    assert parse_yaml(f"path: {name}") == {"path": name}
+
+
+def test_numbers_are_numbers() -> None:
+    text = "[0, 7, -12, +3, 2024, 1.5, -0.0, 1e3, 1.0e+3, .inf, 00.5]"
+
+    assert parse_yaml(text) == [0, 7, -12, 3, 2024, 1.5, 0.0, "1e3", 1000.0, float("inf"), 0.5]
+
+
 def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_bytes(b"\xef\xbb\xbflidars: 1\n")
@@ -90,6 +101,6 @@ def test_no_line_is_named_where_none_is_known(tmp_path: Path) -> None:
     path.write_text("a: 1\nb: [1, 2\n")
     with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML in line 3: did not find"):
         read_yaml(path)
-    path.write_text("a: 2001-99-99\n")
+    path.write_text("a: !!int ''\n")
     with pytest.raises(ConfigError, match=r"config\.yaml: not valid YAML: a value does not"):
         read_yaml(path)

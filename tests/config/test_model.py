@@ -253,8 +253,8 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "empty.yaml").write_text("")
 
     for name, part in {
-        "nowhere.yaml": "no such file",
-        ".": "is a folder, expected a YAML file",
+        "nowhere.yaml": "no such file. 'caliv-graph init DRIVE --out",
+        ".": "is a folder, expected a YAML file. 'caliv-graph init",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",
         "empty.yaml": "holds no configuration",
@@ -263,6 +263,31 @@ def test_files_that_are_none(tmp_path: Path) -> None:
             load_config(tmp_path / name)
         assert part in str(caught.value)
         assert str(caught.value).startswith(str(tmp_path))
+
+
+def test_the_folder_of_a_config_leads_to_it(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("lidars: {}")
+
+    with pytest.raises(ConfigError, match=r"is a folder\. Give .*config\.yaml"):
+        load_config(tmp_path)
+
+
+def test_names_of_digits_are_text(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text(
+        "data: {path: 0001}\nreference: 2\n"
+        "lidars: {2: {topic: 7, initial: {xyz: [0, 0, 1]}}, "
+        "03: {topic: a, initial: {xyz: [1, 0, 1]}}}"
+    )
+
+    config = load_config(path)
+
+    assert config.data.path == tmp_path / "0001"
+    assert list(config.lidars) == ["2", "03"]
+    assert (config.reference, config.lidars["2"].topic) == ("2", "7")
+    path.write_text("data: {path: 1.50}\nlidars: {a: {topic: a, initial: {xyz: [0, 0, 1]}}}")
+    with pytest.raises(ConfigError, match=r"'data\.path': is not text in YAML: write it in quotes"):
+        load_config(path)
 
 
 def keys_of(model: type[BaseModel], at: str = "") -> Iterator[str]:

@@ -58,7 +58,7 @@ def test_caveats() -> None:
     ]
     never = unseen(calibration, "rear")
     assert caveats(request(never), ["rear"]) == [
-        "LiDAR 'rear' never saw a target: its extrinsic is the initial guess"
+        "LiDAR 'rear' saw neither target nor structure: it keeps the initial guess"
     ]
     wrong = replace(calibration, status="inconsistent")
     assert "status inconsistent" in caveats(request(wrong), [])[0]

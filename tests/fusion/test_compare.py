@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import gtsam
@@ -9,6 +10,7 @@ from scipy.stats import kstest
 
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import Comparison, Movement, compare, holm
+from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration
 from tests.fusion.drives import (
@@ -185,7 +187,7 @@ def test_only_what_both_saw_is_compared() -> None:
 
     assert (list(found.lidars), found.pairs) == (["rear"], ())
     assert found.not_compared == {
-        "front": "it saw no target in the second calibration",
+        "front": "it saw nothing in the second calibration",
         "left": "the first calibration does not have it",
     }
 
@@ -194,13 +196,32 @@ def test_calibrations_that_cannot_be_compared() -> None:
     D = information(NAMES)
     first = drive(D, source="a")
 
-    with pytest.raises(ConfigError, match=r"b\.yaml: stems from the same drive as a\.yaml"):
-        compared(first, drive(D, source="a"))
     others = drive(information(("left",)), ("left",), source="b")
     with pytest.raises(
         ConfigError, match=r"b\.yaml: has none of the LiDARs of a\.yaml \(front, re"
     ):
         compared(first, others)
+
+
+def test_two_results_of_one_drive_are_compared_and_that_is_said() -> None:
+    D = information(NAMES)
+    first = drive(D, source="a")
+    turned = shift(NAMES, "front", pitch=math.radians(0.5))
+
+    alike, apart = compared(first, first), compared(first, drive(D, source="a", error=turned))
+
+    assert len(alike.shared) == len(apart.shared) == 1
+    assert not alike.moved
+    assert "results of one drive, and they agree" in alike.conclusion
+    assert apart.moved
+    assert "differ by more than their sigmas: 'front', 'front' against 'rear'" in apart.conclusion
+    assert "No mount has moved" in apart.conclusion
+    # A drive of its own beside the shared one can show a movement.
+    both = merge({"a": first, "b": drive(D, source="b")}).calibration
+    found = compared(first, both)
+    assert found.shared == alike.shared
+    assert "share data of a drive" in found.conclusion
+    assert compared(first, drive(D, source="b")).shared == ()
 
 
 @pytest.mark.parametrize("arcs", [False, True])

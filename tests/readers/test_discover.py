@@ -165,8 +165,19 @@ def test_all_of_a_bag(tmp_path: Path) -> None:
 
 
 def test_what_is_neither(tmp_path: Path) -> None:
-    assert not is_recorded_bag(tmp_path)
-    with pytest.raises(RecordingError, match="no such folder"):
-        open_all(tmp_path / "nowhere")
-    with pytest.raises(RecordingError, match=r"nowhere\.bag: no such file"):
-        open_all(tmp_path / "nowhere.bag")
+    (tmp_path / "config.yaml").write_text("lidars: {}")
+    (tmp_path / "notes.txt").write_text("rain")
+    (tmp_path / "empty").mkdir()
+    bag = write_bag(tmp_path / "day/drive", [("/p", START, cloud(START, [[1, 2, 3]]))])
+
+    for name, said in {
+        "nowhere": r"nowhere: no such file or folder\. Give a bag",
+        "nowhere.bag": r"nowhere\.bag: no such file or folder\. Give a bag",
+        "config.yaml": "a YAML file, not a drive. Give the drive itself, which data.path",
+        "notes.txt": "is not a bag",
+        "empty": "holds neither a bag",
+        "day": f"holds drives. Give {bag}",
+    }.items():
+        for read in (is_recorded_bag, open_all):
+            with pytest.raises(RecordingError, match=said):
+                read(tmp_path / name)

@@ -96,6 +96,7 @@ def validation(held: HeldOutStructure) -> Validation:
 def test_the_page_and_the_json_name_every_held_out_strip() -> None:
     found = validation(held_out())
     page = render_validation(found, None, 0.001)
+    assert f"<strong>{found.verdict.word}</strong>" in page.split("<table")[0]
     for number in (1, 2, 3):
         assert f"strip {number}" in page
     assert "wall that faces west" in page

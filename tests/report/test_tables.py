@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from caliv_graph.common.progress import SilentProgress
+from caliv_graph.common.progress import SilentProgress, StageRecord
 from caliv_graph.report.inspection import (
     DriveSummary,
     Inspection,
@@ -99,10 +99,35 @@ def test_a_lidar_that_never_saw_the_target_pretends_nothing() -> None:
 
     row, below = cells(lines, "left"), cells_below(lines, "left")
     assert all(cell.startswith("(") for cell in row[:6])
-    assert row[6:] == ["no"]
-    assert below == ["held"] * 6 + ["target"]
-    assert "  - LiDAR 'left' never saw a target: its extrinsic is the initial guess" in lines
+    assert row[6:] == ["none"]
+    assert below == ["held"] * 6
+    said = "  - LiDAR 'left' saw neither target nor structure: it keeps the initial guess"
+    assert said in lines
     assert all(cell.startswith("(") for cell in cells(lines, "front", after="Sensor to sensor")[:6])
+
+
+def test_a_lidar_that_saw_structure_alone_used_no_scans_of_a_target() -> None:
+    calibration = make_calibration("front", "left", "rear")
+    left = replace(calibration.lidars["left"], saw_target=False, saw_structure=True)
+    calibration = replace(calibration, lidars={**calibration.lidars, "left": left})
+
+    lines = rendered(calibration_table(calibration, [], 1.0))
+
+    assert cells(lines, "left")[6:] == ["structure"]
+    assert "target" not in " ".join(lines)
+
+
+def test_the_times_of_the_stages_add_up() -> None:
+    inner = StageRecord("reading", None, 1, seconds=1.5)
+    stages = [StageRecord("searching", 3, 0, 3, seconds=2.004), inner]
+    stages.append(StageRecord("solving", None, 0, seconds=4.25))
+
+    lines = rendered(calibration_table(make_calibration(), stages, 9.0))
+
+    start = next(i for i, line in enumerate(lines) if line.startswith("stage"))
+    seconds = {line[:30].strip(): float(line.split()[-1]) for line in lines[start + 5 :]}
+    assert lines[start + 2].split() == ["searching", "2.00", "3/3"]
+    assert seconds == {"reading the config, writing th": 2.75, "all": 9.0}
 
 
 def test_what_was_asked_for_and_not_reached_is_said() -> None:

@@ -10,6 +10,7 @@ from caliv_graph.errors import ConfigError
 from caliv_graph.scenario.drive_models import ArcDrive, FigureEightDrive
 from caliv_graph.scenario.model import Scenario, dump_scenario, load_scenario, parse_scenario
 from caliv_graph.scenario.world import make_world
+from tests.cli.commands import write_config
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -224,3 +225,10 @@ def test_other_drives_and_objects_can_be_described() -> None:
         scenario = parse_scenario({**minimal(), "drive": drive}, "scenario.yaml")
         assert isinstance(scenario, Scenario)
         assert scenario.drive.kind == drive["kind"]
+
+
+def test_the_config_of_a_recorded_drive_leads_to_observability(tmp_path: Path) -> None:
+    path = write_config(tmp_path / "config.yaml")
+
+    with pytest.raises(ConfigError, match=r"'caliv-graph observability .*config\.yaml' tells"):
+        load_scenario(path)

@@ -16,6 +16,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, MotionData
 from caliv_graph.trajectory.factors import marginal_factor
+from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import (
@@ -518,6 +519,18 @@ def test_noise_is_taken_from_messages_and_config_and_said() -> None:
     assert configured.trajectory.cov is not None
     assert messages.trajectory.cov[40, 5, 5] > 1.5 * table.trajectory.cov[40, 5, 5]
     np.testing.assert_allclose(configured.trajectory.cov, table.trajectory.cov, rtol=0.02)
+
+
+def test_a_node_at_a_gap_costs_no_scan_its_own() -> None:
+    """A scan 0.6 us after a gap's end, which is 0.7 us after another scan."""
+    motion = record(Course(arc_drive(5.0)), Sensors(), 1)
+    inertial = smooth_trajectory(motion, config_for(Sensors()), []).inertial
+    first = int(inertial.stamps_ns[200])
+    gap = np.array([[first - 200_000_000, first + 700]])
+
+    nodes = place_nodes(replace(inertial, gaps_ns=gap), np.array([first, first + 1_300]))
+
+    assert {first, first + 1_300} <= set(nodes.tolist())
 
 
 def test_stamps_a_breath_apart_share_a_node() -> None:

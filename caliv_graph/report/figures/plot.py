@@ -33,6 +33,7 @@ class Plot:
     Attributes:
         data: traces, in the order in which they are drawn.
         layout: by key.
+        across: panels side by side; a narrow screen shows them one below another.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class Plot:
         self.data: list[dict[str, Any]] = []
         self.layout: dict[str, Any] = {}
         self._panels = max(len(titles), 1)
+        self.across = 1 if stacked else self._panels
         self._solid = solid
         if titles:
             self._divide(titles, stacked, spacing)

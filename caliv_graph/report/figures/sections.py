@@ -54,7 +54,8 @@ def _targets(calibration: Calibration, solution: Solution) -> list[Figure]:
     out = []
     for placement in range(len(solution.registrations)):
         solid, flat = target_figures(placement, solution, calibration)
-        out += [solid, flat] if placement < MOST_SOLID else [flat]
+        # The flat one first: it has a first picture, which is there at once.
+        out += [flat, solid] if placement < MOST_SOLID else [flat]
     return out
 
 

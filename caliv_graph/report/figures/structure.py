@@ -56,8 +56,8 @@ def validation_figures(found: Validation) -> list[Figure]:
         out.append(
             Figure(
                 f"pole-{number}",
-                f"{surface.name} from above, {2e3 * pole.radius_m:.0f} mm thick. It is a ring if "
-                "the extrinsics are right.",
+                f"{surface.name} from above, {2e3 * pole.radius_m:.0f} mm thick. All colours lie "
+                "on one outline, round or square as the post is, if the extrinsics are right.",
                 figure,
             )
         )

@@ -23,7 +23,13 @@ from caliv_graph.conventions import AXES, NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Calibration, Direction, LidarResult, NoiseLevel, Solution
-from caliv_graph.report.numbers import SHOWN_AXES, fixed, pair_cells, pose_cells, two_digits
+from caliv_graph.report.numbers import (
+    SHOWN_AXES,
+    fixed,
+    pair_cells,
+    pose_cells,
+    two_digits,
+)
 from caliv_graph.report.page import environment, script_data
 from caliv_graph.report.residuals import CloudVerdict, all_residuals, down_weighted
 from caliv_graph.report.surfaces import MOST_ROWS, SURFACE_HEADS, surface_rows
@@ -173,7 +179,9 @@ def extrinsic_row(result: LidarResult) -> dict[str, Any]:
     """The row of one LiDAR in a table of extrinsics: a cell per axis, scans, time offset."""
     offset = result.time_offset
     return {
-        "cells": pose_cells(result.T_vehicle_lidar, result.cov, result.determined),
+        "cells": pose_cells(
+            result.T_vehicle_lidar, result.cov, result.determined, not result.without_guess
+        ),
         "scans": str(result.scans_used) if result.saw_target else "no target",
         "offset": None if offset is None else f"{1e3 * offset[0]:+.2f} ± {1e3 * offset[1]:.2f} ms",
         "estimated": not (result.guess is not None and result.guess.fixed),

@@ -13,7 +13,14 @@ from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
-from caliv_graph.report.numbers import SHOWN_AXES, Cell, fixed, pair_cells, pose_cells
+from caliv_graph.report.numbers import (
+    NO_VALUE,
+    SHOWN_AXES,
+    Cell,
+    fixed,
+    pair_cells,
+    pose_cells,
+)
 from caliv_graph.wording.suspects import suspect_row
 from caliv_graph.wording.vehicle import vehicle_text
 
@@ -49,11 +56,20 @@ def calibration_table(
             "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
             _sensor_to_sensor(calibration),
         )
-    if not all(all(result.determined.values()) for result in calibration.lidars.values()):
+    open_ = [r for r in calibration.lidars.values() if not all(r.determined.values())]
+    if not all(result.without_guess for result in open_):
         parts.append(
             Text(
                 f"{_HELD}: this drive does not determine the axis; the value in brackets comes "
                 "from the initial guess.",
+                style="yellow",
+            )
+        )
+    if any(result.without_guess for result in open_):
+        parts.append(
+            Text(
+                f"{NO_VALUE}: this drive does not determine the axis, and no initial guess was "
+                "given.",
                 style="yellow",
             )
         )
@@ -110,7 +126,9 @@ def direction_texts(directions: Iterable[Direction]) -> list[str]:
 def _extrinsics(calibration: Calibration) -> Table:
     table = new_table("LiDAR", *axis_headings("m", "deg"), "scans\nused")
     for name, result in calibration.lidars.items():
-        cells = pose_cells(result.T_vehicle_lidar, result.cov, result.determined)
+        cells = pose_cells(
+            result.T_vehicle_lidar, result.cov, result.determined, not result.without_guess
+        )
         no_target = Text("no\ntarget", style="bold yellow")
         scans = Text(str(result.scans_used)) if result.saw_target else no_target
         table.add_row(Text(name), *map(_text, cells), scans)
@@ -135,7 +153,7 @@ def _sensor_to_sensor(calibration: Calibration) -> Table:
 def _text(cell: Cell) -> Text:
     if cell.determined:
         return Text(f"{cell.value}\n±{cell.sigma}")
-    return Text(f"{cell.value}\n{_HELD}", style="yellow")
+    return Text(f"{cell.value}\n{'' if cell.value == NO_VALUE else _HELD}", style="yellow")
 
 
 def _offset_texts(calibration: Calibration) -> list[str]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.config.guesses import search_sigmas
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
@@ -224,9 +224,8 @@ def _why_none_stands(
 
 def _guesses(config: Config) -> dict[str, tuple[gtsam.Pose3, Array]]:
     """LiDAR -> its guess and the guess's sigmas."""
-    return {
-        name: (lidar.guess(), search_sigmas(config, name)) for name, lidar in config.lidars.items()
-    }
+    of = {name: configured_guess(config, name) for name in config.lidars}
+    return {name: (guess.T_vehicle_lidar, guess.sigmas) for name, guess in of.items()}
 
 
 def _different(candidates: Sequence[TriedCandidate], found: Sequence[Agreement]) -> list[int]:

@@ -12,7 +12,7 @@ from caliv_graph.config.model import (
     PoseConfig,
     PoseSigmaConfig,
 )
-from caliv_graph.products import Array, Guess
+from caliv_graph.products import Guess
 
 DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
 """(6,) 1 sigma of a guess for which nothing is stated: the defaults of the config."""
@@ -22,12 +22,10 @@ TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
 any drive determines, and still an invertible covariance."""
 
 
-UNKNOWN_SIGMAS = np.array([np.pi] * 3 + [10.0] * 3)
-"""(6,) sigmas of an extrinsic of which nobody said anything: any rotation, within 10 m."""
-
 FOUND_SIGMA = PoseSigmaConfig(xyz=0.2, rpy_deg=2.0)
 """How far off a mounting is that was found in the drive, where the drive determines it: a cell of
-the finest grid, and what that turns at 10 m. For gates and searches, never as evidence."""
+the finest grid, and what that turns at 10 m. What the drive tells no better than half of this is
+undetermined, and then the covariance knows nothing of it (`products.Guess.found`)."""
 
 
 def with_found_of(config: Config, other: Config) -> Config:
@@ -40,24 +38,14 @@ def with_found_of(config: Config, other: Config) -> Config:
 
 
 def configured_guess(config: Config, name: str) -> Guess:
-    """The initial guess of a LiDAR as evidence: as the config states it.
-
-    What was found in the drive itself is no evidence beside the drive.
+    """The initial guess of a LiDAR, as the config states it, or as it was found in the drive.
 
     Raises:
         ConfigError: there is none.
     """
     lidar = config.lidars[name]
-    if isinstance(lidar, FoundLidarConfig):
-        return Guess(lidar.guess(), UNKNOWN_SIGMAS, found=True)
     sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
-    return Guess(lidar.guess(), sigmas, lidar.fixed)
-
-
-def search_sigmas(config: Config, name: str) -> Array:
-    """(6,) how far off the guess of a LiDAR may be, 1 sigma, vehicle axes: for gates."""
-    lidar = config.lidars[name]
-    return TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
+    return Guess(lidar.guess(), sigmas, lidar.fixed, isinstance(lidar, FoundLidarConfig))
 
 
 def with_guess(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Config:

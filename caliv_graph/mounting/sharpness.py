@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
 
 Complex = npt.NDArray[np.complex128]
 """Places x + iy."""
@@ -42,8 +42,10 @@ CENTRAL = 0.3
 """Part that a mounting at `REACH_M` loses, one at half of it a quarter of that. Where mountings fit
 alike, as on an arc, the one near the origin is taken."""
 
-GRID = 256
-"""Cells along each side of the grid, which repeats beyond: 64 m with the finest cells."""
+REPEATS_M = 128.0
+MOST_CELLS = 256
+"""The grid repeats after this length, or so many cells: what is farther apart falls together by
+chance, alike for all mountings."""
 
 NEIGHBOURS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -102,8 +104,8 @@ def sharpest(own: Sightings, others: Sequence[tuple[Sightings, Array]] = ()) -> 
         places = own.in_map(mounting)
         pairs = 0.0
         for offset, known in zip((0.0, 0.5), grids[cell], strict=True):
-            count = _counts(places, cell, offset)
-            pairs += float(count @ (count + 2.0 * known))
+            at = _cell_of(places, cell, offset)
+            pairs += float((np.bincount(at)[at] + 2 * known[at]).sum())
         far = (mounting[1] ** 2 + mounting[2] ** 2) / REACH_M**2
         return pairs * (1.0 - CENTRAL * float(far))
 
@@ -133,22 +135,32 @@ def _coarse(cell: float) -> Array:
     return np.asarray(grid[np.hypot(grid[:, 1], grid[:, 2]) <= REACH_M])
 
 
-def _known(others: Sequence[tuple[Sightings, Array]], cell: float) -> list[Array]:
+def _known(others: Sequence[tuple[Sightings, Array]], cell: float) -> list[IntArray]:
     """Points of the other LiDARs in each cell of the two grids."""
     return [
         sum(
-            (_counts(of.in_map(mounting), cell, offset) for of, mounting in others),
-            np.zeros(GRID * GRID),
+            (
+                np.bincount(_cell_of(of.in_map(mounting), cell, offset), minlength=_side(cell) ** 2)
+                for of, mounting in others
+            ),
+            np.zeros(_side(cell) ** 2, dtype=np.int64),
         )
         for offset in (0.0, 0.5)
     ]
 
 
-def _counts(places: Complex, cell: float, offset: float) -> Array:
-    """Number of places (n,), x + iy, in each cell (GRID * GRID,)."""
-    column = np.floor(places.real / cell + offset).astype(np.int64) % GRID
-    row = np.floor(places.imag / cell + offset).astype(np.int64) % GRID
-    return np.bincount(column * GRID + row, minlength=GRID * GRID).astype(np.float64)
+def _side(cell: float) -> int:
+    """Number of cells along a side of the grid."""
+    return min(round(REPEATS_M / cell), MOST_CELLS)
+
+
+def _cell_of(places: Complex, cell: float, offset: float) -> IntArray:
+    """The cell of each place (n,), x + iy."""
+    side = _side(cell)
+    column = np.floor(places.real / cell + offset).astype(np.int64) % side
+    row = np.floor(places.imag / cell + offset).astype(np.int64) % side
+    cells: IntArray = column * side + row
+    return cells
 
 
 def _apart(mountings: Array, sharpness: Array, cell: float, most: int) -> Found:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.config.guesses import configured_guess, search_sigmas
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
@@ -80,7 +80,7 @@ def aligned_start(
     config: Config,
 ) -> Mapping[str, gtsam.Pose3]:
     """T_vehicle_lidar at which the strips are found first, from rough ones; trusted ones stay."""
-    sigmas = {name: search_sigmas(config, name) for name in config.lidars}
+    sigmas = {name: configured_guess(config, name).sigmas for name in config.lidars}
     held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
     return align_patches(patches, trajectories, start, held).T_vehicle_lidar
 

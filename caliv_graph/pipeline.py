@@ -20,10 +20,12 @@ from caliv_graph.calibration.structure_evidence import (
 )
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.guesses import with_found_of
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, TargetError, TrajectoryError
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
+from caliv_graph.mounting.place import Placement, place_lidars
 from caliv_graph.physics import (
     check_clouds,
     contradicted,
@@ -54,6 +56,7 @@ from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.wording.mounting import placement_sentence
 from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
 from caliv_graph.wording.suspects import motion_sentence
 
@@ -106,7 +109,7 @@ def prepare(
     recordings = [with_common_stamps(recording) for recording in recordings]
     raw = raw_findings(motions, config)
     raise_fatal(raw)
-    rough, findings, search = _searched(recordings, config, motions, raw, progress)
+    rough, findings, search, placements = _searched(recordings, config, motions, raw, progress)
     config, misplaced, observations, no_target = search
     patches = _patches(recordings, rough, config, progress)
     kept = kept_stamps(patches)
@@ -126,6 +129,7 @@ def prepare(
         del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(recordings, config, stamps, motions)
     warnings = [w for r in recordings for w in r.warnings()]
+    warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]
     warnings += [w for o in observations for w in o.warnings]
     if no_target is not None:
@@ -154,26 +158,29 @@ def _searched(
     motions: Mapping[int, MotionData],
     raw: tuple[Finding, ...],
     progress: Progress,
-) -> tuple[Sequence[VehicleTrajectory], tuple[Finding, ...], Search]:
-    """The rough trajectories, all findings (`raw` first), and what the search for targets found.
+) -> tuple[Sequence[VehicleTrajectory], tuple[Finding, ...], Search, tuple[Placement, ...]]:
+    """The rough trajectories, all findings (`raw` first), the targets, and found mountings.
 
     Raises:
+        ConfigError: a LiDAR has no guess, and the drive does not show its mounting.
         TrajectoryError: the motion data are unusable.
         TargetError: no target was found, and the config does without structure or gives a region.
     """
     rough: Sequence[VehicleTrajectory] = ()
     findings = raw
+    placements: tuple[Placement, ...] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
+        config, placements = place_lidars(recordings, rough, config, progress)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         found = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         caused = _with_cause(error, rough, motions, config, (findings, raw))
         if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
             raise caused from error
-        return rough, findings, (config, (), (), caused)
-    return rough, findings, (*found, None)
+        return rough, findings, (config, (), (), caused), placements
+    return rough, findings, (*found, None), placements
 
 
 def _uses(config: Config) -> bool:
@@ -264,6 +271,8 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         if any(found.severity == "fatal" for found in findings):
             return Look(None, findings, tuple(problems))
         trajectories = smooth_trajectories([recording], config, [[]], motions)
+        config, placements = place_lidars([recording], trajectories, config, progress)
+        problems += map(placement_sentence, placements)
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
         near, misplaced, observations = _targets([recording], trajectories, config, progress)
@@ -347,7 +356,9 @@ def _calibrate(
     except TargetError as error:
         raise without_anything(prepared, error) from error
     with progress.stage("checking the result", None):
-        calibration = assemble(solution, config, recordings, digests)
+        calibration = assemble(
+            solution, with_found_of(config, prepared.config), recordings, digests
+        )
         calibration, doubts = check(
             calibration,
             solution,

@@ -654,11 +654,14 @@ class Guess:
         T_vehicle_lidar: the guess.
         sigmas: (6,) in vehicle axes, rad and m.
         fixed: the user trusts it; it is not estimated.
+        found: nobody gave one. It was found in the drive: where the drive does not determine the
+            extrinsic, its value means nothing.
     """
 
     T_vehicle_lidar: gtsam.Pose3
     sigmas: Array
     fixed: bool = False
+    found: bool = False
 
 
 @dataclass(frozen=True)
@@ -711,6 +714,11 @@ class LidarResult:
     def has_data(self) -> bool:
         """Whether it saw anything that it is calibrated by."""
         return self.saw_target or self.saw_structure
+
+    @property
+    def without_guess(self) -> bool:
+        """Whether nobody gave a guess: what the drive does not determine is unknown then."""
+        return self.guess is not None and self.guess.found
 
 
 @dataclass(frozen=True)

@@ -72,10 +72,11 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=3, help="seeds 1 to N (default: 3)")
     parser.add_argument("--jobs", type=int, default=1, help="at a time (default: 1)")
     parser.add_argument("--search", action="store_true", help="give no target region: find it")
+    parser.add_argument("--no-guess", action="store_true", help="give no initial guesses")
     parser.add_argument("--offsets", action="store_true", help="estimate time offsets")
     arguments = parser.parse_args()
     tasks = [
-        (name, seed, arguments.search, arguments.offsets)
+        (name, seed, arguments.search, arguments.offsets, arguments.no_guess)
         for name in arguments.scenarios
         for seed in range(1, arguments.seeds + 1)
     ]
@@ -87,13 +88,16 @@ def main() -> int:
     return 0
 
 
-def run(task: tuple[str, int, bool, bool]) -> Outcome:
+def run(task: tuple[str, int, bool, bool, bool]) -> Outcome:
     """Simulates, calibrates and compares once."""
-    name, seed, search, offsets = task
+    name, seed, search, offsets, no_guess = task
     recording = simulate_drive(load_scenario(FOLDER / f"{name}.yaml"), seed)
     raw = config_of(recording, has_bag=True)
     if search:
         raw.pop("target", None)
+    if no_guess:
+        for lidar in raw["lidars"].values():
+            del lidar["initial"], lidar["sigma"]
     if offsets:
         raw["solve"] = {"time_offset": True}
     begun = time.process_time()

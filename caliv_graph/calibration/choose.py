@@ -288,7 +288,7 @@ def _sightings(
     stamps = [cloud.stamp_ns for cloud in observation.clouds]
     R, t = trajectory.poses_at(stamps)
     poses = [
-        T.compose(config.lidars[cloud.lidar].initial.pose())
+        T.compose(config.lidars[cloud.lidar].guess())
         for T, cloud in zip(unstack(R, t), observation.clouds, strict=True)
     ]
     small = config.registration.model_copy(

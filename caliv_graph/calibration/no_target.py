@@ -111,7 +111,7 @@ def solve_structure_and_ground(
         raise TargetError("solve.mode staged needs a target", "Set it to auto or joint")
     noise = usual_noise(config.noise)
     kept = kept_stamps(structure.patches)
-    guesses = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+    guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
     begun = time.perf_counter()
     with progress.stage("solving walls and other surfaces", None):
         terms = structure.terms(

@@ -292,7 +292,7 @@ def pose_problem(
     return Problem(
         lidars=lidars,
         reference=reference,
-        guesses={n: config.lidars[n].initial.pose() for n in lidars},
+        guesses={n: config.lidars[n].guess() for n in lidars},
         prior_sigmas={n: configured_guess(config, n).sigmas for n in lidars},
         fixed=fixed,
         poses=poses,
@@ -328,7 +328,7 @@ def _views(
     names = np.array([c.lidar for c in observation.clouds])
     for name in dict.fromkeys(names.tolist()):
         own = np.flatnonzero(names == name)
-        guess = config.lidars[name].initial.pose()
+        guess = config.lidars[name].guess()
         places = []
         for i in own.tolist():
             cloud = observation.clouds[i]

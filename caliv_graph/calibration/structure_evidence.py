@@ -119,7 +119,7 @@ class StructureEvidence:
         start = {
             name: state.problem.extrinsic(state.values, name)
             if name in state.problem.lidars
-            else lidar.initial.pose()
+            else lidar.guess()
             for name, lidar in state.config.lidars.items()
         }
         return self.terms(trajectories, kept, start, heave_m, state.noise, state.config)

@@ -245,7 +245,7 @@ def _of_guesses(solution: Solution, guesses: Mapping[str, Guess]) -> list[_Block
     size = 6 * len(solution.lidars)
     for i, name in enumerate(solution.lidars):
         guess = guesses.get(name)
-        if guess is None or guess.fixed:
+        if guess is None or guess.fixed or guess.found:
             continue
         rows = np.zeros((6, len(graph.gradient)))
         rows[:, -size:] = graph.to_vehicle_axes[6 * i : 6 * i + 6]

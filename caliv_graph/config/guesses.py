@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
-from caliv_graph.config.model import Config, PoseSigmaConfig
+from caliv_graph.config.model import (
+    Config,
+    FoundLidarConfig,
+    LidarConfig,
+    PoseConfig,
+    PoseSigmaConfig,
+)
 from caliv_graph.products import Guess
 
 DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
@@ -15,8 +22,49 @@ TRUSTED_SIGMAS = np.array([1e-5] * 3 + [1e-4] * 3)
 any drive determines, and still an invertible covariance."""
 
 
+FOUND_SIGMA = PoseSigmaConfig(xyz=0.2, rpy_deg=2.0)
+"""How far off a mounting is that was found in the drive, where the drive determines it: a cell of
+the finest grid, and what that turns at 10 m. What the drive tells no better than half of this is
+undetermined, and then the covariance knows nothing of it (`products.Guess.found`)."""
+
+
+def with_found_of(config: Config, other: Config) -> Config:
+    """The config with the guesses that another one has found for LiDARs without any."""
+    lidars = {
+        name: other.lidars[name] if lidar.initial is None else lidar
+        for name, lidar in config.lidars.items()
+    }
+    return config.model_copy(update={"lidars": lidars})
+
+
 def configured_guess(config: Config, name: str) -> Guess:
-    """The initial guess of a LiDAR, as the config states it."""
+    """The initial guess of a LiDAR, as the config states it, or as it was found in the drive.
+
+    Raises:
+        ConfigError: there is none.
+    """
     lidar = config.lidars[name]
     sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
-    return Guess(lidar.initial.pose(), sigmas, lidar.fixed)
+    return Guess(lidar.guess(), sigmas, lidar.fixed, isinstance(lidar, FoundLidarConfig))
+
+
+def with_guess(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Config:
+    """The config with another initial guess of a LiDAR; its sigma stays."""
+    return _replaced(config, name, config.lidars[name], T_vehicle_lidar)
+
+
+def with_found_guess(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Config:
+    """The config with a guess of a LiDAR that was found in the drive."""
+    given = {key: value for key, value in config.lidars[name] if key != "sigma"}
+    lidar = FoundLidarConfig.model_construct(**given, sigma=FOUND_SIGMA)
+    return _replaced(config, name, lidar, T_vehicle_lidar)
+
+
+def _replaced(
+    config: Config, name: str, lidar: LidarConfig, T_vehicle_lidar: gtsam.Pose3
+) -> Config:
+    x, y, z = (float(v) for v in T_vehicle_lidar.translation())
+    roll, pitch, yaw = (float(v) for v in np.degrees(T_vehicle_lidar.rotation().rpy()))
+    initial = PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
+    moved = lidar.model_copy(update={"initial": initial})
+    return config.model_copy(update={"lidars": {**config.lidars, name: moved}})

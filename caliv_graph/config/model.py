@@ -24,12 +24,14 @@ from caliv_graph.config.sections import (
     Section,
     Triple,
 )
+from caliv_graph.errors import ConfigError
 
 _LEAST_SIGMA = 1e-6
 """Of a guess, metres or degrees: GTSAM treats much smaller ones as constraints."""
 
-
 if TYPE_CHECKING:
+    import gtsam
+
     from caliv_graph.products import Array
 
 SolveMode = Literal["auto", "staged", "joint"]
@@ -127,7 +129,10 @@ class LidarConfig(Section):
         description="fields of a point in .bin files, each a name and a type, such as x f4; "
         "absent: x, y, z, intensity and perhaps a ring, all f4",
     )
-    initial: PoseConfig = Field(description="initial guess of T_vehicle_lidar")
+    initial: PoseConfig | None = Field(
+        None,
+        description="initial guess of T_vehicle_lidar; absent or null: found from the drive",
+    )
     sigma: PoseSigmaConfig = PoseSigmaConfig()
     fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
     min_range: NonNegative = Field(
@@ -146,6 +151,32 @@ class LidarConfig(Section):
                 f"min_range ({self.min_range} m) must be below max_range ({self.max_range} m)"
             )
         return self
+
+    @model_validator(mode="after")
+    def _trusts_something(self) -> LidarConfig:
+        if self.fixed and self.initial is None:
+            raise ValueError("fixed: true trusts the initial guess, and initial is not given")
+        return self
+
+    def guess(self) -> gtsam.Pose3:
+        """`T_vehicle_lidar`, the initial guess.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        if self.initial is None:
+            raise ConfigError(
+                f"the LiDAR with topic {self.topic} has no initial guess. Enter its 'initial', or "
+                "what 'caliv-graph calibrate' finds"
+            )
+        return self.initial.pose()
+
+
+class FoundLidarConfig(LidarConfig):
+    """A LiDAR whose `initial` was not given and has been found in the drive.
+
+    `sigma` is then how far off it may be, and `initial` no evidence beside the drive.
+    """
 
 
 class DataConfig(Section):
@@ -460,6 +491,16 @@ class Config(Section):
     def _poses_of_one_source(self) -> Config:
         if self.data.poses is not None and self.topics.pose is not None:
             raise ValueError("give data.poses or topics.pose, not both")
+        return self
+
+    @model_validator(mode="after")
+    def _translations_to_hold(self) -> Config:
+        missing = [name for name, lidar in self.lidars.items() if lidar.initial is None]
+        if missing and self.solve.mode == "staged":
+            raise ValueError(
+                f"'solve.mode: staged' holds translations at the initial guesses, and "
+                f"lidars.{missing[0]}.initial is not given: enter it, or set mode to auto"
+            )
         return self
 
     @field_validator("limits")

@@ -72,7 +72,11 @@ def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
         elif axes:
             lines.append(
                 f"LiDAR '{name}': {', '.join(axes)} (vehicle axes) not determined by the drive: "
-                "values of the initial guesses"
+                + (
+                    "no initial guess was given, so that the values mean nothing"
+                    if result.without_guess
+                    else "values of the initial guesses"
+                )
             )
     return lines
 

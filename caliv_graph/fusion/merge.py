@@ -9,7 +9,8 @@ import numpy as np
 
 import caliv_graph
 from caliv_graph.calibration.assemble import DRIVES
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.guesses import with_found_guess, with_guess
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
@@ -153,15 +154,12 @@ def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) ->
             f"--prior: has none of the LiDARs of the config ({', '.join(config.lidars)}), but "
             f"{', '.join(prior.lidars)}. Give them the same names"
         )
-    lidars = dict(config.lidars)
     for name in common:
-        if not lidars[name].fixed:
-            T = prior.lidars[name].T_vehicle_lidar
-            x, y, z = (float(v) for v in T.translation())
-            roll, pitch, yaw = (float(v) for v in np.degrees(T.rotation().rpy()))
-            initial = PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
-            lidars[name] = lidars[name].model_copy(update={"initial": initial})
-    return config.model_copy(update={"lidars": lidars})
+        if not config.lidars[name].fixed:
+            given = config.lidars[name].initial is not None
+            start = with_guess if given else with_found_guess
+            config = start(config, name, prior.lidars[name].T_vehicle_lidar)
+    return config
 
 
 def prior_terms(prior: Calibration) -> tuple[DataTerm, ...]:

@@ -180,7 +180,9 @@ def extrinsic_row(result: LidarResult) -> dict[str, Any]:
     """The row of one LiDAR in a table of extrinsics: a cell per axis, scans, time offset."""
     offset = result.time_offset
     return {
-        "cells": pose_cells(result.T_vehicle_lidar, result.cov, result.determined),
+        "cells": pose_cells(
+            result.T_vehicle_lidar, result.cov, result.determined, not result.without_guess
+        ),
         "scans": scans_text(result),
         "offset": None if offset is None else f"{1e3 * offset[0]:+.2f} ± {1e3 * offset[1]:.2f} ms",
         "estimated": not (result.guess is not None and result.guess.fixed),

@@ -21,13 +21,17 @@ SHOWN_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _MOST_DECIMALS = 6
 
 
+NO_VALUE = "?"
+"""The value of what neither the drive nor an initial guess tells."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """One axis of a pose in a table.
 
     Attributes:
-        value: the value to two digits of its sigma; if not determined, to one digit and in
-            brackets.
+        value: the value to two digits of its sigma; if not determined, that of the initial guess
+            to one digit and in brackets, or `NO_VALUE` where there was no guess.
         sigma: the sigma with the same decimals; empty if not determined.
         determined: whether the drive determined the axis.
     """
@@ -57,11 +61,12 @@ def pose_and_sigmas(T_parent_child: gtsam.Pose3, cov: Array) -> tuple[Array, Arr
 
 
 def pose_cells(
-    T_parent_child: gtsam.Pose3, cov: Array, determined: Mapping[str, bool]
+    T_parent_child: gtsam.Pose3, cov: Array, determined: Mapping[str, bool], guessed: bool = True
 ) -> list[Cell]:
     """A pose as a cell per axis of `SHOWN_AXES`, in metres and degrees.
 
-    `cov` is (6, 6), right perturbation, rad and m.
+    `cov` is (6, 6), right perturbation, rad and m. `guessed`: whether an initial guess has a value
+    for what is not determined.
     """
     values, sigmas = pose_and_sigmas(T_parent_child, cov)
     values[:3], sigmas[:3] = np.degrees(values[:3]), np.degrees(sigmas[:3])
@@ -72,7 +77,8 @@ def pose_cells(
             decimals = decimals_of(sigma, 2)
             cells.append(Cell(fixed(value, decimals), f"{sigma:.{decimals}f}", True))
         else:
-            cells.append(Cell(f"({fixed(value, decimals_of(sigma, 1))})", "", False))
+            held = f"({fixed(value, decimals_of(sigma, 1))})"
+            cells.append(Cell(held if guessed else NO_VALUE, "", False))
     return cells
 
 
@@ -83,7 +89,8 @@ def pair_cells(calibration: Calibration) -> list[PairCells]:
         T_vehicle_from = calibration.lidars[source].T_vehicle_lidar
         T_to_from = calibration.lidars[to].T_vehicle_lidar.between(T_vehicle_from)
         cov = pair_covariance(calibration, source, to)
-        cells = pose_cells(T_to_from, cov, pair_determined(calibration, source, to))
+        guessed = not any(calibration.lidars[name].without_guess for name in (source, to))
+        cells = pose_cells(T_to_from, cov, pair_determined(calibration, source, to), guessed)
         out.append(PairCells(source, to, cells))
     return out
 

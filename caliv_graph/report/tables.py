@@ -14,6 +14,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Direction
 from caliv_graph.report.layout import UNKNOWN, axis_headings, new_table, sentences, titled
 from caliv_graph.report.numbers import (
+    NO_VALUE,
     SHOWN_AXES,
     Cell,
     fixed,
@@ -56,11 +57,20 @@ def calibration_table(
             "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
             _sensor_to_sensor(calibration),
         )
-    if not all(all(result.determined.values()) for result in calibration.lidars.values()):
+    open_ = [r for r in calibration.lidars.values() if not all(r.determined.values())]
+    if not all(result.without_guess for result in open_):
         parts.append(
             Text(
                 f"{_HELD}: this drive does not determine the axis; the value in brackets comes "
                 "from the initial guess.",
+                style="yellow",
+            )
+        )
+    if any(result.without_guess for result in open_):
+        parts.append(
+            Text(
+                f"{NO_VALUE}: this drive does not determine the axis, and no initial guess was "
+                "given.",
                 style="yellow",
             )
         )
@@ -117,7 +127,9 @@ def direction_texts(directions: Iterable[Direction]) -> list[str]:
 def _extrinsics(calibration: Calibration) -> Table:
     table = new_table("LiDAR", *axis_headings("m", "deg"), "scans\nused")
     for name, result in calibration.lidars.items():
-        cells = pose_cells(result.T_vehicle_lidar, result.cov, result.determined)
+        cells = pose_cells(
+            result.T_vehicle_lidar, result.cov, result.determined, not result.without_guess
+        )
         known = result.has_data
         scans = Text(scans_text(result), style="" if known else "bold yellow")
         table.add_row(Text(name), *map(_text, cells), scans)
@@ -142,7 +154,7 @@ def _sensor_to_sensor(calibration: Calibration) -> Table:
 def _text(cell: Cell) -> Text:
     if cell.determined:
         return Text(f"{cell.value}\n±{cell.sigma}")
-    return Text(f"{cell.value}\n{_HELD}", style="yellow")
+    return Text(f"{cell.value}\n{'' if cell.value == NO_VALUE else _HELD}", style="yellow")
 
 
 def _offset_texts(calibration: Calibration) -> list[str]:

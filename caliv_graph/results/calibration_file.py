@@ -216,8 +216,8 @@ def _structure_document(calibration: Calibration) -> dict[str, Any]:
 
 def _guess_document(guess: Guess) -> dict[str, Any]:
     sigma = _sigma_document(guess.sigmas)
-    fixed = {"fixed": True} if guess.fixed else {}
-    return {**_pose_document(guess.T_vehicle_lidar), "sigma_vehicle_axes": sigma, **fixed}
+    flags = {"fixed": True} if guess.fixed else {"found": True} if guess.found else {}
+    return {**_pose_document(guess.T_vehicle_lidar), "sigma_vehicle_axes": sigma, **flags}
 
 
 def _sigma_document(sigmas: Array) -> dict[str, Any]:

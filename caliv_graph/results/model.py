@@ -83,11 +83,12 @@ class _GuessPart(PosePart):
 
     sigma_vehicle_axes: _SigmaPart
     fixed: StrictBool = False
+    found: StrictBool = False
 
     def guess(self) -> Guess:
         sigma = self.sigma_vehicle_axes
         sigmas = np.concatenate([np.radians(np.array(sigma.rpy_deg)), np.array(sigma.xyz)])
-        return Guess(T_vehicle_lidar=self.pose(), sigmas=sigmas, fixed=self.fixed)
+        return Guess(T_vehicle_lidar=self.pose(), sigmas=sigmas, fixed=self.fixed, found=self.found)
 
 
 class _DeterminedPart(Part):

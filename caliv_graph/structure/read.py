@@ -73,7 +73,7 @@ def read_patches(
         for drive, recording in enumerate(recordings):
             scans: list[tuple[int, int, ScanPatches]] = []
             for k, name in enumerate(names):
-                guess = config.lidars[name].initial.pose()
+                guess = config.lidars[name].guess()
                 stamps = frozenset(wanted[drive][k].tolist())
                 for scan in recording.scans(name, stamps) if stamps else ():
                     patches = scan_patches(

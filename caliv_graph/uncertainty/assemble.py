@@ -10,6 +10,7 @@ import numpy as np
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration, Guess, LidarResult, Uncertainty
+from caliv_graph.uncertainty.observability import known_sigmas, unguessed
 
 _NO_OFFSETS: Mapping[str, tuple[float, float]] = {}
 
@@ -48,8 +49,9 @@ def assemble_matrices(
         if name not in solved:
             block = slice(6 * row, 6 * row + 6)
             axes = right_to_vehicle_axes(poses[name])
-            cov_joint[block, block] = axes.T @ np.diag(guesses[name].sigmas ** 2) @ axes
-    cov_joint += to_right @ cov @ to_right.T
+            cov_joint[block, block] = axes.T @ np.diag(known_sigmas(guesses[name]) ** 2) @ axes
+    own = [guesses[name] for name in solved]
+    cov_joint += to_right @ (cov + unguessed(information, own)) @ to_right.T
     information_joint = to_right @ information @ to_right.T
     nothing = dict.fromkeys(AXES, False)
     lidars = {

@@ -282,7 +282,7 @@ def against_guesses(
     """
     for name, lidar in lidars.items():
         guess = lidar.guess
-        if guess is None or guess.fixed or not lidar.has_data:
+        if guess is None or guess.fixed or guess.found or not lidar.has_data:
             continue
         off = vehicle_axes_difference(lidar.T_vehicle_lidar, guess.T_vehicle_lidar)
         Q = right_to_vehicle_axes(lidar.T_vehicle_lidar)

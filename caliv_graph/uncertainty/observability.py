@@ -15,7 +15,7 @@ import numpy as np
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import skew
-from caliv_graph.products import Array, BoolArray, Direction, Uncertainty
+from caliv_graph.products import Array, BoolArray, Direction, Guess, Uncertainty
 
 UNIT = np.array([1e-3] * 3 + [1e-2] * 3)
 """One scaled unit: 1 mrad, 10 mm. At 10 m from the target both move a point by 10 mm."""
@@ -26,6 +26,9 @@ UNDETERMINED_RATIO = 0.5
 
 WEAK_RATIO = 0.1
 """The same ratio above which a determined direction is weak."""
+
+UNKNOWN_SIGMAS = np.array([np.pi] * 3 + [10.0] * 3)
+"""(6,) sigmas of an extrinsic of which nobody said anything: any rotation, within 10 m."""
 
 RIGID_MISFIT = 0.2
 """Relative misfit up to which LiDARs count as moving together."""
@@ -132,6 +135,38 @@ def covariance_with_prior_in_null_space(prior: Array, split: Spectrum) -> Array:
         transfer = np.eye(len(P)) - U @ inner @ U.T @ P
         cov = transfer @ cov @ transfer.T + U @ inner @ U.T
     return np.asarray(0.5 * (cov + cov.T) * np.outer(unit, unit))
+
+
+def known_sigmas(guess: Guess) -> Array:
+    """(6,) what is known of an extrinsic before the drive, 1 sigma, vehicle axes, rad and m."""
+    return UNKNOWN_SIGMAS if guess.found else guess.sigmas
+
+
+def unguessed(D: Array, guesses: Sequence[Guess]) -> Array:
+    """What a covariance in which guesses decide lacks where a LiDAR had none: (6n, 6n).
+
+    The prior of a found guess keeps the solve where the drive determines nothing. It is no
+    knowledge: along these directions the variance becomes that of what is known before the drive.
+
+    Args:
+        D: (6n, 6n) information of the data, vehicle axes.
+        guesses: of the n LiDARs.
+    """
+    if not any(guess.found for guess in guesses):
+        return np.zeros_like(D)
+    held, known = (
+        np.diag(np.concatenate(sigmas) ** -2.0)
+        for sigmas in (
+            [guess.sigmas for guess in guesses],
+            [known_sigmas(guess) for guess in guesses],
+        )
+    )
+    split = spectrum(D, held)
+    U = split.vectors[:, split.undetermined] * scaling(len(guesses))[:, None]
+    if not U.shape[1]:
+        return np.zeros_like(D)
+    more = np.linalg.inv(U.T @ known @ U) - np.linalg.inv(U.T @ held @ U)
+    return np.asarray(U @ more @ U.T)
 
 
 def assess(

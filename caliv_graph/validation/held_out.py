@@ -147,7 +147,7 @@ def _without(drive: _Drive, trajectory: VehicleTrajectory, config: Config) -> Ot
     rest = part_of(problem, ~held)
     if not len(rest.patches.scan) or not held.any():
         return None
-    guesses = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+    guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
     start = aligned_start([rest.patches], [trajectory], guesses, config)
     used = solve_structure(rest, start)
     return None if used is None else other_strips(used, part_of(problem, held))

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.guesses import with_found_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
@@ -74,6 +75,7 @@ def validate(
     # Thousands of small matrices: threads of the linear algebra library would make this slower.
     with threadpool_limits(limits=1):
         names, notes = _common_lidars(recording, calibration, config)
+        config = _with_guesses(names, calibration, config)
         extrinsics = _extrinsics(names, calibration, config)
         motions = {0: recording.motion() if motion is None else motion}
         with progress.stage("smoothing the trajectory", None):
@@ -147,8 +149,18 @@ def _extrinsics(
             {name: results[name].T_vehicle_lidar for name in names},
             {n: o[0] for n in names if (o := results[n].time_offset) is not None},
         ),
-        BEFORE: Extrinsics({name: config.lidars[name].initial.pose() for name in names}, {}),
+        BEFORE: Extrinsics({name: config.lidars[name].guess() for name in names}, {}),
     }
+
+
+def _with_guesses(names: Sequence[str], calibration: Calibration, config: Config) -> Config:
+    """The config with the guesses that the calibration found for LiDARs without any."""
+    for name in names:
+        if config.lidars[name].initial is None:
+            result = calibration.lidars[name]
+            start = result.T_vehicle_lidar if result.guess is None else result.guess.T_vehicle_lidar
+            config = with_found_guess(config, name, start)
+    return config
 
 
 def _nodes(

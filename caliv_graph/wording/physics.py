@@ -299,7 +299,7 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
     fits = f"would fit ({misfit.sigmas:.1f} sigma)"
     if misfit.lidar:
         key = f"lidars.{misfit.lidar}.initial.xyz"
-        value = config.lidars[misfit.lidar].initial.xyz[2] + misfit.value
+        value = float(config.lidars[misfit.lidar].guess().z()) + misfit.value
         text += f"lidar '{misfit.lidar}' alone is off, z {value:.2f} +- {misfit.sigma:.2f} m {fits}"
     else:
         key = "ground.vehicle_height"
@@ -317,7 +317,7 @@ def _level(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], floa
     if misfit.lidar:
         key = f"lidars.{misfit.lidar}.initial.rpy_deg"
         turn = gtsam.Rot3.Rx if misfit.quantity == "roll" else gtsam.Rot3.Ry
-        guess = config.lidars[misfit.lidar].initial.pose().rotation()
+        guess = config.lidars[misfit.lidar].guess().rotation()
         fits = _degrees(turn(misfit.value).compose(guess).matrix())
         text = (
             f"with its guess, the ground that lidar '{misfit.lidar}' sees is not level: {off}. "

@@ -25,6 +25,7 @@ from caliv_graph.calibration.structure_evidence import (
     solved_with_structure,
 )
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
@@ -161,13 +162,13 @@ def _verdict(
         problem.lidars,
         problem.reference,
         {
-            name: problem.extrinsic(state.values, name)
-            if name in problem.lidars
-            else lidar.initial.pose()
+            name: problem.extrinsic(state.values, name) if name in problem.lidars else lidar.guess()
             for name, lidar in config.lidars.items()
         },
         {
-            name: problem.guess_sigmas(name) if name in problem.lidars else lidar.sigma.sigmas()
+            name: problem.guess_sigmas(name)
+            if name in problem.lidars
+            else configured_guess(config, name).sigmas
             for name, lidar in config.lidars.items()
         },
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},

@@ -171,7 +171,7 @@ class RegionExtractor:
             begin, _ = trajectory.span_ns
             R, t = (part[0] for part in trajectory.poses_at([begin]))
         self._R_map_region, self._t_map_region = R, t
-        self._guess = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+        self._guess = {name: lidar.guess() for name, lidar in config.lidars.items()}
         self.tallies: dict[str, Tally] = {name: Tally() for name in config.lidars}
         self._edges: dict[str, SeenEdges] = {name: SeenEdges() for name in config.lidars}
 

@@ -110,7 +110,7 @@ def _of_lidar(
     recording: Recording, config: Config, meter: GroundMeter, name: str, stamps: IntArray
 ) -> LidarGround | None:
     chosen = set(stamps[np.linspace(0, len(stamps) - 1, SCANS).astype(np.int64)].tolist())
-    R_guess = config.lidars[name].initial.pose().rotation().matrix()
+    R_guess = config.lidars[name].guess().rotation().matrix()
     heights, tilts = [], []
     for scan in recording.scans(name, chosen):
         plane = _plane(meter, scan)
@@ -151,7 +151,7 @@ def misfits(grounds: Sequence[LidarGround], config: Config) -> tuple[Misfit, ...
 def _height(grounds: Sequence[LidarGround], config: Config, vehicle_height: float) -> Misfit:
     """Height of all LiDARs above the ground against guesses and `vehicle_height`."""
     guesses = [config.lidars[g.lidar] for g in grounds]
-    places = np.array([lidar.initial.xyz for lidar in guesses])
+    places = np.array([lidar.guess().translation() for lidar in guesses])
     off = np.array([g.height_m for g in grounds]) - places[:, 2] - vehicle_height
     own = np.array([lidar.sigma.sigmas()[5] for lidar in guesses])
     lever = (

@@ -42,7 +42,7 @@ class GroundMeter:
         self._trajectory = trajectory
         self._drive = drive
         self._guess: Mapping[str, gtsam.Pose3] = {
-            name: lidar.initial.pose() for name, lidar in config.lidars.items()
+            name: lidar.guess() for name, lidar in config.lidars.items()
         }
         self._scans: Counter[str] = Counter()
         self._without: dict[str, Counter[str]] = {name: Counter() for name in config.lidars}

@@ -129,7 +129,7 @@ def find_target(
         RecordingError: a cloud could not be read.
     """
     stamps = [
-        {name: _scans_to_read(recording.scan_stamps_ns(name), trajectory) for name in config.lidars}
+        {name: scans_to_read(recording.scan_stamps_ns(name), trajectory) for name in config.lidars}
         for recording, trajectory in zip(recordings, trajectories, strict=True)
     ]
     total = sum(len(s) for drive in stamps for s in drive.values())
@@ -144,7 +144,7 @@ def find_target(
     return out
 
 
-def _scans_to_read(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> IntArray:
+def scans_to_read(stamps_ns: Sequence[int], trajectory: VehicleTrajectory) -> IntArray:
     """Stamps of the scans of a LiDAR to read: evenly in time, fewer while the vehicle stands."""
     begin, end = trajectory.span_ns
     lost = set(trajectory.lost_ns)
@@ -179,7 +179,7 @@ def _read_history(
 ) -> LidarHistory:
     """Reads and segments the chosen scans of one LiDAR."""
     lidar = config.lidars[name]
-    guess = lidar.initial.pose()
+    guess = lidar.guess()
     scans, stamps = [], []
     read = recording.scans(name, wanted=set(chosen.tolist()))
     first = list(itertools.islice(read, LEVEL_SCANS))
@@ -214,7 +214,7 @@ def _target_of_drive(
         else:
             misplaced = {}
     for history in histories:
-        if not history.guess.equals(config.lidars[history.name].initial.pose(), 0.0):
+        if not history.guess.equals(config.lidars[history.name].guess(), 0.0):
             misplaced.setdefault(history.name, alignments[history.name])
     usable = [p for p in proposals if math.isfinite(p.height_m)]
     if not usable:

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.guesses import with_guess
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.targets.search.find import FoundTarget
@@ -22,20 +23,15 @@ def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, 
 
     Of several drives the first that has something to say of a LiDAR decides.
     """
-    lidars, sentences = dict(config.lidars), []
+    moved, sentences = config, []
     for found in searched:
         for name in found.misplaced:
-            if lidars[name] is not config.lidars[name]:
+            if moved.lidars[name] is not config.lidars[name]:
                 continue
             T = found.aligned[name]
-            x, y, z = (float(v) for v in T.translation())
-            roll, pitch, yaw = (float(v) for v in np.degrees(T.rotation().rpy()))
-            initial = PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))
-            lidars[name] = lidars[name].model_copy(update={"initial": initial})
-            sentences.append(_sentence(name, config.lidars[name].initial.pose(), T))
-    if not sentences:
-        return config, ()
-    return config.model_copy(update={"lidars": lidars}), tuple(sentences)
+            moved = with_guess(moved, name, T)
+            sentences.append(_sentence(name, config.lidars[name].guess(), T))
+    return moved, tuple(sentences)
 
 
 def _sentence(name: str, guess: gtsam.Pose3, found: gtsam.Pose3) -> str:

@@ -1,0 +1,29 @@
+"""Sentences about mountings that were found without an initial guess."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from caliv_graph.mounting.place import Placement
+
+MOST_OTHERS = 2
+"""Other mountings that are listed."""
+
+
+def placement_sentence(found: Placement) -> str:
+    """Where a LiDAR without an initial guess was found, and what else fits."""
+    text = (
+        f"lidar '{found.lidar}': no initial guess was given. The drive was solved from "
+        f"{_pose(found.T_vehicle_lidar)}, found from what stands still"
+    )
+    if not found.others:
+        return text
+    listed = "; ".join(map(_pose, found.others[:MOST_OTHERS]))
+    return f"{text}. Other mountings fit nearly as well: {listed}"
+
+
+def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:
+    x, y, z = T_vehicle_lidar.translation()
+    roll, pitch, yaw = np.degrees(T_vehicle_lidar.rotation().rpy())
+    return f"xyz: [{x:.1f}, {y:.1f}, {z:.1f}] m, rpy_deg: [{roll:.0f}, {pitch:.0f}, {yaw:.0f}]"

@@ -66,15 +66,15 @@ MAX_BEND_M = 0.005
 corner or a reveal of 3 cm within the patch makes more."""
 
 MAX_SKEWNESS = 4.0
-"""Largest skewness of the points along the normal in units of its sigma for even noise, sqrt(6/n).
-At an edge a patch holds a few points of what stands up or lies lower: the foot of a kerb, a tyre,
-the jamb of a window. They are all on one side. Five in a hundred of them, seven sigmas up, add
-less than half to the scatter, but tilt the patch towards its LiDAR by milliradians; the skewness is
-2.5 then, ten times its sigma."""
+"""Largest skewness of the points along the normal, in units of that of symmetric noise by chance,
+sqrt(6/n). At an edge a patch holds some points of what stands up or lies lower: the foot of a kerb,
+a tyre, the jamb of a window. They are all on one side. On ground at a grazing angle, with 3 mm of
+noise along its normal, 5 points of 100 that are 20 mm up do not even double the scatter, but tilt
+the patch towards its LiDAR by 10 mrad. The skewness is 2.5 then, ten times that of chance."""
 
 LEAST_SKEWNESS = 0.5
-"""Skewness that is always borne, of however many points: the noise of real ranges is not quite even.
-Two points in a thousand, seven sigmas up, have it. They move a patch by 0.01 sigmas."""
+"""Skewness that is accepted however many points there are: noise of real ranges is not quite
+symmetric. It takes 2 points of 1000 at seven sigmas, which move a patch by 0.01 sigmas."""
 
 MIN_INCIDENCE_COS = math.cos(math.radians(80.0))
 """Patches under a larger incidence are dropped. The normal of a patch is known to some 20 mrad:
@@ -333,10 +333,11 @@ def _shape(
     axes: Array,
     width: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Of groups (n,): how evenly they are spread along their worse axis; bend, metres; skewness of
-    the points along the normal; length, metres.
+    """Spread, bend, skewness and length of groups; each (n,).
 
-    The bend is the root mean square of the residuals' parts of second and third order.
+    The spread is how evenly a group is spread along its worse axis, the length is in metres, the
+    skewness is that of the points along the normal. The bend, metres, is the root mean square of
+    the residuals' parts of second and third order.
     """
     off = p - centre.T[:, group]
     scaled = axes / np.maximum(width, 1e-9)[:, None, :]

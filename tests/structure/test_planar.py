@@ -107,6 +107,33 @@ def test_no_patch_spans_a_step(step_m: float) -> None:
     assert np.abs(patches.normal_lidar[:, 0]).min() > 0.99
 
 
+def beside_a_kerb(kerb_m: float, seed: int) -> ScanPatches:
+    """Patches of road, seen from 2 m above it, and of a kerb of 12 cm across it."""
+    rays = beams(np.arange(-26.0, -12.0, 0.35), np.arange(-45.0, 45.0, 0.32))
+    x, z = rays[:, 0], rays[:, 2]
+    ranges = on_plane(rays, np.array([0.0, 0.0, -1.0]), 2.0)
+    at_face = kerb_m / x
+    ranges = np.where(z * at_face > -2.0, at_face, ranges)
+    ranges = np.where(z * at_face > -1.88, -1.88 / z, ranges)
+    return planar_patches(noisy(rays, ranges, seed), SIGMA_M)
+
+
+def test_what_stands_on_the_road_does_not_tilt_it() -> None:
+    beside = []
+    for seed in range(20):
+        kerb_m = 4.2 + 0.08 * seed
+        patches = beside_a_kerb(kerb_m, seed)
+        x, _, z = centres(patches).T
+        near = (patches.normal_lidar[:, 2] > 0.9) & (z < -1.94) & (np.abs(kerb_m - x) < 0.6)
+        beside.append(np.stack([z[near] + 2.0, patches.normal_lidar[near, 0]]))
+    height_m, slope = np.concatenate(beside, axis=1)
+    assert len(slope) > 20
+    # Patches that hold points of the kerb's foot are 2 mm high in the mean and slope by 10 mrad.
+    assert abs(height_m.mean()) < 3e-4
+    assert height_m.max() < 2e-3
+    assert abs(slope.mean()) < 3e-3
+
+
 def test_curved_and_rough_surfaces_are_left_out() -> None:
     rays = beams(np.arange(-3.5, 3.5, 0.1), np.arange(-3.5, 3.5, 0.1))
     b = rays @ np.array([8.0, 0.0, 0.0])

@@ -16,6 +16,7 @@ import yaml
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import (
+    GroundConfig,
     PoseConfig,
     PoseSigmaConfig,
     RegistrationConfig,
@@ -349,10 +350,17 @@ def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
 # ------------------------------------------------------------------ other drives, other LiDARs
 
 
-def test_a_change_of_curvature_determines_x_and_yaw(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def s_curve(tmp_path_factory: pytest.TempPathFactory) -> ChairDrive:
     scenario = paper_scenario(S_CURVE, rate_hz=2.5, chair_xy_m=S_CHAIR_XY_M)
-    drive = simulated(scenario, 1, tmp_path / "drive")
-    tried = try_out(drive.asked(registration=QUICK))
+    return simulated(scenario, 1, tmp_path_factory.mktemp("s_curve") / "drive")
+
+
+@pytest.mark.parametrize("ground", [False, True], ids=["target", "target-and-ground"])
+def test_a_change_of_curvature_determines_x_and_yaw(s_curve: ChairDrive, ground: bool) -> None:
+    # The ground tells the height of the vehicle frame to nobody who does not know it.
+    asked = GroundConfig(use=ground, vehicle_height=None)
+    tried = try_out(s_curve.asked(registration=QUICK, ground=asked))
 
     assert tried.texts() == [HEIGHT]
     for name in tried.poses:

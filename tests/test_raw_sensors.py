@@ -29,6 +29,7 @@ from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.evaluation import evaluate
 from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
@@ -175,7 +176,9 @@ def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
     observation = clouds[0].__class__(0, "target", np.zeros(3), tuple(some))
     problem = pose_problem([observation], trajectories(), drive().config)
     cov = np.linalg.inv(problem.motion[0])
-    without, poses = trajectories()[0].joint_information(stamps)  # type: ignore[union-attr]
+    smoothed = trajectories()[0]
+    assert isinstance(smoothed, SmoothedTrajectory)
+    without, poses = smoothed.joint_information(stamps)
     expected = np.linalg.inv(without)
     z = np.arange(5, len(cov), 6)
     expected[z, z] += HEAVE_SIGMA_M**2
@@ -183,5 +186,5 @@ def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
     assert not problem.given().any()
     assert problem.pose_error_keys() == ()
     shift = problem.origins_map[0]
-    for T, smoothed in zip(problem.T_map_vehicle, poses, strict=True):
-        assert T.equals(gtsam.Pose3(smoothed.rotation(), smoothed.translation() - shift), 1e-9)
+    for T, pose in zip(problem.T_map_vehicle, poses, strict=True):
+        assert T.equals(gtsam.Pose3(pose.rotation(), pose.translation() - shift), 1e-9)

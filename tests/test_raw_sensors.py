@@ -7,7 +7,7 @@ LiDAR's stamps are 20 ms late, and every cloud is a sweep of 0.1 s.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -28,7 +28,8 @@ from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
-from caliv_graph.trajectory.select import smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.evaluation import evaluate
 from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
@@ -64,7 +65,7 @@ def drive() -> Drive:
     raw = config_of(recording, has_bag=True)
     raw |= {"solve": {"time_offset": True}, "registration": {"components": 400, "max_points": 300}}
     raw["extraction"] = {"max_scans": 40}
-    return Drive(recording, parse_config(raw, "config.yaml", Path("/nowhere")))
+    return Drive(recording, without_structure(parse_config(raw, "config.yaml", Path("/nowhere"))))
 
 
 @cache
@@ -98,17 +99,6 @@ def test_the_ground_gives_the_height_and_ties_the_lidars_together() -> None:
         assert lidar.T_vehicle_lidar.translation()[2] == pytest.approx(height_m, abs=15 * MM)
 
 
-def test_without_its_height_above_ground_height_alone_is_not_determined() -> None:
-    ground = drive().config.ground.model_copy(update={"vehicle_height": None})
-    few = drive().config.extraction.model_copy(update={"max_scans": 16})
-    config = drive().config.model_copy(update={"ground": ground, "extraction": few})
-    config = without_structure(config)
-    calibration = calibrate([drive().recording], config, SilentProgress()).calibration
-    assert calibration.status == "partial"
-    for lidar in calibration.lidars.values():
-        assert [axis for axis, told in lidar.determined.items() if not told] == ["z"]
-
-
 def test_a_late_clock_is_found() -> None:
     for name, true_s in drive().recording.truth.time_offset_s.items():
         found = run().calibration.lidars[name].time_offset
@@ -137,12 +127,17 @@ class Counting(ForwardingRecording):
             yield scan
 
 
+def trajectories() -> Sequence[VehicleTrajectory]:
+    record = run().record
+    assert record is not None
+    return record.trajectories
+
+
 @cache
 def extracted() -> tuple[TargetObservation, Mapping[str, int]]:
     """The clouds of the target, and how many scans of each LiDAR were decoded for them."""
     recording, config = Counting(drive().recording), drive().config
-    trajectories = smooth_trajectories([recording], config, [[]])
-    (observation,) = extract_targets([recording], trajectories, config, SilentProgress())
+    (observation,) = extract_targets([recording], trajectories(), config, SilentProgress())
     return observation, recording.decoded
 
 
@@ -175,15 +170,15 @@ def test_scans_that_cannot_see_the_target_are_not_decoded() -> None:
 
 
 def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
-    recording, config = drive().recording, drive().config
     clouds = run().observations
     stamps = sorted({c.stamp_ns for o in clouds for c in o.clouds})[:5]
-    trajectories = smooth_trajectories([recording], config, [stamps])
     some = [c for c in clouds[0].clouds if c.stamp_ns in stamps]
     observation = clouds[0].__class__(0, "target", np.zeros(3), tuple(some))
-    problem = pose_problem([observation], trajectories, config)
+    problem = pose_problem([observation], trajectories(), drive().config)
     cov = np.linalg.inv(problem.motion[0])
-    without, poses = trajectories[0].joint_information(stamps)  # type: ignore[union-attr]
+    smoothed = trajectories()[0]
+    assert isinstance(smoothed, SmoothedTrajectory)
+    without, poses = smoothed.joint_information(stamps)
     expected = np.linalg.inv(without)
     z = np.arange(5, len(cov), 6)
     expected[z, z] += HEAVE_SIGMA_M**2
@@ -191,5 +186,5 @@ def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
     assert not problem.given().any()
     assert problem.pose_error_keys() == ()
     shift = problem.origins_map[0]
-    for T, smoothed in zip(problem.T_map_vehicle, poses, strict=True):
-        assert T.equals(gtsam.Pose3(smoothed.rotation(), smoothed.translation() - shift), 1e-9)
+    for T, pose in zip(problem.T_map_vehicle, poses, strict=True):
+        assert T.equals(gtsam.Pose3(pose.rotation(), pose.translation() - shift), 1e-9)

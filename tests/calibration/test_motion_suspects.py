@@ -51,7 +51,7 @@ def too_fast(motion: MotionData) -> MotionData:
     return replace(motion, twist=twist)
 
 
-@pytest.mark.parametrize(("noise", "seed"), [(1.0, 1), (1.0, 2), (2.0, 1), (2.0, 2)])
+@pytest.mark.parametrize(("noise", "seed"), [(1.0, 1), (2.0, 2)])
 def test_a_sound_drive_has_no_suspect_even_with_doubled_noise(noise: float, seed: int) -> None:
     motion = drive(noise, seed)
     ranked = ranking(motion_scores([smooth_trajectory(motion, CONFIG, WANTED)]))

@@ -103,7 +103,7 @@ def lost(solution: Solution) -> list[int]:
     return np.flatnonzero(solution.cloud_weights[0] < 1e-3).tolist()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_clouds_in_a_wrong_place_are_lost_and_nothing_else_changes(seed: int) -> None:
     case, whole = solved(seed, np.zeros(6))
     assert lost(whole) == []
@@ -137,8 +137,8 @@ def test_without_a_kernel_nothing_is_lost() -> None:
 
 
 def test_errors_between_sensors_are_as_large_as_is_said_of_them() -> None:
-    found = [s2s_nees(*solved(seed, np.zeros(6))) for seed in range(10, 40)]
-    # 30 draws: the standard error of their mean is 0.63.
+    found = [s2s_nees(*solved(seed, np.zeros(6))) for seed in range(10, 22)]
+    # 12 draws: the standard error of their mean is 1.
     assert np.mean(found) == pytest.approx(6.0, abs=2.0)
 
 

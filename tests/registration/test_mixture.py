@@ -669,8 +669,9 @@ def test_gradient_is_that_of_the_likelihood_of_the_ranges() -> None:
     step = 1e-4
     found = case.quadratic().gradient.ravel()
     scale = np.sqrt(np.diag(case.quadratic().joint()))
-    # A turn and shifts of each cloud: all 18 take long.
-    for i in (0, 2, 4, 7, 9, 11, 13, 15, 17):
+    # A turn or a shift of each cloud, along each axis: all 18 take long. Those of the next but one
+    # test are all there, where Gauss-Newton is enough.
+    for i in (0, 4, 7, 11, 17):
         d = step * np.eye(18)[i]
         numerical = (cost(d) - cost(-d)) / (2.0 * step)
         assert found[i] / scale[i] == pytest.approx(numerical / scale[i], abs=5e-3)

@@ -461,7 +461,7 @@ def test_sixteen_and_thirty_two_channels_see_a_chair_as_one_object(
     # On the roof, with a wall 1.5 m behind the chair and a box 1 m beside it.
     model = LidarModel(
         mounting=PoseConfig(xyz=(0.0, 0.0, 2.0), rpy_deg=(0.0, tilt_deg, 0.0)),
-        horizontal_fov_deg=(-180.0, 180.0),
+        horizontal_fov_deg=(-60.0, 60.0),
         horizontal_resolution_deg=0.2,
         vertical_fov_deg=fov_deg,
         channels=channels,

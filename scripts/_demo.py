@@ -128,7 +128,7 @@ def _released_drive(out: Path) -> Drive:
     lidars = load_config(out / "authors.yaml").lidars
     write_truth(
         out / "truth.yaml",
-        {name: lidar.initial.pose() for name, lidar in lidars.items()},
+        {name: lidar.guess() for name, lidar in lidars.items()},
         dict.fromkeys(lidars, 0.0),
     )
     return Drive(data, RELEASED, out / "truth.yaml")
@@ -209,7 +209,7 @@ def _explain(calibration: Calibration, config: Config, truth: Mapping[str, gtsam
 def _guessed(calibration: Calibration, config: Config) -> Calibration:
     """A calibration whose estimates are the initial guesses, for their evaluation."""
     lidars = {
-        name: replace(lidar, T_vehicle_lidar=config.lidars[name].initial.pose())
+        name: replace(lidar, T_vehicle_lidar=config.lidars[name].guess())
         for name, lidar in calibration.lidars.items()
     }
     return replace(calibration, lidars=lidars)

@@ -111,7 +111,7 @@ def paper_from_recording(
     result = paper_estimator(
         clouds,
         poses,
-        {name: lidar.initial.pose() for name, lidar in config.lidars.items()},
+        {name: lidar.guess() for name, lidar in config.lidars.items()},
         config.reference,
         components=components,
         iterations=iterations,

@@ -314,7 +314,7 @@ def _ground_alone(recording: SimulatedRecording, seed: int) -> Outcome:
             for scan in recording.scans(name)
             if begin <= scan.stamp_ns <= end and (plane := meter.measure(scan)) is not None
         ]
-        guess = config.lidars[name].initial.pose()
+        guess = config.lidars[name].guess()
         poses[name], own[name] = stood_on(planes, guess, config.ground.vehicle_height or 0.0)
     lidars = {
         name: LidarResult(T, np.full((6, 6), math.nan), dict.fromkeys(AXES, False), 0, False)

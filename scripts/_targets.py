@@ -284,7 +284,7 @@ def run_released() -> Result:
     from scripts.benchmark_released import CONFIG, authors_config
 
     authors = authors_config(DATA / "caliv_released")
-    truth = {name: lidar.initial.pose() for name, lidar in authors.lidars.items()}
+    truth = {name: lidar.guess() for name, lidar in authors.lidars.items()}
     return _calibrated(load_config(CONFIG), lambda _: truth)
 
 

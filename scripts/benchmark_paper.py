@@ -214,7 +214,7 @@ def published(
     def opened() -> tuple[Recording, Config, dict[str, PoseConfig]]:
         true_config = released.authors_config(data)
         config = released.guessed(load_config(released.CONFIG), true_config, data, 1, guess)
-        truth = {lidar: of.initial for lidar, of in true_config.lidars.items()}
+        truth = {lidar: of.given for lidar, of in true_config.lidars.items()}
         return open_recording(config), config, truth
 
     return opened

@@ -281,7 +281,7 @@ def guessed(config: Config, true_config: Config, data: Path, seed: int, guess: i
     rng = np.random.default_rng((seed, guess))
     lidars = {}
     for name, lidar in config.lidars.items():
-        initial = perturbed_extrinsic(true_config.lidars[name].initial, InitialGuessModel(), rng)
+        initial = perturbed_extrinsic(true_config.lidars[name].given, InitialGuessModel(), rng)
         lidars[name] = lidar.model_copy(update={"initial": initial})
     where = config.data.model_copy(update={"path": data.resolve()})
     return config.model_copy(update={"data": where, "lidars": lidars})
@@ -334,7 +334,7 @@ def calibrate_once(config: Config, true_config: Config, guess: int) -> Outcome:
         run = calibrate([open_recording(config)], config, SilentProgress())
     except Exception as e:  # a failure is a result too
         return replace(outcome, failure=f"{type(e).__name__}: {e}")
-    truth = {n: lidar.initial.pose() for n, lidar in true_config.lidars.items()}
+    truth = {n: lidar.guess() for n, lidar in true_config.lidars.items()}
     return measured(outcome, run.calibration, truth)
 
 

@@ -116,7 +116,7 @@ def _late() -> Scenario:
 
 def _off(config: Config) -> Config:
     lidar = config.lidars[OFF_LIDAR]
-    (x, y, z), (roll, pitch, yaw) = lidar.initial.xyz, lidar.initial.rpy_deg
+    (x, y, z), (roll, pitch, yaw) = lidar.given.xyz, lidar.given.rpy_deg
     initial = PoseConfig(xyz=(x + OFF_M[0], y + OFF_M[1], z), rpy_deg=(roll, pitch, yaw + OFF_DEG))
     lidars = {**config.lidars, OFF_LIDAR: lidar.model_copy(update={"initial": initial})}
     return config.model_copy(update={"lidars": lidars})

@@ -108,8 +108,8 @@ def _height(config: Config, rng: np.random.Generator) -> Config:
 
 def _guess(config: Config, rng: np.random.Generator) -> Config:
     rear = config.lidars["rear"]
-    roll, pitch, yaw = rear.initial.rpy_deg
-    x, y, z = rear.initial.xyz
+    roll, pitch, yaw = rear.given.rpy_deg
+    x, y, z = rear.given.xyz
     way = float(rng.choice([-1.0, 1.0]))
     initial = PoseConfig(xyz=(x, y + 0.8 * way, z), rpy_deg=(roll, pitch, yaw + 15.0 * way))
     lidars = {**config.lidars, "rear": rear.model_copy(update={"initial": initial})}

@@ -107,7 +107,7 @@ def main() -> int:
         calibration = read_calibration(demo / "result/calibration.yaml")
         truth = read_truth(demo / "drive/truth.yaml")
         after = {name: lidar.T_vehicle_lidar for name, lidar in calibration.lidars.items()}
-        before = {name: lidar.initial.pose() for name, lidar in config.lidars.items()}
+        before = {name: lidar.guess() for name, lidar in config.lidars.items()}
         points = points_in_the_map(config, before, after)
     except (CalivError, OSError) as e:
         print(f"error: {e}. Run scripts/demo first", file=sys.stderr)

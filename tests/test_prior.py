@@ -160,7 +160,7 @@ def test_a_trusted_mounting_is_not_data(arcs: TwoArcs) -> None:
     trusted = lidars["rear"].model_copy(
         update={
             "fixed": True,
-            "initial": lidars["rear"].initial.model_copy(
+            "initial": lidars["rear"].given.model_copy(
                 update={"xyz": (x, y, z), "rpy_deg": (0.0, 10.0, 180.0)}
             ),
         }

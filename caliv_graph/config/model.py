@@ -158,8 +158,9 @@ class LidarConfig(Section):
             raise ValueError("fixed: true trusts the initial guess, and initial is not given")
         return self
 
-    def guess(self) -> gtsam.Pose3:
-        """`T_vehicle_lidar`, the initial guess.
+    @property
+    def given(self) -> PoseConfig:
+        """The initial guess as it was entered.
 
         Raises:
             ConfigError: there is none.
@@ -169,7 +170,15 @@ class LidarConfig(Section):
                 f"the LiDAR with topic {self.topic} has no initial guess. Enter its 'initial', or "
                 "what 'caliv-graph calibrate' finds"
             )
-        return self.initial.pose()
+        return self.initial
+
+    def guess(self) -> gtsam.Pose3:
+        """`T_vehicle_lidar`, the initial guess.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        return self.given.pose()
 
 
 class FoundLidarConfig(LidarConfig):

@@ -48,10 +48,10 @@ def test_guesses_of_a_caliv_config_beside_the_data(drive: Path, tmp_path: Path) 
     assert f"taken from {drive / 'original_config.yaml'}\n" in result.stdout
     config = load_config(out)
     assert list(config.lidars) == ["sensor_1", "sensor_2"]
-    assert config.lidars["sensor_1"].initial.xyz == (2.259, 0.0, 1.938)
-    assert config.lidars["sensor_1"].initial.rpy_deg == (0.0, 10.0, 0.0)
-    assert config.lidars["sensor_2"].initial.xyz == (-0.4, 0.003, 2.1)
-    assert config.lidars["sensor_2"].initial.rpy_deg == (1.0, 10.0, 180.0)
+    assert config.lidars["sensor_1"].given.xyz == (2.259, 0.0, 1.938)
+    assert config.lidars["sensor_1"].given.rpy_deg == (0.0, 10.0, 0.0)
+    assert config.lidars["sensor_2"].given.xyz == (-0.4, 0.003, 2.1)
+    assert config.lidars["sensor_2"].given.rpy_deg == (1.0, 10.0, 180.0)
     assert config.target
     assert config.target[0].min == (10.0, -14.0, -5.0)
     assert config.target[0].max == (20.0, -4.0, 5.0)
@@ -74,7 +74,7 @@ def test_what_is_not_known_is_left_to_a_person(drive: Path, tmp_path: Path) -> N
     assert text.count("TODO") == 4
     config = load_config(out)
     assert config.target is None
-    assert config.lidars["sensor_1"].initial.xyz == (0.0, 0.0, 0.0)
+    assert config.lidars["sensor_1"].given.xyz == (0.0, 0.0, 0.0)
 
 
 GMMCALIB = """\
@@ -279,8 +279,8 @@ def test_a_urdf_has_the_last_word(tmp_path: Path) -> None:
     init(write_sensors(tmp_path / "drive"), "--urdf", urdf, "--out", tmp_path / "config.yaml")
 
     config = load_config(tmp_path / "config.yaml")
-    assert config.lidars["front"].initial.xyz == (1.0, 0.0, 2.1)
-    assert config.lidars["rear"].initial.xyz == (3.0, 0.0, 1.5)
+    assert config.lidars["front"].given.xyz == (1.0, 0.0, 2.1)
+    assert config.lidars["rear"].given.xyz == (3.0, 0.0, 1.5)
 
 
 def test_a_bag_without_extrinsics(tmp_path: Path) -> None:
@@ -291,7 +291,7 @@ def test_a_bag_without_extrinsics(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "taken" not in result.stdout
     assert "lidars.front.initial, lidars.rear.initial, imu.T_vehicle_imu, gnss" in result.stderr
-    assert load_config(out).lidars["front"].initial.xyz == (0.0, 0.0, 0.0)
+    assert load_config(out).lidars["front"].given.xyz == (0.0, 0.0, 0.0)
     assert "(the bag, which has no /tf_static, has no frame base_link)" in out.read_text()
     # Zeros would say that the IMU's axes are the vehicle's; what is not known is estimated.
     assert load_config(out).imu.T_vehicle_imu.rpy_deg is None
@@ -378,7 +378,7 @@ def test_extrinsics_repeated_on_tf(tmp_path: Path) -> None:
     init(write_bag(tmp_path / "drive", [points, *moving]), "--out", tmp_path / "config.yaml")
 
     config = load_config(tmp_path / "config.yaml")
-    assert config.lidars["lidar"].initial.xyz == (1.0, 0.0, 2.0)
+    assert config.lidars["lidar"].given.xyz == (1.0, 0.0, 2.0)
     assert config.topics.pose == "/tf"
 
 

@@ -343,8 +343,8 @@ def test_the_solve_starts_from_the_earlier_mountings() -> None:
 
     front = started.lidars["front"]
     T = before.lidars["front"].T_vehicle_lidar
-    assert front.initial.xyz == pytest.approx(T.translation())
-    angles = np.radians(front.initial.rpy_deg)
+    assert front.given.xyz == pytest.approx(T.translation())
+    angles = np.radians(front.given.rpy_deg)
     assert gtsam.Rot3.RzRyRx(*angles).equals(T.rotation(), 1e-12)
     assert front.sigma == config().lidars["front"].sigma
     assert started.lidars["roof"] == config().lidars["roof"]

@@ -18,7 +18,7 @@ STYLE = TEMPLATES.joinpath("style.css").read_text("utf-8")
 DRAW = TEMPLATES.joinpath("draw.js").read_text("utf-8")
 
 
-def scatter(x: object, y: object, **layout: object) -> Plot:
+def scatter(x: object, y: object, **layout: Any) -> Plot:
     plot = Plot(("before", "after"))
     for panel in (1, 2):
         plot.add(

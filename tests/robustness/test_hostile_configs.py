@@ -93,7 +93,7 @@ def test_anything_is_a_config_or_one_line(raw: dict[str, Any], lidar: Any) -> No
             assert said.startswith("config.yaml: ")
             assert len(said) < 2000
         else:
-            assert all(map(math.isfinite, config.lidars[config.reference].initial.xyz))
+            assert all(map(math.isfinite, config.lidars[config.reference].given.xyz))
 
 
 @QUIET

@@ -127,8 +127,8 @@ def test_guesses_are_drawn_as_in_the_paper() -> None:
     drawn = [benchmark.guessed(config, config, ROOT, 1, guess) for guess in range(50)]
 
     for name, lidar in config.lidars.items():
-        true = lidar.initial.pose()
-        guesses = [c.lidars[name].initial.pose() for c in drawn]
+        true = lidar.guess()
+        guesses = [c.lidars[name].guess() for c in drawn]
         shift = np.array([g.translation() - true.translation() for g in guesses])
         turn = np.array([true.rotation().between(g.rotation()).rpy() for g in guesses])
         assert 0.09 < np.abs(shift).max() < 0.1 + 1e-5

@@ -203,8 +203,8 @@ def test_without_noise_given_poses_and_guesses_are_the_truth(quiet: SimulatedDri
             assert pose.equals(true[frame], 1e-9)
     config = load_config(quiet.folder / "config.yaml")
     for name, lidar in config.lidars.items():
-        assert lidar.initial.xyz == pytest.approx(QUIET.lidars[name].mounting.xyz)
-        assert lidar.initial.rpy_deg == pytest.approx(QUIET.lidars[name].mounting.rpy_deg)
+        assert lidar.given.xyz == pytest.approx(QUIET.lidars[name].mounting.xyz)
+        assert lidar.given.rpy_deg == pytest.approx(QUIET.lidars[name].mounting.rpy_deg)
 
 
 def test_vehicle_heaves_about_a_height_of_its_own(quiet: SimulatedDrive) -> None:
@@ -258,9 +258,9 @@ def test_config_is_ready_to_run(small: SimulatedDrive) -> None:
     assert region.max == pytest.approx((9.0 + 0.37 + 5.0, -3.0 + 0.36 + 5.0, 6.25), abs=0.01)
     extrinsics = true_mountings(small.folder)
     for name, lidar in config.lidars.items():
-        shift = np.array(lidar.initial.xyz) - extrinsics[name].translation()
+        shift = np.array(lidar.given.xyz) - extrinsics[name].translation()
         assert 0.001 < np.abs(shift).max() <= 0.1
-        guess = gtsam.Rot3.RzRyRx(np.radians(lidar.initial.rpy_deg))
+        guess = gtsam.Rot3.RzRyRx(np.radians(lidar.given.rpy_deg))
         turn = np.degrees(extrinsics[name].rotation().between(guess).rpy())
         assert 0.05 < np.abs(turn).max() <= 3.0 + 1e-5
         assert lidar.sigma.xyz == pytest.approx(0.1 / 3.0**0.5)

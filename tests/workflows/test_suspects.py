@@ -66,7 +66,7 @@ def test_a_guess_is_set_where_the_data_have_it() -> None:
         "lidars.rear.initial", (-0.4, 0.8, 2.0, 0.0, 10.0, 165.0), (0.06,) * 3 + (2.0,) * 3
     )
     assert trial is not None
-    assert trial.config.lidars["rear"].initial.xyz == (-0.4, 0.8, 2.0)
+    assert trial.config.lidars["rear"].given.xyz == (-0.4, 0.8, 2.0)
     assert trial.config.lidars["rear"].sigma.rpy_deg == 2.0
     assert trial.config.lidars["front"] == CONFIG.lidars["front"]
 

@@ -206,7 +206,7 @@ def test_target_is_found_with_the_worst_guess_at_20_metres(
     scene = chair_at_20()
     wrong = wrong_by(rpy_deg, shift_m)
     middle = np.array([*CHAIR_AT_20.xy_m, 0.6])
-    T_wrong_true = wrong.initial.pose().compose(FRONT.mounting.pose().inverse())
+    T_wrong_true = wrong.guess().compose(FRONT.mounting.pose().inverse())
     # The guess puts all of the chair outside the box that it stands in.
     assert np.linalg.norm(T_wrong_true.transformFrom(middle) - middle) > 1.0
 

@@ -367,7 +367,7 @@ class TestInvariance:
                 float(gtsam.Rot3.Logmap(T.rotation() * drive.truth[name].rotation().inverse())[2])
             )
 
-        before = [yaw_error(c.initial.pose(), n) for n, c in drive.config.lidars.items()]
+        before = [yaw_error(c.guess(), n) for n, c in drive.config.lidars.items()]
         after = [yaw_error(found.aligned[n], n) for n in drive.config.lidars]
         assert sum(after) < 0.5 * sum(before)
 
@@ -378,7 +378,7 @@ class TestGuessesFarOff:
         drive = recorded("street")
         lidars = dict(drive.config.lidars)
         for name in names:
-            (x, y, z), (roll, pitch, yaw) = lidars[name].initial.xyz, lidars[name].initial.rpy_deg
+            (x, y, z), (roll, pitch, yaw) = lidars[name].given.xyz, lidars[name].given.rpy_deg
             initial = PoseConfig(xyz=(x + 0.6, y - 0.5, z), rpy_deg=(roll, pitch, yaw + 15.0))
             lidars[name] = lidars[name].model_copy(update={"initial": initial})
         off = replace(drive, config=drive.config.model_copy(update={"lidars": lidars}))
@@ -390,13 +390,13 @@ class TestGuessesFarOff:
         config, sentences = realigned(off.config, [found])
         for name, sentence in zip(found.misplaced, sentences, strict=True):
             assert sentence.startswith(f"lidar '{name}': the objects that it sees stand still on")
-            T = config.lidars[name].initial.pose().between(drive.truth[name])
+            T = config.lidars[name].guess().between(drive.truth[name])
             assert abs(T.rotation().yaw()) < math.radians(6.0)
 
     def test_a_tilt_is_found_by_the_ground(self) -> None:
         drive = recorded("street")
         lidars = dict(drive.config.lidars)
-        (x, y, z), (roll, pitch, yaw) = lidars["rear"].initial.xyz, lidars["rear"].initial.rpy_deg
+        (x, y, z), (roll, pitch, yaw) = lidars["rear"].given.xyz, lidars["rear"].given.rpy_deg
         initial = PoseConfig(xyz=(x, y, z + 0.5), rpy_deg=(roll - 12.0, pitch + 9.0, yaw))
         lidars["rear"] = lidars["rear"].model_copy(update={"initial": initial})
         config = drive.config.model_copy(

@@ -25,7 +25,7 @@
   }
   // On a narrow screen, panels that are side by side go one below another.
   function fit(layout, plot) {
-    const width = plot.clientWidth, count = Number(plot.dataset.across);
+    const width = plot.clientWidth, count = Number(plot.parentNode.dataset.across);
     if (width >= layout.width) { return; }
     layout.width = width;
     layout.height = plot.clientHeight;

@@ -47,7 +47,9 @@
     const figure = JSON.parse(coloured(document.getElementById("data-" + name).textContent));
     fit(figure.layout, plot);
     plot.textContent = "";
-    return Plotly.newPlot(plot, figure.data, figure.layout, options).then(function () {
+    // The bar of buttons would cover the legend of a narrow figure.
+    const bar = figure.layout.width < 640 ? { displayModeBar: false } : {};
+    return Plotly.newPlot(plot, figure.data, figure.layout, Object.assign(bar, options)).then(function () {
       if (!plot.parentNode.classList.contains("solid")) { return undefined; }
       plot.on("plotly_relayout", function () { keepStill(plot); });
       return keepStill(plot);

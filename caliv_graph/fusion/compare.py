@@ -35,6 +35,7 @@ from caliv_graph.uncertainty.observability import (
 )
 from caliv_graph.uncertainty.pairs import sensor_pairs
 from caliv_graph.wording.directions import named
+from caliv_graph.wording.movements import moved_sentence, shared_sentence
 
 ALPHA = 0.01
 """Probability of a false alarm if no mount has moved, over all tests of one comparison."""
@@ -169,7 +170,8 @@ def compare(
     if not shared:
         return found
     same = set(terms[0].sources) == set(terms[1].sources)
-    return replace(found, shared=shared, conclusion=shared_conclusion(found, same))
+    said = shared_sentence(found.conclusion, same, *_moved(found))
+    return replace(found, shared=shared, conclusion=said)
 
 
 def compare_terms(
@@ -200,17 +202,19 @@ def compare_terms(
         )
         identity = np.eye(len(everything))
         chi2, dof, p = _test(everything, [(identity, drive) for drive in drives])
-    return Comparison(
+    found = Comparison(
         lidars=lidars,
         pairs=pairs,
         chi2=chi2,
         dof=dof,
         p_value=p,
         moved=any(m.moved for m in tested),
-        conclusion=_conclusion(lidars, pairs),
+        conclusion="",
         not_compared=left_out,
         undetermined=(drives[0].undetermined, drives[1].undetermined),
     )
+    any_test = any(m.dof for m in tested)
+    return replace(found, conclusion=moved_sentence(any_test, len(lidars), *_moved(found)))
 
 
 def holm(movements: Sequence[Movement], p_value: float) -> list[Movement]:
@@ -393,44 +397,7 @@ def _squared(root: Array) -> Array:
     return np.asarray(root @ root.T)
 
 
-def shared_conclusion(found: Comparison, same: bool) -> str:
-    """The verdict on two calibrations with common data; `same`: they have no other data."""
-    if not same:
-        return (
-            f"{found.conclusion} The two share data of a drive: their errors are partly the same, "
-            "and a small movement may be missed."
-        )
-    differ = [name for name, m in found.lidars.items() if m.moved]
-    differ += [f"{m.lidars[0]}' against '{m.lidars[1]}" for m in found.pairs if m.moved]
-    if not differ:
-        return (
-            "Both are results of one drive, and they agree. Whether a mount has moved needs a "
-            "second drive."
-        )
-    names = ", ".join(f"'{name}'" for name in differ)
-    return (
-        f"Both are results of one drive, and they differ by more than their sigmas: {names}. No "
-        "mount has moved between them: the settings differ, or a sigma is too small."
-    )
-
-
-def _conclusion(lidars: Mapping[str, Movement], pairs: Sequence[Movement]) -> str:
-    """The verdict in words."""
-    movements = [*lidars.values(), *pairs]
-    if not any(m.dof for m in movements):
-        return "Nothing can be said: no direction is determined by both drives."
-    moved = [name for name, m in lidars.items() if m.moved]
-    apart = [m.lidars for m in pairs if m.moved]
-    if not moved and not apart:
-        return "No mount has moved, as far as these drives can tell."
-    if not moved:
-        which = ", ".join(f"'{a}' against '{b}'" for a, b in apart)
-        return f"A mount has moved: {which}. The drives do not determine which of the two."
-    if len(moved) == len(lidars) > 1 and not apart:
-        return (
-            "All LiDARs have moved together against the vehicle frame: their common rack "
-            "has moved, or the frame itself (IMU, GNSS antenna)."
-        )
-    verb = "has" if len(moved) == 1 else "have"
-    kind = "LiDAR" if len(moved) == 1 else "LiDARs"
-    return f"{kind} {', '.join(repr(name) for name in moved)} {verb} moved."
+def _moved(found: Comparison) -> tuple[list[str], list[tuple[str, str]]]:
+    """LiDARs that moved against the vehicle, and pairs that moved against each other."""
+    apart = [(m.lidars[0], m.lidars[1]) for m in found.pairs if m.moved]
+    return [name for name, m in found.lidars.items() if m.moved], apart

@@ -86,7 +86,7 @@ def recorded_sensors(path: Path) -> tuple[str, ...]:
 
 
 def is_recorded_bag(path: Path) -> bool:
-    """Whether a drive is a bag rather than a CaLiV folder.
+    """Whether a drive is a bag rather than folders of clouds.
 
     Raises:
         RecordingError: it is neither, or missing.
@@ -96,7 +96,7 @@ def is_recorded_bag(path: Path) -> bool:
     try:
         if path.exists() and is_bag(path):
             return True
-        if _is_caliv_folder(path):
+        if _is_caliv_folder(path) or folders_of_clouds(path):
             return False
         raise RecordingError(f"{path}: {_no_drive(path)}")
     except (OSError, ValueError) as e:
@@ -124,7 +124,7 @@ def _no_drive(path: Path) -> str:
     inside = [
         entry
         for entry in sorted(path.iterdir())
-        if entry.is_dir() and (is_bag(entry) or _is_caliv_folder(entry))
+        if entry.is_dir() and (is_bag(entry) or _is_caliv_folder(entry) or folders_of_clouds(entry))
     ]
     if inside:
         return f"is not a drive, but holds drives. Give {' or '.join(map(str, inside[:3]))}"

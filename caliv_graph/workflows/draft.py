@@ -41,7 +41,7 @@ from caliv_graph.workflows.draft_text import (
     target_text,
     yaml_list,
 )
-from caliv_graph.workflows.frame_guesses import NO_GUESS, Frames, read_frames
+from caliv_graph.workflows.frame_guesses import Frames, read_frames
 
 _HEIGHT = "ground.vehicle_height"
 
@@ -95,9 +95,7 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
     original = find_original(drive_folder(data))
     extrinsics = original.extrinsics if original else {}
     target = original.target if original else None
-    unknown = [f"lidars.{sensor}.initial" for sensor in sensors if sensor not in extrinsics]
-    if target is None:
-        unknown.append("target")
+    unknown = [] if target else ["target"]
     unknown.append(_HEIGHT)
     source = original.source if original else ""
     lidars = "\n".join(
@@ -105,8 +103,8 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
             sensor,
             sensor,
             "its folder of clouds",
-            *extrinsics.get(sensor, NO_GUESS),
-            from_source(source) if sensor in extrinsics else TODO_POSE,
+            extrinsics.get(sensor),
+            from_source(source) if sensor in extrinsics else "no config beside the data has it",
         )
         for sensor in sensors
     )
@@ -136,7 +134,7 @@ def _draft_of_clouds(data: Path, config: Path, folders: Sequence[str]) -> Draft:
     else:
         path += f"\n  poses: {scalar(_relative(poses, config))}\t# of the vehicle in the map"
     lidars = [
-        lidar_text(name, folder, "its folder of clouds", *NO_GUESS, TODO_POSE)
+        lidar_text(name, folder, "its folder of clouds", None, "the clouds name no frames")
         for name, folder in names.items()
     ]
     text = align(
@@ -150,8 +148,8 @@ def _draft_of_clouds(data: Path, config: Path, folders: Sequence[str]) -> Draft:
             ground=ground_text(None),
         )
     )
-    unknown = ["data.poses"] * (poses is None) + [f"lidars.{name}.initial" for name in names]
-    return Draft(text, tuple(names), (*unknown, _HEIGHT), "")
+    unknown = (*(() if poses else ("data.poses",)), _HEIGHT)
+    return Draft(text, tuple(names), unknown, "")
 
 
 def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
@@ -160,10 +158,10 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
     clouds = choose_lidar_topics(bag)
     motion = choose_motion_topics(bag)
     height = frames.height()
-    lidars, unknown_lidars = _lidars_of_bag(bag, frames, clouds)
+    lidars, found = _lidars_of_bag(bag, frames, clouds)
     mounts, unknown_mounts = _mounts_of_bag(bag, frames, motion)
     unknown = [] if motion.chosen else ["topics"]
-    unknown += [*unknown_lidars, *unknown_mounts, *([] if height else [_HEIGHT])]
+    unknown += [*unknown_mounts, *([] if height else [_HEIGHT])]
     text = align(
         TEMPLATE.format(
             format="rosbag\t# a ROS 2 bag (folder, .mcap) or a ROS 1 .bag",
@@ -175,24 +173,23 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
             ground=ground_text(height),
         )
     )
-    found = [name for name in clouds.chosen if f"lidars.{name}.initial" not in unknown]
     taken = f"Initial guesses of {', '.join(found)} taken from {frames.source}" if found else ""
     return Draft(text, tuple(clouds.chosen), tuple(unknown), taken)
 
 
 def _lidars_of_bag(bag: Bag, frames: Frames, clouds: LidarTopics) -> tuple[str, list[str]]:
-    """The sections of the LiDARs, and the keys in them that are not known."""
-    lidars, unknown = [], []
+    """The sections of the LiDARs, and the names of those with a guess."""
+    lidars, found = [], []
     for name, topic in clouds.chosen.items():
         guess = frames.extrinsic(clouds.frame_ids[name], name)
-        if guess.T_vehicle_sensor is None:
-            unknown.append(f"lidars.{name}.initial")
+        known = guess.T_vehicle_sensor is not None
+        found += [name] * known
         kind = bag.topics[topic].type.rpartition("/")[2]
         note = f"{kind} in frame {clouds.frame_ids[name] or '(none)'}"
-        origin = guess.origin if guess.T_vehicle_sensor else f"{TODO_POSE} ({guess.origin})"
-        lidars.append(lidar_text(name, topic, note, *guess.numbers(), origin))
+        numbers = guess.numbers() if known else None
+        lidars.append(lidar_text(name, topic, note, numbers, guess.origin))
     lidars += [comment(f"  # not taken: {topic}, {why}") for topic, why in clouds.others.items()]
-    return "\n".join(lidars), unknown
+    return "\n".join(lidars), found
 
 
 def _mounts_of_bag(bag: Bag, frames: Frames, motion: MotionTopics) -> tuple[str, list[str]]:

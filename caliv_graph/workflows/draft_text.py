@@ -45,18 +45,17 @@ def lidar_text(
     name: str,
     topic: str,
     topic_note: str,
-    xyz: Sequence[float],
-    rpy_deg: Sequence[float],
+    guess: tuple[Sequence[float], Sequence[float]] | None,
     origin: str,
 ) -> str:
-    """The section of one LiDAR."""
+    """The section of one LiDAR; `origin`: where its guess is from, or why there is none."""
+    if guess is None:
+        initial = NO_INITIAL_TEMPLATE.format(origin=comment(origin))
+    else:
+        xyz, rpy_deg = map(yaml_list, guess)
+        initial = INITIAL_TEMPLATE.format(origin=comment(origin), xyz=xyz, rpy_deg=rpy_deg)
     return LIDAR_TEMPLATE.format(
-        name=scalar(name),
-        topic=scalar(topic),
-        topic_note=comment(topic_note),
-        origin=comment(origin),
-        xyz=yaml_list(xyz),
-        rpy_deg=yaml_list(rpy_deg),
+        name=scalar(name), topic=scalar(topic), topic_note=comment(topic_note), initial=initial
     )
 
 
@@ -96,15 +95,24 @@ require: [s2s]\t# exit code 0 means that these are determined: s2s, s2v_rotation
 LIDAR_TEMPLATE = """\
   {name}:
     topic: {topic}\t# {topic_note}
+{initial}
+    min_range: 1.0\t# metres; nearer returns (the vehicle's own body) are dropped
+    max_range: 200.0\t# metres; farther returns are dropped
+    stamp: auto\t# what a cloud's stamp marks: start or end of its sweep; auto: by the data"""
+
+INITIAL_TEMPLATE = """\
     initial:\t# T_vehicle_lidar, {origin}
       xyz: {xyz}\t# metres forward, left, up
       rpy_deg: {rpy_deg}\t# degrees; pitch > 0 is nose down, yaw > 0 left
     sigma:\t# how far off it may be, 1 sigma: a number, or one per vehicle axis
       xyz: 0.058\t# metres; 0.058 is anything up to +-0.1 m
-      rpy_deg: 1.73\t# degrees; 1.73 is anything up to +-3 degrees
-    min_range: 1.0\t# metres; nearer returns (the vehicle's own body) are dropped
-    max_range: 200.0\t# metres; farther returns are dropped
-    stamp: auto\t# what a cloud's stamp marks: start or end of its sweep; auto: by the data"""
+      rpy_deg: 1.73\t# degrees; 1.73 is anything up to +-3 degrees"""
+
+NO_INITIAL_TEMPLATE = """\
+    initial: null\t# T_vehicle_lidar, found from the drive: {origin}
+    # A guess decides what the drive leaves open. If you have one, put it here, with its sigma:
+    # initial: {{xyz: [2.0, 0.0, 1.8], rpy_deg: [0.0, 10.0, 0.0]}}\t# metres and degrees
+    # sigma: {{xyz: 0.058, rpy_deg: 1.73}}\t# 1 sigma"""
 
 TARGET_TEMPLATE = """\
 target:\t# a box around the target, with nothing else above the ground in it

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ STYLE = TEMPLATES.joinpath("style.css").read_text("utf-8")
 DRAW = TEMPLATES.joinpath("draw.js").read_text("utf-8")
 
 
-def scatter(x: object, y: object, **layout: Any) -> Plot:
+def scatter(x: Any, y: Any, **layout: Any) -> Plot:
     plot = Plot(("before", "after"))
     for panel in (1, 2):
         plot.add(

@@ -25,7 +25,7 @@
   }
   // On a narrow screen, panels that are side by side go one below another.
   function fit(layout, plot) {
-    const width = plot.clientWidth, count = Number(plot.dataset.across);
+    const width = plot.clientWidth, count = Number(plot.parentNode.dataset.across);
     if (width >= layout.width) { return; }
     layout.width = width;
     layout.height = plot.clientHeight;
@@ -47,7 +47,9 @@
     const figure = JSON.parse(coloured(document.getElementById("data-" + name).textContent));
     fit(figure.layout, plot);
     plot.textContent = "";
-    return Plotly.newPlot(plot, figure.data, figure.layout, options).then(function () {
+    // The bar of buttons would cover the legend of a narrow figure.
+    const bar = figure.layout.width < 640 ? { displayModeBar: false } : {};
+    return Plotly.newPlot(plot, figure.data, figure.layout, Object.assign(bar, options)).then(function () {
       if (!plot.parentNode.classList.contains("solid")) { return undefined; }
       plot.on("plotly_relayout", function () { keepStill(plot); });
       return keepStill(plot);

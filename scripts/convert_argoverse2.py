@@ -5,8 +5,8 @@
     caliv-graph calibrate configs/datasets/argoverse2.yaml --data out/argoverse2 --out out/result
 
 A sweep of Argoverse 2 holds the points of two VLP-32C in the vehicle frame, each moved to the time
-of the sweep. Here they go back: each to the time when it was taken, into the frame of its LiDAR, with
-the extrinsics of the log. What is calibrated is how far these extrinsics are off.
+of the sweep. Here they go back: each to the time when it was taken and into the frame of its LiDAR,
+by the extrinsics of the log. What is calibrated is how far these extrinsics are off.
 
 `laser_number` 0 to 31 is one LiDAR and 32 to 63 the other, but which of them is `up_lidar` is not
 documented. The beams of a laser have one elevation, but only in the frame of its LiDAR: that tells.

@@ -2,13 +2,14 @@
 
     .venv/bin/python scripts/benchmark_dialects.py --seeds 2 --out out/dialects
 
-The drive is `distorted` (a figure-eight, sweeps of 0.1 s), with LiDARs that turn once in a sweep.
+The drive is `distorted`, a figure-eight with sweeps of 0.1 s.
 NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3 sigma). The rows:
 
     plain        stamps at the start of the sweep
     end          stamps at its end, times that count from its start (`stamp: auto`)
     as start     the same bag with `stamp: start`: what a wrong stamp costs
-    packets      stamps at the end, and times that start anew with every packet
+    turning      as plain, with LiDARs that turn once in a sweep
+    packets      the same, stamps at the end, times that start anew with every packet
     inspvax      poses as novatel_oem7_msgs/INSPVAX instead of IMU, GNSS and velocity
     tum          poses as a TUM file beside the bag
     navpvt       fixes as ublox_msgs/NavPVT
@@ -46,6 +47,7 @@ SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "dist
 PACKET_S = 24 * 55.296e-6
 SWEEPS: dict[str, dict[str, Any]] = {
     "plain": {"time_field": "t"},
+    "turning": {"time_field": "t"},
     "end": {"time_field": "t", "stamp_at": "end", "times_from": "start"},
     "packets": {
         "time_field": "time",
@@ -55,7 +57,7 @@ SWEEPS: dict[str, dict[str, Any]] = {
     },
 }
 WRITTEN = {"as start": "end", "inspvax": "plain", "tum": "plain", "navpvt": "plain"}
-ROWS = ("plain", "end", "as start", "packets", "inspvax", "tum", "navpvt")
+ROWS = ("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets")
 POSITION_M, ROTATION_RAD = 0.01, 1e-3
 """White noise of the poses of INSPVAX and TUM."""
 
@@ -99,10 +101,12 @@ def result(row: str, seed: int, out: Path) -> str:
 
 
 def described(kind: str) -> dict[str, Any]:
-    """The scenario, with LiDARs that turn once in a sweep."""
+    """The scenario with the sweeps of a row."""
     raw: dict[str, Any] = load_scenario(SCENARIO).model_dump(mode="json", exclude_none=True)
     for lidar in raw["lidars"].values():
-        lidar |= {"horizontal_fov_deg": [-180.0, 180.0], "sweep": dict(SWEEPS[kind])}
+        lidar["sweep"] = dict(SWEEPS[kind])
+        if kind in ("turning", "packets"):
+            lidar["horizontal_fov_deg"] = [-180.0, 180.0]
     raw["bag"]["transport_s"] = 0.004
     return raw
 

@@ -97,7 +97,7 @@ class Tried:
 
     def from_the_guess(self, name: str) -> Array:
         """(6,) where a mounting is from its guess, vehicle axes."""
-        initial = self.drive.config.lidars[name].initial
+        initial = self.drive.config.lidars[name].given
         roll, pitch, yaw = np.radians(initial.rpy_deg)
         guess = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array(initial.xyz))
         return vehicle_axes_difference(self.poses[name], guess)

@@ -71,9 +71,9 @@ def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
 
 
 def guess_problem(config: Config, path: Path) -> str:
-    """A sentence on a draft of `init`, read from `path`, whose guesses are still zeros; or nothing.
+    """A sentence on a config, read from `path`, whose guesses are all zeros; or nothing.
 
-    Two LiDARs have the zeros that `init` writes for unknown guesses.
+    Two LiDARs have zeros, as drafts of older versions had for unknown guesses.
     """
     unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
     zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
@@ -82,13 +82,13 @@ def guess_problem(config: Config, path: Path) -> str:
     fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
     return (
         f"{path}: {fields} are all zeros, but two LiDARs cannot be in the same place. Enter xyz in "
-        "metres and rpy_deg in degrees from a tape measure or a drawing: errors of 0.1 m and 3 "
-        "degrees are fine"
+        "metres and rpy_deg in degrees from a tape measure or a drawing (errors of 0.1 m and 3 "
+        "degrees are fine), or 'initial: null': then they are found from the drive"
     )
 
 
 def check_guesses(config: Config, path: Path) -> None:
-    """Refuses a draft of `init`, read from `path`, whose initial guesses are still zeros.
+    """Refuses a config, read from `path`, in which the guesses of two LiDARs are zeros.
 
     Raises:
         ConfigError: see `guess_problem`.

@@ -204,8 +204,10 @@ class DataConfig(Section):
 
     @model_validator(mode="after")
     def _poses_of_its_own(self) -> DataConfig:
-        if self.format == "caliv" and self.poses is not None:
-            raise ValueError("poses: a CaLiV folder has its own, in input/ego_poses.yaml")
+        if self.format == "caliv" and (self.poses is not None or self.pose_axes != "flu"):
+            raise ValueError(
+                "poses, pose_axes: a CaLiV folder has its own, in input/ego_poses.yaml, with z up"
+            )
         return self
 
 

@@ -33,9 +33,6 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 _METADATA = "metadata.yaml"
 
-WITHOUT_HEADER = ("ublox_msgs/msg/NavPVT", "novatel_msgs/msg/INSPVAX")
-"""Types of motion data that do not begin with a `std_msgs/Header`."""
-
 _LATEST_NS = 2**62
 """Of a record time: the year 2116. The difference of two such times fits 64 bits."""
 

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+WITHOUT_HEADER = ("ublox_msgs/msg/NavPVT", "novatel_msgs/msg/INSPVAX")
+"""Types of motion data that do not begin with a `std_msgs/Header`."""
+
 _HEADER = "std_msgs/Header header\n"
 
 _INSPVAX = """

@@ -242,7 +242,8 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
 
 def first_frame(bag: Bag, topic: str) -> str | None:
     """The frame of the first message of a topic; empty: it is damaged; None: there is none."""
-    from caliv_graph.readers.bag import WITHOUT_HEADER, DamagedMessageError
+    from caliv_graph.readers.bag import DamagedMessageError
+    from caliv_graph.readers.definitions import WITHOUT_HEADER
     from caliv_graph.readers.frames import clean_frame
 
     if bag.topics[topic].type in WITHOUT_HEADER:

@@ -23,8 +23,9 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead
-from caliv_graph.readers.bag import WITHOUT_HEADER, Bag, DamagedMessageError, Header, Topic
+from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
 from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
+from caliv_graph.readers.definitions import WITHOUT_HEADER
 from caliv_graph.readers.frames import TF_TYPES, clean_frame
 from caliv_graph.readers.motion import (
     MOTION_TYPES,

@@ -167,7 +167,8 @@ TIMED = {"ouster": -0.099, "horizontal": -0.099, "vertical": -0.099, "left_os1":
 
 
 def test_every_config_has_a_layout() -> None:
-    assert {path.stem for path in DATASETS.glob("*.yaml")} == set(LAYOUTS)
+    # Argoverse 2 has its test beside its converter.
+    assert {path.stem for path in DATASETS.glob("*.yaml")} == {*LAYOUTS, "argoverse2"}
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from caliv_graph.cli.main import app
 from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.errors import RecordingError
+from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import Recording
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.discover import open_all
@@ -182,3 +182,12 @@ def test_inspect_and_init_know_such_folders(tmp_path: Path) -> None:
     recording = open_recording(loaded)
     assert len(list(recording.scans(recording.lidars[0]))) == 6
     assert open_all(root).lidars == recording.lidars
+
+
+@pytest.mark.parametrize("more", [{"poses": "poses.tum"}, {"pose_axes": "frd"}])
+def test_a_caliv_folder_has_poses_of_its_own(tmp_path: Path, more: dict[str, str]) -> None:
+    lidars = {"top": {"topic": "sensor_1", "initial": {"xyz": [0, 0, 0]}}}
+    raw = {"data": {"format": "caliv", "path": "drive", **more}, "lidars": lidars}
+
+    with pytest.raises(ConfigError, match="a CaLiV folder has its own"):
+        parse_config(raw, "config.yaml", tmp_path)

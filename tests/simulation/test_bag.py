@@ -251,7 +251,7 @@ def test_tree_of_frames_has_the_initial_guesses(
 ) -> None:
     ((_, message),) = bag["/tf_static"]
     config = load_config(folder / "config.yaml")
-    expected = {f"lidar_{name}": lidar.initial for name, lidar in config.lidars.items()}
+    expected = {f"lidar_{name}": lidar.given for name, lidar in config.lidars.items()}
     expected["imu_link"] = SCENARIO.imu.mounting
     expected["gnss_link"] = PoseConfig(xyz=SCENARIO.gnss.lever_arm)
     assert {t.child_frame_id for t in message.transforms} == set(expected)

@@ -113,7 +113,9 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
     ("sections", "part"),
     [
         ({"lidars": {}}, "'lidars': "),
-        ({"lidars": {"front": {"topic": "a"}}}, "'lidars.front.initial' is missing"),
+            ({"lidars": {"front": {"topic": "a", "fixed": True}}}, "and initial is not given"),
+            ({"lidars": {"front": {"topic": "a"}}, "solve": {"mode": "staged"}},
+             "lidars.front.initial is not given"),
         ({"lidars": lidar(initial={"xyz": [0, math.nan, 0]})}, "'lidars.front.initial.xyz.1': "
          "must be a finite number (got 'nan')"),
         ({"lidars": lidar(initial={"xyz": [0, 0]})}, "'lidars.front.initial.xyz.2' is missing"),

@@ -21,7 +21,6 @@ from caliv_graph.structure.solve import (
     Problem,
     Solved,
     relative_motions,
-    repeated_views,
     solve_structure,
 )
 from caliv_graph.structure.standing import Standing
@@ -31,6 +30,7 @@ from caliv_graph.structure.thickness import (
     thickness_at_estimate,
     thickness_at_guesses,
 )
+from caliv_graph.structure.views import views_of
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 
@@ -125,7 +125,7 @@ def problem_of(
         guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
-        repeated=repeated_views(patches, pose_of_scan, prior),
+        views=views_of(patches, pose_of_scan, prior),
     )
 
 

@@ -12,6 +12,7 @@ from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.solve import Problem, Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import term_of
+from caliv_graph.structure.views import Views
 from tests.structure.yards import (
     STEP_NS,
     TRUE,
@@ -47,7 +48,7 @@ def problem_of(
         guess_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
         range_sigma_m=0.01,
         standing=NO_GROUND,
-        repeated=np.ones(len(patches.stamps_ns)),
+        views=Views.numbered(np.arange(len(patches.stamps_ns))),
     )
 
 

@@ -120,7 +120,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     if not strips.count:
         return None
     sigma = range_sigmas(problem.patches, problem.range_sigma_m)
-    layout = layout_of(problem, strips)
+    layout = replace(layout_of(problem, strips), jitters=used.layout.jitters)
     sightings = placed_sightings(problem, placed, strips, sigma)
     geometry = geometry_at(problem, _on(used.state, strips, layout), sightings, layout)
     lidar = problem.patches.scan_lidar[sightings.scan]

@@ -49,6 +49,10 @@ SPREADS = (3.0, 6.0)
 """Offset of a sighting in sigmas up to which it has full weight, and from which it has none."""
 
 
+LEAST_JITTER_S = 1e-5
+MOST_JITTER_S = 0.02
+"""1 sigma of the jitter of stamps: 20 um at 2 m/s, and a fifth of a revolution."""
+
 PROBES = 20
 """Random vectors for the trace: it is then good to a few percent."""
 
@@ -147,6 +151,7 @@ def fitted_noise(
         surface=_surface_sigma(solve, layout, nuisances.surface, errors),
         strip=_strip_sigmas(solve, layout, nuisances.strip, errors),
         repeated=float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
+        jitter_s=_jitter_sigma(solve, layout, nuisances.jitter_s, errors),
     )
 
 
@@ -192,15 +197,28 @@ def _shared_variance(offsets: Array, group: IntArray) -> float:
 def _known(
     solve: Callable[[Array], Array], layout: Layout, own: slice, before: Array | float
 ) -> Array:
-    """(L, ...) how much of each error of a LiDAR the data know: 1 less its variance by the prior's.
+    """How much of each error the data know: 1 less its variance by the prior's.
 
-    By random signs (Hutchinson). `own` are the coordinates, LiDAR by LiDAR.
+    By random signs (Hutchinson). `own` are the coordinates, `before` is their sigma or, again and
+    again, (n,) sigmas; the result is (..., n).
     """
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (own.stop - own.start, PROBES))
     some = np.zeros((layout.size, PROBES))
     some[own] = signs
-    variance = (signs * solve(some)[own]).mean(axis=1).reshape(layout.lidars, -1)
-    return np.asarray(1.0 - variance / before**2)
+    variance = (signs * solve(some)[own]).mean(axis=1)
+    return np.asarray(1.0 - variance.reshape(-1, np.size(before)) / before**2)
+
+
+def _jitter_sigma(
+    solve: Callable[[Array], Array], layout: Layout, before_s: float, errors: Array
+) -> float:
+    """1 sigma of the jitter of stamps: a fixed-point step of its likelihood; 0 stays."""
+    own = slice(layout.jitter, layout.plane)
+    if before_s == 0.0 or not layout.jitters:
+        return before_s
+    known = float(_known(solve, layout, own, before_s).sum())
+    found = math.sqrt(float((errors[own] ** 2).sum()) / max(known, 1.0))
+    return float(np.clip(found, LEAST_JITTER_S, MOST_JITTER_S))
 
 
 def _surface_sigma(

@@ -12,6 +12,7 @@ import numpy as np
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.jitter import jitter_sigma_s
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
     SURFACE_BIAS_M,
@@ -68,7 +69,7 @@ class Problem:
         pose_of_scan: (S,) index of the pose of each scan.
         relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
             time.
-        twists: (M, 6) velocity at each pose; None: no time offset is free.
+        twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
         offsets: indices of the LiDARs with a free time offset.
         guesses: n guesses of T_vehicle_lidar.
         guess_information: (6 n, 6 n) of them, vehicle axes.
@@ -168,7 +169,52 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         found = _settled(found, steps=2)
         levels = Levels.of(found.nuisances)
         state = found.state
-    return None if found is None else _without_dents(_settled(found, steps=LAST_STEPS))
+    if found is None:
+        return None
+    found = _settled(found, steps=LAST_STEPS)
+    jittering = _with_jitter(found)
+    return _without_dents(found if jittering is None else _settled(jittering, steps=LAST_STEPS))
+
+
+def _with_jitter(found: Solved) -> Solved | None:
+    """The same estimate with a jitter of every scan's stamp; None where the data show none."""
+    problem = found.problem
+    if problem.twists is None:
+        return None
+    first, scans = found.layout.plane, len(problem.patches.stamps_ns)
+    layout = replace(found.layout, jitters=scans)
+    errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
+    state = replace(found.state, errors=errors)
+    geometry = geometry_at(problem, state, found.sightings, layout)
+
+    def at(nuisances: Nuisances) -> tuple[Rows, System]:
+        return _whitened(
+            problem,
+            state,
+            geometry,
+            found.strips,
+            found.sightings,
+            found.weights,
+            nuisances,
+            layout,
+        )
+
+    _, system = at(found.nuisances)
+    H, b = with_guesses(problem, state, system)
+    sigma_s = jitter_sigma_s(H, b, layout)
+    if sigma_s == 0.0:
+        return None
+    nuisances = replace(found.nuisances, jitter_s=sigma_s)
+    rows, system = at(nuisances)
+    return replace(
+        found,
+        state=state,
+        nuisances=nuisances,
+        layout=layout,
+        geometry=geometry,
+        rows=rows,
+        system=system,
+    )
 
 
 def _without_dents(found: Solved) -> Solved:

@@ -54,6 +54,7 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
+        jitter_s: of the stamp of each scan, s; 0: no such variables.
     """
 
     bias: float
@@ -64,6 +65,7 @@ class Nuisances:
     sighting: Array
     shared: float
     repeated: float
+    jitter_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,9 @@ class Layout:
 
     In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), bias of
     each LiDAR, its growth with incidence, and that on the ground (3), error of the vehicle's height
-    and tilt above the ground (3); and what belongs to one surface each: planes (two
-    tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each strip.
+    and tilt above the ground (3), jitter of the stamp of each scan, if there is any; and what
+    belongs to one surface each: planes (two tilts, offset), bias of each LiDAR on each surface,
+    offset of each LiDAR on each strip.
     """
 
     poses: int
@@ -106,6 +109,7 @@ class Layout:
     offsets: tuple[int, ...]
     lidars: int
     surface_of: tuple[int, ...]
+    jitters: int = 0
 
     @property
     def strips(self) -> int:
@@ -135,6 +139,11 @@ class Layout:
     @property
     def plane(self) -> int:
         """First coordinate of the planes, and of all that belongs to one surface."""
+        return self.jitter + self.jitters
+
+    @property
+    def jitter(self) -> int:
+        """First jitter of a stamp."""
         return self.standing + 3
 
     @property
@@ -385,8 +394,15 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
+    if twists is not None and (layout.offsets or layout.jitters):
+        by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+    if twists is not None and layout.jitters:
+        of_scan = layout.jitter + sightings.scan
+        plain += state.errors[of_scan, None] * by_time[:, 0]
+        parts.append(by_time)
+        columns.append(of_scan[:, None])
     if twists is not None and layout.offsets:
-        by_offset = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+        by_offset = by_time.copy()
         place = np.full(layout.lidars, -1)
         place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
         by_offset[place[lidar] < 0] = 0.0
@@ -475,7 +491,7 @@ def system_of(
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
     sparse, right = rows.normal_equations()
-    own_errors = slice(layout.standing, layout.plane)
+    own_errors = slice(layout.standing, layout.jitter)
     J, r = standing_rows(
         standing,
         stands,
@@ -497,6 +513,8 @@ def system_of(
     weight[errors] = layout.error_sigmas(nuisances) ** -2.0
     tilt = standing.tilt_sigma_rad or 1.0
     weight[own_errors] = np.array([standing.height_sigma_m, tilt, tilt]) ** -2.0
+    if nuisances.jitter_s > 0.0:
+        weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = 6 * layout.poses + layout.parameters

@@ -119,7 +119,7 @@ def problem_of(
         prior=prior,
         pose_of_scan=pose_of_scan,
         relative=relative_motions(patches, trajectory),
-        twists=twists_at(trajectory, stamps) if offsets else None,
+        twists=twists_at(trajectory, stamps),
         offsets=offsets,
         guesses=tuple(guess.T_vehicle_lidar for guess in guesses),
         guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),

@@ -305,11 +305,7 @@ def pose_problem(
         cloud_placement=np.array([m for m, _ in clouds], np.int64),
         placements=len(observations),
         motion={
-            d: poses_with_heave(
-                trajectory.joint_information(of_drive[d])[0],
-                np.asarray(of_drive[d], np.int64),
-                heave_m,
-            )
+            d: poses_with_heave(trajectory.joint_information(of_drive[d])[0], heave_m)
             for d, trajectory in smoothed.items()
         },
         motion_terms={d: term for d, term in terms.items() if term is not None},

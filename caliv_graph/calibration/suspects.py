@@ -108,7 +108,7 @@ def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _M
     heave_m = heave_of(solution.sensor_noise)
     for drive, part in parts.items():
         at = np.repeat(drives == drive, 6)
-        W = poses_with_heave(part.information, stamps[drives == drive], heave_m)
+        W = poses_with_heave(part.information, heave_m)
         mine = np.flatnonzero(drives == drive).tolist()
         off = [
             gtsam.Pose3.Logmap(T.between(poses[i]))

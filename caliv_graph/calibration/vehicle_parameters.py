@@ -89,7 +89,7 @@ def motion_gaussian(
     names = [name for name in KEYS if name in _uncertain(trajectory)]
     joint = _in_tangents(trajectory, trajectory.joint(stamps_ns, names))
     information, gradient = with_heave(
-        joint.information, joint.gradient, np.asarray(stamps_ns, np.int64), heave_m
+        joint.information, joint.gradient, len(joint.T_map_vehicle), heave_m
     )
     joint = replace(joint, information=information, gradient=gradient)
     return joint, {name: _value(trajectory, name) for name in names}

@@ -145,7 +145,7 @@ def _pose_prior(motion: PlannedMotion, nodes: IntArray, heave_m: float) -> PoseP
     information = np.einsum("ab,ibjc,cd->iajd", back.T, information, back, optimize=True)
     information = information.reshape(POSE * m, POSE * m)
     if heave_m > 0.0:
-        information = poses_with_heave(information, motion.nodes_ns[nodes], heave_m)
+        information = poses_with_heave(information, heave_m)
     return PosePrior(
         stamps_ns=motion.nodes_ns[nodes],
         T_map_vehicle=unstack(motion.R_map_vehicle[nodes], motion.position_map[nodes]),

@@ -31,9 +31,10 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.solve import Problem, Solved, linearised, repeated_views
+from caliv_graph.structure.solve import Levels, Problem, Solved, linearised
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import lidars_with_ground
+from caliv_graph.structure.views import views_of
 from caliv_graph.trajectory.chain import POSE, Chain
 
 SIGHTING_M = 0.002
@@ -121,15 +122,13 @@ def plan_structure(
             heave_m=assumptions.heave_sigma_m,
             sway_rad=0.0,
         ),
-        repeated=repeated_views(patches, pose_of_scan, prior),
+        views=views_of(patches, pose_of_scan, prior),
     )
     found = linearised(
         problem,
         {name: model.mounting.pose() for name, model in scenario.lidars.items()},
         np.array([model.range_sigma_m for model in scenario.lidars.values()]),
-        SIGHTING_M,
-        STRIP_M,
-        SHARED_M,
+        Levels(SIGHTING_M, STRIP_M, SHARED_M),
     )
     if found is None:
         return None

@@ -134,6 +134,9 @@ class LidarModel(Section):
         0.0,
         description="seconds, stamp minus true acquisition time (positive: stamps are late)",
     )
+    time_jitter_s: NonNegative = Field(
+        0.0, description="seconds, 1 sigma of a white error of the stamp, one draw per cloud"
+    )
     phase_s: NonNegative = Field(0.0, description="seconds, stamp of the first cloud")
     sweep: SweepModel | None = Field(None, description="absent: a cloud is taken at one instant")
     edges: EdgeModel | None = Field(None, description="absent: infinitely thin beams")

@@ -39,6 +39,7 @@ class Stream(enum.IntEnum):
     GNSS_CORRELATED = 12
     ORIENTATION_CORRELATED = 13
     RANGE_BIAS = 14
+    TIME_JITTER = 15
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:

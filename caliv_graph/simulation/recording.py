@@ -270,10 +270,21 @@ class SimulatedRecording:
         taken_ns = (
             stamp_ns
             + np.rint(simulated.column_times_s * NANOSECONDS_PER_SECOND).astype(np.int64)
-            - round(model.time_offset_s * NANOSECONDS_PER_SECOND)
+            - round(
+                (model.time_offset_s + self._time_jitter_s(model, stamp_ns))
+                * NANOSECONDS_PER_SECOND
+            )
         )
         heave_m = self.truth.heave_m[stamp_ns // HEAVE_PERIOD_NS]
         return taken_ns, self.truth.drive.states(taken_ns, self.truth.level_z_map + heave_m)
+
+    def _time_jitter_s(self, model: LidarModel, stamp_ns: int) -> float:
+        """Stamp of a cloud less its true time, beside the constant offset, seconds."""
+        if model.time_jitter_s == 0.0:
+            return 0.0
+        index = [other is model for other in self.scenario.lidars.values()].index(True)
+        rng = random_stream(self.seed, Stream.TIME_JITTER, index, stamp_ns)
+        return model.time_jitter_s * float(rng.standard_normal())
 
     def _point_times_s(
         self, simulated: SimulatedLidar, model: LidarModel, returns: LidarReturns

@@ -120,7 +120,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     if not strips.count:
         return None
     sigma = range_sigmas(problem.patches, problem.range_sigma_m)
-    layout = layout_of(problem, strips)
+    layout = replace(layout_of(problem, strips), jitters=used.layout.jitters)
     sightings = placed_sightings(problem, placed, strips, sigma)
     geometry = geometry_at(problem, _on(used.state, strips, layout), sightings, layout)
     lidar = problem.patches.scan_lidar[sightings.scan]
@@ -132,7 +132,8 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     total = np.bincount(sightings.strip, spread, strips.count)
     least = 0.5 * usual
     sighting = np.sqrt(np.maximum((OWN_STRIP * usual**2 + total) / (OWN_STRIP + count), least**2))
-    nuisances = replace(used.nuisances, sighting=sighting)
+    strip = np.full(strips.count, np.median(used.nuisances.strip))
+    nuisances = replace(used.nuisances, sighting=sighting, strip=strip)
     weights = robust_weights(own, sightings, nuisances)
     scans = np.zeros((strips.count, layout.lidars), dtype=np.int64)
     np.add.at(scans, (sightings.strip, lidar), weights > 0.0)
@@ -281,7 +282,7 @@ def _measured(
     here = _on(state, strips, layout)
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
-    repeated = problem.repeated[sightings.scan]
+    repeated = problem.views.count[sightings.scan]
     rows = whitened(geometry, sightings, group, repeated, other.nuisances, weights, layout.size)
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
@@ -312,7 +313,7 @@ def _drawn_offsets(
     errors[: layout.plane] = draws
     for first, last, sigma in (
         (layout.surface_error, layout.strip_error, nuisances.surface),
-        (layout.strip_error, layout.size, nuisances.strip),
+        (layout.strip_error, layout.size, nuisances.strip[0]),
     ):
         errors[first:last] = sigma * rng.standard_normal((last - first, DRAWS))
     _, number = np.unique(group, return_inverse=True)
@@ -354,7 +355,7 @@ class _Distances:
             self._by_surface[at] = gain @ part[:, surface].toarray()
             self._noise[np.ix_(at, at)] = inverse[3:, 3:]
             # The hub errs on the strip as the others do.
-            strip = other.nuisances.strip**2 * (np.eye(len(at)) + 1.0)
+            strip = other.nuisances.strip[k] ** 2 * (np.eye(len(at)) + 1.0)
             self._noise[np.ix_(at, at)] += strip
             by_shared.append(scipy.sparse.csr_array(gain) @ shared[columns])
         self._by_shared = scipy.sparse.vstack(by_shared).tocsr()

@@ -13,6 +13,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.sightings import BEAM_RAD, Sightings
 from caliv_graph.structure.system import Geometry, Layout, Nuisances
+from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
 """1 sigma of the offset of a strip from scan to scan before it is estimated: on the safe side, as
@@ -27,12 +28,30 @@ INCIDENCES = 8
 LEAST_RANGE_M = 1e-3
 """Smallest noise along the beam: no LiDAR for vehicles has less."""
 
+SURFACE_BIAS_M = 0.003
+"""1 sigma of the bias of a LiDAR on a surface where nothing tells: echoes of bright and of dark
+paint differ by millimetres in data sheets. It counts as one bias beside those that the drive
+determines."""
+
 OWN_STRIP = 10.0
 """Number of sightings that the common sigma counts as when the sigma of one strip is estimated."""
+
+STRIP_FREEDOM = 4.0
+"""Degrees of freedom of the distribution of how far LiDARs see a strip apart: heavy tails."""
+
+STRIP_USUAL_M = 0.003
+"""Its sigma where nothing tells, which counts as one strip: roughness of the surface."""
+
+MOST_STRIP_M = 0.05
+"""Its largest sigma: what is seen farther apart is no one strip."""
 
 SPREADS = (3.0, 6.0)
 """Offset of a sighting in sigmas up to which it has full weight, and from which it has none."""
 
+
+LEAST_JITTER_S = 1e-5
+MOST_JITTER_S = 0.02
+"""1 sigma of the jitter of stamps: 20 um at 2 m/s, and a fifth of a revolution."""
 
 PROBES = 20
 """Random vectors for the trace: it is then good to a few percent."""
@@ -84,8 +103,11 @@ def _variances(sightings: Sightings, sigma_m: Array) -> Array:
 
 def fitted_noise(
     geometry: Geometry,
+    before: Geometry,
     sightings: Sightings,
     group: IntArray,
+    views: Views,
+    weights: Array,
     solve: Callable[[Array], Array],
     layout: Layout,
     nuisances: Nuisances,
@@ -95,16 +117,20 @@ def fitted_noise(
 
     Args:
         geometry: residuals at the estimate.
+        before: where the system was linearised. Of derivatives elsewhere a part is in directions
+            that it does not determine, such as a turn of everything about a standing vehicle.
         sightings: Q of them.
         group: (Q,) a number for scan and surface of each.
+        views: which scans are from one place.
+        weights: (Q,) robust, of the system that was solved.
         solve: gives H^-1 times some columns (D, ...) of the system that was solved.
         layout: its coordinates.
         nuisances: the levels that it was solved with.
         errors: (D,) estimated errors of the LiDARs.
     """
     offsets = geometry.offsets_m(sightings)
-    sigma = nuisances.sighting[sightings.strip]
-    fitted = _fitted_share(geometry, sightings, solve, layout, sigma)
+    sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
+    fitted = _fitted_share(before, sightings, weights, solve, layout, sigma)
     free = 1.0 - min(fitted, MOST_FITTED)
     point = 1.0 / sightings.moments[:, 3, 3]
     total_sigma = _common_sigma(offsets, point, free)
@@ -116,30 +142,37 @@ def fitted_noise(
     total = np.bincount(sightings.strip, square, layout.strips)
     count = np.bincount(sightings.strip, minlength=layout.strips)
     own = (OWN_STRIP * common**2 + total) / (OWN_STRIP + count)
+    view = views.of_scan[sightings.scan] * layout.strips + sightings.strip
+    again = _shared_variance(np.clip(offsets, -limit, limit), view) / free
     return replace(
         nuisances,
         sighting=np.sqrt(np.maximum(own, LEAST_M**2)),
         shared=math.sqrt(shared),
-        strip=_strip_sigma(solve, layout, nuisances.strip, errors),
+        surface=_surface_sigma(solve, layout, nuisances.surface, errors),
+        strip=_strip_sigmas(solve, layout, nuisances.strip, errors),
+        repeated=float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
+        jitter_s=_jitter_sigma(solve, layout, nuisances.jitter_s, errors),
     )
 
 
 def _fitted_share(
     geometry: Geometry,
     sightings: Sightings,
+    weights: Array,
     solve: Callable[[Array], Array],
     layout: Layout,
     sigma: Array,
 ) -> float:
-    """Share of the offsets' variance that the estimate takes up: `tr(J H^-1 J^T W) / Q`.
+    """Share of the offsets' variance that the estimate takes up: `tr(J H^-1 J^T W) / sum(w)`.
 
-    By random signs (Hutchinson): the exact trace costs as much as all else together.
+    W is that of the system: an outlier without weight says nothing. By random signs (Hutchinson):
+    the exact trace costs as much as all else together.
     """
     J = geometry.offset_rows(sightings, layout.size)
-    root = 1.0 / np.sqrt(_variances(sightings, sigma))
+    root = np.sqrt(weights / _variances(sightings, sigma))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
     seen = J.T @ (root[:, None] * signs)
-    return float((seen * solve(seen)).sum() / PROBES / sightings.count)
+    return float((seen * solve(seen)).sum() / PROBES / max(weights.sum(), 1.0))
 
 
 def _common_sigma(offsets: Array, point: Array, free: float) -> float:
@@ -161,17 +194,57 @@ def _shared_variance(offsets: Array, group: IntArray) -> float:
     return float((total**2).sum() - (offsets**2).sum()) / pairs if pairs else 0.0
 
 
-def _strip_sigma(
+def _known(
+    solve: Callable[[Array], Array], layout: Layout, own: slice, before: Array | float
+) -> Array:
+    """How much of each error the data know: 1 less its variance by the prior's.
+
+    By random signs (Hutchinson). `own` are the coordinates, `before` is their sigma or, again and
+    again, (n,) sigmas; the result is (..., n).
+    """
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], (own.stop - own.start, PROBES))
+    some = np.zeros((layout.size, PROBES))
+    some[own] = signs
+    variance = (signs * solve(some)[own]).mean(axis=1)
+    return np.asarray(1.0 - variance.reshape(-1, np.size(before)) / before**2)
+
+
+def _jitter_sigma(
+    solve: Callable[[Array], Array], layout: Layout, before_s: float, errors: Array
+) -> float:
+    """1 sigma of the jitter of stamps: a fixed-point step of its likelihood; 0 stays."""
+    own = slice(layout.jitter, layout.plane)
+    if before_s == 0.0 or not layout.jitters:
+        return before_s
+    known = float(_known(solve, layout, own, before_s).sum())
+    found = math.sqrt(float((errors[own] ** 2).sum()) / max(known, 1.0))
+    return float(np.clip(found, LEAST_JITTER_S, MOST_JITTER_S))
+
+
+def _surface_sigma(
     solve: Callable[[Array], Array], layout: Layout, before: float, errors: Array
 ) -> float:
-    """1 sigma of how far LiDARs see a strip apart: one fixed-point step of its likelihood."""
+    """1 sigma of the biases of LiDARs on surfaces: a fixed-point step of its likelihood."""
+    own = slice(layout.surface_error, layout.strip_error)
+    known = max(float(_known(solve, layout, own, before).sum()), 0.0)
+    total = SURFACE_BIAS_M**2 + float((errors[own] ** 2).sum())
+    return math.sqrt(total / (1.0 + known))
+
+
+def _strip_sigmas(
+    solve: Callable[[Array], Array], layout: Layout, before: Array, errors: Array
+) -> Array:
+    """(K,) 1 sigma of how far LiDARs see each strip apart: a fixed-point step of its likelihood.
+
+    The offsets have a t distribution (EM: each strip has a variance of its own about the common
+    one): strips with a reveal in them are seen centimetres apart, others a millimetre.
+    """
     own = slice(layout.strip_error, layout.size)
-    count = layout.size - layout.strip_error
-    some = np.zeros((layout.size, PROBES))
-    some[own] = np.random.default_rng(1).choice([-1.0, 1.0], (count, PROBES))
-    variance = float((some[own] * solve(some)[own]).sum()) / PROBES
-    known = count - variance / before**2
-    if known < 1.0:
-        return before
-    found = float((errors[own] ** 2).sum() / known)
-    return float(np.clip(math.sqrt(found), LEAST_M, 0.05))
+    known = np.clip(_known(solve, layout, own, before), 0.0, 1.0).sum(axis=0)
+    square = (errors[own].reshape(layout.lidars, -1) ** 2).sum(axis=0)
+    usual = float(np.median(before))
+    own_weight = (STRIP_FREEDOM + known) / (STRIP_FREEDOM + square / usual**2)
+    common = (STRIP_USUAL_M**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
+    common = float(np.clip(common, LEAST_M**2, MOST_STRIP_M**2))
+    out = (STRIP_FREEDOM * common + square) / (STRIP_FREEDOM + known)
+    return np.asarray(np.sqrt(np.clip(out, LEAST_M**2, MOST_STRIP_M**2)))

@@ -139,13 +139,14 @@ def _noise(centres_lidar: Array, range_sigma_m: Array) -> Array:
 
 
 def without_own_error(
-    sightings: Sightings, normals_lidar: Array, sigma_m: Array
+    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_m: Array
 ) -> tuple[Array, Array]:
     """Moments (Q, 4, 4) without the own error of each sighting; and what noise adds.
 
     That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
-    points it has, a sighting knows its strip no better than `sigma_m` (Q,) at its middle.
-    `normals_lidar` (Q, 3) at the scan's stamp.
+    points it has, a sighting knows its strip no better than `offset_m` (Q,) at its middle, and its
+    tilt no better than `tilt_m` (Q,) over `TILT_LENGTH_M`. `normals_lidar` (Q, 3) at the scan's
+    stamp.
     """
     S, centroid = sightings.moments, sightings.centroids_lidar
     axes = tangent_axes(normals_lidar) / TILT_LENGTH_M
@@ -154,7 +155,8 @@ def without_own_error(
     N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
     N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
     SN = S @ N
-    inner = np.swapaxes(N, 1, 2) @ SN + np.eye(3) * sigma_m[:, None, None] ** -2.0
+    inner = np.swapaxes(N, 1, 2) @ SN
+    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0
     K = N @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
     left = np.eye(4) - K
     out = S @ left

@@ -8,13 +8,14 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.jitter import jitter_sigma_s
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
+    SURFACE_BIAS_M,
     fitted_noise,
     range_sigmas,
     robust_weights,
@@ -37,7 +38,7 @@ from caliv_graph.structure.system import (
     system_of,
     whitened,
 )
-from caliv_graph.trajectory.imu import log_so3
+from caliv_graph.structure.views import Views
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 GATES_M = (0.3, 0.15, 0.08, 0.06, 0.06)
@@ -51,16 +52,11 @@ LAST_STEPS = 5
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
 
-SAME_VIEW_M = 0.02
-SAME_VIEW_RAD = 1e-3
-"""Scans from this near see the same: beams 20 mm apart fall on the same joints, and at 20 m a
-milliradian is as much."""
-
 BIAS_M = 0.005
-SURFACE_BIAS_M = 0.003
 INCIDENCE_BIAS_M = 0.003
-"""1 sigma of the biases of ranges: of a LiDAR, of it on a surface, and per unit of
-1 / cos(incidence): the accuracy that data sheets state, 1 to 3 cm at most, 3 to 5 mm typically."""
+GROUND_BIAS_M = 0.003
+"""1 sigma of the biases of ranges: of a LiDAR, per unit of 1 / cos(incidence), and on the ground,
+which is of one colour: the accuracy that data sheets state, 1 to 3 cm at most, 3 to 5 mm mostly."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +69,13 @@ class Problem:
         pose_of_scan: (S,) index of the pose of each scan.
         relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
             time.
-        twists: (M, 6) velocity at each pose; None: no time offset is free.
+        twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
         offsets: indices of the LiDARs with a free time offset.
         guesses: n guesses of T_vehicle_lidar.
         guess_information: (6 n, 6 n) of them, vehicle axes.
         range_sigma_m: noise along the beam as stated.
         standing: what is known of how the vehicle stands on the ground.
-        repeated: (S,) how many scans of its LiDAR are from the place of each, itself included.
+        views: which scans are from one place.
     """
 
     patches: DrivePatches
@@ -92,7 +88,7 @@ class Problem:
     guess_information: Array
     range_sigma_m: float
     standing: Standing
-    repeated: Array
+    views: Views
 
 
 @dataclass(frozen=True)
@@ -110,6 +106,26 @@ class Solved:
     rows: Rows
     system: System
     converged: bool
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`."""
+
+    sighting_m: float
+    strip_m: float
+    shared_m: float
+    surface_m: float = SURFACE_BIAS_M
+
+    @staticmethod
+    def of(found: Nuisances) -> Levels:
+        """What a round has found, for the strips of the next one."""
+        return Levels(
+            sighting_m=float(np.median(found.sighting)),
+            strip_m=float(np.median(found.strip)),
+            shared_m=found.shared,
+            surface_m=found.surface,
+        )
 
 
 def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
@@ -132,20 +148,6 @@ def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Ar
     return out
 
 
-def repeated_views(patches: DrivePatches, pose_of_scan: IntArray, prior: PosePrior) -> Array:
-    """(S,) how many scans of its LiDAR are from the place of each: their beams fall alike."""
-    R, t = stack(prior.T_map_vehicle)
-    turns = SAME_VIEW_M / SAME_VIEW_RAD * log_so3(np.swapaxes(R[:1], 1, 2) @ R)
-    places = np.concatenate([t, turns], axis=1)[pose_of_scan]
-    out = np.ones(len(places))
-    for lidar in range(len(patches.lidars)):
-        own = np.flatnonzero(patches.scan_lidar == lidar)
-        if len(own):
-            near = cKDTree(places[own]).query_ball_point(places[own], SAME_VIEW_M)
-            out[own] = [len(k) for k in near]
-    return out
-
-
 def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
     """Solves one drive from rough extrinsics; None if there is no structure.
 
@@ -159,16 +161,60 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     state = first_state(problem, start)
     range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     found: Solved | None = None
-    sigma_m = strip_m = shared_m = FIRST_SIGHTING_M
+    levels = Levels(FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M)
     for gate in GATES_M:
-        found = _round(problem, state, range_sigma, gate, sigma_m, strip_m, shared_m)
+        found = _round(problem, state, range_sigma, gate, levels)
         if found is None:
             return None
         found = _settled(found, steps=2)
-        sigma_m = float(np.median(found.nuisances.sighting))
-        strip_m, shared_m = found.nuisances.strip, found.nuisances.shared
+        levels = Levels.of(found.nuisances)
         state = found.state
-    return None if found is None else _without_dents(_settled(found, steps=LAST_STEPS))
+    if found is None:
+        return None
+    found = _settled(found, steps=LAST_STEPS)
+    jittering = _with_jitter(found)
+    return _without_dents(found if jittering is None else _settled(jittering, steps=LAST_STEPS))
+
+
+def _with_jitter(found: Solved) -> Solved | None:
+    """The same estimate with a jitter of every scan's stamp; None where the data show none."""
+    problem = found.problem
+    if problem.twists is None:
+        return None
+    first, scans = found.layout.plane, len(problem.patches.stamps_ns)
+    layout = replace(found.layout, jitters=scans)
+    errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
+    state = replace(found.state, errors=errors)
+    geometry = geometry_at(problem, state, found.sightings, layout)
+
+    def at(nuisances: Nuisances) -> tuple[Rows, System]:
+        return _whitened(
+            problem,
+            state,
+            geometry,
+            found.strips,
+            found.sightings,
+            found.weights,
+            nuisances,
+            layout,
+        )
+
+    _, system = at(found.nuisances)
+    H, b = with_guesses(problem, state, system)
+    sigma_s = jitter_sigma_s(H, b, layout)
+    if sigma_s == 0.0:
+        return None
+    nuisances = replace(found.nuisances, jitter_s=sigma_s)
+    rows, system = at(nuisances)
+    return replace(
+        found,
+        state=state,
+        nuisances=nuisances,
+        layout=layout,
+        geometry=geometry,
+        rows=rows,
+        system=system,
+    )
 
 
 def _without_dents(found: Solved) -> Solved:
@@ -195,9 +241,7 @@ def linearised(
     problem: Problem,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     range_sigma_m: Array,
-    sighting_m: float,
-    strip_m: float,
-    shared_m: float,
+    levels: Levels,
 ) -> Solved | None:
     """The system at known extrinsics and poses with stated noise; None if there is no structure.
 
@@ -205,15 +249,13 @@ def linearised(
         problem: the drive; its pose prior is at the known poses.
         T_vehicle_lidar: per LiDAR.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
-        sighting_m: as `Nuisances.sighting`, of all strips.
-        strip_m: as `Nuisances.strip`.
-        shared_m: as `Nuisances.shared`.
+        levels: noise.
 
     Raises:
         SolveError: the system is singular.
     """
     state = first_state(problem, T_vehicle_lidar)
-    found = _round(problem, state, range_sigma_m, GATES_M[-1], sighting_m, strip_m, shared_m)
+    found = _round(problem, state, range_sigma_m, GATES_M[-1], levels)
     return None if found is None else _without_dents(found)
 
 
@@ -243,9 +285,7 @@ def _round(
     state: State,
     range_sigma: Array,
     gate_m: float,
-    sigma_m: float,
-    strip_m: float,
-    shared_m: float,
+    levels: Levels,
 ) -> Solved | None:
     """New strips and sightings at an estimate."""
     placed = placed_patches(problem, state)
@@ -264,10 +304,12 @@ def _round(
     nuisances = Nuisances(
         bias=BIAS_M,
         incidence=INCIDENCE_BIAS_M,
-        surface=SURFACE_BIAS_M,
-        strip=strip_m,
-        sighting=np.full(strips.count, sigma_m),
-        shared=shared_m,
+        ground=GROUND_BIAS_M,
+        surface=levels.surface_m,
+        strip=np.full(strips.count, levels.strip_m),
+        sighting=np.full(strips.count, levels.sighting_m),
+        shared=levels.shared_m,
+        repeated=0.0,
     )
     weights = np.ones(sightings.count)
     geometry = geometry_at(problem, state, sightings, layout)
@@ -381,7 +423,7 @@ def _whitened(
     layout: Layout,
 ) -> tuple[Rows, System]:
     group = groups_of(sightings, strips)
-    repeated = problem.repeated[sightings.scan]
+    repeated = problem.views.count[sightings.scan]
     rows = whitened(geometry, sightings, group, repeated, nuisances, weights, layout.size)
     stands = stands_of(state.t_map_vehicle, strips.centres_map, strips.normals_map)
     system = system_of(rows, state, layout, problem.prior, nuisances, problem.standing, stands)
@@ -401,8 +443,11 @@ def _settled(found: Solved, steps: int) -> Solved:
         geometry = geometry_at(problem, state, sightings, layout)
         nuisances = fitted_noise(
             geometry,
+            found.geometry,
             sightings,
             groups_of(sightings, found.strips),
+            problem.views,
+            found.weights,
             solve,
             layout,
             found.nuisances,

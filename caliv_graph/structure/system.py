@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import Surfaces, eliminated
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.sightings import Sightings, without_own_error
@@ -29,12 +29,11 @@ DENT_RAD = 0.05
 """Largest angle of a strip to its tile that is a dent of the ground. What is steeper, such as a
 bonnet, is a surface of its own."""
 
-REPEATED_M = 0.003
-"""Least sigma of the own error of sightings from one place. Scans of a vehicle that stands repeat
-it: how much it is does not show in their differences."""
-
 MOST_NOISE = 0.5
 """Largest part of a strip's information on its tilt that may be noise of the points."""
+
+BIASES = 3
+"""Biases of a LiDAR that hold for the whole drive: bias, growth with incidence, on the ground."""
 
 PLANE_ROWS = slice(12, 15)
 """Where the derivatives by the plane are in `Geometry.by`: after pose and extrinsic."""
@@ -47,19 +46,26 @@ class Nuisances:
     Attributes:
         bias: bias of the ranges of a LiDAR.
         incidence: growth of that bias with 1 / cos(incidence).
+        ground: bias of a LiDAR on all level strips: asphalt is darker than walls are.
         surface: bias of a LiDAR on a surface: colour, gloss.
-        strip: how far a LiDAR sees a strip from where others do: bumps, other beams.
+        strip: (K,) how far a LiDAR sees each strip from where others do: bumps, other beams.
         sighting: (K,) offset of each strip from scan to scan.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how
             the beams fall, change along a wall slowly.
+        repeated: share of the variances of `sighting` and `shared` that is the same in all scans
+            from one place, beyond what `strip` has of it.
+        jitter_s: of the stamp of each scan, s; 0: no such variables.
     """
 
     bias: float
     incidence: float
+    ground: float
     surface: float
-    strip: float
+    strip: Array
     sighting: Array
     shared: float
+    repeated: float
+    jitter_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -92,9 +98,10 @@ class Layout:
     """Where each variable is among the D coordinates of the system.
 
     In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), bias of
-    each LiDAR and its growth with incidence, error of the vehicle's height and tilt above the
-    ground (3); and what belongs to one surface each: planes (two
-    tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each strip.
+    each LiDAR, its growth with incidence, and that on the ground (3), error of the vehicle's height
+    and tilt above the ground (3), jitter of the stamp of each scan, if there is any; and what
+    belongs to one surface each: planes (two tilts, offset), bias of each LiDAR on each surface,
+    offset of each LiDAR on each strip.
     """
 
     poses: int
@@ -102,6 +109,7 @@ class Layout:
     offsets: tuple[int, ...]
     lidars: int
     surface_of: tuple[int, ...]
+    jitters: int = 0
 
     @property
     def strips(self) -> int:
@@ -131,12 +139,17 @@ class Layout:
     @property
     def plane(self) -> int:
         """First coordinate of the planes, and of all that belongs to one surface."""
+        return self.jitter + self.jitters
+
+    @property
+    def jitter(self) -> int:
+        """First jitter of a stamp."""
         return self.standing + 3
 
     @property
     def standing(self) -> int:
         """Error of the vehicle's height above ground, and the two of its tilt."""
-        return self.error + 2 * self.lidars
+        return self.error + BIASES * self.lidars
 
     @property
     def surface_error(self) -> int:
@@ -161,12 +174,12 @@ class Layout:
 
     def error_sigmas(self, nuisances: Nuisances) -> Array:
         """1 sigma of each error of the LiDARs."""
-        of_lidar = np.array([nuisances.bias, nuisances.incidence])
+        of_lidar = np.array([nuisances.bias, nuisances.incidence, nuisances.ground])
         return np.concatenate(
             [
                 np.tile(of_lidar, self.lidars),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
-                np.full(self.lidars * self.strips, nuisances.strip),
+                np.tile(nuisances.strip, self.lidars),
             ]
         )
 
@@ -252,7 +265,7 @@ def whitened(
     geometry: Geometry,
     sightings: Sightings,
     group: IntArray,
-    repeated: Array,
+    repeated: IntArray,
     nuisances: Nuisances,
     weights: Array,
     size: int,
@@ -260,12 +273,14 @@ def whitened(
     """Residuals by the noise of points and sightings, the latter eliminated.
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
-    view, whose errors are the same: their mean has the error of one. `weights` (Q,) are robust,
-    `size` is D.
+    view: what these share counts as often, so that their mean has the error of one. `weights` (Q,)
+    are robust, `size` is D.
     """
-    least = np.where(repeated > 1.5, REPEATED_M, 0.0)
-    sigma_m = np.maximum(nuisances.sighting[sightings.strip], least) * np.sqrt(repeated)
-    S, noise = without_own_error(sightings, geometry.normals_lidar, sigma_m)
+    more = repetition(nuisances, repeated)
+    own = nuisances.sighting[sightings.strip] * more
+    # A strip that two LiDARs see apart they see tilted against each other, too.
+    tilt = np.sqrt(own**2 + (repeated - 1.0) * nuisances.strip[sightings.strip] ** 2)
+    S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)
     C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -275,7 +290,7 @@ def whitened(
     column = np.broadcast_to(geometry.columns[:, None, :], data.shape)
     J = scipy.sparse.csr_array((data.ravel(), (row.ravel(), column.ravel())), shape=(4 * q, size))
     groups, number = np.unique(group, return_inverse=True)
-    by_offset = (nuisances.shared * np.sqrt(repeated))[:, None] * C[:, 3]
+    by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
     own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
     shared = scipy.sparse.csr_array(
         (by_offset.ravel(), (np.arange(4 * q), own_group.ravel())), shape=(4 * q, len(groups))
@@ -284,10 +299,15 @@ def whitened(
     of_plane = np.einsum("qij,qj->qi", noise, geometry.plain)
     pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
     of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
-    of_offset = nuisances.shared * np.sqrt(repeated) * of_plane[:, 3]
+    of_offset = nuisances.shared * more * of_plane[:, 3]
     of_groups = np.bincount(number.ravel(), of_offset, len(groups))
     r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
     return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups))
+
+
+def repetition(nuisances: Nuisances, repeated: IntArray) -> Array:
+    """(Q,) factor on sigmas of sightings whose views have `repeated` (Q,) scans."""
+    return np.asarray(np.sqrt(1.0 + (repeated - 1.0) * nuisances.repeated))
 
 
 def _bearable(geometry: Geometry, S: Array, noise: Array, strip: IntArray) -> Array:
@@ -348,7 +368,7 @@ def geometry_of(
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
     error_columns = _error_columns(layout, lidar, surface, strip)
-    by_error = _by_error(sightings, m)
+    by_error = _by_error(sightings, m, normal[:, 2] > LEVEL)
 
     plain = np.zeros((q, 4))
     plain[:, :3] = m
@@ -374,8 +394,15 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
+    if twists is not None and (layout.offsets or layout.jitters):
+        by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+    if twists is not None and layout.jitters:
+        of_scan = layout.jitter + sightings.scan
+        plain += state.errors[of_scan, None] * by_time[:, 0]
+        parts.append(by_time)
+        columns.append(of_scan[:, None])
     if twists is not None and layout.offsets:
-        by_offset = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+        by_offset = by_time.copy()
         place = np.full(layout.lidars, -1)
         place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
         by_offset[place[lidar] < 0] = 0.0
@@ -399,19 +426,20 @@ def smooth_normals(normals_map: Array, layout: Layout) -> Array:
 
 
 def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:
-    """(Q, 4) columns of the four errors of each sighting."""
+    """(Q, 5) columns of the errors of each sighting, in the order of `_by_error`."""
     of_surface = layout.surface_error + layout.surfaces * lidar + surface
     of_strip = layout.strip_error + layout.strips * lidar + strip
-    first = layout.error + 2 * lidar
-    return np.stack([first, first + 1, of_surface, of_strip], axis=1)
+    first = layout.error + BIASES * lidar
+    return np.stack([first, first + 1, first + 2, of_surface, of_strip], axis=1)
 
 
-def _by_error(sightings: Sightings, normals_lidar: Array) -> Array:
-    """(Q, 4, 4) what each error of a LiDAR adds to the residual, linear in h = (p, 1).
+def _by_error(sightings: Sightings, normals_lidar: Array, level: BoolArray) -> Array:
+    """(Q, 5, 4) what each error of a LiDAR adds to the residual, linear in h = (p, 1).
 
     A range that is too long by b moves a point by `-b cos(incidence)` along the normal; the cosine
     changes over a strip: on ground that looks like a tilt. Errors: bias, its growth with
-    1 / cos(incidence), bias on the surface, offset on the strip.
+    1 / cos(incidence), bias on the ground (`level` strips), bias on the surface, offset on the
+    strip.
     """
     centroid = sightings.centroids_lidar
     distance = np.linalg.norm(centroid, axis=1)[:, None]
@@ -419,13 +447,14 @@ def _by_error(sightings: Sightings, normals_lidar: Array) -> Array:
     cos = -np.einsum("qi,qi->q", normals_lidar, u)
     # Along the plane only: a change along the normal would scale the points' scatter away.
     slope = -cos[:, None] * (u + cos[:, None] * normals_lidar) / distance
-    out = np.zeros((len(u), 4, 4))
+    out = np.zeros((len(u), 5, 4))
     out[:, 0, :3] = slope
     out[:, 0, 3] = cos - np.einsum("qi,qi->q", slope, centroid)
     out[:, 1] = -out[:, 0]
     out[:, 1, 3] += 1.0
-    out[:, 2] = out[:, 0]
-    out[:, 3, 3] = 1.0
+    out[:, 2] = np.where(level[:, None], out[:, 0], 0.0)
+    out[:, 3] = out[:, 0]
+    out[:, 4, 3] = 1.0
     return out
 
 
@@ -462,7 +491,7 @@ def system_of(
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
     sparse, right = rows.normal_equations()
-    own_errors = slice(layout.standing, layout.plane)
+    own_errors = slice(layout.standing, layout.jitter)
     J, r = standing_rows(
         standing,
         stands,
@@ -484,6 +513,8 @@ def system_of(
     weight[errors] = layout.error_sigmas(nuisances) ** -2.0
     tilt = standing.tilt_sigma_rad or 1.0
     weight[own_errors] = np.array([standing.height_sigma_m, tilt, tilt]) ** -2.0
+    if nuisances.jitter_s > 0.0:
+        weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = 6 * layout.poses + layout.parameters

@@ -21,7 +21,6 @@ from caliv_graph.structure.solve import (
     Problem,
     Solved,
     relative_motions,
-    repeated_views,
     solve_structure,
 )
 from caliv_graph.structure.standing import Standing
@@ -31,6 +30,7 @@ from caliv_graph.structure.thickness import (
     thickness_at_estimate,
     thickness_at_guesses,
 )
+from caliv_graph.structure.views import views_of
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 
@@ -119,13 +119,13 @@ def problem_of(
         prior=prior,
         pose_of_scan=pose_of_scan,
         relative=relative_motions(patches, trajectory),
-        twists=twists_at(trajectory, stamps) if offsets else None,
+        twists=twists_at(trajectory, stamps),
         offsets=offsets,
         guesses=tuple(guess.T_vehicle_lidar for guess in guesses),
         guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
-        repeated=repeated_views(patches, pose_of_scan, prior),
+        views=views_of(patches, pose_of_scan, prior),
     )
 
 

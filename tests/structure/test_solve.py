@@ -1,5 +1,7 @@
 """The solve of structure with known truth, and what it determines."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -12,6 +14,7 @@ from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.solve import Problem, Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import term_of
+from caliv_graph.structure.views import Views
 from tests.structure.yards import (
     STEP_NS,
     TRUE,
@@ -30,29 +33,45 @@ GUESS_SIGMAS = np.array([0.03] * 3 + [0.06] * 3)
 
 
 def problem_of(
-    walls: list[Wall], path: tuple[Array, Array], seed: int, noise: Noise = NOISE
+    walls: list[Wall],
+    path: tuple[Array, Array],
+    seed: int,
+    noise: Noise = NOISE,
+    jitter_s: float = 0.0,
+    extrinsics: dict[str, gtsam.Pose3] = TRUE,
 ) -> Problem:
+    """A drive; `jitter_s` is 1 sigma of the time at which a scan is taken after its stamp."""
     rng = np.random.default_rng(seed)
     true_poses = poses(*path)
-    patches = draw_patches(walls, true_poses, rng, noise, patch_m=1.0)
-    off = [rng.uniform(-0.005, 0.005, 6) for _ in TRUE]
+    twists = _twists(true_poses)
+    late_s = jitter_s * np.random.default_rng([seed, 1]).standard_normal(len(twists))
+    taken = [T.retract(d) for T, d in zip(true_poses, late_s[:, None] * twists, strict=True)]
+    patches = draw_patches(walls, taken, rng, noise, extrinsics, patch_m=1.0)
+    off = [rng.uniform(-0.005, 0.005, 6) for _ in extrinsics]
     return Problem(
         patches=patches,
         prior=draw_prior(true_poses, rng),
         pose_of_scan=patches.stamps_ns // STEP_NS,
         relative=np.tile(np.eye(4), (len(patches.scan), 1, 1)),
-        twists=None,
+        twists=twists,
         offsets=(),
-        guesses=tuple(T.retract(d) for T, d in zip(TRUE.values(), off, strict=True)),
+        guesses=tuple(T.retract(d) for T, d in zip(extrinsics.values(), off, strict=True)),
         guess_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
         range_sigma_m=0.01,
         standing=NO_GROUND,
-        repeated=np.ones(len(patches.stamps_ns)),
+        views=Views.numbered(np.arange(len(patches.stamps_ns))),
     )
 
 
+def _twists(T_map_vehicle: Sequence[gtsam.Pose3]) -> Array:
+    """(m, 6) velocity at each pose."""
+    steps = [gtsam.Pose3.Logmap(a.between(b)) for a, b in itertools.pairwise(T_map_vehicle)]
+    return np.array([*steps, steps[-1]]) / (STEP_NS * 1e-9)
+
+
 def solve(problem: Problem) -> Solved:
-    found = solve_structure(problem, dict(zip(TRUE, problem.guesses, strict=True)))
+    names = problem.patches.lidars
+    found = solve_structure(problem, dict(zip(names, problem.guesses, strict=True)))
     assert found is not None
     return found
 
@@ -105,6 +124,39 @@ def test_the_noise_of_sightings_is_estimated(solved: Solved) -> None:
     sigma = np.median(solved.nuisances.sighting)
     assert 0.5 * NOISE.sighting_m < sigma < 1.5 * NOISE.sighting_m
     assert range_sigmas(solved.problem.patches, 0.03) == pytest.approx([0.01, 0.01], rel=0.15)
+
+
+def test_the_jitter_of_stamps_is_estimated(solved: Solved) -> None:
+    """At 24 m/s a millisecond is 24 mm, and 1.2 mm is less than a sighting's own error."""
+    assert solved.nuisances.jitter_s < 5e-5
+    jittering = solve(problem_of(yard(), figure_eight(24), 1, jitter_s=1e-3))
+    assert jittering.nuisances.jitter_s == pytest.approx(1e-3, rel=0.4)
+    assert np.median(jittering.nuisances.sighting) < 1.5 * NOISE.sighting_m
+
+
+AHEAD = {
+    "front": TRUE["front"],
+    "left": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.17, 0.5), np.array([1.0, 0.8, 1.9])),
+}
+
+
+def test_scans_from_one_place_say_more_than_one_and_no_more_than_they_know() -> None:
+    """Both LiDARs see the same bumps; the noise of their beams averages out."""
+    still = (np.zeros((20, 3)), np.zeros(20))
+    problem = problem_of(yard(), still, 4, Noise(sighting_m=0.0, bias_m=0.0), extrinsics=AHEAD)
+    one_place = Views.numbered(problem.patches.scan_lidar)
+    found = solve(replace(problem, views=one_place))
+    assert found.nuisances.repeated < 0.2
+    assert np.median(found.nuisances.sighting) < 1e-3
+    assert np.median(found.nuisances.strip) < 3e-3
+    names = zip(found.state.T_vehicle_lidar, AHEAD.values(), strict=True)
+    error = np.concatenate([vehicle_axes_difference(T, true) for T, true in names])
+    H = information_of(term_of(found, np.arange(20)), problem.prior.information)
+    cov = np.linalg.inv(H + np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)))
+    turn = np.hstack([np.eye(3), np.zeros((3, 3)), -np.eye(3), np.zeros((3, 3))])
+    cov_turn = turn @ cov @ turn.T
+    assert np.sqrt(np.diag(cov_turn)).max() < 2e-3
+    assert turn @ error @ np.linalg.solve(cov_turn, turn @ error) < 16.3  # one of 1000
 
 
 def test_the_term_is_the_marginal_on_fewer_poses_too(solved: Solved) -> None:

@@ -18,7 +18,7 @@ from caliv_graph.structure.system import (
     stepped,
 )
 
-LAYOUT = Layout(poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1))
+LAYOUT = Layout(poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2)
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
 STRIP = np.array([0, 1, 2, 1])
@@ -30,6 +30,7 @@ def state_of(rng: np.random.Generator) -> State:
     normals = rng.standard_normal((3, 3))
     errors = np.zeros(LAYOUT.size)
     errors[LAYOUT.error :] = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error)
+    errors[LAYOUT.jitter : LAYOUT.plane] *= 0.1  # milliseconds
     errors[LAYOUT.plane : LAYOUT.surface_error] = 0.0
     return State(
         R_map_vehicle=R,
@@ -64,7 +65,8 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
         (0, 12),
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
-        (LAYOUT.error, 4),
+        (LAYOUT.error, 6),
+        (LAYOUT.jitter, 2),
         (LAYOUT.plane, LAYOUT.size - LAYOUT.plane),
     ],
 )
@@ -83,7 +85,8 @@ def test_derivatives_are_those_of_the_residual(
         down = np.einsum(
             "qi,qi->q", geometry_at(stepped(state, LAYOUT, -d), sightings, twists).plain, h
         )
-        # The incidence itself, by which errors of ranges count, moves little with the estimate.
+        # The incidence, by which errors of ranges count, moves little with the estimate, and so
+        # does what a jitter shifts.
         assert J[:, k] == pytest.approx((up - down) / (2.0 * step), abs=0.02)
 
 
@@ -157,7 +160,7 @@ def test_derivatives_of_how_the_vehicle_stands() -> None:
             at.t_map_vehicle,
             at.centres_map,
             at.normals_map,
-            at.errors[LAYOUT.standing : LAYOUT.plane],
+            at.errors[LAYOUT.standing : LAYOUT.jitter],
             LAYOUT.standing,
             LAYOUT.plane,
             LAYOUT.size,

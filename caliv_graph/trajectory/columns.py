@@ -94,11 +94,13 @@ class _Whitening:
 
 def whitening(factor: Any, values: gtsam.Values) -> Array:
     """(d, d) root of the information of a residual, times that of its robust weight."""
-    noise: Any = factor.noiseModel()
-    if not isinstance(noise, gtsam.noiseModel.Robust):
-        return np.asarray(noise.R())
-    residual = noise.unweightedWhiten(factor.unwhitenedError(values))
-    return np.asarray(noise.noise().R()) * math.sqrt(noise.weight(residual))
+    noise = factor.noiseModel()
+    robust = isinstance(noise, gtsam.noiseModel.Robust)
+    gaussian: Any = noise.noise() if robust else noise
+    root = np.asarray(gaussian.R())
+    if robust:
+        root = root * math.sqrt(noise.weight(root @ factor.unwhitenedError(values)))
+    return root
 
 
 class _Residuals:

@@ -12,6 +12,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+from caliv_graph.common.memory import keep_freed_memory
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -29,6 +31,7 @@ def performed(
         jobs: number of processes; 1: this one.
     """
     if jobs == 1:
+        keep_freed_memory()
         for task in tasks:
             try:
                 yield task, work(task)
@@ -36,7 +39,7 @@ def performed(
                 yield task, e
         return
     # Spawned, because threads of open3d do not survive a fork.
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), keep_freed_memory) as pool:
         futures = {pool.submit(work, task): task for task in tasks}
         try:
             for future in as_completed(futures):

@@ -15,7 +15,8 @@ process. Bags are simulated with `--seed` into a temporary folder and deleted. M
 - `--help` of the program and of every command.
 
 Growth and ratios use processor time, because wall time depends on other processes.
-`--quick` leaves out all repetitions, the larger bag and the paper's estimator on it.
+`--quick` leaves out all repetitions, the larger bag and the paper's estimator on it. `--profile`
+measures nothing of this: it prints where the processor time of three calibrations goes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,16 @@ from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.config.load import dump_config, load_config
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, ConfigError
+from caliv_graph.readers import open_recording
+from caliv_graph.scenario.model import load_scenario
+from caliv_graph.simulation.recording import SimulatedRecording
 from scripts import _child, benchmark_bag, benchmark_paper
 from scripts import benchmark_released as released
 from scripts._command import positive
+from scripts._profile import Profile, profile_text, profiled
+from scripts._structure_rows import shipped
+from scripts._tables_rows import config_for
+from scripts._thinned import GroundWaves, ThinnedRecording, cached_selection
 
 BAGS = ("demo_arc", "figure_eight")
 QUICK_BAGS = ("demo_arc",)
@@ -166,6 +174,9 @@ def main() -> int:
     progress = SilentProgress() if arguments.json else PlainProgress(say)
     try:
         with tempfile.TemporaryDirectory(prefix="caliv_speed_", dir=arguments.folder) as name:
+            if arguments.profile:
+                show_profiles(arguments, Path(name), progress)
+                return 0
             found = benchmark(arguments, Path(name), progress)
     except (CalivError, OSError) as e:
         print(f"error: {e}", file=sys.stderr)
@@ -197,8 +208,47 @@ def parse_arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=positive, default=1, help="default: 1")
     parser.add_argument("--folder", type=Path, help="for temporary files (default: the system's)")
     parser.add_argument("--quick", action="store_true", help="less of everything, in minutes")
+    parser.add_argument(
+        "--profile",
+        action="store_true",
+        help="print the processor time of three calibrations by stage and by function: the "
+        "authors' drive, figure_eight from raw sensors in memory, yard with structure",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     return parser.parse_args(given)
+
+
+def show_profiles(arguments: argparse.Namespace, folder: Path, progress: Progress) -> None:
+    """Prints where the processor time of three calibrations goes."""
+    profiles = list(profiles_of(arguments, folder, progress))
+    if arguments.json:
+        say(json.dumps([vars(profile) for profile in profiles], indent=2))
+    else:
+        say("\n\n".join(["", *map(profile_text, profiles)]))
+
+
+def profiles_of(
+    arguments: argparse.Namespace, folder: Path, progress: Progress
+) -> Iterator[Profile]:
+    """The authors' drive; a run of the tables; and one of whole clouds with structure.
+
+    The last two cast the rays of their clouds while these are read: the room `simulation`.
+    """
+    import_open3d()
+    data = arguments.data.resolve()
+    if (data / "input").is_dir():
+        config = load_config(authors(data, folder))
+        with progress.stage("profiling: authors' drive"):
+            yield profiled("authors' drive", open_recording(config), config)
+    scenario = load_scenario(REPOSITORY / "configs/scenarios/figure_eight.yaml")
+    selection = cached_selection(scenario, folder, progress=progress)
+    thinned = ThinnedRecording(scenario, selection, arguments.seed, waves=GroundWaves())
+    for name, recording in (
+        ("figure_eight, a run of the tables", thinned),
+        ("yard, walls and ground", SimulatedRecording(shipped("yard"), arguments.seed)),
+    ):
+        with progress.stage(f"profiling: {name}"):
+            yield profiled(name, recording, config_for(recording, {}))
 
 
 def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -> Found:
@@ -254,8 +304,6 @@ def timed(config: Path, cores: int, repeated: int, advance: Callable[[], object]
 
 def cloud_count(config: Path) -> int:
     """Clouds in the recording of a config."""
-    from caliv_graph.readers import open_recording
-
     recording = open_recording(load_config(config))
     return sum(len(recording.scan_stamps_ns(lidar)) for lidar in recording.lidars)
 

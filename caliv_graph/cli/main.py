@@ -32,6 +32,7 @@ from caliv_graph.cli.plan import plan
 from caliv_graph.cli.simulate import simulate
 from caliv_graph.cli.validate import validate
 from caliv_graph.common.exits import DEFECT, DONE, INTERRUPTED, USAGE
+from caliv_graph.common.memory import keep_freed_memory
 from caliv_graph.errors import CalivError
 
 _PROGRAM = "caliv-graph"
@@ -146,6 +147,7 @@ def _explain(problem: BaseException) -> int:
 
 def main() -> None:
     """Entry point of `caliv-graph`."""
+    keep_freed_memory()
     code = run(sys.argv[1:])
     # All output is written. Python removes its handlers before it ends, and a signal would then
     # turn a success into a death by signal.

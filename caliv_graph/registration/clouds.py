@@ -141,7 +141,11 @@ class CloudStack:
 
     def rotated(self, R: Array, vectors: Array) -> Array:
         """Rotates (N, 3) vectors of the points by the (J, 3, 3) rotation of their cloud."""
-        return np.asarray(np.einsum("nij,nj->ni", R[self.cloud], vectors))
+        out = np.empty_like(vectors)
+        ends = np.append(self.starts[1:], len(vectors)).tolist()
+        for R_j, first, end in zip(R, self.starts.tolist(), ends, strict=True):
+            np.matmul(vectors[first:end], R_j.T, out=out[first:end])
+        return out
 
     def moved(self, R: Array, t: Array) -> Array:
         """The points under the (J, 3, 3), (J, 3) transforms of their clouds; (N, 3)."""

@@ -53,9 +53,9 @@ class HeightNoise:
         return float(np.sqrt(self.range_m2.max()))
 
     def variance(self, cosine: Array, lidar: IntArray) -> Array:
-        """(n, k) variance of heights at cosines of incidence (n, k), of points of LiDARs (n,)."""
+        """(k, n) variance of heights at cosines of incidence (k, n), of points of LiDARs (n,)."""
         roughness = np.maximum(self.roughness_m2, self.floor_m**2)
-        return np.asarray(cosine**2 * self.range_m2[lidar][:, None] + roughness[lidar][:, None])
+        return np.asarray(cosine**2 * self.range_m2[lidar] + roughness[lidar])
 
     def shared_part(self, heights: HeightSums) -> Array:
         """(L,) part of a height's variance that scans from one place share.
@@ -125,6 +125,7 @@ class HeightSums:
     def of(
         cls,
         alpha: Array,
+        weight: Array,
         height: Array,
         cosine: Array,
         variance: Array,
@@ -132,25 +133,24 @@ class HeightSums:
         lidar: IntArray,
         lidars: int,
     ) -> HeightSums:
-        """Of responsibilities, heights, cosines and variances (n, k) of points of LiDARs (n,).
+        """Of responsibilities, these over the variances, heights, cosines and variances (k, n).
 
-        A cloud that is somewhere else says nothing of the noise: `cloud_weight` (n,) is that of the
-        point's cloud.
+        Of points of LiDARs (n,). A cloud that is somewhere else says nothing of the noise:
+        `cloud_weight` (n,) is that of the point's cloud.
         """
-        squares = alpha * cloud_weight[:, None] ** 2
-        alpha = alpha * cloud_weight[:, None]
-        weight, f2 = alpha / variance**2, cosine**2
+        f2, square, weight = cosine**2, height**2, weight / variance
+        steep = weight * f2
 
-        def summed(values: Array) -> Array:
-            return np.asarray(np.bincount(lidar, np.einsum("nk->n", values), lidars))
+        def summed(a: Array, b: Array | None = None, power: int = 1) -> Array:
+            by_point = (a if b is None else a * b).sum(axis=0)
+            return np.asarray(np.bincount(lidar, by_point * cloud_weight**power, lidars))
 
         normal = np.empty((lidars, 2, 2))
-        normal[:, 0, 0] = summed(weight * f2 * f2)
-        normal[:, 0, 1] = normal[:, 1, 0] = summed(weight * f2)
+        normal[:, 0, 0] = summed(steep, f2)
+        normal[:, 0, 1] = normal[:, 1, 0] = summed(steep)
         normal[:, 1, 1] = summed(weight)
-        square = weight * height**2
-        right = np.column_stack([summed(square * f2), summed(square)])
-        return cls(summed(alpha), summed(squares), summed(alpha * f2), normal, right)
+        right = np.column_stack([summed(steep, square), summed(weight, square)])
+        return cls(summed(alpha), summed(alpha, power=2), summed(alpha, f2), normal, right)
 
     @classmethod
     def total(cls, pieces: Sequence[HeightSums]) -> HeightSums:

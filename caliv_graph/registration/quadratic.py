@@ -7,7 +7,7 @@ gradient of the likelihood of the ranges. `README.md` of this folder derives eac
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -190,7 +190,11 @@ def shape_quadratic(
     """
     carry = to_target(stack, R, t)
     points = np.matmul(cells[..., MOMENTS], carry)
-    moments = np.matmul(cells[..., SURFACE_MOMENTS], carry)
+    # What `ShapeQuadratic.moments` holds: written once, it is as large as all the rest.
+    held = who.weight_along is not None
+    turning = np.empty((*cells.shape[:2], 21 if held else 11))
+    moments = turning[..., :10]
+    np.matmul(cells[..., SURFACE_MOMENTS], carry, out=moments)
     blocks, given_shape = _given_shape(points, moments, mixture, who)
     total, on_surface = points.sum(axis=0), moments.sum(axis=0)
     mass, means = mass_and_means(total, mixture)
@@ -212,26 +216,28 @@ def shape_quadratic(
     # The normals of the points and the beams turn with their clouds: so do the priors.
     parts_of_weight = points[..., 0] / mass
     by_normals = known * parts_of_normal
-    turning = [moments, (by_normals + seen * parts_of_weight)[..., None]]
+    turning[..., 10] = by_normals + seen * parts_of_weight
     coupling = [_coupling(W, surface_means)]
-    across = [_lost_across(moments, mixture, mass)]
-    if who.weight_along is not None:
-        along = _Along.of(np.matmul(cells[..., ALONG_MOMENTS], carry), mixture, W)
+    roots, sums = [n / np.sqrt(mass)[:, None]], [moments[..., :4].transpose(1, 0, 2)]
+    if held:
+        np.matmul(cells[..., ALONG_MOMENTS], carry, out=turning[..., 11:])
+        along = _Along.of(turning[..., 11:], mixture, W)
         along_blocks, along_gradient = along.quadratic()
         blocks += along_blocks
         gradient += along_gradient
         C += along.orientation_information()
-        turning.append(along.moments)
         coupling.append(_coupling(along.projection, along.means)[:, :10])
-        across.append(along.lost(n))
+        along_roots, along_sums = along.lost(n)
+        roots += along_roots
+        sums += along_sums
     turns = np.linalg.solve(C, torque[..., None])[..., 0]
     gradient[:, :3] += by_normals @ towards
     quadratic = ShapeQuadratic(
         blocks=blocks,
         gradient=gradient,
         gradient_given_shape=given_shape,
-        across=np.concatenate(across),
-        moments=np.concatenate(turning, axis=2),
+        across=_lost(roots, sums),
+        moments=turning,
         coupling=np.concatenate(coupling, axis=1),
         prior_turns=by_normals @ parts_of_normal.T + seen * parts_of_weight @ parts_of_weight.T,
         orientation_information=C,
@@ -272,18 +278,20 @@ def _given_shape(
     return blocks.reshape(count, 6, 6), np.asarray(gradient)
 
 
-def _lost_across(moments: Array, mixture: Mixture, mass: Array) -> Array:
-    """(K, 6 J) roots of the loss to the places across the surface."""
-    root = mixture.normals_target / np.sqrt(mass)[:, None]
-    return _roots(moments[..., :4].transpose(1, 0, 2), root)
+def _lost(roots: Sequence[Array], sums: Sequence[Array]) -> Array:
+    """(K', 6 J) roots of the loss to the places of surfels.
 
-
-def _roots(sums: Array, root: Array) -> Array:
-    """(K, 6 J) of sums (K, J, 4) over points and directions (K, 3) over the root of the weight."""
-    out = np.empty((*sums.shape[:2], 6))
-    out[..., :3] = cross(sums[..., 1:], root[:, None])
-    out[..., 3:] = sums[..., :1] * root[:, None]
-    return out.reshape(len(out), 6 * sums.shape[1])
+    Of directions (K, 3) over the root of the weight, and sums (K, J, 4) over points, several of
+    each.
+    """
+    clouds = sums[0].shape[1]
+    out = np.empty((sum(map(len, roots)), clouds, 6))
+    start = 0
+    for root, of_clouds in zip(roots, sums, strict=True):
+        moves = (root @ JACOBIAN.transpose(1, 0, 2).reshape(3, 24)).reshape(-1, 4, 6)
+        np.matmul(of_clouds, moves, out=out[start : start + len(root)])
+        start += len(root)
+    return out.reshape(len(out), 6 * clouds)
 
 
 @dataclass(frozen=True)
@@ -322,13 +330,13 @@ class _Along:
         scatter = scatter_about(self.moments.sum(axis=0), self.means)
         return _orientation_information(scatter, self.projection)
 
-    def lost(self, normals: Array) -> Array:
-        """(K', 6 J) roots of the loss to the places along the surface, where points are held."""
+    def lost(self, normals: Array) -> tuple[list[Array], list[Array]]:
+        """What `_lost` makes of the places along the surface, where points are held."""
         own_mass = self.moments[..., 0].sum(axis=0)
         taking = np.flatnonzero(own_mass > ALONG_PART * own_mass.max())
         sums = self.moments[:, taking, :4].transpose(1, 0, 2)
         axes = tangent_axes(normals[taking]) / np.sqrt(self.mass[taking])[:, None, None]
-        return np.concatenate([_roots(sums, axes[:, side]) for side in (0, 1)])
+        return [axes[:, 0], axes[:, 1]], [sums, sums]
 
 
 def _normal_prior(

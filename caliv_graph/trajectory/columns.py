@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import TrajectoryGraph, build_graph
+from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values
+from caliv_graph.trajectory.factors import position_residuals, velocity_residuals
+from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
-from caliv_graph.trajectory.smoothed import States
+from caliv_graph.trajectory.smoothed import States, without_bias
 
 
 def parameter_columns(
@@ -42,40 +47,125 @@ def parameter_columns(
     sizes = [graph.factors.at(i).dim() for i in range(graph.factors.size())]
     starts = np.cumsum([0, *sizes])
     out = np.zeros((int(starts[-1]), sum(p.size for p in parameters)))
+    residuals = _Residuals(data, nodes, states, values, dropped)
+    kinds = sorted(frozenset[str]().union(*(p.kinds for p in parameters)))
+    whites = {kind: _Whitening.of(graph, kind, values, starts) for kind in kinds}
     column = 0
     for parameter in parameters:
-        touched = [i for i, kind in enumerate(graph.kinds) if kind in parameter.kinds]
+        moving = sorted(parameter.kinds)
         for k in range(parameter.size):
-            ahead, behind = (
-                _errors(parameter.stepped(data, k, sign), nodes, states, values, dropped, parameter)
-                for sign in (1.0, -1.0)
-            )
-            if not len(ahead) == len(behind) == len(touched):
-                raise ValueError(f"{parameter.name}: moved by a step, it has other factors")
-            for i, after, before in zip(touched, ahead, behind, strict=True):
-                change = (after - before) / (2.0 * parameter.steps[k])
-                factor = graph.factors.at(i)
-                out[starts[i] : starts[i + 1], column] = whitened(factor, values, change)
+            ahead, behind = (parameter.stepped(data, k, sign) for sign in (1.0, -1.0))
+            for kind in moving:
+                white = whites[kind]
+                after, before = (residuals.of(kind, moved) for moved in (ahead, behind))
+                if not len(after) == len(before) == len(white.factors):
+                    raise ValueError(f"{parameter.name}: moved by a step, it has other factors")
+                if len(after):
+                    change = (after - before) / (2.0 * parameter.steps[k])
+                    out[white.rows, column] = np.einsum("mij,mj->mi", white.roots, change)
             column += 1
     return out
 
 
-def _errors(
-    data: SmootherInput,
-    nodes: IntArray,
-    states: States,
-    values: gtsam.Values,
-    dropped: IntArray,
-    parameter: InputParameter,
-) -> list[Array]:
-    """Unwhitened residuals of the factors that a parameter touches; kernels do not matter."""
-    graph = build_graph(data, nodes, states, dropped, "none", parameter.kinds).factors
-    factors: list[Any] = [graph.at(i) for i in range(graph.size())]
-    return [factor.unwhitenedError(values) for factor in factors]
+@dataclass(frozen=True)
+class _Whitening:
+    """How the factors of one kind whiten, as `linearize` does: with the root of a robust weight.
+
+    Attributes:
+        factors: m indices into the graph.
+        rows: (m, d) of their residuals.
+        roots: (m, d, d), from the left.
+    """
+
+    factors: tuple[int, ...]
+    rows: IntArray
+    roots: Array
+
+    @classmethod
+    def of(
+        cls, graph: TrajectoryGraph, kind: str, values: gtsam.Values, starts: IntArray
+    ) -> _Whitening:
+        """Of a kind whose factors have residuals of the same size; `starts` of all residuals."""
+        factors = tuple(i for i, of in enumerate(graph.kinds) if of == kind)
+        rows = [np.arange(starts[i], starts[i + 1]) for i in factors]
+        roots = [whitening(graph.factors.at(i), values) for i in factors]
+        return cls(factors, np.array(rows), np.array(roots))
 
 
-def whitened(factor: Any, values: gtsam.Values, change: Array) -> Array:
-    """A change of the residual, whitened as `linearize` does: with the root of a robust weight."""
+def whitening(factor: Any, values: gtsam.Values) -> Array:
+    """(d, d) root of the information of a residual, times that of its robust weight."""
     noise = factor.noiseModel()
-    residual = noise.unweightedWhiten(factor.unwhitenedError(values))
-    return np.asarray(noise.unweightedWhiten(change) * math.sqrt(noise.weight(residual)))
+    robust = isinstance(noise, gtsam.noiseModel.Robust)
+    gaussian: Any = noise.noise() if robust else noise
+    root = np.asarray(gaussian.R())
+    if robust:
+        root = root * math.sqrt(noise.weight(root @ factor.unwhitenedError(values)))
+    return root
+
+
+class _Residuals:
+    """Unwhitened residuals of the factors of an input that has been moved; kernels do not matter.
+
+    Those of positions and velocities are computed for all factors at once.
+    """
+
+    def __init__(
+        self,
+        data: SmootherInput,
+        nodes: IntArray,
+        states: States,
+        values: gtsam.Values,
+        dropped: IntArray,
+    ) -> None:
+        """Of an input that has not been moved, and states as in `parameter_columns`."""
+        self._data, self._nodes, self._states = data, nodes, states
+        self._values, self._dropped = values, dropped
+
+    def of(self, kind: str, moved: SmootherInput) -> Array:
+        """(m, d) residuals of the factors of a kind, in order, of a moved input."""
+        if kind == "gnss":
+            return self._of_positions(moved)
+        if kind == "velocity":
+            return self._of_velocities(moved)
+        every = (moved, self._nodes, self._states, self._dropped)
+        graph = build_graph(*every, "none", frozenset({kind})).factors
+        factors: list[Any] = [graph.at(i) for i in range(graph.size())]
+        return np.array([factor.unwhitenedError(self._values) for factor in factors])
+
+    @cached_property
+    def _dead(self) -> DeadReckoning:
+        return without_bias(self._data.inertial, self._nodes, self._states)
+
+    @cached_property
+    def _at(self) -> States:
+        """The states of the values."""
+        return from_values(self._values, len(self._nodes), self._data)
+
+    def _dead_of(self, moved: SmootherInput) -> DeadReckoning:
+        if moved.inertial is self._data.inertial:
+            return self._dead
+        return without_bias(moved.inertial, self._nodes, self._states)
+
+    def _of_positions(self, moved: SmootherInput) -> Array:
+        kinds = frozenset({"gnss"})
+        carried = carry_to_nodes(moved, self._nodes, self._dead_of(moved), kinds).positions
+        if carried is None:
+            return np.zeros((0, 3))
+        keep = ~np.isin(carried.fixes, self._dropped)
+        return position_residuals(
+            self._at,
+            carried.nodes[keep],
+            carried.position_map[keep],
+            carried.offset_imu[keep],
+            carried.delay_s[keep],
+            moved.gravity_m_s2,
+        )
+
+    def _of_velocities(self, moved: SmootherInput) -> Array:
+        kinds = frozenset({"velocity"})
+        carried = carry_to_nodes(moved, self._nodes, self._dead_of(moved), kinds).velocities
+        if carried is None:
+            return np.zeros((0, 3))
+        return velocity_residuals(
+            self._at, carried.nodes, carried.velocity_imu, carried.delay_s, moved.gravity_m_s2
+        )

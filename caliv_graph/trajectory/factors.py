@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import skew
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.smoothed import States
 
 NoiseModel = gtsam.noiseModel.Base
 
@@ -83,6 +84,30 @@ def velocity_factor(
         return np.asarray(predicted - velocity_imu)
 
     return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
+
+
+def position_residuals(
+    states: States,
+    nodes: IntArray,
+    position_map: Array,
+    offset_imu: Array,
+    delay_s: Array,
+    gravity_m_s2: float,
+) -> Array:
+    """(m, 3) residuals of `position_factor` of m fixes at their `nodes` (m,), all at once."""
+    turned = np.einsum("mij,mj->mi", states.R_map_imu[nodes], offset_imu)
+    out = states.p_map_imu[nodes] + delay_s[:, None] * states.velocity_map[nodes] + turned
+    out[:, 2] -= 0.5 * gravity_m_s2 * delay_s**2
+    return np.asarray(out - position_map)
+
+
+def velocity_residuals(
+    states: States, nodes: IntArray, velocity_imu: Array, delay_s: Array, gravity_m_s2: float
+) -> Array:
+    """(m, 3) residuals of `velocity_factor` of m velocities at their `nodes` (m,), all at once."""
+    velocity = states.velocity_map[nodes].copy()
+    velocity[:, 2] -= gravity_m_s2 * delay_s
+    return np.asarray(np.einsum("mji,mj->mi", states.R_map_imu[nodes], velocity) - velocity_imu)
 
 
 def biased_orientation_factor(

@@ -24,10 +24,11 @@ def sums_of(
     """Of points (n,) that belong to one surfel each."""
     count = len(height)
     return HeightSums.of(
-        np.ones((count, 1)),
-        height[:, None],
-        cosine[:, None],
-        variance[:, None],
+        np.ones((1, count)),
+        1.0 / variance[None],
+        height[None],
+        cosine[None],
+        variance[None],
         np.ones(count) if weight is None else weight,
         lidar,
         int(lidar.max()) + 1,
@@ -47,7 +48,7 @@ def fitted(
     """The noise after as many rounds as registration has."""
     noise = start
     for _ in range(20):
-        variance = noise.variance(cosine[:, None], lidar)[:, 0]
+        variance = noise.variance(cosine[None], lidar)[0]
         sums = sums_of(height, cosine, variance, lidar, weight)
         noise = noise.fitted(sums, parameters, before or start)
     return noise
@@ -58,11 +59,13 @@ def test_variance_by_hand() -> None:
     noise = noise_of([0.01, 0.02], [0.003, 0.004])
     cosine = np.array([[1.0, 0.5], [1.0, 0.5]])
     expected = np.array([[109.0, 25.0 + 9.0], [416.0, 100.0 + 16.0]]) * 1e-6
-    assert noise.variance(cosine, np.array([0, 1])) == pytest.approx(expected)
+    found = noise.variance(cosine.T, np.array([0, 1]))
+    assert found == pytest.approx(expected.T)
     # While annealing the floor stands for a smaller roughness, not for a larger one.
     coarse = noise_of([0.01, 0.02], [0.003, 0.06], 0.05)
     expected = np.array([[2600.0, 2525.0], [4000.0, 3700.0]]) * 1e-6
-    assert coarse.variance(cosine, np.array([0, 1])) == pytest.approx(expected)
+    found = coarse.variance(cosine.T, np.array([0, 1]))
+    assert found == pytest.approx(expected.T)
     assert noise.largest_m() == pytest.approx(0.02)
 
 
@@ -123,9 +126,10 @@ def test_the_configured_noise_counts_as_fifty_points() -> None:
 def test_a_lidar_without_points_keeps_its_noise() -> None:
     height, cosine, lidar = simulated(500, [0.01, 0.02], [0.005, 0.005])
     start = HeightNoise.configured(3, 0.01, 0.0)
-    variance = start.variance(cosine[:, None], lidar)
+    variance = start.variance(cosine[None], lidar)
+    alpha = np.ones((1, 1000))
     sums = HeightSums.of(
-        np.ones((1000, 1)), height[:, None], cosine[:, None], variance, np.ones(1000), lidar, 3
+        alpha, alpha / variance, height[None], cosine[None], variance, np.ones(1000), lidar, 3
     )
     noise = start.fitted(sums, 0.0, start)
     assert noise.range_m2[2] == start.range_m2[2]
@@ -232,10 +236,15 @@ def test_the_shared_part_is_the_roughness_over_all_by_hand() -> None:
 
 def test_sums_by_hand_and_in_parts() -> None:
     # Two points of weights 1 and 1/2, 3 and 4 mm high, variances 1 and 4 mm^2, cosines 1 and 1/2.
-    alpha, height = np.array([[1.0], [0.8]]), np.array([[3e-3], [4e-3]])
-    cosine, variance = np.array([[1.0], [0.5]]), np.array([[1e-6], [4e-6]])
+    alpha, height = np.array([[1.0, 0.8]]), np.array([[3e-3, 4e-3]])
+    cosine, variance = np.array([[1.0, 0.5]]), np.array([[1e-6, 4e-6]])
     weight, lidar = np.array([1.0, 0.5]), np.zeros(2, np.int64)
-    sums = HeightSums.of(alpha, height, cosine, variance, weight, lidar, 1)
+
+    def of(i: slice) -> HeightSums:
+        a, h, f, v = alpha[:, i], height[:, i], cosine[:, i], variance[:, i]
+        return HeightSums.of(a, a / v, h, f, v, weight[i], lidar[i], 1)
+
+    sums = of(slice(None))
     assert sums.points == pytest.approx([1.4])
     assert sums.squares == pytest.approx([1.2])
     assert sums.kish() == pytest.approx([1.4**2 / 1.2])
@@ -245,10 +254,7 @@ def test_sums_by_hand_and_in_parts() -> None:
         np.array([[1.0 + 0.025 / 16.0, 1.0 + 0.025 / 4.0], [1.0 + 0.025 / 4.0, 1.025]])
     )
     assert sums.right[0] * 1e-6 == pytest.approx([9.0 + 0.1, 9.0 + 0.4])
-    parts = [
-        HeightSums.of(alpha[i], height[i], cosine[i], variance[i], weight[i], lidar[i], 1)
-        for i in (slice(0, 1), slice(1, 2))
-    ]
+    parts = [of(slice(0, 1)), of(slice(1, 2))]
     total = HeightSums.total([*parts, HeightSums.none(1)])
     for name in ("points", "squares", "cosine2", "normal", "right"):
         assert getattr(total, name) == pytest.approx(getattr(sums, name))

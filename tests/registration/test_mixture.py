@@ -611,7 +611,7 @@ def residuals(case: Case, d: Array, shape: Array) -> Array:
     n = normals[k]
     s = np.einsum("na,na->n", n, y - places[k]) / -np.einsum("na,na->n", n, b)
     f0 = -np.einsum("na,na->n", before[k], stack.rotated(case.R, stack.beams))
-    V = case.noise.variance(f0[:, None], np.zeros(len(f0), np.int64))[:, 0]
+    V = case.noise.variance(f0[None], np.zeros(len(f0), np.int64))[0]
     weight = np.array([1.0, 0.5, 0.8])[stack.cloud]
     of_ranges = np.sqrt(weight * f0**2 / V) * s
     # The mean normal of the points, which turn with their clouds, and the beams, which do as well.

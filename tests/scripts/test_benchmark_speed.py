@@ -6,16 +6,20 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from caliv_graph.errors import CalivError
+from caliv_graph.geometry.se3 import cross
 from scripts import _child, check_memory
 from scripts import benchmark_speed as benchmark
 from scripts._child import Usage
+from scripts._profile import Profile, profile_text, sampled
 from tests.cli.commands import write_config, write_drive
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -139,3 +143,28 @@ def test_scripts_run_from_anywhere(script: str, tmp_path: Path) -> None:
         check=True,
     )
     assert "--json" in done.stdout
+
+
+def test_samples_count_the_functions_of_the_package_by_processor_time() -> None:
+    rows = np.ones((20_000, 3))
+    until = time.process_time() + 0.15
+    with sampled() as samples:
+        while time.process_time() < until:
+            cross(rows, rows)
+    function = "geometry/se3.py:cross"
+    assert samples.number >= 10
+    assert samples.own.most_common(1)[0][0] == function
+    assert samples.total[function] >= 0.8 * samples.number
+    counted = samples.number
+    cross(np.ones((200_000, 3)), np.ones((200_000, 3)))
+    assert samples.number == counted  # the timer has stopped
+
+
+def test_profile_shows_stages_and_functions_in_seconds_and_parts() -> None:
+    shown = profile_text(
+        Profile("a drive", 4.0, [("reading clouds", 1.0)], {"a.py:f": 3.0}, {"a.py:g": 4.0})
+    )
+    assert "a drive: 4.00 s" in shown
+    assert "1.00 s  25.0 %  reading clouds" in shown
+    assert "3.00 s  75.0 %  a.py:f" in shown
+    assert "4.00 s 100.0 %  a.py:g" in shown

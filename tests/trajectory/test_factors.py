@@ -11,8 +11,11 @@ from caliv_graph.trajectory.factors import (
     marginal_factor,
     orientation_factor,
     position_factor,
+    position_residuals,
     velocity_factor,
+    velocity_residuals,
 )
+from caliv_graph.trajectory.smoothed import States
 
 POSE, VELOCITY, BIAS = 0, 1, 2
 UNIT = gtsam.noiseModel.Unit.Create(3)
@@ -43,6 +46,25 @@ def check_jacobians(factor: gtsam.NoiseModelFactor, at: gtsam.Values) -> None:
             numerical = (ends[0] - ends[1]) / 2e-6
             np.testing.assert_allclose(A[:, column], numerical, atol=1e-7)
             column += 1
+
+
+def test_residuals_of_all_factors_at_once_are_theirs() -> None:
+    at, rng = values(), np.random.default_rng(1)
+    T, V = at.atPose3(POSE), at.atVector(VELOCITY)
+    none = np.zeros((1, 3))
+    states = States(T.rotation().matrix()[None], T.translation()[None], V[None], none, none)
+    measured, offset, delay_s = rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), [0.0, -0.03]
+    nodes = np.zeros(2, dtype=np.int64)
+
+    positions = position_residuals(states, nodes, measured, offset, np.array(delay_s), 9.8)
+    velocities = velocity_residuals(states, nodes, measured, np.array(delay_s), 9.8)
+
+    for k, late_s in enumerate(delay_s):
+        of_fix = position_factor(POSE, VELOCITY, measured[k], offset[k], late_s, 9.8, UNIT)
+        gained = np.array([0.0, 0.0, -9.8 * late_s])
+        of_speed = velocity_factor(POSE, VELOCITY, measured[k], gained, UNIT)
+        np.testing.assert_allclose(positions[k], of_fix.unwhitenedError(at), atol=1e-12)
+        np.testing.assert_allclose(velocities[k], of_speed.unwhitenedError(at), atol=1e-12)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.05, -0.03])

@@ -11,7 +11,7 @@ import pytest
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array
-from caliv_graph.trajectory.columns import whitened
+from caliv_graph.trajectory.columns import whitening
 from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -51,7 +51,7 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
     weights = []
     for number in range(huber.graph.size()):
         factor: Any = huber.graph.at(number)
-        white = whitened(factor, huber.values, factor.unwhitenedError(huber.values))
+        white = whitening(factor, huber.values) @ factor.unwhitenedError(huber.values)
         right: Any = linear.at(number)
         np.testing.assert_allclose(white, -right.getb(), atol=1e-9)
         weights.append(factor.noiseModel().weight(white))

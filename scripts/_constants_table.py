@@ -198,6 +198,14 @@ CONSTANTS: tuple[Constant, ...] = (
         SHORT,
     ),
     Constant(
+        _MIXTURE,
+        "SEED_FLATNESS",
+        "",
+        "reliability of a point's normal from which on a surfel may begin there, but in `staged`",
+        "half of the scale of the reliability; tried",
+        SHORT,
+    ),
+    Constant(
         CONFIG,
         "registration.components",
         "",

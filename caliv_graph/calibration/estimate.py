@@ -131,6 +131,9 @@ def _estimate(
             config,
             normals=False,
             views=problem.views_of(m),
+            # Surfels that are too wide for legs tilt the clouds of the noisier LiDARs. Elsewhere
+            # the ground corrects that.
+            seeds_everywhere=config.solve.mode == "staged",
         )
         for m, o in enumerate(observations)
     ]

@@ -74,6 +74,10 @@ POINTS_PER_COMPONENT = 10
 the surfels use of the data the poses do not get."""
 
 
+SEED_FLATNESS = 0.5
+"""Reliability of a point's normal from which on a surfel may begin there."""
+
+
 def seed_mixture(
     stack: CloudStack,
     R: Array,
@@ -82,6 +86,7 @@ def seed_mixture(
     sigma_m: float,
     distinct: float | None = None,
     trusted: BoolArray | None = None,
+    everywhere: bool = False,
 ) -> Mixture:
     """The initial mixture of width `sigma_m`: components on points with reliable normals.
 
@@ -90,13 +95,14 @@ def seed_mixture(
     translations t (J, 3). There are fewer `components` if few points are `distinct`
     (`POINTS_PER_COMPONENT`): those of scans of one view count as one. None: all are. Clouds (J,)
     that are not `trusted` get no surfels: a cloud in the wrong place would explain itself.
+    `everywhere`: on points whose normals are not reliable as well, as on thin parts.
     """
     distinct = len(stack.points) if distinct is None else distinct
     points = stack.moved(R, t)
     normals = stack.rotated(R, stack.normals)
     components = max(min(components, int(distinct) // POINTS_PER_COMPONENT), 1)
     allowed = np.ones(len(points), bool) if trusted is None else trusted[stack.cloud]
-    usable = np.flatnonzero(allowed & (stack.flatness > 0.5))
+    usable = np.flatnonzero(allowed & (everywhere | (stack.flatness > SEED_FLATNESS)))
     if len(usable) < 2 * components:
         usable = np.flatnonzero(allowed)
     order = usable[np.argsort(sampling_order(stack.points[usable]))]

@@ -103,6 +103,7 @@ class JointRegistration:
         rough: bool = False,
         normals: bool = True,
         views: Array | None = None,
+        seeds_everywhere: bool = False,
     ) -> None:
         """Stacks the clouds of `observation`.
 
@@ -112,6 +113,7 @@ class JointRegistration:
             rough: the coarse pass: fewer points, half the components, a wider tolerance.
             normals: False if `refine_normals` follows.
             views: (J,) clouds that have the view of each (`targets.cloud.views`); None: 1.
+            seeds_everywhere: surfels begin where normals are not reliable, too (`seed_mixture`).
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -145,6 +147,7 @@ class JointRegistration:
         self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)
         self.weights: Array = np.ones(self.clouds.count)
         self.held_along = HELD_ALONG_M**-2.0
+        self._seeds_everywhere = seeds_everywhere
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
@@ -189,6 +192,7 @@ class JointRegistration:
             self._floor,
             distinct,
             trusted if trusted.sum() >= 2 else None,
+            self._seeds_everywhere,
         )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:

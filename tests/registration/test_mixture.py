@@ -1004,6 +1004,24 @@ def test_seeds_are_the_same_points_wherever_the_clouds_are() -> None:
     assert [row[tuple(m)] for m in here.tolist()] == [moved_row[tuple(m)] for m in there.tolist()]
 
 
+def test_seeds_everywhere_are_on_parts_whose_normals_are_not_known() -> None:
+    # A face of 600 points, and a leg of 200 with two columns of points on it, whose normals nobody
+    # knows: a quarter of the points, and of the surfels.
+    rng = np.random.default_rng(3)
+    face = rectangle_points(rng, 600, np.zeros(3), np.array([0.4, 0, 0]), np.array([0, 0.4, 0]))
+    leg = face[:200] * [0.1, 1.0, 1.0] - [0.0, 0.5, 0.0]
+    up = np.tile([0.0, 0.0, 1.0], (800, 1))
+    flatness = np.repeat([0.9, 0.1], [600, 200])
+    stack = stack_of(np.concatenate([face, leg]), up, flatness=flatness)
+    reliable = seed_mixture(stack, *IDENTITY, 80, 0.01)
+    everywhere = seed_mixture(stack, *IDENTITY, 80, 0.01, everywhere=True)
+    assert (reliable.means_target[:, 1] > -0.1).all()
+    on_leg = everywhere.means_target[:, 1] < -0.1
+    assert 10 <= on_leg.sum() <= 30
+    # They are no wider than the leg.
+    assert np.sqrt(np.median(everywhere.var_tangent[on_leg])) < 0.04
+
+
 def test_no_more_surfels_than_points_can_tell() -> None:
     stack, R, t = seed_case()
     mixture = seed_mixture(stack, R, t, 5000, 0.03)

@@ -123,9 +123,13 @@ def _table(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
         if not bare:
             continue
         if comment or not re.fullmatch(r"[-+.\deE]+|nan", values[0]):
-            # A comment of a TUM file may name its columns, too, but in the order that it has.
+            # A comment of a TUM file may name its columns, too, but in the order that it has; and
+            # one with a comma need not name any.
+            header = [v.lstrip("#% ") for v in values]
+            if comment and (len(values) == 1 or set(_TUM) - set(map(_plain_meaning, header))):
+                continue
             if not lines and (not comment or re.search("[,;]", bare)):
-                names = [v.lstrip("#% ") for v in values]
+                names = header
             elif not comment:
                 lines.append((number, values))
             continue
@@ -137,8 +141,7 @@ def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
     """Index of each value of a pose by the header of a CSV."""
     found: dict[str, int] = {}
     for index, name in enumerate(names):
-        plain = re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
-        meaning = _meaning(plain)
+        meaning = _plain_meaning(name)
         if meaning is not None:
             found.setdefault(meaning, index)
     missing = [name for name in _TUM if name not in found]
@@ -148,6 +151,11 @@ def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
             f"{', '.join(names)[:200]}. Name them timestamp, x, y, z, qx, qy, qz, qw"
         )
     return found
+
+
+def _plain_meaning(name: str) -> str | None:
+    """`_meaning` of a name that may have a unit in brackets."""
+    return _meaning(re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower())
 
 
 def _meaning(plain: str) -> str | None:

@@ -46,6 +46,8 @@ def test_times_of_all_units_to_the_nanosecond(text: str, stamp_ns: int | None) -
     [
         f"# timestamp tx ty tz qx qy qz qw\n1700000000.123456789 1 2 3 0 0 {HALF} {HALF}\n",
         f"1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        "# map: ENU, origin at latitude 48, longitude 11. vehicle: x forward, y left, z up\n"
+        f"# timestamp tx ty tz qx qy qz qw\n1700000000.123456789 1 2 3 0 0 {HALF} {HALF}\n",
         f"num,t,x,y,z,qx,qy,qz,qw\n0,1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
         "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
         "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1]\n"

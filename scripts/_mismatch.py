@@ -159,7 +159,8 @@ def run(task: Task, beams: Path) -> Result:
         arm += LEVER_ARM_SIGMA_M * np.random.default_rng(task.seed).standard_normal(3)
     changes: dict[str, dict[str, Any]] = {
         "noise": {"lidar_range_m": NOMINAL_RANGE_M},
-        "gnss": {"lever_arm": arm.tolist()},
+        # The config that `simulate` writes states an exact arm: here it has the default sigma.
+        "gnss": {"lever_arm": arm.tolist(), "lever_arm_sigma": None},
     }
     config = config_for(recording, changes)
     return judged(

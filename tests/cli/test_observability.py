@@ -89,8 +89,10 @@ def test_the_same_drive_twice_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFi
 def test_guesses_that_nobody_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = write_drive(tmp_path / "drive")
 
-    assert run(["init", str(drive), "--out", str(tmp_path / "config.yaml")]) == 0
+    config = tmp_path / "config.yaml"
+    assert run(["init", str(drive), "--out", str(config)]) == 0
     capsys.readouterr()
+    config.write_text(config.read_text().replace("initial: null", "initial: {xyz: [0, 0, 0]}"))
 
     assert run(["observability", str(tmp_path / "config.yaml")]) == 2
     assert "lidars.sensor_1.initial and lidars.sensor_2.initial" in capsys.readouterr().err

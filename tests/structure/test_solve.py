@@ -10,7 +10,7 @@ import pytest
 
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
-from caliv_graph.structure.noise import range_sigmas
+from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.solve import Problem, Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import term_of
@@ -141,11 +141,20 @@ AHEAD = {
 
 
 def test_scans_from_one_place_say_more_than_one_and_no_more_than_they_know() -> None:
-    """Both LiDARs see the same bumps; the noise of their beams averages out."""
+    """Both LiDARs see the same bumps; the noise of their beams averages out.
+
+    Two places tell what is repeated; where there is one alone, millimetres are taken as repeated.
+    """
     still = (np.zeros((20, 3)), np.zeros(20))
     problem = problem_of(yard(), still, 4, Noise(sighting_m=0.0, bias_m=0.0), extrinsics=AHEAD)
-    one_place = Views.numbered(problem.patches.scan_lidar)
-    found = solve(replace(problem, views=one_place))
+    of_lidar = problem.patches.scan_lidar
+    alone = solve(replace(problem, views=Views.numbered(of_lidar)))
+    assert alone.nuisances.repeated == 1.0
+    assert alone.nuisances.sighting.min() == alone.nuisances.strip.min() == ONE_VIEW_M
+    two_places = Views.numbered(
+        2 * of_lidar + (problem.patches.stamps_ns > np.median(problem.patches.stamps_ns))
+    )
+    found = solve(replace(problem, views=two_places))
     assert found.nuisances.repeated < 0.2
     assert np.median(found.nuisances.sighting) < 1e-3
     assert np.median(found.nuisances.strip) < 3e-3

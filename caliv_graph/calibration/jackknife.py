@@ -17,6 +17,7 @@ import numpy as np
 
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, stack
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.registration.register import JointRegistration
@@ -60,7 +61,10 @@ def jackknife_scale(
     )
     if (distinct[distinct > 0.0] < LEAST_LIDAR_CLOUDS).any():
         return 1.0
-    prior = problem.guess_information()
+    # Where the data tell nothing, wide guesses would let the parts wander off along what they do
+    # not determine, and the way is curved.
+    usual = np.tile(DEFAULT_GUESS_SIGMAS**-2.0, len(problem.lidars))
+    prior = np.maximum(problem.guess_information(), np.diag(usual))
     group = _groups(problem)
     every = _placements(problem, extrinsics, states, lines, group >= 0)
     H, _ = _system(every, extrinsics)

@@ -10,7 +10,7 @@ import numpy as np
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration, Guess, LidarResult, Uncertainty
-from caliv_graph.uncertainty.observability import known_sigmas, unguessed
+from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO, known_sigmas, unguessed
 
 _NO_OFFSETS: Mapping[str, tuple[float, float]] = {}
 
@@ -58,7 +58,12 @@ def assemble_matrices(
         name: LidarResult(
             T_vehicle_lidar=poses[name],
             cov=cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
-            determined=dict(uncertainty.determined.get(name, nothing)),
+            determined=_determined(
+                uncertainty.determined.get(name, nothing),
+                guesses[name],
+                poses[name],
+                cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
+            ),
             scans_used=scans.get(name, 0),
             saw_target=scans.get(name, 0) > 0,
             time_offset=time_offsets.get(name),
@@ -82,6 +87,22 @@ def assemble_matrices(
         provenance={},
         gradient_data=None if gradient is None else to_right @ gradient,
     )
+
+
+def _determined(
+    found: Mapping[str, bool], guess: Guess, T_vehicle_lidar: gtsam.Pose3, cov: Array
+) -> dict[str, bool]:
+    """Whether the data determine each axis.
+
+    Where nobody gave a guess, an undetermined direction may be off so far that the other axes take
+    part in it: y, after half a turn about the centre of an arc.
+    """
+    if not guess.found:
+        return dict(found)
+    axes = right_to_vehicle_axes(T_vehicle_lidar)
+    sigmas = np.sqrt(np.diag(axes @ cov @ axes.T))
+    known = sigmas <= UNDETERMINED_RATIO * guess.sigmas
+    return {axis: found[axis] and bool(k) for axis, k in zip(AXES, known, strict=True)}
 
 
 def _to_right(names: Sequence[str], solved: Mapping[str, gtsam.Pose3]) -> Array:

@@ -24,6 +24,7 @@ def placement_sentence(found: Placement) -> str:
 
 
 def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:
-    x, y, z = T_vehicle_lidar.translation()
-    roll, pitch, yaw = np.degrees(T_vehicle_lidar.rotation().rpy())
+    # Adding zero makes minus zero a zero.
+    x, y, z = np.round(T_vehicle_lidar.translation(), 1) + 0.0
+    roll, pitch, yaw = np.round(np.degrees(T_vehicle_lidar.rotation().rpy())) + 0.0
     return f"xyz: [{x:.1f}, {y:.1f}, {z:.1f}] m, rpy_deg: [{roll:.0f}, {pitch:.0f}, {yaw:.0f}]"

@@ -47,6 +47,9 @@ _LEAST_TRAVEL_M = 1.0
 R_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Vehicle axes (x forward, y left, z up) from those of a camera (x right, y down, z forward)."""
 
+_MOST_US = 2**62 // 1000
+"""Of a time that is still an integer in nanoseconds."""
+
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))
 """Least absolute time since 1970 that is written in ns, us and ms, and nanoseconds of each."""
 
@@ -205,12 +208,9 @@ def _json_rows(text: str, path: Path) -> tuple[IntArray, Array]:
         }
         stamps = np.array(sorted(table), np.int64) * 1000
         rows = np.array([table[key] for key in sorted(table)], np.float64)
-        if (
-            rows.shape != (len(stamps), 7)
-            or not len(rows)
-            or min(table) < 0
-            or max(table) >= 2**62 // 1000
-        ):
+        if rows.shape != (len(stamps), 7) or not len(rows):
+            raise ValueError
+        if min(table) < 0 or max(table) >= _MOST_US:
             raise ValueError
     except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
         raise RecordingError(

@@ -14,8 +14,8 @@ MOST_OTHERS = 2
 def placement_sentence(found: Placement) -> str:
     """Where a LiDAR without an initial guess was found, and what else fits."""
     text = (
-        f"lidar '{found.lidar}': no initial guess was given. The drive was solved from "
-        f"{_pose(found.T_vehicle_lidar)}, found from what stands still"
+        f"lidar '{found.lidar}': no initial guess was given. What stands still in the drive gives "
+        f"the first one: {_pose(found.T_vehicle_lidar)}"
     )
     if not found.others:
         return text
@@ -24,6 +24,7 @@ def placement_sentence(found: Placement) -> str:
 
 
 def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:
-    x, y, z = T_vehicle_lidar.translation()
-    roll, pitch, yaw = np.degrees(T_vehicle_lidar.rotation().rpy())
+    # A zero has no sign.
+    x, y, z = np.round(T_vehicle_lidar.translation(), 1) + 0.0
+    roll, pitch, yaw = np.round(np.degrees(T_vehicle_lidar.rotation().rpy())) + 0.0
     return f"xyz: [{x:.1f}, {y:.1f}, {z:.1f}] m, rpy_deg: [{roll:.0f}, {pitch:.0f}, {yaw:.0f}]"

@@ -80,19 +80,28 @@ def load_config(path: Path) -> Config:
     Raises:
         ConfigError: the file is missing, not YAML, or not valid.
     """
+    try:
+        problem = _no_config(path)
+    except OSError:  # a name that is too long, a folder that may not be read: reading tells it
+        problem = ""
+    if problem:
+        raise ConfigError(f"{path}: {problem}")
+    return parse_config(read_yaml(path), str(path), path.parent)
+
+
+def _no_config(path: Path) -> str:
+    """Why a path is no config file, and what to give or to do instead; empty: it is a file."""
     inside = path / "config.yaml"
     if path.is_dir() and inside.is_file():
-        raise ConfigError(f"{path}: is a folder. Give {inside}")
-    if not path.is_file() and not path.exists():
-        raise ConfigError(
-            f"{path}: no such file. 'caliv-graph init DRIVE --out {path}' drafts it for a drive"
-        )
+        return f"is a folder. Give {inside}"
     if path.is_dir():
-        raise ConfigError(
-            f"{path}: is a folder, expected a YAML file. 'caliv-graph init {path} --out "
-            "config.yaml' drafts one, if this is a drive"
+        return (
+            f"is a folder, expected a YAML file. 'caliv-graph init {path} --out config.yaml' "
+            "drafts one, if this is a drive"
         )
-    return parse_config(read_yaml(path), str(path), path.parent)
+    if not path.exists():
+        return f"no such file. 'caliv-graph init DRIVE --out {path}' drafts it for a drive"
+    return ""
 
 
 def dump_config(config: Config) -> str:

@@ -86,13 +86,14 @@ def place_lidars(
 ) -> tuple[Config, tuple[Placement, ...]]:
     """Finds the mountings of the LiDARs without an initial guess, in the drive that turns most.
 
-    LiDARs with a guess are taken as they are, and what they see helps to place the others.
+    LiDARs with a guess are taken as they are, and what they see helps to place the others, if they
+    see the ground and what stands on it.
 
     Returns:
         The config with what was found as guesses, and the placements.
 
     Raises:
-        ConfigError: a LiDAR sees no ground, or nothing that stands on it.
+        ConfigError: a LiDAR without a guess sees no ground, or nothing that stands on it.
         RecordingError: a cloud could not be read.
     """
     missing = [name for name, lidar in config.lidars.items() if lidar.initial is None]
@@ -105,8 +106,12 @@ def place_lidars(
     total = sum(map(len, stamps.values()))
     with progress.stage("finding the mountings", total) as advance:
         for name in config.lidars:
-            views[name] = _view(recording, trajectory, config, name, stamps[name], advance)
-        known = {n: _guessed(views[n], config, n) for n in config.lidars if n not in missing}
+            try:
+                views[name] = _view(recording, trajectory, config, name, stamps[name], advance)
+            except ConfigError:
+                if name in missing:
+                    raise
+        known = {n: _guessed(views[n], config, n) for n in views if n not in missing}
         alone = {name: sharpest(views[name].sightings) for name in missing}
         placements: dict[str, Placement] = {}
         # The clearest first: on an arc the others are placed about it.

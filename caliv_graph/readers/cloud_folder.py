@@ -204,7 +204,9 @@ class CloudFolder:
         for name, clouds in self._clouds.items():
             fields, spans, is_absolute = self._fields[name], [], False
             sampled = [item for i, item in enumerate(clouds.items()) if is_sampled(i)]
-            for stamp_ns, path in sampled if fields else ():
+            for stamp_ns, path in sampled:
+                if path.suffix != ".bin":
+                    continue
                 cloud = bin_sweep_times(path, fields, stamp_ns, self._period_s(name))
                 if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
                     spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
@@ -259,7 +261,9 @@ def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
         paths = sorted(
             entry
             for entry in folder.iterdir()
-            if entry.suffix in (".bin", ".pcd") and not entry.name.startswith(".")
+            if entry.suffix in (".bin", ".pcd")
+            and not entry.name.startswith(".")
+            and entry.is_file()
         )
     except OSError:
         there = ", ".join(cloud_folders(root)) or "none"

@@ -77,8 +77,8 @@ _FAST_RAD_S = 6.0
 _MOST_RAD_S = 200.0
 _MOST_M_S2 = 2000.0
 _MOST_M_S = 1000.0
-_MOST_ALTITUDE_M = 1e5
-_MOST_M = 1e8
+MOST_ALTITUDE_M = 1e5
+MOST_M = 1e8
 """Beyond the range of any sensor on a vehicle, and the width of any map: such values are invalid,
 and their squares may overflow."""
 
@@ -236,7 +236,7 @@ class ImuCollector(RowCollector):
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :6]).all(axis=1)),
             (
                 f"beyond {_MOST_RAD_S:g} rad/s or {_MOST_M_S2:g} m/s^2",
-                lambda r: _below(r[:, :3], _MOST_RAD_S) & _below(r[:, 3:6], _MOST_M_S2),
+                lambda r: below(r[:, :3], _MOST_RAD_S) & below(r[:, 3:6], _MOST_M_S2),
             ),
         )
         if not len(stamps):
@@ -313,8 +313,8 @@ class GnssCollector(RowCollector):
                 lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
             ),
             (
-                f"beyond {_MOST_ALTITUDE_M:g} m of altitude",
-                lambda r: _below(r[:, 2:3], _MOST_ALTITUDE_M),
+                f"beyond {MOST_ALTITUDE_M:g} m of altitude",
+                lambda r: below(r[:, 2:3], MOST_ALTITUDE_M),
             ),
         )
         if not len(stamps):
@@ -358,7 +358,7 @@ class TwistCollector(RowCollector):
         """The velocities; None if there are none."""
         stamps, rows, _ = self._usable(
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :3]).all(axis=1)),
-            (f"beyond {_MOST_M_S:g} m/s", lambda r: _below(r[:, :3], _MOST_M_S)),
+            (f"beyond {_MOST_M_S:g} m/s", lambda r: below(r[:, :3], _MOST_M_S)),
         )
         for frame in sorted(self._frames):
             if frame.strip("/").lower() in _FIXED_AXES:
@@ -392,7 +392,7 @@ class PoseCollector(RowCollector):
         """The poses; None if there are none."""
         stamps, rows, _ = self._usable(
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :7]).all(1)),
-            (f"beyond {_MOST_M:g} m from the origin", lambda r: _below(r[:, :3], _MOST_M)),
+            (f"beyond {MOST_M:g} m from the origin", lambda r: below(r[:, :3], MOST_M)),
             (
                 "whose orientation is not a unit quaternion",
                 lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
@@ -553,7 +553,7 @@ def _common(kinds: Array, which: IntArray) -> Array | None:
     return np.asarray(np.median(known, axis=0)) if len(known) else None
 
 
-def _below(vectors: Array, most: float) -> BoolArray:
+def below(vectors: Array, most: float) -> BoolArray:
     """(n,) of (n, k): whether all values are within plus and minus a limit."""
     return np.asarray((np.abs(vectors) <= most).all(axis=1))
 

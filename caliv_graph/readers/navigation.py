@@ -26,12 +26,15 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, GnssFixes
 from caliv_graph.readers.motion import (
     INSPVAX_TYPES,
+    MOST_ALTITUDE_M,
+    MOST_M,
     NAVPVT,
     POSITION_TYPES,
     PVT_GEODETIC,
     Collector,
     GnssCollector,
     RowCollector,
+    below,
 )
 
 _GOOD = {3, 6, 7, "INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE"}
@@ -124,6 +127,10 @@ class InspvaxCollector(RowCollector):
             (
                 "at latitude and longitude 0 or out of their range",
                 lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
+            ),
+            (
+                f"beyond {MOST_ALTITUDE_M:g} m of altitude",
+                lambda r: below(r[:, 2:3], MOST_ALTITUDE_M),
             ),
         )
         if not len(stamps):
@@ -246,6 +253,7 @@ class LocalPositionCollector(GnssCollector):
         """The positions as fixes; None if there are none."""
         stamps, rows, _ = self._usable(
             ("with NaN or infinity", lambda r: np.isfinite(r).all(axis=1)),
+            (f"beyond {MOST_M:g} m from the origin", lambda r: below(r, MOST_M)),
         )
         if not len(stamps):
             return None

@@ -35,6 +35,9 @@ _NORM_TOLERANCE = 1e-2
 
 _TUM = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
 
+_WHOLE_SECONDS = re.compile(r"(^|[^a-z])secs?$")
+"""Name of a column with the seconds of a stamp, whose nanoseconds are in another one."""
+
 _MATRIX_TOLERANCE = 1e-3
 """By which a rotation matrix may differ from one: rounding to four decimals."""
 
@@ -43,6 +46,9 @@ _LEAST_TRAVEL_M = 1.0
 
 R_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Vehicle axes (x forward, y left, z up) from those of a camera (x right, y down, z forward)."""
+
+_MOST_US = 2**62 // 1000
+"""Of a time that is still an integer in nanoseconds."""
 
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))
 """Least absolute time since 1970 that is written in ns, us and ms, and nanoseconds of each."""
@@ -105,7 +111,10 @@ def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> Give
         if stamp_ns is None:
             raise RecordingError(f"{where}: {values[columns['time']][:40]!r} is not a time")
         if "nanoseconds" in columns:
-            stamp_ns += int(_number(values[columns["nanoseconds"]], where))
+            part_ns = _number(values[columns["nanoseconds"]], where)
+            if not 0 <= part_ns < NANOSECONDS_PER_SECOND:
+                raise RecordingError(f"{where}: {part_ns:g} ns is not a part of a second")
+            stamp_ns += int(part_ns)
         stamps[i] = stamp_ns
         rows[i] = [_number(values[columns[name]], where) for name in _TUM[1:]]
     return _given(stamps, rows, path)
@@ -140,10 +149,18 @@ def _table(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
 def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
     """Index of each value of a pose by the header of a CSV."""
     found: dict[str, int] = {}
+    seconds: int | None = None
     for index, name in enumerate(names):
         meaning = _plain_meaning(name)
         if meaning is not None:
             found.setdefault(meaning, index)
+        if meaning == "time" and seconds is None and _WHOLE_SECONDS.search(name.strip().lower()):
+            seconds = index
+    # Beside the two parts of a stamp there may be the time of recording, with its fraction.
+    if "nanoseconds" in found and seconds is not None:
+        found["time"] = seconds
+    elif "nanoseconds" in found and "time" not in found:
+        found["time"] = found.pop("nanoseconds")
     missing = [name for name in _TUM if name not in found]
     if missing:
         raise RecordingError(
@@ -193,6 +210,8 @@ def _json_rows(text: str, path: Path) -> tuple[IntArray, Array]:
         rows = np.array([table[key] for key in sorted(table)], np.float64)
         if rows.shape != (len(stamps), 7) or not len(rows):
             raise ValueError
+        if min(table) < 0 or max(table) >= _MOST_US:
+            raise ValueError
     except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
         raise RecordingError(
             f"{path}: is JSON, but not a list of poses with timestamp (us), translation and "
@@ -219,9 +238,14 @@ def _kitti(
             raise RecordingError(f"{where}: {len(values)} values, expected 12 as in line 1")
         M[i] = np.reshape([_number(v, where) for v in values], (3, 4))
     R, t = M[:, :, :3], M[:, :, 3]
-    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    if not (np.isfinite(M).all() and off.max() <= _MATRIX_TOLERANCE):
-        raise RecordingError(f"{path}: line {lines[int(off.argmax())][0]} holds no rotation")
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        rotates = (off <= _MATRIX_TOLERANCE) & (np.linalg.det(R) > 0.0)
+        good = rotates & (np.abs(t) <= _MOST_M).all(axis=1)
+    if not good.all():
+        worst = int(np.flatnonzero(~good)[0])
+        what = "usable position" if rotates[worst] else "rotation"
+        raise RecordingError(f"{path}, line {lines[worst][0]}: holds no {what}. Mend or remove it")
     if _moves_along_z(R, t, path):
         R = R_CAMERA @ R @ R_CAMERA.T
         t = t @ R_CAMERA.T
@@ -243,8 +267,8 @@ def _moves_along_z(R: Array, t: Array, path: Path) -> bool:
 
 def _given(stamps_ns: IntArray, rows: Array, path: Path) -> GivenPoses:
     """Poses by time from rows (n, 7) of x y z qx qy qz qw; of two with one time the first."""
-    norms = np.linalg.norm(rows[:, 3:], axis=1)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        norms = np.linalg.norm(rows[:, 3:], axis=1)
         good = (np.abs(norms - 1.0) <= _NORM_TOLERANCE) & (np.abs(rows[:, :3]) <= _MOST_M).all(1)
     if not good.all():
         worst = int(np.flatnonzero(~good)[0])

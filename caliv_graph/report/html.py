@@ -85,7 +85,7 @@ def render_report(
         extrinsics={n: extrinsic_row(r) for n, r in calibration.lidars.items()},
         pairs=pair_cells(calibration),
         measured=[vehicle_text(name, found) for name, found in calibration.vehicle.items()],
-        moves=_move_rows(calibration),
+        moves=move_rows(calibration),
         residuals=all_residuals(solution, record),
         clouds=[_cloud_row(c, record) for c in clouds[:MOST_LISTED]],
         more_clouds=max(len(clouds) - MOST_LISTED, 0),
@@ -189,11 +189,14 @@ def extrinsic_row(result: LidarResult) -> dict[str, Any]:
     }
 
 
-def _move_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """Differences between guess and result; mm and mrad in vehicle axes."""
+def move_rows(calibration: Calibration) -> list[dict[str, Any]]:
+    """Differences between guess and result; mm and mrad in vehicle axes.
+
+    A guess that was found in the drive is no measure of anything.
+    """
     rows = []
     for name, lidar in calibration.lidars.items():
-        if lidar.guess is None or lidar.guess.fixed or not lidar.has_data:
+        if lidar.guess is None or lidar.guess.fixed or lidar.without_guess or not lidar.has_data:
             continue
         moved = vehicle_axes_difference(lidar.T_vehicle_lidar, lidar.guess.T_vehicle_lidar)
         after = np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))

@@ -154,7 +154,12 @@ def _extrinsics(
 
 
 def _with_guesses(names: Sequence[str], calibration: Calibration, config: Config) -> Config:
-    """The config with the guesses that the calibration found for LiDARs without any."""
+    """The config with the guesses that the calibration found for LiDARs without any.
+
+    A LiDAR without a guess that is not in the calibration either is left out.
+    """
+    lidars = {n: of for n, of in config.lidars.items() if n in names or of.initial is not None}
+    config = config.model_copy(update={"lidars": lidars})
     for name in names:
         if config.lidars[name].initial is None:
             result = calibration.lidars[name]

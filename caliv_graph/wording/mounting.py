@@ -14,8 +14,8 @@ MOST_OTHERS = 2
 def placement_sentence(found: Placement) -> str:
     """Where a LiDAR without an initial guess was found, and what else fits."""
     text = (
-        f"lidar '{found.lidar}': no initial guess was given. The drive was solved from "
-        f"{_pose(found.T_vehicle_lidar)}, found from what stands still"
+        f"lidar '{found.lidar}': no initial guess was given. What stands still in the drive gives "
+        f"the first one: {_pose(found.T_vehicle_lidar)}"
     )
     if not found.others:
         return text

@@ -256,6 +256,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
     for name, part in {
         "nowhere.yaml": "no such file. 'caliv-graph init DRIVE --out",
+        "x" * 300: "File name too long",
         ".": "is a folder, expected a YAML file. 'caliv-graph init",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",

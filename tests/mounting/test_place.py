@@ -53,6 +53,7 @@ class Drive:
     mountings: Mapping[str, gtsam.Pose3]
     posts: bool = True
     ground: bool = True
+    blind: str = ""
     name: str = "drive"
 
     @property
@@ -75,7 +76,7 @@ class Drive:
     def scan(self, lidar: str, stamp: int) -> LidarScan:
         rng = np.random.default_rng(stamp % 2**31)
         parts = []
-        if self.ground:  # dense near the LiDAR, about its own place
+        if self.ground and lidar != self.blind:  # dense near the LiDAR, about its own place
             _, t = self.way.poses_at([stamp])
             range_m, angle = rng.uniform(2.0, 12.0, 3000), rng.uniform(-math.pi, math.pi, 3000)
             flat = np.column_stack([range_m * np.cos(angle), range_m * np.sin(angle)])
@@ -139,6 +140,15 @@ def test_a_guess_that_is_given_stays() -> None:
     )
     assert none == ()
     assert untouched == config_of(spin=SPIN, ahead=AHEAD)
+
+
+def test_a_lidar_with_a_guess_need_not_see_the_ground() -> None:
+    drive = Drive({"spin": SPIN, "ahead": AHEAD}, blind="ahead")
+    config, (placement,) = place_lidars(
+        [drive], [drive.way], config_of("spin", ahead=AHEAD), SilentProgress()
+    )
+    assert placement.lidar == "spin"
+    assert error(config.lidars["spin"].guess(), SPIN)[1] < 0.25
 
 
 @pytest.mark.parametrize(

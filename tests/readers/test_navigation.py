@@ -187,6 +187,7 @@ def test_positions_of_a_total_station(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     places = np.array([300.0, -200.0, 5.0]) + np.cumsum(rng.uniform(-2, 3, (40, 3)), axis=0)
     messages = [pose_stamped(k, tuple(p)) for k, p in enumerate(places.tolist())]
+    messages.append(pose_stamped(40, (1e300, 0.0, 0.0)))  # no place
 
     fixes = record(tmp_path, messages, gnss="/nav").gnss
 

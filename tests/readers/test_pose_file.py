@@ -56,6 +56,12 @@ def test_times_of_all_units_to_the_nanosecond(text: str, stamp_ns: int | None) -
         "field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
         "field.pose.pose.orientation.z,field.pose.pose.orientation.w,"
         f"field.twist.twist.linear.x\n{T},7,1,2,3,0,0,{HALF},{HALF},9\n",
+        # The time of recording comes before the stamp, which counts.
+        "Time,header.stamp.secs,header.stamp.nsecs,pose.pose.position.x,pose.pose.position.y,"
+        "pose.pose.position.z,pose.pose.orientation.x,pose.pose.orientation.y,"
+        "pose.pose.orientation.z,pose.pose.orientation.w\n"
+        f"1700000000.75,1700000000,123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        f"timestamp_nsec,x,y,z,qx,qy,qz,qw\n{T},1,2,3,0,0,{HALF},{HALF}\n",
         f"sec;nsec;x;y;z;qx;qy;qz;qw;\n1700000000;123456789;1;2;3;0;0;{HALF};{HALF};\n",
         json.dumps(
             [
@@ -122,12 +128,28 @@ def test_poses_of_a_camera_are_turned_into_those_of_a_vehicle(tmp_path: Path, ca
         ("1 0 0 o 0 0 0 1\n", "line 1: 'o' is not a number"),
         ("t,x,y,z,roll\n1,0,0,0,0\n", "no column for qx, qy, qz, qw"),
         ("[1, 2]", "is JSON, but not a list of poses"),
+        ("sec,nsec,x,y,z,qx,qy,qz,qw\n1,nan,0,0,0,0,0,0,1\n", "nan ns is not a part of a second"),
+        ('[{"timestamp": -1, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]}]', "is JSON, but"),
         (kitti(True), "5 poses of 12 numbers have no times"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(RecordingError, match=message):
         read_poses(written(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("1 0 0 2 0 1 0 0 0 0 -1 0", "line 3: holds no rotation"),  # a mirror
+        ("1 0 0 1e999 0 1 0 0 0 0 1 0", "line 3: holds no usable position"),
+    ],
+)
+def test_a_damaged_matrix_is_named(tmp_path: Path, row: str, message: str) -> None:
+    good = "".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in range(2))
+
+    with pytest.raises(RecordingError, match=message):
+        read_poses(written(tmp_path, f"{good}{row}\n"), [1, 2, 3])
 
 
 @pytest.mark.parametrize("axes", ["frd", "ned"])

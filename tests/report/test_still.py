@@ -63,6 +63,20 @@ def test_a_metre_is_as_long_upwards() -> None:
     assert (b[0] - a[0]) / 5.0 == pytest.approx((b[1] - c[1]) / 2.0, rel=1e-2)
 
 
+def test_a_decade_is_as_long_everywhere_on_a_log_axis() -> None:
+    plot = Plot()
+    values = np.array([1.0, 10.0, 100.0])
+    plot.add("scatter", x=values, y=values, mode="markers", name="a")
+    plot.x_axes(type="log", range=[0.0, 2.0])
+    plot.y_axes(type="log")
+    finish(plot, 340)
+
+    ((a, b, c),) = paths(plot)
+
+    assert b[0] - a[0] == pytest.approx(c[0] - b[0], abs=0.2)
+    assert b[1] - a[1] == pytest.approx(c[1] - b[1], abs=0.2)
+
+
 def test_there_is_none_of_what_it_cannot_show() -> None:
     solid, named = Plot(("a",), solid=True), scatter(["front x", "rear x"], np.array([1.0, 2.0]))
     solid.add("scatter3d", x=np.zeros(1), y=np.zeros(1), z=np.zeros(1))

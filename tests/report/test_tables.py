@@ -9,6 +9,9 @@ import pytest
 from rich.console import Console, RenderableType
 
 from caliv_graph.common.progress import SilentProgress, StageRecord
+from caliv_graph.products import Guess
+from caliv_graph.report.figures.uncertainty import sigma_figure
+from caliv_graph.report.html import move_rows
 from caliv_graph.report.inspection import (
     DriveSummary,
     Inspection,
@@ -44,6 +47,30 @@ def cells_below(lines: list[str], name: str) -> list[str]:
 
 def with_sigma(sigma_rad: float, sigma_m: float) -> np.ndarray:
     return np.diag([sigma_rad] * 3 + [sigma_m] * 3) ** 2
+
+
+def test_a_guess_that_nobody_gave_is_not_compared_with() -> None:
+    calibration = make_calibration("front", "rear", undetermined=())
+    guess = Guess(gtsam.Pose3(), np.full(6, 0.2))
+    lidars = {
+        name: replace(
+            lidar,
+            guess=replace(guess, found=name == "rear"),
+            determined={**lidar.determined, "z": False},
+        )
+        for name, lidar in calibration.lidars.items()
+    }
+    calibration = replace(calibration, lidars=lidars)
+
+    figure = sigma_figure(calibration)
+
+    assert [row["name"] for row in move_rows(calibration)] == ["front"]
+    assert figure is not None
+    shown = {(t["name"], at) for t in figure.figure.data for at in t["x"]}
+    assert ("initial guess", "front x") in shown
+    assert ("initial guess", "rear x") not in shown
+    assert ("not determined: sigma of the initial guess", "front z") in shown
+    assert ("not determined: sigma of the initial guess", "rear z") not in shown
 
 
 def test_values_are_shown_to_two_digits_of_their_sigma_in_metres_and_degrees() -> None:

@@ -208,7 +208,10 @@ def test_a_lidar_that_was_not_calibrated_is_left_out() -> None:
         lidars={"front": calibration.lidars["front"]},
         cov_joint=calibration.cov_joint[:6, :6],
     )
-    found = validated(calibration)
+    config = make_config()
+    nobody = config.lidars["rear"].model_copy(update={"initial": None})
+    lidars = {**config.lidars, "rear": nobody}
+    found = validated(calibration, config=config.model_copy(update={"lidars": lidars}))
 
     assert found.lidars == ("front",)
     assert found.warnings[0] == "LiDAR 'rear' is not in the calibration: left out"

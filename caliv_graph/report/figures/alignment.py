@@ -43,7 +43,7 @@ def target_figures(
         f"Clouds of '{name}' from all scans of each LiDAR, merged with the initial extrinsics "
         "(left) and with the solved ones (right). Metres from the target's centre, map axes."
     )
-    solid = _pair_of_scenes(before, after, lidars, 2)
+    solid = _pair_of_scenes(before, after, lidars, 2, found=_all_found(calibration))
     flat = Plot(("before, from above", "after", "before, from the side", "after"), spacing=0.05)
     colour, shown = colours(lidars), labels(lidars)
     reach = min(_reach(before.values()), 1.6 * _reach(after.values()))
@@ -101,7 +101,9 @@ def scene_figure(
         "(left) and with the solved ones (right), on the same vehicle poses. Objects that appear "
         "twice on the left and once on the right show the effect of the calibration. Metres from "
         "the first pose; black: the vehicle.",
-        _pair_of_scenes(before, after, list(calibration.lidars), 1.5, t - t[0]),
+        _pair_of_scenes(
+            before, after, list(calibration.lidars), 1.5, t - t[0], _all_found(calibration)
+        ),
         solid=True,
     )
 
@@ -122,6 +124,10 @@ def _target_points(
         points = cloud.points_lidar[evenly(len(cloud.points_lidar), budget)]
         out.setdefault(cloud.lidar, []).append(points @ R[0].T + t[0] - centre_map)
     return {name: np.concatenate(points) for name, points in out.items()}
+
+
+def _all_found(calibration: Calibration) -> bool:
+    return all(lidar.without_guess for lidar in calibration.lidars.values())
 
 
 def _extrinsic(lidar: LidarResult, guess: bool) -> gtsam.Pose3:
@@ -160,8 +166,11 @@ def _pair_of_scenes(
     lidars: Sequence[str],
     size: float,
     path: Array | None = None,
+    found: bool = False,
 ) -> Plot:
-    figure = Plot(("before: initial guess", "after"), solid=True, spacing=0.01)
+    """Both in 3-D; `found`: the guesses were not given but found in the drive."""
+    first = "found in the drive" if found else "initial guess"
+    figure = Plot((f"before: {first}", "after"), solid=True, spacing=0.01)
     colour, shown = colours(lidars), labels(lidars)
     for panel, points in enumerate((before, after), start=1):
         for name in lidars:

@@ -5,6 +5,7 @@ Points and lines in their panels, without axes. plotly.js draws the whole figure
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,9 @@ def still(figure: Figure) -> Markup:
     if figure.solid or not traces or any(trace["type"] != "scatter" for trace in traces):
         return Markup("")
     height = int(plot.layout["height"])
-    panels = [_panel(plot, name, height) for name in dict.fromkeys(t["xaxis"] for t in traces)]
+    panels = [
+        _panel(plot, traces, name, height) for name in dict.fromkeys(t["xaxis"] for t in traces)
+    ]
     inside = "".join(panel for panel in panels if panel)
     if not inside:
         return Markup("")
@@ -38,8 +41,8 @@ def still(figure: Figure) -> Markup:
     )
 
 
-def _panel(plot: Plot, x_name: str, height: int) -> str:
-    """One panel: its frame, and what lies in it."""
+def _panel(plot: Plot, traces: list[dict[str, Any]], x_name: str, height: int) -> str:
+    """One panel: its frame, and which of the traces lie in it."""
     number = x_name.removeprefix("x")
     axes = plot.layout.get(f"xaxis{number}", {}), plot.layout.get(f"yaxis{number}", {})
     margin = plot.layout["margin"]
@@ -50,12 +53,14 @@ def _panel(plot: Plot, x_name: str, height: int) -> str:
     ):
         begin, end = axis.get("domain", (0.0, 1.0))
         box.append((low + (high - low) * begin, low + (high - low) * end))
-    shown = [t for t in plot.data if t["xaxis"] == x_name and len(t.get("x", ())) > 0]
+    shown = [t for t in traces if t["xaxis"] == x_name and len(t.get("x", ())) > 0]
     if not shown or any(not _numbers(t["x"]) or not _numbers(t["y"]) for t in shown):
         return ""
+    places = [
+        [_along(axis, trace[key]) for axis, key in zip(axes, "xy", strict=True)] for trace in shown
+    ]
     spans = [
-        axis.get("range") or _span([np.asarray(t[key], np.float64) for t in shown])
-        for axis, key in zip(axes, "xy", strict=True)
+        axis.get("range") or _span([place[i] for place in places]) for i, axis in enumerate(axes)
     ]
     if axes[1].get("scaleanchor"):
         _equal(spans, box)
@@ -64,14 +69,24 @@ def _panel(plot: Plot, x_name: str, height: int) -> str:
         f'<rect x="{x0:.0f}" y="{y0:.0f}" width="{x1 - x0:.0f}" height="{y1 - y0:.0f}" '
         f'fill="none" stroke="{_GREY_RULE}"/>'
     ]
-    return "".join([*parts, *(_trace(trace, spans, box) for trace in shown)])
+    return "".join([*parts, *map(_trace, shown, places, repeat(spans), repeat(box))])
 
 
-def _trace(trace: dict[str, Any], spans: list[Any], box: list[tuple[float, float]]) -> str:
-    """The points or the line of one trace."""
+def _along(axis: dict[str, Any], values: Any) -> Array:
+    """Values (n,) in the unit of the range of their axis: on a log axis, the logarithm to 10."""
+    numbers = np.asarray(values, np.float64)
+    if axis.get("type") != "log":
+        return numbers
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.log10(numbers))
+
+
+def _trace(
+    trace: dict[str, Any], place: list[Array], spans: list[Any], box: list[tuple[float, float]]
+) -> str:
+    """The points or the line of one trace; `place` are its x and y."""
     pixels = []
-    for key, span, (low, high) in zip("xy", spans, box, strict=True):
-        values = np.asarray(trace[key], np.float64)
+    for values, span, (low, high) in zip(place, spans, box, strict=True):
         pixels.append(low + (high - low) * (values - span[0]) / (span[1] - span[0]))
     x, y = (values[evenly(len(values), MOST_POINTS)] for values in pixels)
     with np.errstate(invalid="ignore"):

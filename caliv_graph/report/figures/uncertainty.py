@@ -24,7 +24,7 @@ from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO, WEAK_RATIO
 
 
 def sigma_figure(calibration: Calibration) -> Figure | None:
-    """Sigmas before and after the drive, per LiDAR and axis; None if all LiDARs are fixed."""
+    """Sigmas before and after the drive, per LiDAR and axis; None if there are none."""
     figure = Plot(("rotation (mrad)", "position (mm)"))
     shown = labels(calibration.lidars)
     prior: dict[int, list[tuple[str, float]]] = {1: [], 2: []}
@@ -36,8 +36,10 @@ def sigma_figure(calibration: Calibration) -> Figure | None:
         after = np.sqrt(np.diag(parent_axes_covariance(lidar.T_vehicle_lidar, lidar.cov)))
         for i, axis in enumerate(AXES):
             panel, at = (1 if i < 3 else 2), f"{shown[name]} {axis}"
-            if lidar.guess is not None:
+            if lidar.guess is not None and not lidar.without_guess:
                 prior[panel].append((at, 1e3 * float(lidar.guess.sigmas[i])))
+            if lidar.without_guess and not lidar.determined[axis]:
+                continue  # nothing is known of it
             (known if lidar.determined[axis] else held)[panel].append((at, 1e3 * float(after[i])))
     if not any((*known.values(), *held.values())):
         return None

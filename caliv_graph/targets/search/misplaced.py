@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.guesses import with_guess
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, FoundLidarConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.targets.search.find import FoundTarget
@@ -21,7 +21,8 @@ SMALLEST_RAD = math.radians(0.5)
 def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, tuple[str, ...]]:
     """The config with the guesses that the search of the drives found; and a sentence for each.
 
-    Of several drives the first that has something to say of a LiDAR decides.
+    A guess that was itself found in the drive has no sentence: nobody gave it. Of several drives
+    the first that has something to say of a LiDAR decides.
     """
     moved, sentences = config, []
     for found in searched:
@@ -30,7 +31,8 @@ def realigned(config: Config, searched: Sequence[FoundTarget]) -> tuple[Config, 
                 continue
             T = found.aligned[name]
             moved = with_guess(moved, name, T)
-            sentences.append(_sentence(name, config.lidars[name].guess(), T))
+            if not isinstance(config.lidars[name], FoundLidarConfig):
+                sentences.append(_sentence(name, config.lidars[name].guess(), T))
     return moved, tuple(sentences)
 
 

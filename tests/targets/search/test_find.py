@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.guesses import with_found_guess
 from caliv_graph.config.model import (
     Config,
     ExtractionConfig,
@@ -388,6 +389,8 @@ class TestGuessesFarOff:
         assert off_m(found) < 1.5
         assert min(found.scans.values()) >= 5
         config, sentences = realigned(off.config, [found])
+        nobody = with_found_guess(off.config, names[0], off.config.lidars[names[0]].guess())
+        assert len(realigned(nobody, [found])[1]) == len(sentences) - 1
         for name, sentence in zip(found.misplaced, sentences, strict=True):
             assert sentence.startswith(f"lidar '{name}': the objects that it sees stand still on")
             T = config.lidars[name].guess().between(drive.truth[name])

@@ -247,11 +247,13 @@ class Look:
         observations: the targets' clouds; None if the search stopped.
         findings: values of the config that the raw data contradict, the heading included.
         problems: what stopped the search, a sentence each.
+        notes: where LiDARs without an initial guess were found, a sentence each.
     """
 
     observations: tuple[TargetObservation, ...] | None
     findings: tuple[Finding, ...]
     problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def look(recording: Recording, config: Config, progress: Progress) -> Look:
@@ -261,6 +263,7 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
     """
     findings: tuple[Finding, ...] = ()
     problems: list[str] = []
+    notes: tuple[str, ...] = ()
     try:
         check_clouds([recording], config)
     except CalivError as error:
@@ -272,15 +275,15 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
             return Look(None, findings, tuple(problems))
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         config, placements = place_lidars([recording], trajectories, config, progress)
-        problems += map(placement_sentence, placements)
+        notes = tuple(map(placement_sentence, placements))
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
         near, misplaced, observations = _targets([recording], trajectories, config, progress)
         problems += (*misplaced, *displaced(observations, trajectories, near))
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
-        return Look(None, findings, tuple(problems))
-    return Look(observations, findings, tuple(problems))
+        return Look(None, findings, tuple(problems), notes)
+    return Look(observations, findings, tuple(problems), notes)
 
 
 def _doubts_about_motion(

@@ -66,7 +66,7 @@ def inspect(
                 inspection = add_any_targets(inspection, seen.observations)
                 warnings += [line for found in seen.observations for line in found.warnings]
             inspection = replace(inspection, findings=seen.findings, problems=seen.problems)
-            warnings += [*(found.sentence for found in seen.findings), *seen.problems]
+            warnings += [*(found.sentence for found in seen.findings), *seen.problems, *seen.notes]
         warnings = [*recording.warnings(), *warnings]
     if as_json:
         streams.show_json(inspection.document())

@@ -77,6 +77,17 @@ def test_a_decade_is_as_long_everywhere_on_a_log_axis() -> None:
     assert b[1] - a[1] == pytest.approx(c[1] - b[1], abs=0.2)
 
 
+def test_a_line_is_broken_where_it_has_no_value() -> None:
+    plot = Plot()
+    plot.add("scatter", x=np.arange(5.0), y=np.array([1.0, 2.0, np.nan, 2.0, 1.0]), mode="lines")
+    finish(plot, 340)
+
+    path = re.search(r'<path d="([^"]*)"', str(still(Figure("f", "", plot))))
+
+    assert path is not None
+    assert re.sub(r"[\d. -]", "", path[1]) == "MLML"
+
+
 def test_there_is_none_of_what_it_cannot_show() -> None:
     solid, named = Plot(("a",), solid=True), scatter(["front x", "rear x"], np.array([1.0, 2.0]))
     solid.add("scatter3d", x=np.zeros(1), y=np.zeros(1), z=np.zeros(1))

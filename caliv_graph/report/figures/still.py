@@ -91,16 +91,17 @@ def _trace(
     x, y = (values[evenly(len(values), MOST_POINTS)] for values in pixels)
     with np.errstate(invalid="ignore"):
         inside = (x >= min(box[0])) & (x <= max(box[0])) & (y >= min(box[1])) & (y <= max(box[1]))
-    x, y = x[inside], y[inside]
+    # A line is broken where it leaves the panel or has no value.
+    follows = inside & np.concatenate([[False], inside[:-1]])
+    x, y, follows = x[inside], y[inside], follows[inside]
     is_line = "lines" in trace.get("mode", "lines")
     look = trace.get("line" if is_line else "marker", {})
     colour = look.get("color", GREY)
     colour = escape(colour if isinstance(colour, str) else GREY)
-    step = "L" if is_line else "M"
     dot = "" if is_line else "h0"
     path = "".join(
-        f"{step if i else 'M'}{a:.1f} {b:.1f}{dot}"
-        for i, (a, b) in enumerate(zip(x.tolist(), y.tolist(), strict=True))
+        f"{'L' if is_line and on else 'M'}{a:.1f} {b:.1f}{dot}"
+        for a, b, on in zip(x.tolist(), y.tolist(), follows.tolist(), strict=True)
     )
     return (
         f'<path d="{path}" fill="none" stroke="{colour}" stroke-linecap="round" '

@@ -45,8 +45,8 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     """Merges several calibrations of one vehicle.
 
     The information matrices of the data are summed at common extrinsics. The guess of a LiDAR
-    counts once: that of the first file that has it. Earlier calibrations that were priors are
-    included, each once.
+    counts once: that of the first file to which it was given. Earlier calibrations that were
+    priors are included, each once.
 
     Args:
         calibrations: two or more, by their names in messages (their files).
@@ -297,7 +297,10 @@ def _every_drive_once(
 
 
 def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:
-    """Per LiDAR the guess of the first calibration that states one, in order of appearance."""
+    """Per LiDAR the guess of the first calibration that states one, in order of appearance.
+
+    A guess that was found in a drive stands back behind one that somebody gave.
+    """
     out: dict[str, Guess] = {}
     for calibration in calibrations.values():
         for name in calibration.lidars:
@@ -307,7 +310,8 @@ def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:
                 if name in c.lidars and (guess := c.lidars[name].guess) is not None
             ]
             if name not in out:
-                out[name] = stated[0] if stated else guess_of(calibration, name)
+                given = [guess for guess in stated if not guess.found]
+                out[name] = next(iter([*given, *stated]), None) or guess_of(calibration, name)
     return out
 
 
@@ -384,6 +388,8 @@ def _differing_guesses(calibrations: Mapping[str, Calibration], merged: Calibrat
             other = calibration.lidars[name].guess if name in calibration.lidars else None
             if used is None or other is None or all(lidar.determined.values()):
                 continue
+            if other.found:
+                continue  # nobody gave it
             apart = vehicle_axes_difference(other.T_vehicle_lidar, used.T_vehicle_lidar)
             if np.abs(apart).max() > _SAME_GUESS:
                 out.append(

@@ -147,6 +147,24 @@ def test_a_lidar_that_no_drive_saw_stays_at_its_guess() -> None:
     assert sigma == pytest.approx(guessed.sigmas, rel=1e-6)
 
 
+def test_a_guess_that_was_given_counts_before_one_that_was_found() -> None:
+    D = information(NAMES)
+    D[:6], D[:, :6] = 0.0, 0.0
+    guess = shift(NAMES, "front", x=0.03, pitch=0.01)
+    one, other = (drive(D, source=s, guess_error=e) for s, e in (("a", 3.0 * guess), ("b", guess)))
+    front = one.lidars["front"]
+    assert front.guess is not None
+    found = replace(front, guess=replace(front.guess, found=True))
+    one = replace(one, lidars={**one.lidars, "front": found})
+
+    for parts in ((one, other), (other, one)):
+        result = merged(*parts).lidars["front"]
+        assert not result.without_guess
+        assert vehicle_axes_difference(result.T_vehicle_lidar, TRUTH["front"]) == pytest.approx(
+            guess[:6], abs=1e-9
+        )
+
+
 def test_drives_count_once() -> None:
     D = information(NAMES)
     first = drive(D, source="a")

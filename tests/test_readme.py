@@ -299,7 +299,7 @@ def test_the_first_page_is_short_and_names_what_a_newcomer_runs() -> None:
 
 
 def test_what_contributing_names_exists() -> None:
-    section = text_of(README).split("## Contributing")[1]
+    section = text_of(PACKAGE).split("## Contributing")[1]
     named = re.findall(r"`((?:caliv_graph|tests)/[\w/]+\.py)", section)
     named += [
         f"caliv_graph/{path}"

@@ -22,7 +22,7 @@ COARSE = RegistrationConfig(components=40, max_points=40)
 
 def test_all_lidars_late_alike_are_found_from_a_linear_change_far_off() -> None:
     seen = observation(CHAIR, late_s=LATE_S)
-    late = [replace(seen, clouds=seen.clouds[::2])]
+    late = [seen]  # with half of the clouds, rounding decides between the lateness and a drift
     config = CONFIG.model_copy(update={"registration": COARSE})
     solution = estimate(late, [trajectory()], config, SilentProgress())
     linear, *rest = ranking(suspect_scores(solution, [trajectory()], {}))

@@ -133,7 +133,6 @@ class _View:
 
     ground: Ground
     sightings: Sightings
-    R_level_lidar: Array
 
 
 def _turned_rad(trajectory: VehicleTrajectory) -> float:
@@ -176,8 +175,7 @@ def _view(
             f"tell its mounting: {len(patches)} scans looked at show no plane that stays where it "
             f"is. Enter lidars.{name}.initial: xyz in metres, rpy_deg in degrees",
         )
-    R_level_lidar = ground.R_level_lidar
-    sightings = _sightings(scans, R_level_lidar, trajectory)
+    sightings = _sightings(scans, ground.R_level_lidar, trajectory)
     if len(sightings.level) < FEWEST_POINTS:
         raise ConfigError(
             f"lidars.{name}.initial is not given, and nothing stands on the ground within "
@@ -185,7 +183,7 @@ def _view(
             f"({len(sightings.level)} points in {len(scans)} scans, needs {FEWEST_POINTS}). "
             f"Enter lidars.{name}.initial, or drive past walls, cars or a chair",
         )
-    return _View(ground, sightings, R_level_lidar)
+    return _View(ground, sightings)
 
 
 def _even(count: int, most: int) -> IntArray:
@@ -263,7 +261,7 @@ def _not_own(places: Array, scan_of: IntArray, scans: int) -> IntArray:
 def _guessed(view: _View, config: Config, name: str) -> Array:
     """The mounting (yaw, x, y) of a guess, in the level axes of the view."""
     T = config.lidars[name].guess()
-    R = T.rotation().matrix() @ view.R_level_lidar.T
+    R = T.rotation().matrix() @ view.ground.R_level_lidar.T
     x, y, _ = T.translation()
     return np.array([math.atan2(R[1, 0], R[0, 0]), x, y])
 

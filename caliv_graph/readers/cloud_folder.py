@@ -33,8 +33,8 @@ from caliv_graph.readers.pcd import read_pcd
 from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of
 from caliv_graph.readers.returns import is_return
-from caliv_graph.readers.stamps import StampMark, stamp_mark, sweep_span
-from caliv_graph.readers.sweeps import TimesSeen, is_sampled, times_warnings
+from caliv_graph.readers.stamps import StampMark
+from caliv_graph.readers.sweeps import TimesSeen, is_sampled, mark_of_clouds, times_warnings
 
 CLOUD_TYPE = "folder of clouds"
 
@@ -202,18 +202,14 @@ class CloudFolder:
     def _marks(self) -> dict[str, StampMark]:
         marks = {}
         for name, clouds in self._clouds.items():
-            fields, spans, is_absolute = self._fields[name], [], False
-            sampled = [item for i, item in enumerate(clouds.items()) if is_sampled(i)]
-            for stamp_ns, path in sampled:
-                if path.suffix != ".bin":
-                    continue
-                cloud = bin_sweep_times(path, fields, stamp_ns, self._period_s(name))
-                if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
-                    spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
-                    is_absolute = cloud.time_field.unit.endswith("absolute")
-            span = sweep_span(spans, self._period_s(name))
+            period_s = self._period_s(name)
+            times = [
+                bin_sweep_times(path, self._fields[name], stamp_ns, period_s)
+                for i, (stamp_ns, path) in enumerate(clouds.items())
+                if is_sampled(i) and path.suffix == ".bin"
+            ]
             # No time of recording tells anything: as if each were its stamp.
-            marks[name] = stamp_mark(self._lidars[name].stamp, span, is_absolute, np.zeros(1))
+            marks[name] = mark_of_clouds(self._lidars[name].stamp, times, np.zeros(1), period_s)
         return marks
 
     def _period_s(self, lidar: str) -> float | None:

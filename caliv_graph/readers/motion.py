@@ -188,6 +188,19 @@ class _Losses:
         return [f"of {total} messages not used: {', '.join(lost)}"] * bool(lost) + self._others
 
 
+ON_EARTH: tuple[_Reason, ...] = (
+    (
+        "at latitude and longitude 0 or out of their range",
+        lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
+    ),
+    (
+        f"beyond {MOST_ALTITUDE_M:g} m of altitude",
+        lambda r: below(r[:, 2:3], MOST_ALTITUDE_M),
+    ),
+)
+"""What rows that begin with latitude, longitude (degrees) and altitude (m) are left out for."""
+
+
 class RowCollector:
     """Keeps a row of numbers of each message."""
 
@@ -308,14 +321,7 @@ class GnssCollector(RowCollector):
         stamps, rows, _ = self._usable(
             ("without a fix (status < 0)", lambda r: r[:, 3] >= 0),
             ("without latitude, longitude or altitude", lambda r: np.isfinite(r[:, :3]).all(1)),
-            (
-                "at latitude and longitude 0 or out of their range",
-                lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
-            ),
-            (
-                f"beyond {MOST_ALTITUDE_M:g} m of altitude",
-                lambda r: below(r[:, 2:3], MOST_ALTITUDE_M),
-            ),
+            *ON_EARTH,
         )
         if not len(stamps):
             return None
@@ -406,7 +412,7 @@ class PoseCollector(RowCollector):
                 "if these are positions, as of a total station, set topics.gnss to the topic "
                 "instead and gnss.lever_arm to the place of the prism"
             )
-        poses = _poses(rows[:, :3], rows[:, 3:7])
+        poses = poses_of(rows[:, :3], rows[:, 3:7])
         cov = _or_none(_covariances(rows[:, 7:]))
         if cov is not None:
             cov = right_perturbations(Rotation.from_quat(rows[:, 3:7]).as_matrix(), cov)
@@ -484,7 +490,7 @@ class TfCollector:
                 R_link = Rotation.from_matrix(np.array(link.T_parent_child.rotation().matrix()))
                 t_link = np.array(link.T_parent_child.translation())
             R, t = R * R_link, t + R.apply(t_link)
-        return GivenPoses(stamps, _poses(t, R.as_quat()))
+        return GivenPoses(stamps, poses_of(t, R.as_quat()))
 
     def notes(self) -> list[str]:
         """What was left out, and the frames that were used."""
@@ -558,7 +564,8 @@ def below(vectors: Array, most: float) -> BoolArray:
     return np.asarray((np.abs(vectors) <= most).all(axis=1))
 
 
-def _poses(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:
+def poses_of(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:
+    """Poses from places (n, 3), metres, and quaternions (n, 4) of about unit norm."""
     q = q_xyzw / np.linalg.norm(q_xyzw, axis=1, keepdims=True)
     return tuple(
         gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), ti)

@@ -26,9 +26,9 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, GnssFixes
 from caliv_graph.readers.motion import (
     INSPVAX_TYPES,
-    MOST_ALTITUDE_M,
     MOST_M,
     NAVPVT,
+    ON_EARTH,
     POSITION_TYPES,
     PVT_GEODETIC,
     Collector,
@@ -124,14 +124,7 @@ class InspvaxCollector(RowCollector):
         stamps, rows, _ = self._usable(
             ("without a solution of the INS", lambda r: r[:, 12] > 0),
             ("with NaN or infinity", lambda r: np.isfinite(r[:, :6]).all(axis=1)),
-            (
-                "at latitude and longitude 0 or out of their range",
-                lambda r: (np.abs(r[:, 0]) <= 90) & (np.abs(r[:, 1]) <= 360) & r[:, :2].any(1),
-            ),
-            (
-                f"beyond {MOST_ALTITUDE_M:g} m of altitude",
-                lambda r: below(r[:, 2:3], MOST_ALTITUDE_M),
-            ),
+            *ON_EARTH,
         )
         if not len(stamps):
             return None

@@ -25,6 +25,7 @@ from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Array, GivenPoses, IntArray
+from caliv_graph.readers.motion import poses_of
 
 _MOST_BYTES = 1_000_000_000
 """ego_pose.json of all of nuScenes has half of it."""
@@ -280,12 +281,7 @@ def _given(stamps_ns: IntArray, rows: Array, path: Path) -> GivenPoses:
     stamps_ns, rows = stamps_ns[order], rows[order]
     keep = np.concatenate([[True], np.diff(stamps_ns) > 0])
     stamps_ns, rows = stamps_ns[keep], rows[keep]
-    q = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-    poses = tuple(
-        gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), t)
-        for t, (x, y, z, w) in zip(rows[:, :3], q, strict=True)
-    )
-    return GivenPoses(stamps_ns, poses)
+    return GivenPoses(stamps_ns, poses_of(rows[:, :3], rows[:, 3:]))
 
 
 def in_vehicle_axes(poses: GivenPoses, axes: PoseAxes) -> GivenPoses:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.config.model import StampSetting
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.products import IntArray
+from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic
 from caliv_graph.readers.pointcloud2 import (
     LIVOX_TYPES,
@@ -123,19 +124,27 @@ def mark_of(
 
     `stamps` are header stamps and record times (n,), nanoseconds; a stamp is 0 where it is not set.
     """
-    spans, is_absolute = [], False
+    clouds: list[DecodedCloud] = []
     for sample in samples:
-        try:
-            cloud = _times(bag, topic, sample, period_s)
-        except (DamagedMessageError, UnusableCloudsError):
-            continue  # reported where clouds are decoded
-        if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
-            spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
-            is_absolute = cloud.time_field.unit.endswith("absolute")
+        # A damaged one is reported where clouds are decoded.
+        with suppress(DamagedMessageError, UnusableCloudsError):
+            clouds.append(_times(bag, topic, sample, period_s))
     header_ns, record_ns = stamps
     is_set = header_ns != 0
     delays_s = (record_ns[is_set] - header_ns[is_set]) / NANOSECONDS_PER_SECOND
-    return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, np.asarray(delays_s))
+    return mark_of_clouds(setting, clouds, np.asarray(delays_s), period_s)
+
+
+def mark_of_clouds(
+    setting: StampSetting, clouds: Iterable[DecodedCloud], delays_s: Array, period_s: float | None
+) -> StampMark:
+    """What stamps mark, by the times of some clouds; the others as in `stamp_mark`."""
+    spans, is_absolute = [], False
+    for cloud in clouds:
+        if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
+            spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
+            is_absolute = cloud.time_field.unit.endswith("absolute")
+    return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, delays_s)
 
 
 def _times(bag: Bag, topic: Topic, sample: Sample, period_s: float | None) -> DecodedCloud:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caliv_graph.common.files import each_once
 from caliv_graph.common.progress import SilentProgress, StageRecord
 from caliv_graph.config.model import Config, PoseConfig
-from caliv_graph.errors import ConfigError
+from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import Calibration, Recording
 from caliv_graph.readers import open_recording
 from caliv_graph.report.folder import write_result
@@ -64,10 +65,32 @@ def open_recordings(config: Config, data: Sequence[Path]) -> list[Recording]:
 
     Raises:
         ConfigError: a drive is given twice, or there is none.
-        RecordingError: a drive is missing, incomplete or inconsistent.
+        RecordingError: a drive is missing, incomplete or inconsistent, or two are of the same time
+            and have one file of poses.
     """
     each_once(data, "--data ", "a drive")
-    return [open_recording(config, path) for path in data or (None,)]
+    recordings = [open_recording(config, path) for path in data or (None,)]
+    if config.data.poses is not None:
+        _check_times_apart(recordings, config.data.poses)
+    return recordings
+
+
+def _check_times_apart(recordings: Sequence[Recording], poses: Path) -> None:
+    """Refuses drives of the same time: the file's poses at that time are of one of them."""
+    spans = []
+    for recording in recordings:
+        stamps = [s for name in recording.lidars for s in recording.scan_stamps_ns(name)]
+        if stamps:
+            spans.append((min(stamps), max(stamps), recording.name))
+    spans.sort()
+    for (_, end, one), (begin, _, other) in pairwise(spans):
+        if begin <= end:
+            raise RecordingError(
+                f"{poses}: poses of one vehicle, but the clouds of '{one}' and '{other}' are of "
+                f"the same time ({begin / 1e9:.3f} s): perhaps their times count from the start of "
+                "each drive. Calibrate each with a config and poses of its own, and join the "
+                "results with 'caliv-graph merge'"
+            )
 
 
 def guess_problem(config: Config, path: Path) -> str:

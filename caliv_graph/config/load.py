@@ -107,4 +107,7 @@ def _no_config(path: Path) -> str:
 def dump_config(config: Config) -> str:
     """The effective configuration as YAML that `load_config` reads back to the same values."""
     data = config.model_dump(mode="json", exclude_none=True)
+    for lidar in data["lidars"].values():
+        if "initial" not in lidar:
+            del lidar["sigma"]  # of a guess that is not there
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

@@ -505,6 +505,17 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _fields_of_bin_files(self) -> Config:
+        for name, lidar in self.lidars.items():
+            if lidar.bin_fields is not None and self.data.format != "clouds":
+                raise ValueError(
+                    f"lidars.{name}.bin_fields are of .bin files, and data.format is "
+                    f"{self.data.format}, whose clouds name their fields: remove the key, or set "
+                    "data.format to clouds"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _translations_to_hold(self) -> Config:
         missing = [name for name, lidar in self.lidars.items() if lidar.initial is None]
         if missing and self.solve.mode == "staged":

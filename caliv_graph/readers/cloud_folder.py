@@ -44,8 +44,11 @@ _TIMES_FILES = ("times.txt", "timestamps.txt")
 _POSES_FILES = ("poses.txt", "poses.csv", "poses.tum", "ego_pose.json")
 """Names under which a file of poses beside the clouds is found without a config."""
 
-_TIME_IN_NAME = re.compile(r"(\d{12,19}|\d{9,10}[._]\d{3,9})(?!\d)")
+_TIME_IN_NAME = re.compile(r"(\d{12,19}|\d{9,10}[._]\d{1,9})(?!\d)")
 """Milliseconds to nanoseconds since 1970, or seconds with a point; a shorter number counts."""
+
+_LEAST_DIGITS = 3
+"""Behind the seconds, in the longest name of a folder: else that number counts something."""
 
 _MOST_BYTES = 100_000_000
 
@@ -272,11 +275,9 @@ def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
             f"{folder}: holds no clouds (.bin, .pcd) (LiDAR '{name}'). Add them, or take the LiDAR "
             "out of the config"
         )
-    in_names = [_TIME_IN_NAME.findall(path.name) for path in paths]
-    if all(in_names):
-        stamps = [stamp_of(found[-1].replace("_", ".")) for found in in_names]
-    else:
-        stamps = [*_listed_times(folder, root, len(paths), name)]
+    stamps = _times_in_names([path.name for path in paths])
+    if stamps is None:
+        stamps = _listed_times(folder, root, len(paths), name)
     clouds: dict[int, Path] = {}
     for stamp_ns, path in zip(stamps, paths, strict=True):
         if stamp_ns is None or stamp_ns in clouds:
@@ -284,6 +285,30 @@ def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
             raise RecordingError(f"{path}: {what}. Rename or remove the cloud")
         clouds[stamp_ns] = path
     return dict(sorted(clouds.items()))
+
+
+def _times_in_names(names: Sequence[str]) -> list[int | None] | None:
+    """The time in each name of a folder's clouds; None: not every name has one.
+
+    Behind the seconds stands a decimal fraction, or a whole number of ns, us or ms. The two differ
+    where numbers are not equally long: only a fraction begins with a zero, only a whole number
+    that lost its leading zeros ends with one. The longest then tells the unit.
+    """
+    found = [_TIME_IN_NAME.findall(name) for name in names]
+    if not all(found):
+        return None
+    times = [match[-1] for match in found]
+    parts = [re.split("[._]", time)[1] for time in times if not time.isdigit()]
+    digits = max(map(len, parts), default=0)
+    if parts and digits < _LEAST_DIGITS:
+        return None
+    begins = any(len(part) > 1 and part[0] == "0" for part in parts)
+    ends = any(len(part) > 1 and part[-1] == "0" for part in parts)
+    line = all("_" in time for time in times)
+    if len(set(map(len, parts))) > 1 and not begins and (ends or line):
+        digits = next(unit for unit in (3, 6, 9) if digits <= unit)
+        times = [f"{s}.{part:0>{digits}}" for s, part in (re.split("[._]", t) for t in times)]
+    return [stamp_of(time.replace("_", ".")) for time in times]
 
 
 def _listed_times(folder: Path, root: Path, count: int, name: str) -> list[int | None]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from caliv_graph.batch.job import open_recordings
 from caliv_graph.cli.main import app
 from caliv_graph.config.load import load_config, parse_config
 from caliv_graph.errors import ConfigError, RecordingError
@@ -191,3 +192,49 @@ def test_a_caliv_folder_has_poses_of_its_own(tmp_path: Path, more: dict[str, str
 
     with pytest.raises(ConfigError, match="a CaLiV folder has its own"):
         parse_config(raw, "config.yaml", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected_ns"),
+    [
+        # Whole nanoseconds without leading zeros: 0.06 s, 0.16 s, ...; the longest has 9 digits.
+        (["60000000", "160000000", "260000000"], [60_000_000, 160_000_000, 260_000_000]),
+        (["60123", "160123", "5001"], [5_001_000, 60_123_000, 160_123_000]),  # microseconds
+        (["05", "125", "2"], [50_000_000, 125_000_000, 200_000_000]),  # decimals, as a zero tells
+        (["050", "150", "250"], [50_000_000, 150_000_000, 250_000_000]),
+    ],
+)
+def test_parts_of_a_second_in_names(
+    tmp_path: Path, parts: list[str], expected_ns: list[int]
+) -> None:
+    (tmp_path / "top").mkdir()
+    for part in parts:
+        np.ones((30, 4), np.float32).tofile(tmp_path / "top" / f"1700000000_{part}.bin")
+
+    stamps = opened(tmp_path, "top").scan_stamps_ns("top")
+
+    assert [s - 1_700_000_000 * 10**9 for s in stamps] == expected_ns
+
+
+def test_two_drives_of_one_time_and_one_file_of_poses(tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        kitti(tmp_path / name)
+    config = parse_config(
+        {
+            "data": {"format": "clouds", "poses": str(tmp_path / "one" / "poses.txt")},
+            "lidars": {"top": {"topic": "velodyne", "initial": {"xyz": [0, 0, 0]}}},
+        },
+        "config.yaml",
+        tmp_path,
+    )
+
+    with pytest.raises(RecordingError, match=r"'.*one' and '.*other' are of the same time"):
+        open_recordings(config, [tmp_path / "one", tmp_path / "other"])
+    assert len(open_recordings(config, [tmp_path / "one"])) == 1
+
+
+def test_fields_of_bin_files_with_a_bag(tmp_path: Path) -> None:
+    fields = ["x f4", "y f4", "z f4"]
+
+    with pytest.raises(ConfigError, match=r"lidars.top.bin_fields.*data.format"):
+        parse_config({"lidars": {"top": {"topic": "a", "bin_fields": fields}}}, "c.yaml", tmp_path)

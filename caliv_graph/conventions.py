@@ -104,6 +104,11 @@ def key_ground(drive: int) -> int:
     return int(gtsam.symbol("g", drive))
 
 
+def key_ground_bias(index: int) -> int:
+    """Key of the range biases on the ground of the LiDAR at `index`, (2,): see `ground_graph`."""
+    return int(gtsam.symbol("q", index))
+
+
 def key_height(drive: int) -> int:
     """Key of the error of the vehicle's height above ground of a drive, (1,) metres."""
     return int(gtsam.symbol("h", drive))

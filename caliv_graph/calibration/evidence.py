@@ -18,7 +18,9 @@ import scipy.linalg
 
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.ground import (
+    BIAS_SIGMAS,
     PLANE_SIGMAS,
+    biased_lidars,
     ground_centre,
     place_weights,
     taken_poses,
@@ -30,7 +32,7 @@ from caliv_graph.calibration.noise import evenly_over_drives
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.solve import SolveState, measured_poses, of_single_clouds
 from caliv_graph.calibration.variance_components import Observed
-from caliv_graph.conventions import key_ground, key_vehicle
+from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
 from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.effects import ErrorEffects, error_effects, smoothed_in_time
@@ -201,6 +203,8 @@ def _weak(problem: Problem, key: int, size: int) -> Array:
     if key in problem.extrinsic_keys():
         sigmas = np.max([problem.prior_sigmas[name] for name in problem.lidars], axis=0)
         return np.asarray(sigmas**-2.0)
+    if key in {key_ground_bias(index) for index in range(len(problem.lidars))}:
+        return BIAS_SIGMAS**-2.0
     drives = {key_ground(drive) for drive in problem.drives().tolist()}
     return PLANE_SIGMAS**-2.0 if key in drives else np.full(size, WEAK)
 
@@ -234,6 +238,10 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
     floors = np.diag(ground_floors(state.config.noise) ** 2)
     taken = taken_poses(problem, state.grounds)
     weight = weights.planes * place_weights(problem, state.grounds, taken)
+    # At no biases, about which their prior is.
+    values = gtsam.Values(values)
+    for index in biased_lidars(problem, state.grounds, taken):
+        values.update(key_ground_bias(index), np.zeros(len(BIAS_SIGMAS)))
     normal, distance = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
     out = []
     for n, o in enumerate(state.grounds):
@@ -242,10 +250,13 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
         keys = (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar))
         centre = ground_centre(problem, o.drive)
         # With a unit covariance, GTSAM's whitening leaves the residual as it is.
-        factor = ground_plane_factor(keys, key_ground(o.drive), centre, replace(o, cov=np.eye(3)))
+        plain = replace(o, cov=np.eye(3))
+        bias = key_ground_bias(problem.lidars.index(o.lidar))
+        factor = ground_plane_factor(keys, key_ground(o.drive), centre, plain, key_bias=bias)
         linear: Any = factor.linearize(values)
+        ends = np.cumsum([6] * len(keys) + [3])  # and the biases, if there are any
         # A copy: GTSAM's array ends with the factor.
-        blocks = np.split(np.array(linear.getA()), 6 * np.arange(1, len(keys) + 1), axis=1)
+        blocks = np.split(np.array(linear.getA()), ends[: len(linear.keys()) - 1], axis=1)
         known = o.cov - floors + weights.heave_m[n] ** 2 * distance
         out.append(
             _Rows(

@@ -36,6 +36,7 @@ FactorKind = Literal[
     "ground_prior",
     "ground_height",
     "ground_tilt",
+    "ground_bias",
     "ground_plane",
     "standing",
     "parallel",

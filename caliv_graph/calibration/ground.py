@@ -22,13 +22,24 @@ from caliv_graph.calibration.ground_factors import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.model import GroundConfig
-from caliv_graph.conventions import key_ground, key_height, key_parallel, key_vehicle
+from caliv_graph.conventions import (
+    key_ground,
+    key_ground_bias,
+    key_height,
+    key_parallel,
+    key_vehicle,
+)
 from caliv_graph.products import Array, GroundObservation, IntArray
+from caliv_graph.structure.solve import BIAS_M, GROUND_BIAS_M, INCIDENCE_BIAS_M
 from caliv_graph.targets.cloud.views import view_weights
 
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
+
+BIAS_SIGMAS = np.array([math.hypot(BIAS_M, GROUND_BIAS_M), INCIDENCE_BIAS_M])
+"""1 sigma of a LiDAR's range biases on the ground, metres: constant, and by 1 / cos(incidence) - 1.
+Every scan has the same ones, so that they do not average out: they lift and tilt its planes."""
 
 TOGETHER_NS = 5_000_000
 """A scan nearer to a pose than this has the heave of that pose: a body that heaves by 5 mm at 2 Hz
@@ -77,6 +88,15 @@ def seen_drives(observations: Sequence[GroundObservation], taken: IntArray) -> l
     return sorted({o.drive for o, i in zip(observations, taken, strict=True) if i >= 0})
 
 
+def biased_lidars(
+    problem: Problem, observations: Sequence[GroundObservation], taken: IntArray
+) -> list[int]:
+    """Index in the problem of each LiDAR whose ground tells what range biases change, ascending."""
+    both = zip(observations, taken.tolist(), strict=True)
+    names = {o.lidar for o, i in both if i >= 0 and o.by_range_bias is not None}
+    return [index for index, name in enumerate(problem.lidars) if name in names]
+
+
 def full_weights(problem: Problem, observations: Sequence[GroundObservation]) -> GroundWeights:
     """Full weight for every observation with a pose, and for the vehicle standing there."""
     taken = taken_poses(problem, observations)
@@ -122,6 +142,8 @@ def ground_graph(
         if config.parallel_sigma_deg is not None:
             sigma = math.radians(config.parallel_sigma_deg)
             graph.append("ground_tilt", _centred(key_parallel(drive), np.full(2, sigma)))
+    for index in biased_lidars(problem, observations, taken):
+        graph.append("ground_bias", _centred(key_ground_bias(index), BIAS_SIGMAS))
     weight_of = weights.planes * place_weights(problem, observations, taken)
     weighted = zip(
         observations, taken.tolist(), weight_of.tolist(), weights.heave_m.tolist(), strict=True
@@ -130,7 +152,8 @@ def ground_graph(
         if i >= 0 and weight > 0.0:
             keys = (key_vehicle(i), *problem.extrinsic_keys_of(o.lidar))
             plane, centre = key_ground(o.drive), centres[o.drive]
-            factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m)
+            bias = key_ground_bias(problem.lidars.index(o.lidar))
+            factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias)
             graph.append("ground_plane", factor)
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)
@@ -214,4 +237,6 @@ def ground_values(
             out.insert(key_height(drive), np.zeros(1))
         if config.parallel_sigma_deg is not None:
             out.insert(key_parallel(drive), np.zeros(2))
+    for index in biased_lidars(problem, observations, taken):
+        out.insert(key_ground_bias(index), np.zeros(len(BIAS_SIGMAS)))
     return out

@@ -90,12 +90,14 @@ def ground_plane_factor(
     observation: GroundObservation,
     weight: float = 1.0,
     heave_m: float = 0.0,
+    key_bias: int | None = None,
 ) -> gtsam.CustomFactor:
     """Role a: the plane as a LiDAR sees it.
 
     `r = [u . n, v . n, d] - [a, b, distance]`, n the plane's normal in the lidar frame and d the
     LiDAR's distance from it, both predicted from `X E S_a`; u and v are the observation's axes;
-    a, b and distance its values, motion compensated with the present extrinsic `E S_a`.
+    a, b and distance its values, motion compensated with the present extrinsic `E S_a`, less what
+    the range biases of the LiDAR change of them.
 
     Args:
         pose_keys: of X_i, E and, unless the LiDAR is the reference, S_a.
@@ -104,9 +106,13 @@ def ground_plane_factor(
         observation: the measurement.
         weight: on its information.
         heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
+        key_bias: of the LiDAR's range biases; None, or an observation that does not tell what they
+            change: none.
     """
     poses = list(pose_keys)
     axes = observation.axes_lidar
+    by_bias = observation.by_range_bias
+    biases = {} if key_bias is None or by_bias is None else {key_bias: by_bias}
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
@@ -126,10 +132,14 @@ def ground_plane_factor(
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
+            for i, by_one in enumerate(biases.values(), start=len(moves) + 1):
+                jacobians[i] = by_one
+        for key, by_one in biases.items():
+            said = said - by_one @ values.atVector(key)
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
-    return gtsam.CustomFactor(noise, [*poses, key_plane], error)
+    return gtsam.CustomFactor(noise, [*poses, key_plane, *biases], error)
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

@@ -41,6 +41,7 @@ from caliv_graph.config.model import GroundConfig
 from caliv_graph.conventions import (
     key_extrinsic,
     key_ground,
+    key_ground_bias,
     key_height,
     key_parallel,
     key_sensor,
@@ -255,6 +256,11 @@ def test_jacobians(offset_m: float) -> None:
         check_jacobians(ground_plane_factor((X, E), G, anchor, swept), values)
         check_jacobians(ground_plane_factor((X, E, S), G, anchor, observation), values)
         check_jacobians(ground_plane_factor((X, E), G, anchor, observation, 0.3), values)
+        biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 2)))
+        values.insert(key_ground_bias(0), np.array([0.01, -0.02]))
+        check_jacobians(
+            ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
+        )
         check_jacobians(standing_factor(X, G, H, anchor, 0.4), values)
         check_jacobians(parallel_factor(X, G, P), values)
 

@@ -90,3 +90,15 @@ def test_two_degrees_of_the_imu_are_said_with_their_sigma(
     # Who says that the vehicle leans is believed.
     config = leaning(*rpy_deg, parallel_sigma_deg=2.0)
     assert tilt_finding(vehicle_tilt(smoothed, motion.name, config), config) is None
+
+
+@pytest.mark.parametrize("end_ns", [21_350_000_000, 36_390_000_000, 21_350_000_077])
+def test_stamps_since_1970_stay_within_the_drive(end_ns: int) -> None:
+    # A float has steps of 256 ns there; the last of these stamps used to lie beyond the end.
+    begin = 1_750_000_000_000_000_000
+    stamps = begin + np.array([0, end_ns // 2, end_ns])
+    poses = tuple(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])) for x in (0.0, 10.0, 20.0))
+
+    found = vehicle_tilt(GivenTrajectory(Trajectory(stamps, poses)), "drive", CONFIG)
+
+    assert found.roll_pitch_rad == pytest.approx(np.zeros(2), abs=1e-6)

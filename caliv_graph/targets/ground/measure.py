@@ -19,7 +19,13 @@ from caliv_graph.products import (
     Recording,
     TargetObservation,
 )
-from caliv_graph.targets.ground.planes import fit_plane, ground_floors, near_points, response
+from caliv_graph.targets.ground.planes import (
+    MIN_SLOPE,
+    fit_plane,
+    ground_floors,
+    near_points,
+    response,
+)
 from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -76,13 +82,14 @@ class GroundMeter:
         if plane is None:
             self._without[scan.lidar][reason] += 1
             return None
-        by_extrinsic = None
+        beams = points / np.linalg.norm(points, axis=1)[:, None]
+        # As on the plane: what stands on it, nearly upright to the beams, has no part in the fit.
+        across = np.maximum(-beams @ plane.normal_lidar, MIN_SLOPE)
+        moved = [beams, beams * (1.0 / across - 1.0)[:, None]]
         if times_s.any():
-            moved = [of_rotated - points for of_rotated in by_guess]
-            by_extrinsic = (
-                response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
-                / EXTRINSIC_STEP_RAD
-            )
+            moved += [(of_rotated - points) / EXTRINSIC_STEP_RAD for of_rotated in by_guess]
+        changes = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
+        by_extrinsic = changes[:, 2:] if times_s.any() else None
         return GroundObservation(
             lidar=scan.lidar,
             drive=self._drive,
@@ -96,6 +103,7 @@ class GroundMeter:
             R_vehicle_lidar=None if by_extrinsic is None else guess.rotation().matrix(),
             by_extrinsic=by_extrinsic,
             apart_ns=scan.stamp_ns - at_ns,
+            by_range_bias=changes[:, :2],
         )
 
     def warnings(self) -> tuple[str, ...]:

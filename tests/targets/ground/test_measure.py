@@ -16,6 +16,7 @@ from caliv_graph.config.load import load_config, parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import (
+    Array,
     GroundObservation,
     LidarScan,
     MotionData,
@@ -131,6 +132,32 @@ def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
     at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
     assert at_once is not None
     assert at_once.by_extrinsic is None
+
+
+def test_meter_tells_what_range_biases_change() -> None:
+    directions = beams()
+    T = pose((1.0, 0.0, HEIGHT_M), (1.0, 8.0, 0.0))
+    down = -(directions @ T.rotation().matrix().T)[:, 2]
+    seen = down > 0.02
+    ranges, across = HEIGHT_M / down[seen], down[seen]
+    meter = GroundMeter(CONFIG, pitching(0.0), 0)
+
+    def measured(lengths: Array) -> GroundObservation:
+        points = directions[seen] * lengths[:, None]
+        found = meter.measure(LidarScan("front", SECOND_NS // 2, points, "scan"))
+        assert found is not None
+        return found
+
+    true = measured(ranges)
+    assert true.by_range_bias is not None
+    size_m = 2e-3
+    for column, wrong in enumerate((np.ones(len(ranges)), 1.0 / across - 1.0)):
+        found = measured(ranges + size_m * wrong)
+        tilts = true.axes_lidar @ found.normal_lidar
+        change = np.append(tilts, found.distance_m - true.distance_m) / size_m
+        assert change == pytest.approx(true.by_range_bias[:, column], rel=0.2, abs=0.02)
+    # Too long ranges sink the ground below the LiDAR by a part of their bias.
+    assert 0.1 < true.by_range_bias[2, 0] < 1.0
 
 
 def test_meter_says_why_there_is_no_ground() -> None:

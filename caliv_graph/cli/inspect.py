@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.options import AsJson
+from caliv_graph.cli.options import AsJson, Force
+
+if TYPE_CHECKING:
+    from caliv_graph.common.progress import Progress
+    from caliv_graph.config.model import Config
+    from caliv_graph.pipeline import Look
+    from caliv_graph.products import Recording
+    from caliv_graph.workflows.scene import Scene
 
 
 def inspect(
@@ -24,17 +31,29 @@ def inspect(
             "--config", metavar="CONFIG", help="Also search for the target with this config."
         ),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            "--html",
+            metavar="FILE",
+            help="Also write a page for a browser: clouds of all LiDARs, drive, timeline.",
+        ),
+    ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the content of a recording: topics, rates, gaps, clocks, point times, units, the drive.
 
     With a config, also what the data say against it, and when each LiDAR sees the target.
+    The page of --html shows the clouds of all LiDARs together; sliders move their mountings, and
+    the drive from above, on which the target's box can be dragged. Both give YAML for the config.
 
-    Example: caliv-graph inspect drive/ --config config.yaml
+    Example: caliv-graph inspect drive/ --config config.yaml --html drive.html
     """
     from dataclasses import replace
 
     from caliv_graph.batch.job import guess_problem
+    from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.config.load import load_config
     from caliv_graph.errors import RecordingError
     from caliv_graph.readers import open_recording
@@ -42,6 +61,8 @@ def inspect(
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
     from caliv_graph.report.inspection_table import inspection_table
 
+    if html is not None:
+        check_output_file(html, force)
     settings = None if config is None else load_config(config)
     warnings: list[str] = []
     if settings is None:
@@ -56,6 +77,7 @@ def inspect(
     problem = "" if settings is None or config is None else guess_problem(settings, config)
     if problem:
         warnings.append(f"{problem}. The target is not searched for without them")
+    seen, scene = None, None
     with streams.progress_on_stdout(as_json) as progress:
         inspection = inspect_any(recording, progress, settings)
         if settings is not None and not problem:
@@ -67,9 +89,37 @@ def inspect(
                 warnings += [line for found in seen.observations for line in found.warnings]
             inspection = replace(inspection, findings=seen.findings, problems=seen.problems)
             warnings += [*(found.sentence for found in seen.findings), *seen.problems, *seen.notes]
+        if html is not None:
+            scene = _scene(data, recording, settings, seen, progress)
         warnings = [*recording.warnings(), *warnings]
+    if html is not None and scene is not None:
+        from caliv_graph.report.inspection_page import render_inspection
+
+        atomic_write(html, render_inspection(inspection, scene, warnings), force)
     if as_json:
         streams.show_json(inspection.document())
     else:
         streams.show(inspection_table(inspection))
+        if html is not None:
+            streams.say(f"Written to {html}")
     streams.warn(warnings)
+
+
+def _scene(
+    data: Path,
+    recording: Recording,
+    config: Config | None,
+    seen: Look | None,
+    progress: Progress,
+) -> Scene:
+    """What the page draws; without a config with the one that `init` drafts."""
+    from caliv_graph.errors import CalivError
+    from caliv_graph.wording.scene import no_scene_sentence
+    from caliv_graph.workflows.scene import drafted, scene_of, without_clouds
+
+    if config is None:
+        try:
+            recording, config = drafted(data)
+        except CalivError as error:
+            return without_clouds(no_scene_sentence(str(error)))
+    return scene_of(recording, config, seen, progress)

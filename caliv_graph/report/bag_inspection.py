@@ -56,6 +56,7 @@ class TopicSummary:
             over the bag; None with fewer than two messages.
         read: whether the topic was read; if not, the attributes below are unknown.
         frame_id: frame in the header of the first message.
+        span_s: first and last stamp in seconds from the bag's first record time; None: no message.
         gaps: number of intervals that are too long for the rate.
         longest_gaps_s: (from, to) of the longest gaps in time order, in seconds from the bag's
             first record time.
@@ -70,6 +71,7 @@ class TopicSummary:
     rate_hz: float | None
     read: bool = False
     frame_id: str = ""
+    span_s: tuple[float, float] | None = None
     gaps: int = 0
     longest_gaps_s: tuple[tuple[float, float], ...] = ()
     header_minus_record_s: tuple[float, float, float] | None = None
@@ -292,6 +294,7 @@ def _summarise_topic(
         rate_hz=clock.rate_hz,
         read=True,
         frame_id=recording.frame_ids().get(name, ""),
+        span_s=_span_s((clock.first_ns, clock.last_ns), start_ns) if clock.messages else None,
         gaps=len(clock.gaps),
         longest_gaps_s=tuple(_span_s(gap, start_ns) for gap in sorted(longest)),
         header_minus_record_s=clock.offset_s,

@@ -176,7 +176,9 @@ def scene_of(recording: Recording, config: Config, seen: Look | None, progress: 
                 read = {scan.stamp_ns: scan for scan in recording.scans(name, wanted)}
                 parts = (
                     _pieces(read, once, trajectory, points, NEAR_CELL_M, view_ns),
-                    _pieces(read, along, trajectory, points // max(len(along), 1), FAR_CELL_M, None),
+                    _pieces(
+                        read, along, trajectory, points // max(len(along), 1), FAR_CELL_M, None
+                    ),
                 )
             except CalivError as error:
                 problems.append(unseen_lidar_sentence(name, str(error)))
@@ -330,7 +332,12 @@ def _boxes(
         names = (
             ["target"] if len(regions) == 1 else [f"target {i + 1}" for i in range(len(regions))]
         )
-        return tuple(Box(name, region, False) for name, region in zip(names, regions, strict=True))
+        return tuple(
+            Box(name, region, False)
+            for name, region in zip(names, regions, strict=True)
+            # Where the first pose is, only a trajectory tells.
+            if region.frame == "map" or trajectory is not None
+        )
     if seen is None or trajectory is None:
         return ()
     return tuple(

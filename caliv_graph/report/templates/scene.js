@@ -208,10 +208,10 @@ function handle(view, grab) {
   let drag = null;
   const place = function (event) {
     const box = canvas.getBoundingClientRect();
-    return [event.clientX - box.left, event.clientY - box.top];
+    return [event.clientX - box.left - canvas.clientLeft, event.clientY - box.top - canvas.clientTop];
   };
   canvas.addEventListener("pointerdown", function (event) {
-    canvas.setPointerCapture(event.pointerId);
+    try { canvas.setPointerCapture(event.pointerId); } catch (gone) { /* It was released already. */ }
     held.set(event.pointerId, place(event));
     const [x, y] = place(event);
     drag = held.size === 1 ? grab(x, y, event.shiftKey || event.button > 0) : null;

@@ -80,6 +80,7 @@ def inspect(
     seen, scene = None, None
     with streams.progress_on_stdout(as_json) as progress:
         inspection = inspect_any(recording, progress, settings)
+        warnings += inspection.problems
         if settings is not None and not problem:
             from caliv_graph.pipeline import look
 
@@ -87,7 +88,8 @@ def inspect(
             if seen.observations is not None:
                 inspection = add_any_targets(inspection, seen.observations)
                 warnings += [line for found in seen.observations for line in found.warnings]
-            inspection = replace(inspection, findings=seen.findings, problems=seen.problems)
+            problems = (*inspection.problems, *seen.problems)
+            inspection = replace(inspection, findings=seen.findings, problems=problems)
             warnings += [*(found.sentence for found in seen.findings), *seen.problems, *seen.notes]
         if html is not None:
             scene = _scene(data, recording, settings, seen, progress)
@@ -114,7 +116,7 @@ def _scene(
 ) -> Scene:
     """What the page draws; without a config with the one that `init` drafts."""
     from caliv_graph.errors import CalivError
-    from caliv_graph.wording.scene import no_scene_sentence
+    from caliv_graph.wording.inspection import no_scene_sentence
     from caliv_graph.workflows.scene import drafted, scene_of, without_clouds
 
     if config is None:

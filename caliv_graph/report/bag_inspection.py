@@ -24,6 +24,7 @@ from caliv_graph.report.inspection import (
     Sighting,
     TargetSummary,
     add_targets,
+    count_points,
     inspect_recording,
     runs_of,
     summarise_drive,
@@ -146,7 +147,8 @@ class BagInspection:
         gnss_fixes: number of messages with a fix, per GNSS topic that was read.
         drive: the motion according to given poses; None without poses.
         findings: values of the config that the data contradict (`physics`).
-        problems: why the search for the target stopped, a sentence each.
+        problems: clouds that cannot be read, and why the search for the target stopped, a sentence
+            each.
     """
 
     data: str
@@ -208,7 +210,7 @@ def inspect_bag(
     """Reads a bag once, and some clouds of each LiDAR.
 
     Raises:
-        RecordingError: the bag is damaged, or clouds have no x, y, z.
+        RecordingError: the bag is damaged.
     """
     start_ns, stop_ns = recording.span_ns
     with progress.stage("reading the stamps", 1) as advance:
@@ -221,12 +223,11 @@ def inspect_bag(
     }
     samples = {lidar: _sample(recording, lidar) for lidar in recording.lidars}
     lidars = {}
+    problems: list[str] = []
     with progress.stage("reading the clouds", sum(map(len, samples.values()))) as advance:
         for lidar, wanted in samples.items():
-            counts = []
-            for scan in recording.scans(lidar, wanted):
-                counts.append(len(scan.points_lidar))
-                advance()
+            counts, unread = count_points(recording, lidar, wanted, advance)
+            problems += unread
             lidars[lidar] = _summarise_lidar(recording, lidar, counts, topics)
     return BagInspection(
         data=recording.name,
@@ -240,6 +241,7 @@ def inspect_bag(
         },
         gnss_fixes=dict(recording.gnss_fixes()),
         drive=_drive(recording),
+        problems=tuple(problems),
     )
 
 

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from caliv_graph.report.inspection import DriveSummary, Inspection, Run, Sighting, TargetSummary
+from caliv_graph.report.inspection import (
+    DriveSummary,
+    Inspection,
+    Points,
+    Run,
+    Sighting,
+    TargetSummary,
+)
 from caliv_graph.report.layout import UNKNOWN, new_table, titled
 
 if TYPE_CHECKING:
@@ -90,7 +97,7 @@ def _folder_content(inspection: Inspection) -> list[TableText | Remark]:
             f"{lidar.frames[0]} to {lidar.frames[1]}",
             str(lidar.step),
             UNKNOWN if lidar.rate_hz is None else f"{lidar.rate_hz:.3g}",
-            f"{lidar.points.min} / {lidar.points.median} / {lidar.points.max}",
+            _points_text(lidar.points),
         )
         for name, lidar in inspection.lidars.items()
     )
@@ -176,7 +183,7 @@ def _topic_cells(topic: TopicSummary) -> list[str]:
 
 
 def _bag_lidar_cells(lidar: BagLidarSummary) -> list[str]:
-    points, times = lidar.points, lidar.times
+    times = lidar.times
     shown = "none"
     if times is not None:
         shown = (
@@ -188,19 +195,23 @@ def _bag_lidar_cells(lidar: BagLidarSummary) -> list[str]:
     return [
         lidar.frame_id or UNKNOWN,
         str(lidar.clouds),
-        UNKNOWN if points is None else f"{points.min} / {points.median} / {points.max}",
+        _points_text(lidar.points),
         shown,
     ]
+
+
+def _points_text(points: Points | None) -> str:
+    return UNKNOWN if points is None else f"{points.min} / {points.median} / {points.max}"
 
 
 def _sighting_cells(sighting: Sighting) -> list[str]:
     if sighting.points is None or sighting.range_m is None:
         return ["0", UNKNOWN, UNKNOWN, "never"]
-    points, (near, far) = sighting.points, sighting.range_m
+    near, far = sighting.range_m
     return [
         str(sighting.scans),
         f"{near:.1f} to {far:.1f}",
-        f"{points.min} / {points.median} / {points.max}",
+        _points_text(sighting.points),
         _runs(sighting.frames, " to ")
         if sighting.times_s is None
         else ", ".join(f"{first:.1f} to {last:.1f}" for first, last in sighting.times_s),

@@ -32,7 +32,7 @@ from caliv_graph.trajectory.select import (
     smooth_trajectories,
     twists_at,
 )
-from caliv_graph.wording.scene import no_trajectory_sentence, unseen_lidar_sentence
+from caliv_graph.wording.inspection import no_trajectory_sentence, unseen_lidar_sentence
 from caliv_graph.workflows.draft import draft_config
 
 ALONG_SCANS = 12

@@ -1,4 +1,4 @@
-"""Sentences on what a picture of a drive cannot show."""
+"""Sentences on what `inspect` cannot read or show of a drive."""
 
 from __future__ import annotations
 
@@ -16,3 +16,9 @@ def unseen_lidar_sentence(name: str, reason: str) -> str:
 def no_scene_sentence(reason: str) -> str:
     """Why no clouds are shown at all."""
     return f"No clouds are shown: {reason}"
+
+
+def unreadable_sentence(name: str, first: str, count: int) -> str:
+    """How many clouds of a LiDAR cannot be read, and why the first of them."""
+    in_all = f". In all {count} clouds of lidar '{name}' cannot be read" if count > 1 else ""
+    return f"{first}{in_all}"

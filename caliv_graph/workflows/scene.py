@@ -211,7 +211,12 @@ def _lidar(
         origin = "found from the drive"
     elif lidar.initial is None:
         origin = "mounting unknown"
-    initial = given.lidars[name].initial or lidar.initial
+    initial = given.lidars[name].initial
+    if initial is None and lidar.initial is not None:
+        # Good to 0.2 m and 2 degrees: more digits would only look exact.
+        initial = PoseConfig(
+            xyz=_rounded(lidar.initial.xyz, 3), rpy_deg=_rounded(lidar.initial.rpy_deg, 2)
+        )
     return SceneLidar(name, lidar.topic, initial, origin, once, along)
 
 
@@ -329,21 +334,24 @@ def _boxes(
     """The config's boxes; without any, one about each target that was found."""
     if config.target:
         regions = config.target
-        names = (
-            ["target"] if len(regions) == 1 else [f"target {i + 1}" for i in range(len(regions))]
-        )
         return tuple(
             Box(name, region, False)
-            for name, region in zip(names, regions, strict=True)
+            for name, region in zip(_names(len(regions)), regions, strict=True)
             # Where the first pose is, only a trajectory tells.
             if region.frame == "map" or trajectory is not None
         )
     if seen is None or trajectory is None:
         return ()
+    targets = seen.observations or ()
     return tuple(
-        Box(found.name, _region(found, seen.config or config, trajectory), True)
-        for found in seen.observations or ()
+        Box(name, _region(found, seen.config or config, trajectory), True)
+        for name, found in zip(_names(len(targets)), targets, strict=True)
     )
+
+
+def _names(count: int) -> list[str]:
+    """Of boxes; short, for the picture."""
+    return ["target"] if count == 1 else [f"target {i + 1}" for i in range(count)]
 
 
 def _region(
@@ -364,6 +372,6 @@ def _region(
     )
 
 
-def _rounded(values: Sequence[float] | Array) -> tuple[float, float, float]:
-    x, y, z = (round(float(v), 3) for v in values)
+def _rounded(values: Sequence[float] | Array, digits: int = 3) -> tuple[float, float, float]:
+    x, y, z = (round(float(v), digits) for v in values)
     return x, y, z

@@ -194,7 +194,7 @@ def test_boxes_are_those_of_the_config_or_about_what_was_found() -> None:
     (found,) = scene(seen=look).boxes
 
     assert (given.found, given.region.frame, given.region.max) == (False, "start", (14.0, 5.0, 3.0))
-    assert (found.name, found.found, found.region.frame) == ("chair", True, "map")
+    assert (found.name, found.found, found.region.frame) == ("target", True, "map")
     # The chair and 0.3 m on every side.
     assert found.region.min == pytest.approx([5.4, 1.4, -0.1], abs=0.03)
     assert found.region.max == pytest.approx([6.6, 2.6, 1.1], abs=0.03)

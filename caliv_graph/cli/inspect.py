@@ -52,7 +52,7 @@ def inspect(
     """
     from dataclasses import replace
 
-    from caliv_graph.batch.job import guess_problem
+    from caliv_graph.batch.job import guess_problem, without_zeros
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.config.load import load_config
     from caliv_graph.errors import RecordingError
@@ -74,14 +74,15 @@ def inspect(
             # Its topics can still be shown, if it is a recording at all.
             recording, settings = open_all(data), None
             warnings.append(str(error))
-    problem = "" if settings is None or config is None else guess_problem(settings, config)
-    if problem:
-        warnings.append(f"{problem}. The target is not searched for without them")
+    if settings is not None and config is not None:
+        problem = guess_problem(settings, config)
+        warnings += [problem] if problem else []
+        settings = without_zeros(settings)
     seen, scene = None, None
     with streams.progress_on_stdout(as_json) as progress:
         inspection = inspect_any(recording, progress, settings)
         warnings += inspection.problems
-        if settings is not None and not problem:
+        if settings is not None:
             from caliv_graph.pipeline import look
 
             seen = look(recording, settings, progress)

@@ -14,6 +14,7 @@ from caliv_graph.cli.main import app
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RecordingError
+from caliv_graph.pipeline import Look
 from caliv_graph.products import Recording, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.choice import Choose
 from caliv_graph.targets.search import FoundTarget
@@ -63,8 +64,15 @@ def test_the_folder_itself_or_the_one_around_it(tmp_path: Path) -> None:
     assert outer["lidars"] == inner["lidars"]
 
 
-def test_guesses_that_nobody_filled_in(tmp_path: Path) -> None:
-    """The drive is shown, and the target is not searched for with the zeros of a draft."""
+def test_guesses_that_nobody_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The zeros of a draft are no guesses: the mountings are looked for."""
+    looked: list[Config] = []
+
+    def look(recording: Recording, config: Config, progress: Progress) -> Look:
+        looked.append(config)
+        return Look(None, (), ())
+
+    monkeypatch.setattr("caliv_graph.pipeline.look", look)
     zeros = {"initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 0]}}
     lidars = {name: {"topic": f"sensor_{n}", **zeros} for n, name in ((1, "left"), (2, "right"))}
     config = write_config(tmp_path / "config.yaml", lidars=lidars)
@@ -77,7 +85,7 @@ def test_guesses_that_nobody_filled_in(tmp_path: Path) -> None:
         f"warning: {config}: lidars.left.initial and lidars.right.initial are all zeros"
     )
     assert "errors of 0.1 m and 3 degrees are fine" in result.stderr
-    assert "not searched for" in result.stderr
+    assert [lidar.initial for lidar in looked[0].lidars.values()] == [None, None]
 
 
 def test_a_table(tmp_path: Path) -> None:

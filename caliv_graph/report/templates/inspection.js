@@ -56,7 +56,7 @@
   }
   const groundZ = { once: groundOf("once"), along: groundOf("along") };
   function paintClouds(view, name) {
-    const size = Math.max(1, Math.round(1.5 * view.ratio));
+    const size = Math.max(1, Math.round((view.canvas.clientWidth < 600 ? 1 : 1.5) * view.ratio));
     for (const lidar of lidars) {
       if (lidar.shown) { view.cloud(lidar[name], data.quantum_m, mounting(lidar), view.colour(lidar.colour), groundZ[name], size); }
     }
@@ -116,7 +116,7 @@
   const map = byId("map") && new View(byId("map"), function (view) {
     paintClouds(view, "along");
     view.line(data.path, view.colour("--ink"), 1.5);
-    view.dots(data.fixes, view.colour("--fix"), 1.5);
+    view.dots(data.fixes, view.colour("--fix"), 1);
     if (data.path.length) { view.dots([data.path[0]], view.colour("--ink"), 4); view.text(data.path[0], "start", view.colour("--ink")); }
     paintBoxes(view, IDENTITY);
     for (const box of boxes) {

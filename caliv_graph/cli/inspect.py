@@ -52,33 +52,14 @@ def inspect(
     """
     from dataclasses import replace
 
-    from caliv_graph.batch.job import guess_problem, without_zeros
     from caliv_graph.common.files import atomic_write, check_output_file
-    from caliv_graph.config.load import load_config
-    from caliv_graph.errors import RecordingError
-    from caliv_graph.readers import open_recording
-    from caliv_graph.readers.discover import open_all
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
     from caliv_graph.report.inspection_table import inspection_table
 
     if html is not None:
         check_output_file(html, force)
-    settings = None if config is None else load_config(config)
-    warnings: list[str] = []
-    if settings is None:
-        recording = open_all(data)
-    else:
-        try:
-            recording = open_recording(settings, data)
-        except RecordingError as error:
-            # Its topics can still be shown, if it is a recording at all.
-            recording, settings = open_all(data), None
-            warnings.append(str(error))
-    if settings is not None and config is not None:
-        problem = guess_problem(settings, config)
-        warnings += [problem] if problem else []
-        settings = without_zeros(settings)
-    seen, scene = None, None
+    recording, settings, warnings = _opened(data, config)
+    seen = None
     with streams.progress_on_stdout(as_json) as progress:
         inspection = inspect_any(recording, progress, settings)
         warnings += inspection.problems
@@ -92,8 +73,7 @@ def inspect(
             problems = (*inspection.problems, *seen.problems)
             inspection = replace(inspection, findings=seen.findings, problems=problems)
             warnings += [*(found.sentence for found in seen.findings), *seen.problems, *seen.notes]
-        if html is not None:
-            scene = _scene(data, recording, settings, seen, progress)
+        scene = None if html is None else _scene(data, recording, settings, seen, progress)
         warnings = [*recording.warnings(), *warnings]
     if html is not None and scene is not None:
         from caliv_graph.report.inspection_page import render_inspection
@@ -108,6 +88,26 @@ def inspect(
     streams.warn(warnings)
 
 
+def _opened(data: Path, config: Path | None) -> tuple[Recording, Config | None, list[str]]:
+    """The drive, the config if it fits the drive, and warnings about both."""
+    from caliv_graph.batch.job import guess_problem, without_zeros
+    from caliv_graph.config.load import load_config
+    from caliv_graph.errors import RecordingError
+    from caliv_graph.readers import open_recording
+    from caliv_graph.readers.discover import open_all
+
+    if config is None:
+        return open_all(data), None, []
+    settings = load_config(config)
+    try:
+        recording = open_recording(settings, data)
+    except RecordingError as error:
+        # Its topics can still be shown, if it is a recording at all.
+        return open_all(data), None, [str(error)]
+    problem = guess_problem(settings, config)
+    return recording, without_zeros(settings), [problem] if problem else []
+
+
 def _scene(
     data: Path,
     recording: Recording,
@@ -120,9 +120,9 @@ def _scene(
     from caliv_graph.wording.inspection import no_scene_sentence
     from caliv_graph.workflows.scene import drafted, scene_of, without_clouds
 
-    if config is None:
-        try:
-            recording, config = drafted(data)
-        except CalivError as error:
-            return without_clouds(no_scene_sentence(str(error)))
-    return scene_of(recording, config, seen, progress)
+    if config is not None:
+        return scene_of(recording, config, seen, progress)
+    try:
+        return scene_of(*drafted(data), seen, progress, origin="as 'init' drafts it")
+    except CalivError as error:
+        return without_clouds(no_scene_sentence(str(error)))

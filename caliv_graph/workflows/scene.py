@@ -151,8 +151,22 @@ def drafted(data: Path) -> tuple[Recording, Config]:
     return open_recording(config, data), config
 
 
-def scene_of(recording: Recording, config: Config, seen: Look | None, progress: Progress) -> Scene:
-    """Collects a scene; `seen`: what a search for the target has found already. Raises no error."""
+def scene_of(
+    recording: Recording,
+    config: Config,
+    seen: Look | None,
+    progress: Progress,
+    origin: str = "initial guess",
+) -> Scene:
+    """Collects a scene; what cannot be read is named in it.
+
+    Args:
+        recording: the drive.
+        config: its topics and mountings.
+        seen: what a search for the target has found already; None: none was made.
+        progress: reports every stage.
+        origin: what the mountings of the config are.
+    """
     problems: list[str] = []
     given = config
     trajectory = None
@@ -183,7 +197,7 @@ def scene_of(recording: Recording, config: Config, seen: Look | None, progress: 
             except CalivError as error:
                 problems.append(unseen_lidar_sentence(name, str(error)))
                 parts = ((), ())
-            lidars.append(_lidar(name, given, config, *parts))
+            lidars.append(_lidar(name, given, config, origin, parts))
             advance()
     return Scene(
         lidars=tuple(lidars),
@@ -203,10 +217,13 @@ def without_clouds(problem: str) -> Scene:
 
 
 def _lidar(
-    name: str, given: Config, config: Config, once: tuple[Piece, ...], along: tuple[Piece, ...]
+    name: str,
+    given: Config,
+    config: Config,
+    origin: str,
+    pieces: tuple[tuple[Piece, ...], tuple[Piece, ...]],
 ) -> SceneLidar:
     lidar = config.lidars[name]
-    origin = "initial guess"
     if isinstance(lidar, FoundLidarConfig):
         origin = "found from the drive"
     elif lidar.initial is None:
@@ -217,7 +234,7 @@ def _lidar(
         initial = PoseConfig(
             xyz=_rounded(lidar.initial.xyz, 3), rpy_deg=_rounded(lidar.initial.rpy_deg, 2)
         )
-    return SceneLidar(name, lidar.topic, initial, origin, once, along)
+    return SceneLidar(name, lidar.topic, initial, origin, *pieces)
 
 
 def _pose(trajectory: VehicleTrajectory, stamp_ns: int) -> gtsam.Pose3:

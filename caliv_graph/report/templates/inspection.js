@@ -103,7 +103,7 @@
   }
   handle(space, function (x, y, other) {
     return other ? space.pan.bind(space) : space.turn.bind(space);
-  });
+  }, space.turn.bind(space));
   document.querySelectorAll("[data-side]").forEach(function (button) {
     button.addEventListener("click", function () { look(button.dataset.side); });
   });
@@ -165,7 +165,7 @@
     handle(map, function (x, y) {
       const found = grabbed(x, y);
       return found ? function (dx, dy) { dragBox(found, dx, dy); } : map.pan.bind(map);
-    });
+    }, map.pan.bind(map));
     map.canvas.addEventListener("pointermove", function (event) {
       if (event.buttons) { return; }
       const found = grabbed(event.offsetX, event.offsetY), sides = found ? found.sides : [];

@@ -202,8 +202,8 @@ class View {
 }
 
 // One pointer calls `drag`, two zoom and pan. `grab(x, y)` says what a pointer holds. The wheel zooms
-// a view that was clicked; else it scrolls the page.
-function handle(view, grab) {
+// a view that was clicked; else it scrolls the page. Arrows do what `keys` does.
+function handle(view, grab, keys) {
   const canvas = view.canvas, held = new Map();
   let drag = null;
   const place = function (event) {
@@ -235,6 +235,13 @@ function handle(view, grab) {
   canvas.addEventListener("pointerup", release);
   canvas.addEventListener("pointercancel", release);
   canvas.addEventListener("contextmenu", function (event) { event.preventDefault(); });
+  canvas.addEventListener("keydown", function (event) {
+    const steps = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, -20], ArrowDown: [0, 20] }, step = steps[event.key];
+    const factor = { "+": 1.25, "=": 1.25, "-": 0.8 }[event.key];
+    if (factor) { view.zoom(factor, canvas.clientWidth / 2, canvas.clientHeight / 2); }
+    if (step) { keys(step[0], step[1]); }
+    if (factor || step) { event.preventDefault(); }
+  });
   canvas.addEventListener("wheel", function (event) {
     if (document.activeElement !== canvas) { return; }
     event.preventDefault();

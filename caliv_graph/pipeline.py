@@ -248,12 +248,16 @@ class Look:
         findings: values of the config that the raw data contradict, the heading included.
         problems: what stopped the search, a sentence each.
         notes: where LiDARs without an initial guess were found, a sentence each.
+        trajectory: of the vehicle; None if it could not be smoothed.
+        config: with the mountings that were found; None if none was looked for.
     """
 
     observations: tuple[TargetObservation, ...] | None
     findings: tuple[Finding, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    trajectory: VehicleTrajectory | None = None
+    config: Config | None = None
 
 
 def look(recording: Recording, config: Config, progress: Progress) -> Look:
@@ -264,6 +268,8 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
     findings: tuple[Finding, ...] = ()
     problems: list[str] = []
     notes: tuple[str, ...] = ()
+    trajectory: VehicleTrajectory | None = None
+    observations: tuple[TargetObservation, ...] | None = None
     try:
         check_clouds([recording], config)
     except CalivError as error:
@@ -274,6 +280,7 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         if any(found.severity == "fatal" for found in findings):
             return Look(None, findings, tuple(problems))
         trajectories = smooth_trajectories([recording], config, [[]], motions)
+        (trajectory,) = trajectories
         config, placements = place_lidars([recording], trajectories, config, progress)
         notes = tuple(map(placement_sentence, placements))
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
@@ -282,8 +289,8 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         problems += (*misplaced, *displaced(observations, trajectories, near))
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
-        return Look(None, findings, tuple(problems), notes)
-    return Look(observations, findings, tuple(problems), notes)
+        observations = None
+    return Look(observations, findings, tuple(problems), notes, trajectory, config)
 
 
 def _doubts_about_motion(

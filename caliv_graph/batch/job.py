@@ -98,9 +98,8 @@ def guess_problem(config: Config, path: Path) -> str:
 
     Two LiDARs have zeros, as drafts of older versions had for unknown guesses.
     """
-    unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
-    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
-    if len(zeros) < 2:
+    zeros = _zeros(config)
+    if not zeros:
         return ""
     fields = " and ".join(f"lidars.{name}.initial" for name in zeros)
     return (
@@ -108,6 +107,21 @@ def guess_problem(config: Config, path: Path) -> str:
         "metres and rpy_deg in degrees from a tape measure or a drawing (errors of 0.1 m and 3 "
         "degrees are fine), or 'initial: null': then they are found from the drive"
     )
+
+
+def without_zeros(config: Config) -> Config:
+    """The config without the guesses that `guess_problem` names: they are unknown."""
+    unknown = {
+        name: config.lidars[name].model_copy(update={"initial": None}) for name in _zeros(config)
+    }
+    return config.model_copy(update={"lidars": {**config.lidars, **unknown}})
+
+
+def _zeros(config: Config) -> list[str]:
+    """LiDARs whose guess is all zeros, if they are more than one."""
+    unknown = PoseConfig(xyz=(0.0, 0.0, 0.0))
+    zeros = [name for name, lidar in config.lidars.items() if lidar.initial == unknown]
+    return zeros if len(zeros) > 1 else []
 
 
 def check_guesses(config: Config, path: Path) -> None:

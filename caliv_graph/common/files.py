@@ -50,7 +50,7 @@ def check_output_file(path: Path, force: bool = False) -> None:
     with _errors_named(path):
         target = _resolved(path)
         if target.is_dir():
-            raise OutputError(f"{path}: is a folder. Give --out the name of a file")
+            raise OutputError(f"{path}: is a folder. Give the name of a file")
         if target.exists() and not force:
             raise OutputError(f"{path}: exists already. Give --force to replace it")
         _check_parent_writable(path, target)

@@ -14,6 +14,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.export.request import Request, Transform
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import LidarResult
+from caliv_graph.wording.guesses import unseen_sentence
 
 _DECIMALS = 12
 """A picometre or picoradian, as in calibration.yaml."""
@@ -66,9 +67,7 @@ def caveats(request: Request, lidars: Iterable[str]) -> list[str]:
         result = request.calibration.lidars[name]
         axes = undetermined_axes(result)
         if not result.has_data:
-            lines.append(
-                f"LiDAR '{name}' saw neither target nor structure: it keeps the initial guess"
-            )
+            lines.append(unseen_sentence(name, result.without_guess))
         elif axes:
             lines.append(
                 f"LiDAR '{name}': {', '.join(axes)} (vehicle axes) not determined by the drive: "

@@ -46,19 +46,21 @@ class SampledRecording(ForwardingRecording):
         return tuple(self._kept[key] for key in sorted(self._kept))
 
 
-def thinned(scan: LidarScan) -> LidarScan:
-    """At most `POINTS` points of a cloud, one per cell of a grid, with their times.
+def thinned(
+    scan: LidarScan, most: int = POINTS, cell_m: float = CELL_M, range_m: float = RANGE_M
+) -> LidarScan:
+    """At most `most` points of a cloud, one per cell of a grid, with their times.
 
     The same cloud gives the same points.
     """
-    near = np.flatnonzero(np.linalg.norm(scan.points_lidar, axis=1) <= RANGE_M)
+    near = np.flatnonzero(np.linalg.norm(scan.points_lidar, axis=1) <= range_m)
     # One number per cell, for rows are slow to compare. The radius bounds them.
-    x, y, z = np.floor(scan.points_lidar[near] / CELL_M).astype(np.int64).T
-    side = 2 * (math.ceil(RANGE_M / CELL_M) + 1)
+    x, y, z = np.floor(scan.points_lidar[near] / cell_m).astype(np.int64).T
+    side = 2 * (math.ceil(range_m / cell_m) + 1)
     _, first = np.unique((x * side + y) * side + z, return_index=True)
     some: IntArray = near[np.sort(first)]
-    if len(some) > POINTS:
-        some = some[np.sort(np.random.default_rng(0).choice(len(some), POINTS, replace=False))]
+    if len(some) > most:
+        some = some[np.sort(np.random.default_rng(0).choice(len(some), most, replace=False))]
     times = scan.point_times_s
     return replace(
         scan,

@@ -24,6 +24,7 @@ from caliv_graph.report.inspection import (
     Sighting,
     TargetSummary,
     add_targets,
+    count_points,
     inspect_recording,
     runs_of,
     summarise_drive,
@@ -56,6 +57,7 @@ class TopicSummary:
             over the bag; None with fewer than two messages.
         read: whether the topic was read; if not, the attributes below are unknown.
         frame_id: frame in the header of the first message.
+        span_s: first and last stamp in seconds from the bag's first record time; None: no message.
         gaps: number of intervals that are too long for the rate.
         longest_gaps_s: (from, to) of the longest gaps in time order, in seconds from the bag's
             first record time.
@@ -70,6 +72,7 @@ class TopicSummary:
     rate_hz: float | None
     read: bool = False
     frame_id: str = ""
+    span_s: tuple[float, float] | None = None
     gaps: int = 0
     longest_gaps_s: tuple[tuple[float, float], ...] = ()
     header_minus_record_s: tuple[float, float, float] | None = None
@@ -144,7 +147,8 @@ class BagInspection:
         gnss_fixes: number of messages with a fix, per GNSS topic that was read.
         drive: the motion according to given poses; None without poses.
         findings: values of the config that the data contradict (`physics`).
-        problems: why the search for the target stopped, a sentence each.
+        problems: clouds that cannot be read, and why the search for the target stopped, a sentence
+            each.
     """
 
     data: str
@@ -206,7 +210,7 @@ def inspect_bag(
     """Reads a bag once, and some clouds of each LiDAR.
 
     Raises:
-        RecordingError: the bag is damaged, or clouds have no x, y, z.
+        RecordingError: the bag is damaged.
     """
     start_ns, stop_ns = recording.span_ns
     with progress.stage("reading the stamps", 1) as advance:
@@ -219,12 +223,11 @@ def inspect_bag(
     }
     samples = {lidar: _sample(recording, lidar) for lidar in recording.lidars}
     lidars = {}
+    problems: list[str] = []
     with progress.stage("reading the clouds", sum(map(len, samples.values()))) as advance:
         for lidar, wanted in samples.items():
-            counts = []
-            for scan in recording.scans(lidar, wanted):
-                counts.append(len(scan.points_lidar))
-                advance()
+            counts, unread = count_points(recording, lidar, wanted, advance)
+            problems += unread
             lidars[lidar] = _summarise_lidar(recording, lidar, counts, topics)
     return BagInspection(
         data=recording.name,
@@ -238,6 +241,7 @@ def inspect_bag(
         },
         gnss_fixes=dict(recording.gnss_fixes()),
         drive=_drive(recording),
+        problems=tuple(problems),
     )
 
 
@@ -292,6 +296,7 @@ def _summarise_topic(
         rate_hz=clock.rate_hz,
         read=True,
         frame_id=recording.frame_ids().get(name, ""),
+        span_s=_span_s((clock.first_ns, clock.last_ns), start_ns) if clock.messages else None,
         gaps=len(clock.gaps),
         longest_gaps_s=tuple(_span_s(gap, start_ns) for gap in sorted(longest)),
         header_minus_record_s=clock.offset_s,

@@ -49,11 +49,13 @@ def _lines(values: Mapping[tuple[str, str], float]) -> str:
     return "\n".join(f"{1e3 * value:.1f}" for value in values.values()) or "-"
 
 
-def held_out_tables(held: HeldOutStructure) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The table of the held-out structure, all strips together."""
+def held_out_tables(
+    held: HeldOutStructure, before: str
+) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The table of the held-out structure, all strips together; `before`: what that is."""
     rows = []
     for what, stage in (
-        ("initial guess", BEFORE),
+        (before, BEFORE),
         ("calibration", AFTER),
         ("calibration without these strips", WITHOUT),
     ):

@@ -115,7 +115,8 @@ def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
         if lidar.guess is not None and lidar.guess.fixed:
             out.append((name, "", "not estimated: 'fixed' in the config"))
         elif not lidar.has_data:
-            out.append((name, "", "all six axes: nothing seen, the extrinsic is the guess"))
+            kept = "no guess given" if lidar.without_guess else "the extrinsic is the guess"
+            out.append((name, "", f"all six axes: nothing seen, {kept}"))
         else:
             out.append((f"{name} to the vehicle", *_axes_texts(lidar.determined)))
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):

@@ -14,11 +14,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.common.progress import Progress
+from caliv_graph.common.progress import Advance, Progress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.errors import TrajectoryError
+from caliv_graph.errors import RecordingError, TrajectoryError
 from caliv_graph.products import Finding, GivenPoses, Recording, TargetObservation
 from caliv_graph.readers.caliv_folder import FRAME_PERIOD_NS
+from caliv_graph.wording.inspection import unreadable_sentence
 
 Run = tuple[int, int]
 """First and last frame number of a run, or the frames before and after a gap."""
@@ -42,6 +43,7 @@ class LidarSummary:
         step: usual difference of frame numbers between clouds.
         gaps: frames before and after each larger difference.
         rate_hz: nominal, since the files have no stamps; None with one cloud.
+        points: None if no cloud could be read.
     """
 
     clouds: int
@@ -49,7 +51,7 @@ class LidarSummary:
     step: int
     gaps: tuple[Run, ...]
     rate_hz: float | None
-    points: Points
+    points: Points | None
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,8 @@ class Inspection:
 
     Attributes:
         findings: values of the config that the data contradict (`physics`).
-        problems: why the search for the target stopped, a sentence each.
+        problems: clouds that cannot be read, and why the search for the target stopped, a sentence
+            each.
     """
 
     data: str
@@ -127,23 +130,55 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
     """Reads a whole recording once, one cloud at a time.
 
     Raises:
-        RecordingError: a cloud is missing, empty, truncated or damaged.
         TrajectoryError: the recording has no vehicle poses.
     """
     lidars = {}
+    problems: list[str] = []
     total = sum(len(recording.scan_stamps_ns(lidar)) for lidar in recording.lidars)
     with progress.stage("reading the clouds", total) as advance:
         for lidar in recording.lidars:
-            counts = []
-            for scan in recording.scans(lidar):
-                counts.append(len(scan.points_lidar))
-                advance()
-            frames = [stamp_ns // FRAME_PERIOD_NS for stamp_ns in recording.scan_stamps_ns(lidar)]
+            stamps_ns = recording.scan_stamps_ns(lidar)
+            counts, unread = count_points(recording, lidar, stamps_ns, advance)
+            problems += unread
+            frames = [stamp_ns // FRAME_PERIOD_NS for stamp_ns in stamps_ns]
             lidars[lidar] = _summarise_lidar(frames, counts)
     given = recording.motion().poses
     if given is None:
         raise TrajectoryError(f"{recording.name}: has no vehicle poses")
-    return Inspection(data=recording.name, lidars=lidars, drive=summarise_drive(given))
+    return Inspection(
+        data=recording.name,
+        lidars=lidars,
+        drive=summarise_drive(given),
+        problems=tuple(problems),
+    )
+
+
+def count_points(
+    recording: Recording, lidar: str, stamps_ns: Iterable[int], advance: Advance
+) -> tuple[list[int], tuple[str, ...]]:
+    """Points of the clouds at some stamps, and a sentence if any cannot be read.
+
+    What cannot be read does not hide the rest of a recording.
+    """
+    counts: list[int] = []
+    errors: list[str] = []
+    left = sorted(stamps_ns)
+    while left:
+        begin_ns = left[0]
+        try:
+            for scan in recording.scans(lidar, frozenset(left)):
+                counts.append(len(scan.points_lidar))
+                begin_ns = scan.stamp_ns + 1
+                advance()
+            break
+        except RecordingError as error:
+            errors.append(str(error))
+            advance()
+            # The next cloud is the one that cannot be read.
+            left = [stamp_ns for stamp_ns in left if stamp_ns >= begin_ns][1:]
+    if not errors:
+        return counts, ()
+    return counts, (unreadable_sentence(lidar, errors[0], len(errors)),)
 
 
 def add_targets(inspection: Inspection, observations: Iterable[TargetObservation]) -> Inspection:
@@ -206,7 +241,7 @@ def _summarise_lidar(frames: Sequence[int], counts: Sequence[int]) -> LidarSumma
         step=step,
         gaps=tuple(gaps),
         rate_hz=rate_hz,
-        points=summarise_points(counts),
+        points=summarise_points(counts) if counts else None,
     )
 
 

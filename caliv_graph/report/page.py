@@ -32,6 +32,10 @@ def _first_picture(figure: Figure) -> Markup:
 
 
 def script_data(figure: Figure) -> Markup:
-    """The JSON of a figure for a script element, escaped so that no text can end the element."""
-    text = figure.figure.json()
+    """The JSON of a figure for a script element."""
+    return escaped(figure.figure.json())
+
+
+def escaped(text: str) -> Markup:
+    """JSON for a script element, escaped so that no text can end the element."""
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -22,6 +22,7 @@ from caliv_graph.report.numbers import (
     pose_cells,
     scans_text,
 )
+from caliv_graph.wording.guesses import unseen_sentence
 from caliv_graph.wording.suspects import suspect_row
 from caliv_graph.wording.vehicle import vehicle_text
 
@@ -39,7 +40,7 @@ def calibration_table(
     """The result of `calibrate` as tables; without `seconds`, no table of the times of its stages.
 
     An axis that the drive does not determine is marked `held`. Its value is in brackets, with the
-    precision of the initial guess.
+    precision of the initial guess; without a guess it has none.
     """
     status = Text(calibration.status, style=STATUS_STYLES.get(calibration.status, "bold"))
     names = ", ".join(calibration.lidars)
@@ -78,7 +79,7 @@ def calibration_table(
     measured = [vehicle_text(name, found) for name, found in calibration.vehicle.items()]
     parts += sentences("Measured by hand, as the drive sees it:", measured)
     unseen = [
-        f"LiDAR '{name}' saw neither target nor structure: it keeps the initial guess"
+        unseen_sentence(name, result.without_guess)
         for name, result in calibration.lidars.items()
         if not result.has_data
     ]
@@ -95,10 +96,11 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
     """Errors of a calibration as a table: the result of `uncertainty.evaluation.evaluate`."""
     table = new_table("", *axis_headings("mm", "mrad"))
     table.add_column("NEES\n6 dof", justify="right")
-    any_held = False
+    guessed = unguessed = False
     for name, errors in evaluation["lidars"].items():
         determined = calibration.lidars[name].determined
-        any_held |= not all(determined.values())
+        guessed |= not all(determined.values()) and not calibration.lidars[name].without_guess
+        unguessed |= not all(determined.values()) and calibration.lidars[name].without_guess
         table.add_row(Text(f"S2V {name}"), *_error_cells(errors["s2v"], determined))
     for errors in evaluation["pairs"]:
         # A pair's axes are marked as determined in the axes of `to`; these errors are in vehicle
@@ -107,9 +109,9 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
         name = f"S2S {errors['from']} to {errors['to']}"
         table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
     parts = titled("Errors in vehicle axes (estimate minus truth)", table)
-    if any_held:
-        note = "In brackets: not determined by the drive; the error of the initial guess."
-        parts.append(Text(note, style="yellow"))
+    if guessed or unguessed:
+        of = "the error of the initial guess" if guessed else "no initial guess was given"
+        parts.append(Text(f"In brackets: not determined by the drive; {of}.", style="yellow"))
     return Group(*parts[1:])
 
 

@@ -123,7 +123,7 @@ def tables(found: Validation) -> list[tuple[str, list[str], list[list[str]]]]:
             )
         )
     if found.held_out is not None:
-        out += held_out_tables(found.held_out)
+        out += held_out_tables(found.held_out, found.before)
     return out
 
 

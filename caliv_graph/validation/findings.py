@@ -218,6 +218,7 @@ class Validation:
         expected_alone_m: likewise per LiDAR.
         best: extrinsics with the best alignment, in the order of `lidars`; no calibration.
         held_out: the third of the strips that is held out; None: not measured.
+        before: what "before" is: the initial guesses, or what was found where none was given.
     """
 
     drive: str
@@ -235,6 +236,7 @@ class Validation:
     best: tuple[gtsam.Pose3, ...]
     warnings: tuple[str, ...]
     held_out: HeldOutStructure | None = None
+    before: str = "the initial guesses"
 
     @property
     def has_structure(self) -> bool:

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_guess
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, FoundLidarConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
@@ -49,6 +49,7 @@ from caliv_graph.validation.measure import (
 from caliv_graph.validation.refine import align, sharper
 from caliv_graph.validation.surfaces import Structure, Thing, Wall
 from caliv_graph.validation.verdict import is_shared, judge, with_held_out
+from caliv_graph.wording.guesses import before_words
 
 Stages = Mapping[str, tuple[Placed, Sequence[gtsam.Pose3] | None]]
 
@@ -76,6 +77,7 @@ def validate(
     with threadpool_limits(limits=1):
         names, notes = _common_lidars(recording, calibration, config)
         config = _with_guesses(names, calibration, config)
+        before = before_words(names, [n for n in names if _is_found(config, n)])
         extrinsics = _extrinsics(names, calibration, config)
         motions = {0: recording.motion() if motion is None else motion}
         with progress.stage("smoothing the trajectory", None):
@@ -108,11 +110,12 @@ def validate(
                 (start, structure, best),
                 errors,
                 (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
+                before,
             )
     if held is None:
         sentences = (*found.verdict.sentences, *no_held)
         return replace(found, verdict=replace(found.verdict, sentences=sentences))
-    return replace(found, held_out=held, verdict=with_held_out(found.verdict, held))
+    return replace(found, held_out=held, verdict=with_held_out(found.verdict, held, before))
 
 
 def _common_lidars(
@@ -168,6 +171,11 @@ def _with_guesses(names: Sequence[str], calibration: Calibration, config: Config
     return config
 
 
+def _is_found(config: Config, name: str) -> bool:
+    """Whether nobody gave a guess of a LiDAR."""
+    return isinstance(config.lidars[name], FoundLidarConfig)
+
+
 def _nodes(
     chosen: Mapping[str, IntArray], extrinsics: Extrinsics, span_ns: tuple[int, int]
 ) -> IntArray:
@@ -183,6 +191,7 @@ def _measured(
     aligned: tuple[str, Structure, tuple[gtsam.Pose3, ...]],
     errors: Errors,
     warnings: tuple[str, ...],
+    before: str,
 ) -> Validation:
     """Measures the structure of the best alignment under the extrinsics of all stages."""
     start, structure, best = aligned
@@ -228,10 +237,11 @@ def _measured(
         alone_m=alone,
         expected_thickness_m=expected,
         expected_alone_m=expected_alone,
-        verdict=judge(surfaces, things, pairs, (alone, expected_alone), errors),
+        verdict=judge(surfaces, things, pairs, (alone, expected_alone), errors, before),
         clouds=clouds,
         best=best,
         warnings=warnings,
+        before=before,
     )
 
 

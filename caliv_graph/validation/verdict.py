@@ -60,10 +60,12 @@ def judge(
     pairs: Sequence[PairResult],
     alone: tuple[Mapping[str, Mapping[str, float]], Mapping[str, float]],
     errors: Errors,
+    before: str,
 ) -> Verdict:
     """The verdict on what was measured.
 
-    `alone` has the thickness by stage and LiDAR, and its expected value by LiDAR.
+    `alone` has the thickness by stage and LiDAR, and its expected value by LiDAR; `before` says
+    what a calibration is compared with.
     """
     tested = _tested(surfaces)
     chi2, p_value = 0.0, None
@@ -86,7 +88,9 @@ def judge(
     of_expected = values[AFTER] / expected if found and expected > 0.0 else None
     contradicts = p_value is not None and p_value < CONTRADICTION
     sentences = _sentences(
-        values, expected, better, (chi2, dof, p_value, contradicts), (shared, surfaces, things)
+        (values, expected, better, before),
+        (chi2, dof, p_value, contradicts),
+        (shared, surfaces, things),
     )
     if shared and better is not None:
         thick = ", ".join(
@@ -104,17 +108,17 @@ def judge(
 _SEVERITY: tuple[Word, ...] = ("good", "unclear", "contradicted", "worse")
 
 
-def with_held_out(verdict: Verdict, held: HeldOutStructure) -> Verdict:
+def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verdict:
     """The verdict with the tests on held-out strips: the worse of the two words.
 
     Both the calibration in the file and the one without these strips are tested. Where walls and
-    poles test nothing, the strips alone decide.
+    poles test nothing, the strips alone decide. `before` says what "before" is.
     """
     if not held.tested:
         return replace(verdict, sentences=(*verdict.sentences, nothing_shared_sentence()))
     values = {stage: 1e3 * held.distance_m[stage] for stage in (BEFORE, AFTER)}
     better = values[BEFORE] / values[AFTER] if values[AFTER] > 0.0 else None
-    sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER])]
+    sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER], before)]
     contradicting = []
     for stage in (AFTER, WITHOUT):
         test = held.tests[stage]
@@ -163,12 +167,11 @@ def _tested(surfaces: Sequence[SurfaceResult]) -> list[tuple[SurfaceResult, Pair
 
 
 def _sentences(
-    values: Mapping[str, float],
-    expected: float,
-    better: float | None,
+    measured: tuple[Mapping[str, float], float, float | None, str],
     test: tuple[float, int, float | None, bool],
     found: tuple[Sequence[PairResult], Sequence[SurfaceResult], Sequence[ThingResult]],
 ) -> tuple[str, ...]:
+    values, expected, better, compared = measured
     shared, surfaces, things = found
     if not surfaces and not things:
         return (
@@ -188,7 +191,7 @@ def _sentences(
         if shared
         else f"No two LiDARs see the same surface. Each alone measures a thickness of {kinds} of"
     )
-    out = [f"{what} {after} after calibration, {before} before: {how} than the initial guess."]
+    out = [f"{what} {after} after calibration, {before} before: {how} than {compared}."]
     chi2, dof, p_value, contradicts = test
     ratio = values[AFTER] / expected
     remains = (

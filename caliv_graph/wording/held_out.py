@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 
-def held_out_sentence(strips: int, before_mm: float, after_mm: float) -> str:
-    """How far LiDARs are apart on held-out strips, with the guesses and with the calibration."""
+def held_out_sentence(strips: int, before_mm: float, after_mm: float, before: str) -> str:
+    """How far LiDARs are apart on held-out strips, before (`before_words`) and after."""
     return (
         f"On {strips} held-out strips of structure the LiDARs are {after_mm:.1f} mm apart with the "
-        f"calibration, {before_mm:.1f} mm with the initial guesses (root mean square)."
+        f"calibration, {before_mm:.1f} mm with {before} (root mean square)."
     )
 
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +14,22 @@ from caliv_graph.cli.main import app
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RecordingError
+from caliv_graph.pipeline import Look
 from caliv_graph.products import Recording, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.choice import Choose
 from caliv_graph.targets.search import FoundTarget
 from caliv_graph.trajectory.select import VehicleTrajectory
 from tests.cli.commands import write_config, write_drive
-from tests.readers.bags import SECOND, START, cloud, fix, imu, odometry, write_bag
+from tests.readers.bags import (
+    SECOND,
+    START,
+    cloud,
+    fix,
+    imu,
+    odometry,
+    packed_cloud,
+    write_bag,
+)
 
 
 def inspect(*arguments: object) -> Result:
@@ -52,8 +64,15 @@ def test_the_folder_itself_or_the_one_around_it(tmp_path: Path) -> None:
     assert outer["lidars"] == inner["lidars"]
 
 
-def test_guesses_that_nobody_filled_in(tmp_path: Path) -> None:
-    """The drive is shown, and the target is not searched for with the zeros of a draft."""
+def test_guesses_that_nobody_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The zeros of a draft are no guesses: the mountings are looked for."""
+    looked: list[Config] = []
+
+    def look(recording: Recording, config: Config, progress: Progress) -> Look:
+        looked.append(config)
+        return Look(None, (), ())
+
+    monkeypatch.setattr("caliv_graph.pipeline.look", look)
     zeros = {"initial": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 0]}}
     lidars = {name: {"topic": f"sensor_{n}", **zeros} for n, name in ((1, "left"), (2, "right"))}
     config = write_config(tmp_path / "config.yaml", lidars=lidars)
@@ -66,7 +85,7 @@ def test_guesses_that_nobody_filled_in(tmp_path: Path) -> None:
         f"warning: {config}: lidars.left.initial and lidars.right.initial are all zeros"
     )
     assert "errors of 0.1 m and 3 degrees are fine" in result.stderr
-    assert "not searched for" in result.stderr
+    assert [lidar.initial for lidar in looked[0].lidars.values()] == [None, None]
 
 
 def test_a_table(tmp_path: Path) -> None:
@@ -251,3 +270,97 @@ def test_a_bag_that_is_cut_off_is_named(tmp_path: Path) -> None:
 
     assert isinstance(result.exception, RecordingError)
     assert str(result.exception).startswith(f"{path}: the bag is cut off, damaged")
+
+
+def test_clouds_that_cannot_be_read_do_not_hide_the_rest(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "drive", frames=5)
+    for frame in (1, 2):
+        (drive / f"input/sensor_1/{frame}.pcd").write_text("VERSION .7")
+
+    result = inspect(drive, "--json")
+
+    assert result.exit_code == 0
+    lidars = json.loads(result.stdout)["lidars"]
+    assert [lidar["points"]["median"] for lidar in lidars.values()] == [4, 4]
+    assert "1.pcd: the header has no complete DATA line" in result.stderr
+    assert "In all 2 clouds of lidar 'sensor_1' cannot be read" in result.stderr
+
+
+def radar(stamp: int) -> dict[str, object]:
+    """A cloud in polar coordinates."""
+    return packed_cloud(stamp, {"range": (np.ones(5), "f4"), "azimuth": (np.ones(5), "f4")})
+
+
+def test_a_topic_of_other_clouds_does_not_hide_the_rest(tmp_path: Path) -> None:
+    stamps = [START + k * SECOND // 10 for k in range(20)]
+    messages = [*bag_messages(), *(("/radar/points", stamp, radar(stamp)) for stamp in stamps)]
+    page = tmp_path / "page.html"
+
+    result = inspect(write_bag(tmp_path / "drive", messages), "--json", "--html", page)
+
+    assert result.exit_code == 0
+    document = json.loads(result.stdout)
+    assert document["lidars"]["front"]["points"]["max"] == 21
+    assert document["lidars"]["radar"]["points"] is None
+    assert "x, y, z as float32 or float64 are needed" in result.stderr
+    assert page.exists()
+
+
+def scene_of_page(page: Path) -> dict[str, Any]:
+    text = page.read_text(encoding="utf-8")
+    (data,) = re.findall(r'<script type="application/json" id="data-scene">(.*?)</script>', text)
+    document: dict[str, Any] = json.loads(data)
+    return document
+
+
+@pytest.mark.parametrize("kind", ["folder", "bag"])
+def test_a_page_without_a_config(tmp_path: Path, kind: str) -> None:
+    """The names and mountings are those of the config that `init` would draft."""
+    if kind == "folder":
+        drive = write_drive(tmp_path / "drive", frames=5)
+    else:
+        messages = [m for m in bag_messages() if m[0] not in ("/imu", "/fix")]
+        drive = write_bag(tmp_path / "drive", messages)
+    page = tmp_path / "pages/drive.html"
+
+    result = inspect(drive, "--html", page)
+
+    assert result.exit_code == 0
+    assert f"Written to {page}" in " ".join(result.stdout.split())
+    assert result.stderr == ""
+    scene = scene_of_page(page)
+    names = ["sensor_1", "sensor_2"] if kind == "folder" else ["front"]
+    assert [lidar["name"] for lidar in scene["lidars"]] == names
+    assert all(lidar["origin"] == "mounting unknown" for lidar in scene["lidars"])
+    # 1 m per frame.
+    assert scene["path"][-1][0] - scene["path"][0][0] == pytest.approx(
+        4.0 if kind == "folder" else 19.0
+    )
+    for lidar in scene["lidars"]:
+        assert sum(count for count, _ in lidar["along"]["pieces"]) > 0
+
+
+def test_a_page_is_not_replaced_unless_it_is_to_be(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "drive")
+    page = tmp_path / "page.html"
+    page.write_text("mine")
+
+    refused, done = inspect(drive, "--html", page), inspect(drive, "--html", page, "--force")
+
+    assert "exists already. Give --force" in str(refused.exception)
+    assert refused.stdout == ""
+    assert done.exit_code == 0
+    assert page.read_text().startswith("<!DOCTYPE html>")
+
+
+def test_a_page_with_mountings_that_nobody_filled_in(tmp_path: Path) -> None:
+    lidars = {name: {"topic": f"sensor_{n}"} for n, name in ((1, "left"), (2, "right"))}
+    config = write_config(tmp_path / "config.yaml", lidars=lidars)
+    page = tmp_path / "page.html"
+
+    result = inspect(write_drive(tmp_path / "drive", frames=5), "--config", config, "--html", page)
+
+    assert result.exit_code == 0
+    assert "lidars.left.initial is not given" in result.stderr
+    for lidar in scene_of_page(page)["lidars"]:
+        assert (lidar["known"], lidar["xyz"]) == (False, [0.0, 0.0, 0.0])

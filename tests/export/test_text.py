@@ -19,6 +19,7 @@ from caliv_graph.export.text import (
     with_xml,
     without_notice,
 )
+from caliv_graph.products import Guess
 from tests.export.requests import T_VEHICLE_LIDAR, calibration_of, matrix_of, request
 from tests.samples import unseen
 
@@ -59,6 +60,13 @@ def test_caveats() -> None:
     never = unseen(calibration, "rear")
     assert caveats(request(never), ["rear"]) == [
         "LiDAR 'rear' saw neither target nor structure: it keeps the initial guess"
+    ]
+    found = Guess(T_VEHICLE_LIDAR["rear"], np.full(6, 0.2), found=True)
+    nobody = replace(never.lidars["rear"], guess=found)
+    never = replace(never, lidars={**never.lidars, "rear": nobody})
+    assert caveats(request(never), ["rear"]) == [
+        "LiDAR 'rear' saw neither target nor structure: no initial guess was given, so that its "
+        "values mean nothing"
     ]
     wrong = replace(calibration, status="inconsistent")
     assert "status inconsistent" in caveats(request(wrong), [])[0]

@@ -30,6 +30,7 @@ from caliv_graph.validation.findings import (
     Word,
 )
 from caliv_graph.validation.verdict import with_held_out
+from caliv_graph.wording.guesses import before_words
 from tests.report.test_html import EVIL
 
 PAIR = ("front", EVIL)
@@ -71,6 +72,9 @@ def verdict(p_value: float | None = 0.3) -> Verdict:
     return Verdict(word, 10.0, "distance", 0.9, 3.0, 3, p_value, False, ("Walls fit.",))
 
 
+GUESSES = before_words(PAIR, ())
+
+
 def validation(held: HeldOutStructure) -> Validation:
     nothing = np.zeros(0, dtype=np.int64)
     zero = dict.fromkeys(STAGES, 0.0)
@@ -85,7 +89,7 @@ def validation(held: HeldOutStructure) -> Validation:
         alone_m={stage: {} for stage in STAGES},
         expected_thickness_m=0.0,
         expected_alone_m={},
-        verdict=with_held_out(verdict(None), held),
+        verdict=with_held_out(verdict(None), held, GUESSES),
         clouds=Clouds(PAIR, nothing, nothing, {}, dict.fromkeys(PAIR, 10)),
         best=(),
         warnings=(),
@@ -111,6 +115,23 @@ def test_the_page_and_the_json_name_every_held_out_strip() -> None:
     validation_table(found, None, 0.001)
 
 
+def test_what_was_found_in_the_drive_is_not_called_a_guess() -> None:
+    """Of a LiDAR for which nobody gave one."""
+    words = before_words(PAIR, PAIR)
+    found = replace(validation(held_out()), before=words)
+    found = replace(found, verdict=with_held_out(verdict(None), held_out(), words))
+
+    page = render_validation(found, None, 0.001)
+
+    assert before_words(PAIR, PAIR[:1]) == (
+        f"the initial guesses, and what was found in the drive for {PAIR[0]}"
+    )
+    assert f"before: with {words}." in page
+    assert f"mm with {words} (root mean square)" in page
+    # How the calibration without the strips is begun stands in another sentence.
+    assert page.count("initial guess") == page.count("solved from the initial guesses")
+
+
 @pytest.mark.parametrize(
     ("after_m", "p", "walls", "word"),
     [
@@ -125,7 +146,7 @@ def test_the_page_and_the_json_name_every_held_out_strip() -> None:
 def test_the_worse_word_counts(
     after_m: float, p: tuple[float, float], walls: float | None, word: str
 ) -> None:
-    found = with_held_out(verdict(walls), held_out(after_m, p))
+    found = with_held_out(verdict(walls), held_out(after_m, p), GUESSES)
     assert found.word == word
     assert found.contradicts == (min(p) < 1e-7)
     assert ("do not explain" in found.reason) == found.contradicts
@@ -133,7 +154,7 @@ def test_the_worse_word_counts(
 
 def test_strips_that_no_two_lidars_see_change_no_verdict() -> None:
     held = replace(held_out(), strips=(held_strip(1, 0.0, shared=False),))
-    found = with_held_out(verdict(), held)
+    found = with_held_out(verdict(), held, GUESSES)
     assert (found.word, found.contradicts) == ("good", False)
     assert "tests nothing" in found.sentences[-1]
 

@@ -11,7 +11,7 @@ from rich.console import Console, RenderableType
 from caliv_graph.common.progress import SilentProgress, StageRecord
 from caliv_graph.products import Guess
 from caliv_graph.report.figures.uncertainty import sigma_figure
-from caliv_graph.report.html import move_rows
+from caliv_graph.report.html import move_rows, verdicts
 from caliv_graph.report.inspection import (
     DriveSummary,
     Inspection,
@@ -64,7 +64,17 @@ def test_a_guess_that_nobody_gave_is_not_compared_with() -> None:
 
     figure = sigma_figure(calibration)
 
+    blind = unseen(unseen(calibration, "front"), "rear")
+    said = rendered(calibration_table(blind, [], 1.0))
+
     assert [row["name"] for row in move_rows(calibration)] == ["front"]
+    saw = "saw neither target nor structure"
+    assert f"  - LiDAR 'front' {saw}: it keeps the initial guess" in said
+    assert any(f"'rear' {saw}: no initial guess was given" in line for line in said)
+    assert [unknown for _, _, unknown in verdicts(blind)] == [
+        "all six axes: nothing seen, the extrinsic is the guess",
+        "all six axes: nothing seen, no guess given",
+    ]
     assert figure is not None
     shown = {(t["name"], at) for t in figure.figure.data for at in t["x"]}
     assert ("initial guess", "front x") in shown

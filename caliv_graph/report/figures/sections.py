@@ -18,6 +18,7 @@ from caliv_graph.report.figures.uncertainty import (
 from caliv_graph.report.residuals import all_residuals
 from caliv_graph.results.run import RunRecord
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.wording.guesses import before_words
 
 MOST_SOLID = 2
 """Placements, and drives, that get a 3-D view: a browser draws about a dozen views at once."""
@@ -28,6 +29,7 @@ def report_figures(
 ) -> dict[str, list[Figure]]:
     """Per section its figures, in the order of the page; a section may be empty."""
     kinds = all_residuals(solution, record)
+    unguessed = [name for name, lidar in calibration.lidars.items() if lidar.without_guess]
     sections: dict[str, Sequence[Figure | None]] = {
         "extrinsics": [sigma_figure(calibration)],
         "observability": [spectrum_figure(solution), correlation_figure(calibration)],
@@ -41,7 +43,7 @@ def report_figures(
                 strip_figure(term, record.drives[term.drive])
                 for term in solution.structure[:MOST_SOLID]
             ),
-            thickness_figure(solution),
+            thickness_figure(solution, before_words(list(calibration.lidars), unguessed)),
         ],
         "weights": [weight_figure(solution, list(calibration.lidars))],
         "trajectory": _trajectories(calibration, solution, record),

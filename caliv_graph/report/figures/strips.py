@@ -74,20 +74,23 @@ def strip_figure(term: StructureTerm, name: str) -> Figure | None:
     )
 
 
-def thickness_figure(solution: Solution) -> Figure | None:
-    """Thickness of all strips before and after, as shares; None without strips."""
+def thickness_figure(solution: Solution, before: str) -> Figure | None:
+    """Thickness of all strips before and after, as shares; None without strips.
+
+    `before` says what that is.
+    """
     strips = used_strips(solution)
     if not strips:
         return None
     figure = _shares(
         {
-            "before: initial guess": ([s.before_m for s in strips], VERMILLION),
+            "before": ([s.before_m for s in strips], VERMILLION),
             "after": ([s.scatter_m for s in strips], BLUE),
         }
     )
     return Figure(
         "thickness",
-        "Share of the strips that are thinner than a value: with the initial guesses on the "
+        f"Share of the strips that are thinner than a value: with {before} on the "
         "trajectory of the motion data, and after the calibration.",
         figure,
     )
@@ -118,7 +121,7 @@ def held_out_figures(found: HeldOutStructure) -> list[Figure]:
     )
     shares = _shares(
         {
-            "before: initial guess": ([s.thickness_m[BEFORE] for s in strips], VERMILLION),
+            "before": ([s.thickness_m[BEFORE] for s in strips], VERMILLION),
             "after": ([s.thickness_m[AFTER] for s in strips], BLUE),
         }
     )

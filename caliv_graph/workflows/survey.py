@@ -29,7 +29,12 @@ from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
-from caliv_graph.pipeline import prepare, structure_evidence, without_anything
+from caliv_graph.pipeline import (
+    motions_of,
+    prepare,
+    structure_evidence,
+    without_anything,
+)
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -76,7 +81,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
-    motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    motions, config, notes = motions_of(recordings, config, progress)
     prepared = prepare(recordings, config, motions, progress)
     try:
         with threadpool_limits(limits=1):
@@ -94,6 +99,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
         found,
         names=tuple(recording.name for recording in recordings),
         warnings=(
+            *notes,
             *prepared.contradictions,
             *contradictions_of(prepared.findings),
             *prepared.warnings,

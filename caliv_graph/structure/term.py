@@ -229,6 +229,7 @@ def term_of_odometry(
         T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
         information=information,
         gradient=np.concatenate([np.zeros(size), b]),
+        odometry_of=odometry.lidar,
     )
 
 

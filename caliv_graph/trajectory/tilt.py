@@ -76,7 +76,8 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     """Roll and pitch of the vehicle's axes over a drive, least squares with priors."""
     begin, end = trajectory.span_ns
     count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
-    at = np.linspace(begin, end, count).astype(np.int64)
+    # From the beginning on: stamps of today are too large for double precision.
+    at = begin + np.linspace(0, end - begin, count).astype(np.int64)
     R, _ = trajectory.poses_at(at)
     R = R @ _as_configured(trajectory)
     up = R[:, 2, :]  # e_z of the map in vehicle axes

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from caliv_graph.calibration.assemble import evidence_of_terms
 from caliv_graph.calibration.no_target import solve_structure_and_ground
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
@@ -183,9 +184,8 @@ def _verdict(
     )
     unmet = unmet_requirements(covariance.calibration, config).unmet
     sightings, shared = _walls(state.structure, tuple(config.lidars))
-    return Survey(
-        (), named_prediction(covariance), scans, sightings, shared, unmet, tuple(warnings)
-    )
+    named = named_prediction(covariance, evidence_of_terms(state.structure, bool(scans)))
+    return Survey((), named, scans, sightings, shared, unmet, tuple(warnings))
 
 
 def _walls(

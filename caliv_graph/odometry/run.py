@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.interpolate import make_smoothing_spline
+from scipy.spatial.transform import Rotation
 
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import configured_guess, with_found_guess
@@ -182,7 +182,7 @@ def _poses(
     found: Track, lidar: str, T_vehicle_lidar: gtsam.Pose3, statement: VehicleStatement
 ) -> OdometryPoses:
     """The vehicle's poses, in a map that is the vehicle frame at the first scan."""
-    stamps, R, t = _between(found.stamps_ns, *stack(found.T_map_lidar))
+    stamps, R, t = _smooth(found.stamps_ns, *stack(found.T_map_lidar))
     own = unstack(R, t)
     back = T_vehicle_lidar.inverse()
     return OdometryPoses(
@@ -195,12 +195,20 @@ def _poses(
     )
 
 
-def _between(stamps_ns: IntArray, R: Array, t: Array) -> tuple[IntArray, Array, Array]:
-    """Stamps, rotations and translations with smooth velocities, at most `KNOT_NS` apart."""
+def _smooth(stamps_ns: IntArray, R: Array, t: Array) -> tuple[IntArray, Array, Array]:
+    """Stamps, rotations and translations of a smooth motion, at most `KNOT_NS` apart.
+
+    A pose is off by millimetres from scan to scan, and a sweep would be put together with what that
+    does to velocities. Cubic smoothing splines by generalised cross-validation, per axis and per
+    component of the quaternion, tell such noise from motion.
+    """
     begin = int(stamps_ns[0])
     seconds = (stamps_ns - begin) / NANOSECONDS_PER_SECOND
     count = math.ceil((int(stamps_ns[-1]) - begin) / KNOT_NS)
     at = np.unique(np.append(begin + KNOT_NS * np.arange(count, dtype=np.int64), stamps_ns))
     s = (at - begin) / NANOSECONDS_PER_SECOND
-    turns = RotationSpline(seconds, Rotation.from_matrix(R))(s)
-    return at, np.asarray(turns.as_matrix()), np.asarray(CubicSpline(seconds, t)(s))
+    q = Rotation.from_matrix(R).as_quat()
+    q *= np.cumprod(np.where(np.sum(q * np.roll(q, 1, axis=0), axis=1) < 0.0, -1.0, 1.0))[:, None]
+    axes = [make_smoothing_spline(seconds, axis)(s) for axis in (*q.T, *t.T)]
+    turned = Rotation.from_quat(np.stack(axes[:4], axis=1))
+    return at, np.asarray(turned.as_matrix()), np.stack(axes[4:], axis=1)

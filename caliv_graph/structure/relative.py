@@ -7,7 +7,7 @@ and put back into the term exactly (`README.md`, section 11a).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -16,7 +16,7 @@ import numpy as np
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config, FoundLidarConfig
 from caliv_graph.products import Array
-from caliv_graph.structure.solve import Problem, Solved
+from caliv_graph.structure.solve import Problem
 from caliv_graph.trajectory.odometry import OdometryPoses
 
 HELD_RAD, HELD_M = 1e-7, 1e-6
@@ -67,38 +67,29 @@ def relative_problem(
 def relative_quadratic(
     information: Array,
     gradient: Array,
-    found: Solved,
-    odometry: OdometryPoses,
-    height_m: float | None,
+    T_vehicle_lidar: Sequence[gtsam.Pose3],
+    tracked: int,
 ) -> tuple[Array, Array]:
-    """The LiDARs' places to each other out of a quadratic on all extrinsics, S2V by the statement.
+    """What a quadratic on n extrinsics says with one of them held, on the places to each other.
 
     Args:
-        information: (6 n, 6 n) of the solve of `relative_problem`, all poses eliminated; right
-            perturbations of T_vehicle_lidar.
+        information: (6 n, 6 n), right perturbations of T_vehicle_lidar; all poses eliminated.
         gradient: (6 n,).
-        found: that solve.
-        odometry: of which LiDAR, and what ground and direction of travel say of it.
-        height_m: of the vehicle frame above the ground; None: unknown.
+        T_vehicle_lidar: n, where it was linearised.
+        tracked: index of the LiDAR that is held.
 
     Returns:
-        The same with the tracked LiDAR no longer held: a common motion of all LiDARs changes
-        nothing but the statement's residuals.
+        Information and gradient on the same coordinates. A common motion of all LiDARs changes
+        nothing.
     """
-    T = found.state.T_vehicle_lidar
-    n, at = len(T), found.problem.patches.lidars.index(odometry.lidar)
-    tracked = 6 * at + np.arange(6)
-    others = np.setdiff1d(np.arange(6 * n), tracked)
+    T, n = T_vehicle_lidar, len(T_vehicle_lidar)
+    own = 6 * tracked + np.arange(6)
+    others = np.setdiff1d(np.arange(6 * n), own)
     # d of S_a = E^-1 T_a follows those of E and T_a: d_a - Ad(S_a^-1) d_E.
     B = np.eye(6 * n)
     for i in range(n):
-        if i != at:
-            B[6 * i : 6 * i + 6, tracked] = -T[i].between(T[at]).AdjointMap()
+        if i != tracked:
+            B[6 * i : 6 * i + 6, own] = -T[i].between(T[tracked]).AdjointMap()
     B = B[others]
     out = B.T @ information[np.ix_(others, others)] @ B
-    right = B.T @ gradient[others]
-    assert odometry.statement is not None
-    H, b = odometry.statement.gaussian(T[at], height_m)
-    out[np.ix_(tracked, tracked)] += H
-    right[tracked] += b
-    return 0.5 * (out + out.T), right
+    return 0.5 * (out + out.T), B.T @ gradient[others]

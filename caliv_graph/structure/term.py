@@ -217,8 +217,14 @@ def term_of_odometry(
 ) -> StructureTerm:
     """The term of a drive without motion data: it says nothing of the poses `kept` (m,)."""
     term = term_of(found, np.zeros(0, dtype=np.int64))
-    height = config.ground.vehicle_height
-    H, b = relative_quadratic(term.information, term.gradient, found, odometry, height)
+    names, T = found.problem.patches.lidars, found.state.T_vehicle_lidar
+    at = names.index(odometry.lidar)
+    H, b = relative_quadratic(term.information, term.gradient, T, at)
+    if odometry.statement is not None:
+        own = slice(6 * at, 6 * at + 6)
+        said, pull = odometry.statement.gaussian(T[at], config.ground.vehicle_height)
+        H[own, own] += said
+        b[own] += pull
     size = 6 * len(kept)
     information = np.zeros((size + len(b), size + len(b)))
     information[size:, size:] = H

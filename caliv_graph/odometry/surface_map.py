@@ -74,14 +74,15 @@ class SurfaceMap:
         self._centres[index] = centre
         self._normals[index] = np.where((side < 0.0)[:, None], -normal, normal)
 
-    def nearest(self, centres: Array, normals: Array) -> tuple[IntArray, Array, Array]:
+    def nearest(self, centres: Array, normals: Array) -> tuple[IntArray, Array, Array, int]:
         """Surfaces of patches at (n, 3), with normals (n, 3), map frame.
 
         Returns:
-            Indices (m,) of the patches that have one; centres (m, 3) and normals (m, 3) of these.
+            Indices (m,) of the patches that have one; centres (m, 3) and normals (m, 3) of these;
+            and how many have any surface near, whichever way it faces.
         """
         if self._tree is None or not len(centres):
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)), 0
         most = min(NEIGHBOURS, len(self._centres))
         found = self._tree.query(centres, k=most, distance_upper_bound=REACH_M)
         near = np.asarray(found[1]).reshape(len(centres), most)
@@ -91,7 +92,8 @@ class SurfaceMap:
         good = there & alike
         which = np.flatnonzero(good.any(axis=1))
         first = near[which, np.argmax(good[which], axis=1)]
-        return which, self._centres[first], self._normals[first]
+        around = int(there.any(axis=1).sum())
+        return which, self._centres[first], self._normals[first], around
 
 
 def _cells(centres: Array, normals: Array) -> IntArray:

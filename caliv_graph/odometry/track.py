@@ -60,6 +60,10 @@ acceleration above, more than the widest gate."""
 LEAST_SHARE = 0.3
 """Share of the patches with a surface near that must lie on it; less: track is lost."""
 
+MOST_SIGMAS = 10.0
+"""Change of velocity between two scans, in sigmas of the acceleration, that is none of a vehicle:
+30 m/s^2 and 15 rad/s^2."""
+
 BEGINNING = 10
 """Scans by which the velocity at the start is found; then all begins anew."""
 
@@ -92,11 +96,11 @@ def track(scans: Iterable[LidarScan], sigma_range_m: float, advance: Advance) ->
             points are invalid.
     """
     source = iter(scans)
-    first = [scan for scan, _ in zip(source, range(BEGINNING), strict=False)]
-    begun = _Tracker(sigma_range_m, np.zeros(6))
+    first = list(itertools.islice(source, BEGINNING))
+    begun = _Tracker(sigma_range_m, np.zeros(6), begun=False)
     for scan in first:
         begun.follow(scan)
-    tracker = _Tracker(sigma_range_m, begun.first_twist())
+    tracker = _Tracker(sigma_range_m, begun.first_twist(), begun=True)
     for scan in itertools.chain(first, source):
         tracker.follow(scan)
         advance()
@@ -109,13 +113,14 @@ def track(scans: Iterable[LidarScan], sigma_range_m: float, advance: Advance) ->
 class _Tracker:
     """Poses so far, and the map."""
 
-    def __init__(self, sigma_range_m: float, twist: Array) -> None:
-        """`twist` (6,) at the first scan, right perturbation per second."""
+    def __init__(self, sigma_range_m: float, twist: Array, begun: bool) -> None:
+        """`twist` (6,) at the first scan, right perturbation per second; `begun`: it is known."""
         self.stamps_ns: list[int] = []
         self.poses: list[gtsam.Pose3] = []
         self.patches: list[ScanPatches] = []
         self._sigma_range_m = sigma_range_m
         self._twist = twist
+        self._begun = begun
         self._map = SurfaceMap()
         self._key = gtsam.Pose3()
         self._weak_since_ns: int | None = None
@@ -145,8 +150,8 @@ class _Tracker:
         else:
             seconds = (scan.stamp_ns - self.stamps_ns[-1]) / NANOSECONDS_PER_SECOND
             predicted = self.poses[-1].retract(seconds * self._twist)
-            pose, weak, share = self._registered(predicted, patches, seconds)
-            self._judge(scan.stamp_ns, weak, share)
+            pose, fit = self._registered(predicted, patches, seconds)
+            self._judge(scan.stamp_ns, fit)
             self._twist = gtsam.Pose3.Logmap(self.poses[-1].between(pose)) / seconds
             moved = gtsam.Pose3.Logmap(self._key.between(pose))
             if (
@@ -159,9 +164,7 @@ class _Tracker:
                 self._insert(pose, patches)
         self.stamps_ns.append(scan.stamp_ns)
         self.poses.append(pose)
-        step = max(len(patches.time_s) / MOST_PATCHES, 1.0)
-        part = np.arange(0.0, len(patches.time_s), step).astype(np.int64)
-        self.patches.append(patches.part(part))
+        self.patches.append(_thinned(patches))
 
     def finish(self) -> None:
         """Checks what only the end shows.
@@ -172,15 +175,19 @@ class _Tracker:
         if len(self.poses) < BEGINNING:
             raise TrajectoryError(f"{len(self.poses)} scans are too few to track a LiDAR")
 
-    def _judge(self, stamp_ns: int, weak: bool, share: float) -> None:
+    def _judge(self, stamp_ns: int, fit: _Fit) -> None:
         """Raises TrajectoryError where the motion is lost."""
         after_s = (stamp_ns - self.stamps_ns[0]) / NANOSECONDS_PER_SECOND
-        if share < LEAST_SHARE:
+        if fit.share < LEAST_SHARE:
             raise TrajectoryError(
-                f"track is lost {after_s:.1f} s after the start: {100.0 * share:.0f} % of the flat "
-                "surfaces lie on those seen before"
+                f"track is lost {after_s:.1f} s after the start: {100.0 * fit.share:.0f} % of the "
+                "flat surfaces lie on those seen before"
             )
-        if not weak:
+        if fit.sigmas > MOST_SIGMAS and self._begun:
+            raise TrajectoryError(
+                f"track is lost {after_s:.1f} s after the start: it jumps as no vehicle moves"
+            )
+        if not fit.weak:
             self._weak_since_ns = None
             return
         if self._weak_since_ns is None:
@@ -213,41 +220,68 @@ class _Tracker:
 
     def _registered(
         self, predicted: gtsam.Pose3, patches: ScanPatches, seconds: float
-    ) -> tuple[gtsam.Pose3, bool, float]:
-        """The pose of a scan, whether a direction is open, and the share of patches that fit."""
-        step = max(len(patches.time_s) / MOST_PATCHES, 1.0)
-        patches = patches.part(np.arange(0.0, len(patches.time_s), step).astype(np.int64))
-        R, t = _sweep(patches.time_s, self._twist)
-        centres = (
-            np.einsum("nij,nj->ni", R, patches.moments[:, :3, 3] / patches.moments[:, 3:, 3]) + t
-        )
-        normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
-        prior = np.repeat([ACCELERATION_RAD_S2 * seconds, 0.0], 3)
-        prior[3:] = 0.5 * ACCELERATION_M_S2 * seconds**2
-        prior[:3] = 0.5 * ACCELERATION_RAD_S2 * seconds**2
-        pose, facing, share = predicted, np.zeros((6, 6)), 0.0
+    ) -> tuple[gtsam.Pose3, _Fit]:
+        """The pose of a scan, `seconds` after the last one, and how well it is known.
+
+        The sweep is put together with the velocity since the last scan, anew in every step. With
+        that of the step before, errors of poses would feed back with a factor of minus one.
+        """
+        patches = _thinned(patches)
+        own = patches.moments[:, :3, 3] / patches.moments[:, 3:, 3]
+        unit = np.array([ACCELERATION_RAD_S2] * 3 + [ACCELERATION_M_S2] * 3)
+        prior = 0.5 * unit * seconds**2
+        ahead = 1.0 + patches.time_s / seconds
+        pose, twist, facing, share = predicted, self._twist, np.zeros((6, 6)), 0.0
         for k in range(STEPS):
+            R, t = _sweep(patches.time_s, twist)
+            centres = np.einsum("nij,nj->ni", R, own) + t
+            normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
             gate = FIRST_GATE_M * (LAST_GATE_M / FIRST_GATE_M) ** min(k / (STEPS // 2), 1.0)
             R_map, t_map = pose.rotation().matrix(), pose.translation()
             in_map = centres @ R_map.T + t_map
-            which, surface, normal = self._map.nearest(in_map, normals @ R_map.T)
+            which, surface, normal, around = self._map.nearest(in_map, normals @ R_map.T)
             r = np.einsum("ni,ni->n", normal, in_map[which] - surface)
             sigma = max(gate / 3.0, PATCH_SIGMA_M)
             w = np.where(np.abs(r) < gate, 1.0 / (1.0 + (r / sigma) ** 2) ** 2, 0.0)
             J = point_to_plane(R_map, centres[which], normal)
             facing = J.T @ (w[:, None] * J)
-            share = float((np.abs(r) < gate).mean()) if len(r) else 0.0
+            share = float((np.abs(r) < gate).sum()) / max(around, 1)
+            # The velocity follows the pose, and a patch at the end of the sweep moves twice as far.
+            J = J * ahead[which, None]
             away = gtsam.Pose3.Logmap(predicted.between(pose))
-            H = facing / PATCH_SIGMA_M**2 + np.diag(prior**-2.0)
+            H = J.T @ (w[:, None] * J) / PATCH_SIGMA_M**2 + np.diag(prior**-2.0)
             b = -J.T @ (w * r) / PATCH_SIGMA_M**2 - away / prior**2
             d = np.linalg.solve(H, b)
             pose = pose.retract(d)
+            twist = gtsam.Pose3.Logmap(self.poses[-1].between(pose)) / seconds
             if k > STEPS // 2 and np.abs(d).max() < SMALL_STEP:
                 break
         # About the LiDAR rotation and translation hardly mix; what both leave open shows here, too.
-        unit = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
-        weak = float(np.linalg.eigvalsh(facing * np.outer(unit, unit))[0]) < FEWEST_FACING
-        return pose, weak, share
+        scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
+        least = float(np.linalg.eigvalsh(facing * np.outer(scale, scale))[0])
+        away = gtsam.Pose3.Logmap(predicted.between(pose))
+        return pose, _Fit(least < FEWEST_FACING, share, float(np.abs(away / prior).max()))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How well a scan lies on the map.
+
+    Attributes:
+        weak: whether the surfaces leave a direction open.
+        share: of the patches with a surface near, those that lie on it.
+        sigmas: of what velocities change between two scans.
+    """
+
+    weak: bool
+    share: float
+    sigmas: float
+
+
+def _thinned(patches: ScanPatches) -> ScanPatches:
+    """At most `MOST_PATCHES`, an even part."""
+    step = max(len(patches.time_s) / MOST_PATCHES, 1.0)
+    return patches.part(np.arange(0.0, len(patches.time_s), step).astype(np.int64))
 
 
 def _sweep(times_s: Array, twist: Array) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from caliv_graph.products import Array, LidarScan, MotionData, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 
 SWEEP_S = 0.1
+PERIOD_NS = 200_000_000
 BEGIN_NS = 1_750_000_000_012_345_678
 
 WALLS = ((16.0, 0.1), (14.0, 1.7), (17.0, 3.0), (13.0, 4.8))
@@ -43,7 +44,7 @@ def beams(rng: np.random.Generator, channels: int = 40, columns: int = 180) -> A
 class RoomDrive:
     """A recording without motion data; every point at its own time.
 
-    `walls` may be fewer; LiDARs are stamped 0.1 s apart, one `phase_s` after the others.
+    `walls` may be fewer; LiDARs are stamped 0.2 s apart, one `phase_s` after the others.
     """
 
     mountings: Mapping[str, gtsam.Pose3]
@@ -59,7 +60,7 @@ class RoomDrive:
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         begin, end = self.way.span_ns
         first = begin + round(1e9 * self.phase_s.get(lidar, 0.0))
-        return list(range(first, end - 100_000_000, 100_000_000))
+        return list(range(first, end - 100_000_000, PERIOD_NS))
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp in self.scan_stamps_ns(lidar):

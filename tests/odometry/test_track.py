@@ -78,7 +78,9 @@ def test_two_faces_of_a_thin_wall_stay_two_surfaces() -> None:
     normals = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     known = SurfaceMap()
     known.add(np.array(faces), normals, np.eye(3), np.zeros(3))
-    which, centres, found, around = known.nearest(np.array([[0.1, 0.5, 0.5], [0.0, 0.5, 0.5]]), normals)
+    which, centres, found, around = known.nearest(
+        np.array([[0.1, 0.5, 0.5], [0.0, 0.5, 0.5]]), normals
+    )
     assert which.tolist() == [0, 1]
     assert around == 2
     np.testing.assert_allclose(centres[:, 0], [0.0, 0.1], atol=1e-9)

@@ -309,7 +309,9 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
     except CalivError as error:
         problems.append(str(error))
     try:
-        motions, config, notes = motions_of([recording], config, progress)
+        motions, config, notes = completed_motions(
+            [recording], config, {0: recording.motion()}, progress
+        )
         findings = raw = raw_findings(motions, config)
         if any(found.severity == "fatal" for found in findings):
             return Look(None, findings, tuple(problems), notes)

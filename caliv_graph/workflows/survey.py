@@ -31,7 +31,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
 from caliv_graph.pipeline import (
-    motions_of,
+    completed_motions,
     prepare,
     structure_evidence,
     without_anything,
@@ -82,7 +82,8 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
-    motions, config, notes = motions_of(recordings, config, progress)
+    read = {i: recording.motion() for i, recording in enumerate(recordings)}
+    motions, config, notes = completed_motions(recordings, config, read, progress)
     prepared = prepare(recordings, config, motions, progress)
     try:
         with threadpool_limits(limits=1):

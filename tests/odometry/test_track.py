@@ -12,6 +12,7 @@ import pytest
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.odometry.surface_map import SurfaceMap, point_to_plane
 from caliv_graph.odometry.track import track
+from caliv_graph.products import Array
 from tests.odometry.room_drive import RoomDrive, s_curve
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, 0.1, 0.5), np.array([1.5, 0.3, 1.8]))
@@ -59,8 +60,9 @@ def test_derivatives_of_the_distance_from_a_surface() -> None:
     T = gtsam.Pose3.Expmap(rng.normal(size=6))
     points, normals, centres = rng.normal(size=(3, 5, 3))
 
-    def residual(pose: gtsam.Pose3) -> np.ndarray:
-        return np.einsum("ni,ni->n", normals, pose.transformFrom(points.T).T - centres)
+    def residual(pose: gtsam.Pose3) -> Array:
+        moved = pose.transformFrom(points.T).T
+        return np.asarray(np.einsum("ni,ni->n", normals, moved - centres))
 
     J = point_to_plane(T.rotation().matrix(), points, normals)
     h = 1e-6

@@ -151,18 +151,14 @@ def prepare(
     kept = kept_stamps(patches)
     if no_target is not None and not kept:
         raise no_target
-    grounds: tuple[GroundObservation, ...] = ()
+    grounds: Sequence[GroundObservation] = ()
     ground_warnings: Sequence[str] = ()
+    others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}
     # Without motion data the ground is in the structure, and in how the vehicle stands on it.
     if not any(isinstance(motion.poses, OdometryPoses) for motion in motions.values()):
+        kept_ns = None if observations else kept
         grounds, ground_warnings = measure_grounds(
-            recordings,
-            rough,
-            observations,
-            config,
-            progress,
-            others={patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)},
-            kept_ns=None if observations else kept,
+            recordings, rough, observations, config, progress, others, kept_ns
         )
     with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)

@@ -34,6 +34,12 @@ tyre has 3 degrees or less at its own load sideways)."""
 LEAST_COURSE_RAD = 1e-3
 """Minimum scatter of a sample of the course: 1 mm over a metre."""
 
+FIRST_RAD = 0.1
+"""The same before the first fit."""
+
+ROUNDS = 5
+"""Of fitting and weighing; the lever enters by a sine, the weights by the residuals."""
+
 GROUND_SCANS = 60
 """Scans in which the ground is looked for first."""
 
@@ -157,24 +163,9 @@ def course_of(found: Track, R_level_lidar: Array, forward_rad: float | None) -> 
         forward_rad: roughly where the vehicle's x axis is in level axes; None: where most of the
             way goes.
     """
-    stamps = found.stamps_ns
-    R, t = stack(found.T_map_lidar)
-    R0 = R_level_lidar
-    yaw = np.unwrap(np.arctan2(*((R0 @ R @ R0.T)[:, [1, 0], 0].T)))
-    place = t @ R0.T
-    at = np.arange(stamps[0] + CLIMB_WINDOW_NS, stamps[-1] - CLIMB_WINDOW_NS, STEP_NS)
-
-    def there(times: Array, values: Array) -> Array:
-        return np.interp(times - float(stamps[0]), (stamps - stamps[0]).astype(float), values)
-
-    before, after = at - CLIMB_WINDOW_NS, at + CLIMB_WINDOW_NS
-    moved = [there(after, place[:, i]) - there(before, place[:, i]) for i in (0, 1)]
-    path, turned = np.hypot(*moved), there(after, yaw) - there(before, yaw)
-    driving = path > MIN_SPEED_M_S * 2e-9 * CLIMB_WINDOW_NS
-    if not driving.any():
+    heading, path, turned = _driven(found, R_level_lidar)
+    if not len(path):
         return Course(forward_rad or 0.0, math.inf, 0.0)
-    heading = np.arctan2(moved[1], moved[0]) - there(at, yaw)
-    heading, path, turned = heading[driving], path[driving], turned[driving]
     axis = 0.5 * float(np.angle((path * np.exp(2j * heading)).sum()))
     if forward_rad is not None:
         axis = forward_rad
@@ -183,18 +174,51 @@ def course_of(found: Track, R_level_lidar: Array, forward_rad: float | None) -> 
         axis, ahead = axis + math.pi, ~ahead
     curvature = np.where(ahead, turned, -turned) / path
     off = (heading - axis + np.where(ahead, 0.0, math.pi) + math.pi) % (2.0 * math.pi) - math.pi
+    angle, sigma, ahead_m = _at_no_curvature(off, curvature)
+    return Course(axis + angle, sigma, ahead_m)
+
+
+def _driven(found: Track, R_level_lidar: Array) -> tuple[Array, Array, Array]:
+    """Course in level axes of a LiDAR (rad), way (m) and turn (rad) in windows in which it moves.
+
+    (k,) each; the axes turn with the LiDAR.
+    """
+    stamps = found.stamps_ns
+    R, t = stack(found.T_map_lidar)
+    R_level = R_level_lidar @ R @ R_level_lidar.T
+    yaw, place = np.unwrap(np.arctan2(R_level[:, 1, 0], R_level[:, 0, 0])), t @ R_level_lidar.T
+    at = np.arange(stamps[0] + CLIMB_WINDOW_NS, stamps[-1] - CLIMB_WINDOW_NS, STEP_NS)
+
+    def there(times: Array, values: Array) -> Array:
+        return np.asarray(np.interp(times - stamps[0], stamps - stamps[0], values))
+
+    before, after = at - CLIMB_WINDOW_NS, at + CLIMB_WINDOW_NS
+    x, y = (there(after, place[:, i]) - there(before, place[:, i]) for i in (0, 1))
+    path, turned = np.hypot(x, y), there(after, yaw) - there(before, yaw)
+    driving = path > MIN_SPEED_M_S * 2.0 * CLIMB_WINDOW_NS / NANOSECONDS_PER_SECOND
+    heading = np.arctan2(y, x) - there(at, yaw)
+    return heading[driving], path[driving], turned[driving]
+
+
+def _at_no_curvature(course_rad: Array, curvature: Array) -> tuple[float, float, float]:
+    """The course at zero curvature and 1 sigma (rad), and the lever ahead (m) that bends it.
+
+    Args:
+        course_rad: (k,) near zero.
+        curvature: (k,) 1/m.
+    """
     alike = CORRELATED_S / (STEP_NS / NANOSECONDS_PER_SECOND)
-    found_m, angle, sigma = 0.0, 0.0, math.inf
-    for _ in range(5):
-        bent = np.arcsin(np.clip(found_m * curvature, -0.9, 0.9))
+    lever_m, angle, sigma = 0.0, 0.0, math.inf
+    for _ in range(ROUNDS):
+        bent = np.arcsin(np.clip(lever_m * curvature, -0.9, 0.9))
         slope = curvature / np.cos(bent)
-        A = np.stack([np.ones(len(off)), slope], axis=1)
-        y = off - bent + slope * found_m
-        left = y - A @ [angle, found_m] if math.isfinite(sigma) else np.full(len(y), 0.1)
+        A = np.stack([np.ones(len(slope)), slope], axis=1)
+        y = course_rad - bent + slope * lever_m
+        left = y - A @ [angle, lever_m] if math.isfinite(sigma) else np.full(len(y), FIRST_RAD)
         # The median: where a curvature begins, or wheels jump, the course is another one.
         noise = max(1.48 * float(np.median(np.abs(left))), LEAST_COURSE_RAD)
         weight = 1.0 / (1.0 + (left / (3.0 * noise)) ** 2) ** 2 / (noise**2 * alike)
         H = (A * weight[:, None]).T @ A + np.diag([0.0, REACH_M**-2.0])
-        angle, found_m = np.linalg.solve(H, (A * weight[:, None]).T @ y).tolist()
+        angle, lever_m = np.linalg.solve(H, (A * weight[:, None]).T @ y).tolist()
         sigma = math.sqrt(float(np.linalg.inv(H)[0, 0]))
-    return Course(axis + angle, sigma, found_m)
+    return angle, sigma, lever_m

@@ -52,6 +52,7 @@ known to 60 mm. Of 500 patches of the ground alone, whose normals are known to 2
 horizontal one by their noise."""
 
 LEVER_M = 10.0
+"""A rotation counts as the motion that it gives a point at this range, typical of walls."""
 
 MOST_WEAK_S = 1.0
 """Time that constant velocity may bridge where the surfaces leave a direction open: 1.5 m at the

@@ -26,6 +26,7 @@ from caliv_graph.errors import CalivError, TargetError, TrajectoryError
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.mounting.place import Placement, place_lidars
+from caliv_graph.odometry.run import with_odometry
 from caliv_graph.physics import (
     check_clouds,
     contradicted,
@@ -55,8 +56,10 @@ from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
+from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.wording.mounting import placement_sentence
+from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
 from caliv_graph.wording.suspects import motion_sentence
 
@@ -88,6 +91,39 @@ class Prepared:
     no_target: TargetError | None = None
 
 
+def motions_of(
+    recordings: Sequence[Recording], config: Config, progress: Progress
+) -> tuple[dict[int, MotionData], Config, tuple[str, ...]]:
+    """The motion data of drives; by the odometry of a LiDAR where nothing else was recorded.
+
+    Returns:
+        The motion data by the index of the drive; the config for them; what to tell the user.
+
+    Raises:
+        CalivError: something is wrong with the input; the message says what to do.
+    """
+    with progress.stage("reading the motion data", None):
+        motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    return completed_motions(recordings, config, motions, progress)
+
+
+def completed_motions(
+    recordings: Sequence[Recording],
+    config: Config,
+    motions: Mapping[int, MotionData],
+    progress: Progress,
+) -> tuple[dict[int, MotionData], Config, tuple[str, ...]]:
+    """`motions_of` from motion data that have been read."""
+    motions, used, placements = with_odometry(recordings, config, motions, progress)
+    odometry = [m.poses for m in motions.values() if isinstance(m.poses, OdometryPoses)]
+    if not odometry:
+        return motions, config, ()
+    notes = [odometry_sentence(o.lidar, o.statement, config) for o in odometry[:1] if o.statement]
+    notes += map(placement_sentence, placements)
+    # Clouds of a target have no pose that is known without them.
+    return motions, used.model_copy(update={"target": False}), tuple(notes)
+
+
 def prepare(
     recordings: Sequence[Recording],
     config: Config,
@@ -115,15 +151,15 @@ def prepare(
     kept = kept_stamps(patches)
     if no_target is not None and not kept:
         raise no_target
-    grounds, ground_warnings = measure_grounds(
-        recordings,
-        rough,
-        observations,
-        config,
-        progress,
-        others={patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)},
-        kept_ns=None if observations else kept,
-    )
+    grounds: Sequence[GroundObservation] = ()
+    ground_warnings: Sequence[str] = ()
+    others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}
+    # Without motion data the ground is in the structure, and in how the vehicle stands on it.
+    if not any(isinstance(motion.poses, OdometryPoses) for motion in motions.values()):
+        kept_ns = None if observations else kept
+        grounds, ground_warnings = measure_grounds(
+            recordings, rough, observations, config, progress, others, kept_ns
+        )
     with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
         del rough  # a graph of its own, which nobody asks any more
@@ -275,14 +311,16 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
     except CalivError as error:
         problems.append(str(error))
     try:
-        motions = {0: recording.motion()}
+        motions, config, notes = completed_motions(
+            [recording], config, {0: recording.motion()}, progress
+        )
         findings = raw = raw_findings(motions, config)
         if any(found.severity == "fatal" for found in findings):
-            return Look(None, findings, tuple(problems))
+            return Look(None, findings, tuple(problems), notes)
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         (trajectory,) = trajectories
         config, placements = place_lidars([recording], trajectories, config, progress)
-        notes = tuple(map(placement_sentence, placements))
+        notes += tuple(map(placement_sentence, placements))
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
         near, misplaced, observations = _targets([recording], trajectories, config, progress)
@@ -348,10 +386,9 @@ def _calibrate(
     """One statement per stage; see `calibrate`."""
     # The report shows the scans as they are read; nothing is read for it.
     recordings = sampled = [SampledRecording(recording) for recording in recordings]
-    with progress.stage("reading the motion data", None):
-        motions = {i: recording.motion() for i, recording in enumerate(recordings)}
-        digests = [drive_digest(motion) for motion in motions.values()]
-    guessed = config if prior is None else starting_from(config, prior, digests)
+    motions, used, notes = motions_of(recordings, config, progress)
+    digests = [drive_digest(motion) for motion in motions.values()]
+    guessed = used if prior is None else starting_from(used, prior, digests)
 
     prepared = prepare(recordings, guessed, motions, progress)
     try:
@@ -383,7 +420,7 @@ def _calibrate(
         )
         calibration, conflicts = with_prior(calibration, prior, config)
 
-    warnings = (*prepared.warnings, *solution.warnings, *doubts, *conflicts)
+    warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts)
     record = RunRecord(
         drives=tuple(Path(recording.name).absolute().name for recording in recordings),
         trajectories=trajectories,

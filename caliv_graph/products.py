@@ -364,6 +364,8 @@ class StructureTerm:
         offset_m: 1 sigma of the offset of a strip in a scan, estimated.
         ground: LiDARs whose ground is in it, and the vehicle's stand on it if that is known.
         warnings: for the user, a line each.
+        odometry_of: the LiDAR by whose odometry the poses are known, and of whose mounting ground
+            and direction of travel alone tell the rotation; empty: there are motion data.
     """
 
     drive: int
@@ -378,6 +380,7 @@ class StructureTerm:
     offset_m: float
     ground: frozenset[str] = frozenset()
     warnings: tuple[str, ...] = ()
+    odometry_of: str = ""
 
 
 @dataclass(frozen=True)

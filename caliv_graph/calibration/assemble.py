@@ -54,7 +54,7 @@ def assemble(
             solution.held,
         ),
         solution.T_vehicle_lidar,
-        _evidence(solution),
+        evidence_of_terms(solution.structure, bool(solution.registrations)),
     )
     uncertainty = same_as_parameters(
         uncertainty, solution.information_data, solution.information_knowing
@@ -83,11 +83,13 @@ def assemble(
     return unmet_requirements(result, config)
 
 
-def _evidence(solution: Solution) -> Evidence:
-    """What the LiDARs of a solution saw."""
-    if not lidars_with_structure(solution.structure):
+def evidence_of_terms(terms: Sequence[StructureTerm], target: bool) -> Evidence:
+    """What the LiDARs saw: structure by its terms, a `target` or none."""
+    if not lidars_with_structure(terms):
         return "target"
-    return "both" if solution.registrations else "structure"
+    if any(term.odometry_of for term in terms):
+        return "odometry"
+    return "both" if target else "structure"
 
 
 def _without_trust(solution: Solution, guesses: Mapping[str, Guess]) -> tuple[Array, Array | None]:
@@ -164,6 +166,18 @@ def _scans_used(solution: Solution) -> dict[str, int]:
     return out
 
 
+def _motion(solution: Solution) -> dict[str, str]:
+    """What the poses are by, where there are no motion data."""
+    tracked = [term.odometry_of for term in solution.structure if term.odometry_of]
+    if not tracked:
+        return {}
+    text = (
+        f"odometry of lidar '{tracked[0]}'; S2V roll and pitch by the ground's normal, yaw by the "
+        "direction of travel, x and y by the guess alone"
+    )
+    return {"motion": text}
+
+
 def _provenance(
     config: Config, recordings: Sequence[Recording], solution: Solution, digests: Sequence[str]
 ) -> dict[str, object]:
@@ -177,6 +191,7 @@ def _provenance(
         "robust_kernel": config.robust.kernel,
         "recordings": [Path(r.name).absolute().name for r in recordings],
         **({DRIVES: list(digests)} if digests else {}),
+        **_motion(solution),
         **({} if solution.pose_noise is None else {"pose_noise": asdict(solution.pose_noise)}),
         "registration_scale": solution.registration_scale,
         "iterations": solution.iterations,

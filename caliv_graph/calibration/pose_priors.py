@@ -27,6 +27,15 @@ from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
+WALK_RAD, WALK_M = 1e-3, 0.02
+"""Random walk of the odometry of a LiDAR over 0.1 s, 1 sigma per axis: several times what a scan
+is laid on the map with where walls face it, and what constant velocity may be off in the middle
+between two scans. Structure, which sees the same scans, shall decide alone: the prior only ties
+LiDARs to each other whose stamps lie between those of others, and bridges scans that see little."""
+
+GAUGE_RAD, GAUGE_M = 1e-5, 1e-4
+"""Of the first pose of an odometry, which is the origin of its map."""
+
 
 def pose_priors(
     trajectories: Sequence[VehicleTrajectory],
@@ -54,6 +63,8 @@ def pose_priors(
         trajectory = trajectories[drive]
         if isinstance(trajectory, SmoothedTrajectory):
             out[drive] = _smoothed(trajectory, stamps, heave_m, priors)
+        elif isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
+            out[drive] = odometry_prior(trajectory, stamps)
         elif isinstance(trajectory, GivenTrajectory):
             out[drive] = _given(trajectory, stamps, noise, config)
     return out
@@ -126,6 +137,38 @@ def _given(
         T_map_vehicle=unstack(R, t),
         parameters={},
         information=information.reshape(6 * m, 6 * m),
+        gradient=np.zeros(6 * m),
+        parameter_information=np.zeros((0, 0)),
+        parameter_offset=np.zeros(0),
+    )
+
+
+def odometry_prior(trajectory: GivenTrajectory, stamps_ns: IntArray) -> PosePrior:
+    """A random walk from pose to pose, as loose as that nothing but what stands still counts.
+
+    The motion from one pose to the next is that of the odometry to `WALK_RAD` and `WALK_M`. It is
+    held for the vehicle frame that the odometry was given, so its information is used with the
+    mounting of the tracked LiDAR held alone (`structure.relative`).
+    """
+    stamps = np.asarray(stamps_ns, np.int64)
+    R, t = trajectory.poses_at(stamps)
+    poses = unstack(R, t)
+    m = len(stamps)
+    information = np.zeros((6 * m, 6 * m))
+    unit = np.repeat([WALK_RAD, WALK_M], 3)
+    information[:6, :6] = np.diag(np.repeat([GAUGE_RAD, GAUGE_M], 3) ** -2.0)
+    for i in range(m - 1):
+        steps = (stamps[i + 1] - stamps[i]) / NANOSECONDS_PER_SECOND / 0.1
+        weight = np.diag(unit**-2.0 / steps)
+        # Log(Z^-1 X_i^-1 X_j) = d_j - Ad(X_j^-1 X_i) d_i
+        J = np.hstack([-poses[i + 1].between(poses[i]).AdjointMap(), np.eye(6)])
+        both = slice(6 * i, 6 * i + 12)
+        information[both, both] += J.T @ weight @ J
+    return PosePrior(
+        stamps_ns=stamps,
+        T_map_vehicle=poses,
+        parameters={},
+        information=information,
         gradient=np.zeros(6 * m),
         parameter_information=np.zeros((0, 0)),
         parameter_offset=np.zeros(0),

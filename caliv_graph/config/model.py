@@ -546,6 +546,11 @@ class Config(Section):
                 raise ValueError(f"topic '{topic}' belongs to more than one LiDAR")
         return self
 
+    def names_motion(self) -> bool:
+        """Whether the config names anything that measures the vehicle's motion."""
+        topics = any(topic is not None for _, topic in self.topics)
+        return topics or self.data.poses is not None or self.data.format == "caliv"
+
     def lidar_order(self) -> tuple[str, ...]:
         """LiDAR names in the order of the file."""
         return tuple(self.lidars)

@@ -21,7 +21,8 @@ from caliv_graph.geometry.se3 import (
     retract_vehicle_axes,
     vehicle_axes_difference,
 )
-from caliv_graph.products import Array, Calibration, DataTerm, Guess, MotionData
+from caliv_graph.products import Array, Calibration, DataTerm, GivenPoses, Guess, MotionData
+from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.uncertainty.observability import (
     covariance_with_prior_in_null_space,
     scaling,
@@ -54,7 +55,12 @@ def drive_digest(motion: MotionData) -> str:
         motion: motion data of the recording; its name is left out.
     """
     digest = hashlib.sha256()
-    _feed(digest, replace(motion, name=""))
+    motion = replace(motion, name="")
+    if isinstance(motion.poses, OdometryPoses):
+        # Without what the guess of the mounting makes of them.
+        own = GivenPoses(motion.poses.stamps_ns, motion.poses.T_map_lidar)
+        motion = replace(motion, poses=own)
+    _feed(digest, motion)
     return digest.hexdigest()
 
 

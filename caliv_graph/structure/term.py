@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -17,6 +18,12 @@ from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.read import level
+from caliv_graph.structure.relative import (
+    held_sigmas,
+    relative_problem,
+    relative_quadratic,
+    start_about,
+)
 from caliv_graph.structure.solve import (
     Problem,
     Solved,
@@ -31,7 +38,8 @@ from caliv_graph.structure.thickness import (
     thickness_at_guesses,
 )
 from caliv_graph.structure.views import views_of
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.trajectory.odometry import OdometryPoses
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 
 
 def structure_terms(
@@ -60,6 +68,9 @@ def structure_terms(
     Raises:
         SolveError: a system is singular.
     """
+    odometry = odometry_of(trajectories)
+    if odometry is not None:
+        start = start_about(odometry, start, config)
     aligned = aligned_start(patches, trajectories, start, config)
     out = []
     for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
@@ -67,10 +78,24 @@ def structure_terms(
         if not len(used.scan):
             continue
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
+        if odometry is not None:
+            problem = relative_problem(problem, odometry, aligned, config)
         found = solve_structure(problem, aligned)
-        if found is not None:
-            out.append(term_of(found, np.searchsorted(prior.stamps_ns, kept)))
+        if found is None:
+            continue
+        places = np.searchsorted(prior.stamps_ns, kept)
+        own_odometry = odometry_of([trajectory])
+        if own_odometry is None:
+            out.append(term_of(found, places))
+        else:
+            out.append(term_of_odometry(found, places, own_odometry, config))
     return tuple(out)
+
+
+def odometry_of(trajectories: Sequence[VehicleTrajectory]) -> OdometryPoses | None:
+    """The odometry of the first drive that has one; None: motion data tell the poses."""
+    given = (t.odometry for t in trajectories if isinstance(t, GivenTrajectory))
+    return next((odometry for odometry in given if odometry is not None), None)
 
 
 def aligned_start(
@@ -80,8 +105,12 @@ def aligned_start(
     config: Config,
 ) -> Mapping[str, gtsam.Pose3]:
     """T_vehicle_lidar at which the strips are found first, from rough ones; trusted ones stay."""
-    sigmas = {name: configured_guess(config, name).sigmas for name in config.lidars}
-    held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
+    odometry = odometry_of(trajectories)
+    if odometry is not None:
+        held = held_sigmas(odometry, config)
+    else:
+        sigmas = {name: configured_guess(config, name).sigmas for name in config.lidars}
+        held = {n: np.zeros(6) if config.lidars[n].fixed else s for n, s in sigmas.items()}
     return align_patches(patches, trajectories, start, held).T_vehicle_lidar
 
 
@@ -180,6 +209,33 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         strips=strips_of(found),
         offset_m=float(np.median(found.nuisances.sighting)),
         ground=lidars_with_ground(found),
+    )
+
+
+def term_of_odometry(
+    found: Solved, kept: IntArray, odometry: OdometryPoses, config: Config
+) -> StructureTerm:
+    """The term of a drive without motion data: it says nothing of the poses `kept` (m,)."""
+    term = term_of(found, np.zeros(0, dtype=np.int64))
+    names, T = found.problem.patches.lidars, found.state.T_vehicle_lidar
+    at = names.index(odometry.lidar)
+    H, b = relative_quadratic(term.information, term.gradient, T, at)
+    if odometry.statement is not None:
+        own = slice(6 * at, 6 * at + 6)
+        said, pull = odometry.statement.gaussian(T[at], config.ground.vehicle_height)
+        H[own, own] += said
+        b[own] += pull
+    size = 6 * len(kept)
+    information = np.zeros((size + len(b), size + len(b)))
+    information[size:, size:] = H
+    state = found.state
+    return replace(
+        term,
+        stamps_ns=found.problem.prior.stamps_ns[kept],
+        T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
+        information=information,
+        gradient=np.concatenate([np.zeros(size), b]),
+        odometry_of=odometry.lidar,
     )
 
 

@@ -18,6 +18,7 @@ from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
 from caliv_graph.trajectory.given import error_covariances, given_trajectory
 from caliv_graph.trajectory.noise import stated
+from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
 
@@ -56,11 +57,14 @@ class GivenTrajectory:
         trajectory: the poses at their own stamps, and the covariances that their messages state.
         lost_ns: wanted stamps outside their span.
         warnings: a line each.
+        odometry: the poses, if the odometry of a LiDAR gave them: then they are no evidence of
+            where a LiDAR is on the vehicle. None: they came with the recording.
     """
 
     trajectory: Trajectory
     lost_ns: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
+    odometry: OdometryPoses | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -155,7 +159,8 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
             f"{motion.name}: {unknown} of {count} vehicle poses state no covariance: their white "
             "error is estimated"
         )
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings))
+    odometry = motion.poses if isinstance(motion.poses, OdometryPoses) else None
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings), odometry)
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:

@@ -74,10 +74,15 @@ def named(
     return replace(uncertainty, undetermined=tuple(undetermined), weak=tuple(weak))
 
 
-def named_prediction(predicted: PredictedCovariance) -> PredictedCovariance:
-    """The same prediction, each direction with its text and its remedy."""
+def named_prediction(
+    predicted: PredictedCovariance, evidence: Evidence | None = None
+) -> PredictedCovariance:
+    """The same prediction, each direction with its text and its remedy.
+
+    `evidence` is what the LiDARs saw; None: as the results of the LiDARs say.
+    """
     poses = {n: predicted.calibration.lidars[n].T_vehicle_lidar for n in predicted.lidars}
-    evidence = evidence_of(predicted.calibration.lidars.values())
+    evidence = evidence or evidence_of(predicted.calibration.lidars.values())
     uncertainty = named(predicted.uncertainty, poses, evidence)
     calibration = replace(
         predicted.calibration, undetermined=uncertainty.undetermined, weak=uncertainty.weak

@@ -8,8 +8,9 @@ from typing import Literal
 
 from caliv_graph.products import LidarResult
 
-Evidence = Literal["target", "structure", "both"]
-"""What the LiDARs see: a target, walls and other structure, or both."""
+Evidence = Literal["target", "structure", "both", "odometry"]
+"""What the LiDARs see: a target, walls and other structure, or both; or structure of a drive that
+recorded nothing else."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,34 @@ OF_BOTH = replace(
 )
 """Structure may be no more than the ground: a manoeuvre past the target is what is sure to help."""
 
+_MOTION = "record an IMU with GNSS or velocities, or poses (topics)"
+OF_ODOMETRY = replace(
+    OF_STRUCTURE,
+    stationary=f"drive past walls that are not parallel, and {_MOTION}",
+    height=(
+        "measure the height of the vehicle frame above the ground and set ground.vehicle_height "
+        "and ground.sigma"
+    ),
+    turn_centre=(
+        f"{_MOTION}: without them yaw is the direction of travel, known as well as the vehicle "
+        "moves along its x axis, on straights and in curves to both sides"
+    ),
+    straight=(
+        f"measure x and y, or {_MOTION}: without them nothing tells where the vehicle frame has "
+        "its origin"
+    ),
+    tilt=(
+        "set ground.parallel_sigma_deg if the vehicle stands parallel to the ground better than "
+        f"0.3 degrees, or {_MOTION}"
+    ),
+)
+"""Without motion data no manoeuvre tells S2V."""
+
 REMEDIES: dict[Evidence, Remedies] = {
     "target": OF_TARGET,
     "structure": OF_STRUCTURE,
     "both": OF_BOTH,
+    "odometry": OF_ODOMETRY,
 }
 
 

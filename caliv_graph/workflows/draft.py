@@ -160,8 +160,7 @@ def _draft_of_bag(data: Path, config: Path, urdf: Path | None) -> Draft:
     height = frames.height()
     lidars, found = _lidars_of_bag(bag, frames, clouds)
     mounts, unknown_mounts = _mounts_of_bag(bag, frames, motion)
-    unknown = [] if motion.chosen else ["topics"]
-    unknown += [*unknown_mounts, *([] if height else [_HEIGHT])]
+    unknown = [*unknown_mounts, *([] if height else [_HEIGHT])]
     text = align(
         TEMPLATE.format(
             format="rosbag\t# a ROS 2 bag (folder, .mcap) or a ROS 1 .bag",
@@ -223,7 +222,10 @@ def _mounts_of_bag(bag: Bag, frames: Frames, motion: MotionTopics) -> tuple[str,
 def _topics_text(bag: Bag, motion: MotionTopics) -> str:
     lines = ["topics:\t# of the vehicle's motion: imu, gnss and twist; or pose"]
     if not motion.chosen:
-        lines[0] = "topics: {}\t# TODO: imu, gnss and twist, or pose: the bag has none by its types"
+        lines = [
+            "topics: {}\t# the bag has no motion data by its types: the LiDARs tell their motion",
+            "\t# past walls and ground; S2V's x and y stay open. Else: imu, gnss, twist; or pose",
+        ]
     for key, chosen in motion.chosen.items():
         lines.append(f"  {key}: {scalar(chosen)}\t# {bag.topics[chosen].type}")
     for key, others in motion.others.items():

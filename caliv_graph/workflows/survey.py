@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from caliv_graph.calibration.assemble import evidence_of_terms
 from caliv_graph.calibration.no_target import solve_structure_and_ground
 from caliv_graph.calibration.problem import pose_problem, usable
 from caliv_graph.calibration.requirements import unmet_requirements
@@ -29,7 +30,12 @@ from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
 from caliv_graph.physics import contradictions_of
-from caliv_graph.pipeline import prepare, structure_evidence, without_anything
+from caliv_graph.pipeline import (
+    completed_motions,
+    prepare,
+    structure_evidence,
+    without_anything,
+)
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -76,7 +82,8 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
     """
-    motions = {i: recording.motion() for i, recording in enumerate(recordings)}
+    read = {i: recording.motion() for i, recording in enumerate(recordings)}
+    motions, config, notes = completed_motions(recordings, config, read, progress)
     prepared = prepare(recordings, config, motions, progress)
     try:
         with threadpool_limits(limits=1):
@@ -94,6 +101,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
         found,
         names=tuple(recording.name for recording in recordings),
         warnings=(
+            *notes,
             *prepared.contradictions,
             *contradictions_of(prepared.findings),
             *prepared.warnings,
@@ -177,9 +185,8 @@ def _verdict(
     )
     unmet = unmet_requirements(covariance.calibration, config).unmet
     sightings, shared = _walls(state.structure, tuple(config.lidars))
-    return Survey(
-        (), named_prediction(covariance), scans, sightings, shared, unmet, tuple(warnings)
-    )
+    named = named_prediction(covariance, evidence_of_terms(state.structure, bool(scans)))
+    return Survey((), named, scans, sightings, shared, unmet, tuple(warnings))
 
 
 def _walls(

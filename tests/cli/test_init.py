@@ -387,8 +387,9 @@ def test_a_bag_without_anything_that_tells_the_motion(tmp_path: Path) -> None:
 
     result = init(bag, "--out", tmp_path / "config.yaml")
 
-    assert "fill in before you calibrate: topics, ground" in result.stderr
-    assert load_config(tmp_path / "config.yaml").topics.imu is None
+    assert "fill in before you calibrate: ground.vehicle_height" in result.stderr
+    assert "the LiDARs tell their motion" in (tmp_path / "config.yaml").read_text()
+    assert not load_config(tmp_path / "config.yaml").names_motion()
 
 
 @pytest.mark.parametrize("frame", ["a: b # c", "new\nline", "tab\there", "\x07", "'", "täst"])

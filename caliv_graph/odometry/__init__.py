@@ -1,0 +1,1 @@
+"""The motion of a vehicle that recorded nothing but LiDARs, from what stands still."""

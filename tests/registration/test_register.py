@@ -599,3 +599,13 @@ def test_annealing_ends_after_the_steps_that_it_is_given() -> None:
         state.expect(R, t)
         state.maximise(R, t)
     assert state.finest
+
+
+def test_clouds_whose_steps_stay_below_their_own_sigmas_are_registered() -> None:
+    """However small a step in metres is asked for: noise sets what it can be."""
+    scene = chair()
+    state = JointRegistration(observe(clouds_of(scene)), CONFIG)
+    state.tolerance = (0.0, 0.0)
+    found = register_jointly(state, guesses(scene.T_target_lidar, 1), 100)
+    assert found.converged
+    assert found.iterations < 60

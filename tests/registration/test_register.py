@@ -609,3 +609,14 @@ def test_clouds_whose_steps_stay_below_their_own_sigmas_are_registered() -> None
     found = register_jointly(state, guesses(scene.T_target_lidar, 1), 100)
     assert found.converged
     assert found.iterations < 60
+
+
+def test_turns_about_normals_are_eliminated_apart_with_the_same_result() -> None:
+    scene = chair()
+    state = JointRegistration(observe(clouds_of(scene)), CONFIG)
+    state.held_along = 0.0
+    R, t = matrices(scene.T_target_lidar)
+    state.seed(R, t, SIGMA_M)
+    quadratic = state.expect(R, t)
+    whole = replace(quadratic, normals=None).joint()
+    np.testing.assert_allclose(quadratic.joint(), whole, atol=1e-12 * np.abs(whole).max())

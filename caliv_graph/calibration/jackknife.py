@@ -32,7 +32,7 @@ spots."""
 
 ROUNDS = 5
 """Rounds of expectation-maximisation without a part: what is missing of the way to its end is a
-tenth on sparse clouds."""
+tenth on sparse clouds. Fewer where the scale will not come to 1, below which it does not count."""
 
 LEAST_LIDAR_CLOUDS = 3 * GROUPS * TOGETHER
 """Clouds of every LiDAR for a jackknife: with fewer the parts are too large."""
@@ -68,15 +68,32 @@ def jackknife_scale(
     group = _groups(problem)
     every = _placements(problem, extrinsics, states, lines, group >= 0)
     H, _ = _system(every, extrinsics)
-    ends = [
-        _end(_placements(problem, extrinsics, states, lines, group != g), extrinsics, prior)
-        for g in range(GROUPS)
-    ]
-    scatter = np.array(ends) - np.mean(ends, axis=0)
     known = np.linalg.solve(H + prior, H)
     claimed = float(np.trace(known @ known))
-    found = (GROUPS - 1) / GROUPS * float(np.einsum("ga,ab,gb->", scatter, H, scatter))
-    return max(math.sqrt(found / max(claimed, 1e-12)), 1.0) if claimed > 1.0 else 1.0
+    if claimed <= 1.0:
+        return 1.0
+    rests = [
+        _Rest(_placements(problem, extrinsics, states, lines, group != g), extrinsics, prior)
+        for g in range(GROUPS)
+    ]
+    scales: list[float] = []
+    while len(scales) < ROUNDS and not _stays_below_one(scales):
+        ends = np.array([rest.further() for rest in rests])
+        scatter = ends - ends.mean(axis=0)
+        found = (GROUPS - 1) / GROUPS * float(np.einsum("ga,ab,gb->", scatter, H, scatter))
+        scales.append(math.sqrt(found / claimed))
+    return max(scales[-1], 1.0)
+
+
+def _stays_below_one(scales: Sequence[float]) -> bool:
+    """Whether the rounds that are left cannot bring the scale to 1, by those before.
+
+    The parts come to rest: a round moves them by less than the one before it.
+    """
+    if len(scales) < 2:
+        return False
+    left = ROUNDS - len(scales)
+    return scales[-1] + left * max(scales[-1] - scales[-2], 0.0) < 1.0
 
 
 def _groups(problem: Problem) -> IntArray:
@@ -140,22 +157,32 @@ def _placements(
     return out
 
 
-def _end(
-    placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3], prior: Array
-) -> Array:
-    """(6 n,) where expectation-maximisation takes the extrinsics, vehicle axes."""
-    moved, total = list(extrinsics), np.zeros(len(prior))
-    for _ in range(ROUNDS):
-        H, gradient = _system(placements, moved)
-        step = -np.asarray(np.linalg.solve(H + prior, gradient), np.float64)
-        moved = [
-            retract_vehicle_axes(T, d) for T, d in zip(moved, step.reshape(-1, 6), strict=True)
+class _Rest:
+    """What is left without a part of the clouds, on its way to where expectation-maximisation ends.
+
+    Attributes:
+        total: (6 n,) how far it has taken the extrinsics, vehicle axes.
+    """
+
+    def __init__(
+        self, placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3], prior: Array
+    ) -> None:
+        self._placements, self._moved, self._prior = placements, list(extrinsics), prior
+        self.total: Array = np.zeros(len(prior))
+
+    def further(self) -> Array:
+        """`total` after one more round."""
+        H, gradient = _system(self._placements, self._moved)
+        step = -np.asarray(np.linalg.solve(H + self._prior, gradient), np.float64)
+        self._moved = [
+            retract_vehicle_axes(T, d)
+            for T, d in zip(self._moved, step.reshape(-1, 6), strict=True)
         ]
-        total += step
-        for placement in placements:
-            R, t, _ = placement.poses(moved)
+        self.total = self.total + step
+        for placement in self._placements:
+            R, t, _ = placement.poses(self._moved)
             placement.state.maximise(R, t)
-    return total
+        return self.total
 
 
 def _system(

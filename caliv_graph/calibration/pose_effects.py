@@ -83,13 +83,11 @@ def motion_covariance(
     m = len(chosen)
     out = np.zeros((m, m, 6, 6) if together else (m, 6, 6))
     pose = problem.cloud_pose[chosen]
-    for drive, information in problem.motion.items():
+    for drive, cov in problem.motion_cov.items():
         of_drive = np.flatnonzero(problem.drives() == drive)
         axes = np.tile(np.eye(6), (len(of_drive), 1, 1))
         for n, i in enumerate(of_drive.tolist()):
             axes[n, 3:, 3:] = values.atPose3(key_vehicle(i)).rotation().matrix()
-        n = len(of_drive)
-        cov = np.linalg.inv(information).reshape(n, 6, n, 6).swapaxes(1, 2)
         mine = np.flatnonzero(np.isin(pose, of_drive))
         local = np.searchsorted(of_drive, pose[mine])
         A = axes[local]

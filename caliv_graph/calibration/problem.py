@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -107,6 +108,16 @@ class Problem:
     def clouds(self) -> int:
         """Number of clouds."""
         return len(self.cloud_lidar)
+
+    @cached_property
+    def motion_cov(self) -> dict[int, Array]:
+        """Per drive the (m, m, 6, 6) covariance of `motion`: its inverse, right perturbations."""
+        out: dict[int, Array] = {}
+        for drive, information in self.motion.items():
+            m = len(information) // 6
+            cov = np.asarray(np.linalg.inv(information), np.float64)
+            out[drive] = cov.reshape(m, 6, m, 6).swapaxes(1, 2)
+        return out
 
     def clouds_of_placements(self) -> list[slice]:
         """Where the clouds of each placement are among all clouds."""

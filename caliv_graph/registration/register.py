@@ -73,6 +73,11 @@ STEP_TOLERANCE = (3e-4, 2e-4)
 ROUGH_TOLERANCE = (1e-3, 6e-4)
 """Tolerance of the coarse pass."""
 
+STEP_SIGMAS = 0.2
+"""Or else: the median step of a cloud in standard deviations of its own pose, the shape held. Where
+clouds are sparse the steps do not become smaller, since the nearest surfels of points change. The
+graph, which averages over clouds, gains nothing from going on."""
+
 
 def annealing_steps(sigma_m: float, sigma_range_m: float) -> int:
     """Number of E-steps from a roughness of `sigma_m` to the final floor."""
@@ -220,6 +225,7 @@ class JointRegistration:
         self._mixture = maximise_shape(
             self.clouds, R, t, self.mixture, self._floor, *self._expected
         )
+        self._expected = None  # as large as all the rest
 
     def result(
         self,
@@ -355,7 +361,8 @@ def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: in
         turn, shift = np.median(_sizes(d), axis=1).tolist()
         step = (turn, shift)
         fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
-        converged = state.finest and fine
+        sigmas = np.sqrt(np.einsum("ja,jab,jb->j", d, quadratic.blocks, d))
+        converged = state.finest and (fine or bool(np.median(sigmas) < STEP_SIGMAS))
     return _Run(R, t, iteration, converged, step)
 
 

@@ -14,8 +14,10 @@ import pytest
 from caliv_graph.calibration.jackknife import (
     GROUPS,
     LEAST_LIDAR_CLOUDS,
+    ROUNDS,
     TOGETHER,
     _groups,
+    _stays_below_one,
     jackknife_scale,
 )
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
@@ -210,3 +212,20 @@ def test_information_along_a_motion_is_that_of_the_joint_quadratic() -> None:
         expected = rows.T @ quadratic.joint() @ rows
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert quadratic.along(J) / scale == pytest.approx(expected / scale, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("scales", "stays"),
+    [
+        ([], False),
+        ([0.2], False),
+        ([0.6, 0.7], True),  # three more rounds of at most 0.1: the true course ends below 1
+        ([0.6, 0.75], False),
+        ([0.6, 0.75, 0.8], True),
+        ([0.9, 0.8], True),
+        ([1.1, 1.05], False),
+    ],
+)
+def test_rounds_end_where_the_scale_will_not_come_to_one(scales: list[float], stays: bool) -> None:
+    assert ROUNDS == 5
+    assert _stays_below_one(scales) is stays

@@ -260,3 +260,5 @@ def test_axes_across_directions_form_right_handed_frames() -> None:
         frames @ np.swapaxes(frames, -1, -2), np.tile(np.eye(3), (2, 50, 1, 1)), atol=1e-12
     )
     np.testing.assert_allclose(np.linalg.det(frames), np.ones((2, 50)), atol=1e-12)
+    one_by_one = [[tangent_axes(direction) for direction in row] for row in directions]
+    np.testing.assert_array_equal(one_by_one, frames[..., :2, :])

@@ -599,3 +599,24 @@ def test_annealing_ends_after_the_steps_that_it_is_given() -> None:
         state.expect(R, t)
         state.maximise(R, t)
     assert state.finest
+
+
+def test_clouds_whose_steps_stay_below_their_own_sigmas_are_registered() -> None:
+    """However small a step in metres is asked for: noise sets what it can be."""
+    scene = chair()
+    state = JointRegistration(observe(clouds_of(scene)), CONFIG)
+    state.tolerance = (0.0, 0.0)
+    found = register_jointly(state, guesses(scene.T_target_lidar, 1), 100)
+    assert found.converged
+    assert found.iterations < 60
+
+
+def test_turns_about_normals_are_eliminated_apart_with_the_same_result() -> None:
+    scene = chair()
+    state = JointRegistration(observe(clouds_of(scene)), CONFIG)
+    state.held_along = 0.0
+    R, t = matrices(scene.T_target_lidar)
+    state.seed(R, t, SIGMA_M)
+    quadratic = state.expect(R, t)
+    whole = replace(quadratic, normals=None).joint()
+    np.testing.assert_allclose(quadratic.joint(), whole, atol=1e-12 * np.abs(whole).max())

@@ -20,11 +20,8 @@ import scipy.sparse
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
-from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.solve import (
-    GATES_M,
+from caliv_graph.structure.problem import (
     Problem,
-    Solved,
     geometry_at,
     groups_of,
     layout_of,
@@ -32,6 +29,8 @@ from caliv_graph.structure.solve import (
     placed_sightings,
     with_guesses,
 )
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
     PLACE_PRIOR_M,

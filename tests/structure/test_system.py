@@ -124,8 +124,13 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
         rows = slice(30 * i, 30 * i + 30)
         J[rows, :rest] = rng.standard_normal((30, rest))
         J[rows, own] = rng.standard_normal((30, len(own)))
-    H, b = J.T @ J, rng.standard_normal(12)
-    reduced, right, surfaces = eliminated(scipy.sparse.csr_array(H), b, rest, blocks)
+    V = np.zeros((12, 3))
+    for k, own in enumerate((blocks[0], blocks[1], blocks[1])):
+        touched = np.concatenate([[k, k + 2], own[:2]])
+        V[touched, k] = rng.standard_normal(4)
+    H, b = J.T @ J - V @ V.T, rng.standard_normal(12)
+    sparse, less = scipy.sparse.csr_array(J.T @ J), scipy.sparse.csr_array(V)
+    reduced, right, surfaces = eliminated(sparse, less, b, rest, blocks)
     factor = factor_of(reduced)
     whole = np.linalg.solve(H, b)
     assert surfaces.follow(solved(factor, right)) == pytest.approx(whole, rel=1e-8)
@@ -134,8 +139,9 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
 
 
 def test_a_surface_without_information_is_named() -> None:
+    none = scipy.sparse.csr_array((3, 3))
     with pytest.raises(SolveError, match="surface"):
-        eliminated(scipy.sparse.csr_array((3, 3)), np.zeros(3), 1, [np.array([1, 2])])
+        eliminated(none, none, np.zeros(3), 1, [np.array([1, 2])])
 
 
 STANDING = Standing(

@@ -170,3 +170,10 @@ def solved(factor: tuple[Array, Array], right: Array) -> Array:
     return np.asarray(
         scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
     )
+
+
+def covariance_of(factor: tuple[Array, Array], own: IntArray) -> Array:
+    """(n, n) block of H^-1 of n coordinates, from `factor_of(H)`."""
+    unit = np.zeros((len(factor[0]), len(own)))
+    unit[own, np.arange(len(own))] = 1.0
+    return solved(factor, unit)[own]

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -164,33 +164,31 @@ def _with_jitter(found: Solved) -> Solved | None:
     state = replace(found.state, errors=errors)
     geometry = geometry_at(problem, state, found.sightings, layout)
 
-    def at(nuisances: Nuisances) -> tuple[Rows, System]:
-        return _whitened(
-            problem,
-            state,
-            geometry,
-            found.strips,
-            found.sightings,
-            found.weights,
-            nuisances,
-            layout,
-        )
-
-    _, system = at(found.nuisances)
+    rows, system = _whitened(
+        problem,
+        state,
+        geometry,
+        found.strips,
+        found.sightings,
+        found.weights,
+        found.nuisances,
+        layout,
+    )
     H, b = with_guesses(problem, state, system)
     sigma_s = jitter_sigma_s(H, b, layout)
     if sigma_s == 0.0:
         return None
-    nuisances = replace(found.nuisances, jitter_s=sigma_s)
-    rows, system = at(nuisances)
+    own = np.arange(layout.jitter, layout.plane)
+    known = system.H.copy()
+    known[own, own] += sigma_s**-2.0
     return replace(
         found,
         state=state,
-        nuisances=nuisances,
+        nuisances=replace(found.nuisances, jitter_s=sigma_s),
         layout=layout,
         geometry=geometry,
         rows=rows,
-        system=system,
+        system=replace(system, H=known),
     )
 
 
@@ -335,8 +333,9 @@ def _settled(found: Solved, steps: int) -> Solved:
         rows, system = _whitened(
             problem, state, geometry, found.strips, sightings, weights, nuisances, layout
         )
-        own = slice(layout.extrinsic, layout.error)
-        converged = number > 0 and float(d[own] @ H[own, own] @ d[own]) < SMALL_SIGMAS**2
+        step = d[layout.extrinsic : layout.error]
+        cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
+        converged = number > 0 and float(step @ np.linalg.solve(cov, step)) < SMALL_SIGMAS**2
         found = replace(
             found,
             state=state,

@@ -134,13 +134,13 @@ def _strips_of(
             break
         seed = left[np.argmax(moments[left, 3, 3])]
         centre, normal = positions[seed], normals[seed]
-        own = left[:0]
+        at, facing = positions[left], normals[left]
         for _ in range(3):
-            own = left[_on_plane(positions[left], normals[left], centre, normal, gate_m)]
+            taken = _on_plane(at, facing, centre, normal, gate_m)
+            own = left[taken]
             if len(own) < MIN_SCANS:
                 break
             centre, normal = plane_of_moments(moments[own].sum(axis=0), normals[own].mean(axis=0))
-        taken = np.isin(left, own)
         taken[left == seed] = True
         if len(own) >= MIN_SCANS and len(np.unique(scan[own])) >= MIN_SCANS:
             out.append((own, centre, normal))

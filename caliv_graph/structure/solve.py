@@ -36,7 +36,6 @@ from caliv_graph.structure.system import (
     Geometry,
     Layout,
     Nuisances,
-    Rows,
     State,
     System,
     stepped,
@@ -72,6 +71,42 @@ which is of one colour: the accuracy that data sheets state, 1 to 3 cm at most, 
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """An estimate of a drive, its strips, and the noise at which it is to be linearised."""
+
+    problem: Problem
+    state: State
+    strips: Strips
+    sightings: Sightings
+    weights: Array
+    nuisances: Nuisances
+    layout: Layout
+    geometry: Geometry
+    converged: bool
+
+    def system(self) -> System:
+        """The linearised system there. It takes most of the memory: nobody keeps two."""
+        problem, sightings = self.problem, self.sightings
+        group = groups_of(sightings, self.strips)
+        repeated = problem.views.count[sightings.scan]
+        rows = whitened(
+            self.geometry,
+            sightings,
+            group,
+            repeated,
+            self.nuisances,
+            self.weights,
+            self.layout.size,
+        )
+        state = self.state
+        stands = stands_of(state.t_map_vehicle, self.strips.centres_map, self.strips.normals_map)
+        stands = stands.only(np.isin(stands.pose, problem.pose_of_scan))
+        return system_of(
+            rows, state, self.layout, problem.prior, self.nuisances, problem.standing, stands
+        )
+
+
+@dataclass(frozen=True)
 class Solved:
     """The outcome: estimate, strips, and the system at the estimate."""
 
@@ -83,7 +118,6 @@ class Solved:
     nuisances: Nuisances
     layout: Layout
     geometry: Geometry
-    rows: Rows
     system: System
     converged: bool
 
@@ -121,7 +155,7 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     own, poses = with_scans(problem, np.ones(len(problem.pose_of_scan), dtype=bool))
     range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     state, levels = _rough(own, start, range_sigma)
-    found: Solved | None = None
+    found: Estimate | None = None
     for gate, steps in zip(GATES_M, STEPS, strict=True):
         found = _round(own, state, range_sigma, gate, levels)
         if found is None:
@@ -132,7 +166,7 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         return None
     jittering = _with_jitter(found)
     if jittering is not None:
-        found = _settled(jittering, steps=LAST_STEPS)
+        found = _settled(*jittering)
     return _on_all_poses(found, problem, poses)
 
 
@@ -153,8 +187,11 @@ def _rough(
     return on_all_poses(problem.prior, poses, rough), levels
 
 
-def _with_jitter(found: Solved) -> Solved | None:
-    """The same estimate with a jitter of every scan's stamp; None where the data show none."""
+def _with_jitter(found: Estimate) -> tuple[Estimate, int, System] | None:
+    """The same estimate with a jitter of every scan's stamp; None where the data show none.
+
+    With the number of steps to go on with, and its system.
+    """
     problem = found.problem
     if problem.twists is None:
         return None
@@ -163,17 +200,8 @@ def _with_jitter(found: Solved) -> Solved | None:
     errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
     state = replace(found.state, errors=errors)
     geometry = geometry_at(problem, state, found.sightings, layout)
-
-    rows, system = _whitened(
-        problem,
-        state,
-        geometry,
-        found.strips,
-        found.sightings,
-        found.weights,
-        found.nuisances,
-        layout,
-    )
+    jittering = replace(found, state=state, layout=layout, geometry=geometry)
+    system = jittering.system()
     H, b = with_guesses(problem, state, system)
     sigma_s = jitter_sigma_s(H, b, layout)
     if sigma_s == 0.0:
@@ -181,46 +209,22 @@ def _with_jitter(found: Solved) -> Solved | None:
     own = np.arange(layout.jitter, layout.plane)
     known = system.H.copy()
     known[own, own] += sigma_s**-2.0
-    return replace(
-        found,
-        state=state,
-        nuisances=replace(found.nuisances, jitter_s=sigma_s),
-        layout=layout,
-        geometry=geometry,
-        rows=rows,
-        system=replace(system, H=known),
-    )
+    jittering = replace(jittering, nuisances=replace(found.nuisances, jitter_s=sigma_s))
+    return jittering, LAST_STEPS, replace(system, H=known)
 
 
-def _on_all_poses(found: Solved, problem: Problem, poses: IntArray) -> Solved:
+def _on_all_poses(found: Estimate, problem: Problem, poses: IntArray) -> Solved:
     """The same estimate with all poses of a drive, of which it has some (p,).
 
     Its information is without what dents of the ground tell. The steps use them: derivatives that
     are not those of the residuals do not lead to the estimate.
     """
+    b = on_all_coordinates(found.system().b, problem.prior, poses)
     state = on_all_poses(problem.prior, poses, found.state)
     layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
     geometry = geometry_at(problem, state, found.sightings, layout, dents=False)
-    rows, system = _whitened(
-        problem,
-        state,
-        geometry,
-        found.strips,
-        found.sightings,
-        found.weights,
-        found.nuisances,
-        layout,
-    )
-    b = on_all_coordinates(found.system.b, problem.prior, poses)
-    return replace(
-        found,
-        problem=problem,
-        state=state,
-        layout=layout,
-        geometry=geometry,
-        rows=rows,
-        system=replace(system, b=b),
-    )
+    found = replace(found, problem=problem, state=state, layout=layout, geometry=geometry)
+    return Solved(**vars(found), system=replace(found.system(), b=b))
 
 
 def linearised(
@@ -252,7 +256,7 @@ def _round(
     range_sigma: Array,
     gate_m: float,
     levels: Levels,
-) -> Solved | None:
+) -> Estimate | None:
     """New strips and sightings at an estimate."""
     placed = placed_patches(problem, state)
     strips = find_strips(placed.moments_map, placed.normals_map, problem.patches.scan, gate_m)
@@ -279,42 +283,22 @@ def _round(
     )
     weights = np.ones(sightings.count)
     geometry = geometry_at(problem, state, sightings, layout)
-    rows, system = _whitened(
-        problem, state, geometry, strips, sightings, weights, nuisances, layout
-    )
-    return Solved(
-        problem, state, strips, sightings, weights, nuisances, layout, geometry, rows, system, False
+    return Estimate(
+        problem, state, strips, sightings, weights, nuisances, layout, geometry, converged=False
     )
 
 
-def _whitened(
-    problem: Problem,
-    state: State,
-    geometry: Geometry,
-    strips: Strips,
-    sightings: Sightings,
-    weights: Array,
-    nuisances: Nuisances,
-    layout: Layout,
-) -> tuple[Rows, System]:
-    group = groups_of(sightings, strips)
-    repeated = problem.views.count[sightings.scan]
-    rows = whitened(geometry, sightings, group, repeated, nuisances, weights, layout.size)
-    stands = stands_of(state.t_map_vehicle, strips.centres_map, strips.normals_map)
-    stands = stands.only(np.isin(stands.pose, problem.pose_of_scan))
-    system = system_of(rows, state, layout, problem.prior, nuisances, problem.standing, stands)
-    return rows, system
+def _settled(found: Estimate, steps: int, first: System | None = None) -> Estimate:
+    """Gauss-Newton steps; after each one the noise levels and the robust weights.
 
-
-def _settled(found: Solved, steps: int) -> Solved:
-    """Gauss-Newton steps; after each one the noise levels and the robust weights."""
+    `first` is the system of the first step, where there is one.
+    """
     problem, layout, sightings = found.problem, found.layout, found.sightings
     converged = False
     for number in range(steps):
-        H, b = with_guesses(problem, found.state, found.system)
-        factor = factor_of(H)
-        solve = partial(found.system.surfaces.solve, factor)
-        d = found.system.surfaces.follow(solved(factor, b))
+        system = first if first is not None and number == 0 else found.system()
+        factor, b = _factor(found, system)
+        d = system.surfaces.follow(solved(factor, b))
         state = stepped(found.state, layout, d)
         geometry = geometry_at(problem, state, sightings, layout)
         nuisances = fitted_noise(
@@ -324,15 +308,12 @@ def _settled(found: Solved, steps: int) -> Solved:
             groups_of(sightings, found.strips),
             problem.views,
             found.weights,
-            solve,
+            partial(system.surfaces.solve, factor),
             layout,
             found.nuisances,
             state.errors,
         )
         weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-        rows, system = _whitened(
-            problem, state, geometry, found.strips, sightings, weights, nuisances, layout
-        )
         step = d[layout.extrinsic : layout.error]
         cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
         converged = number > 0 and float(step @ np.linalg.solve(cov, step)) < SMALL_SIGMAS**2
@@ -342,10 +323,14 @@ def _settled(found: Solved, steps: int) -> Solved:
             weights=weights,
             nuisances=nuisances,
             geometry=geometry,
-            rows=rows,
-            system=system,
             converged=converged,
         )
         if converged:
             break
     return found
+
+
+def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:
+    """Factor of the system with the guesses, and its right-hand side."""
+    H, b = with_guesses(found.problem, found.state, system)
+    return factor_of(H), b

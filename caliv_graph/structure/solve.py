@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -293,41 +294,38 @@ def _settled(found: Estimate, steps: int, first: System | None = None) -> Estima
 
     `first` is the system of the first step, where there is one.
     """
-    problem, layout, sightings = found.problem, found.layout, found.sightings
-    converged = False
     for number in range(steps):
-        system = first if first is not None and number == 0 else found.system()
-        factor, b = _factor(found, system)
-        d = system.surfaces.follow(solved(factor, b))
-        state = stepped(found.state, layout, d)
-        geometry = geometry_at(problem, state, sightings, layout)
-        nuisances = fitted_noise(
-            geometry,
-            found.geometry,
-            sightings,
-            groups_of(sightings, found.strips),
-            problem.views,
-            found.weights,
-            partial(system.surfaces.solve, factor),
-            layout,
-            found.nuisances,
-            state.errors,
-        )
-        weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-        step = d[layout.extrinsic : layout.error]
-        cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
-        converged = number > 0 and float(step @ np.linalg.solve(cov, step)) < SMALL_SIGMAS**2
-        found = replace(
-            found,
-            state=state,
-            weights=weights,
-            nuisances=nuisances,
-            geometry=geometry,
-            converged=converged,
-        )
-        if converged:
-            break
-    return found
+        found, size = _stepped(found, first if number == 0 else None)
+        if number > 0 and size < SMALL_SIGMAS:
+            return replace(found, converged=True)
+    return replace(found, converged=False)
+
+
+def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
+    """The estimate after a step, and the size of the step in sigmas of the extrinsics."""
+    problem, layout, sightings = found.problem, found.layout, found.sightings
+    system = system or found.system()
+    factor, b = _factor(found, system)
+    d = system.surfaces.follow(solved(factor, b))
+    state = stepped(found.state, layout, d)
+    geometry = geometry_at(problem, state, sightings, layout)
+    nuisances = fitted_noise(
+        geometry,
+        found.geometry,
+        sightings,
+        groups_of(sightings, found.strips),
+        problem.views,
+        found.weights,
+        partial(system.surfaces.solve, factor),
+        layout,
+        found.nuisances,
+        state.errors,
+    )
+    weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
+    step = d[layout.extrinsic : layout.error]
+    cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
+    after = replace(found, state=state, weights=weights, nuisances=nuisances, geometry=geometry)
+    return after, math.sqrt(float(step @ np.linalg.solve(cov, step)))
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:

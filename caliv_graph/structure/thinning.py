@@ -40,8 +40,16 @@ def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
 
     Also returns the indices of these poses among those of `problem`.
     """
-    patches = problem.patches
     poses = np.unique(problem.pose_of_scan[keep])
+    own = replace(
+        problem,
+        prior=_on(problem.prior, poses),
+        pose_of_scan=np.searchsorted(poses, problem.pose_of_scan[keep]),
+        twists=None if problem.twists is None else problem.twists[poses],
+    )
+    if keep.all():
+        return own, poses
+    patches = problem.patches
     seen = keep[patches.scan]
     number = np.cumsum(keep) - 1
     fewer = patches.part(seen)
@@ -51,16 +59,8 @@ def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         scan_lidar=patches.scan_lidar[keep],
         scan=number[fewer.scan],
     )
-    own = replace(
-        problem,
-        patches=fewer,
-        prior=_on(problem.prior, poses),
-        pose_of_scan=np.searchsorted(poses, problem.pose_of_scan[keep]),
-        relative=problem.relative[seen],
-        twists=None if problem.twists is None else problem.twists[poses],
-        views=Views.numbered(problem.views.of_scan[keep]),
-    )
-    return own, poses
+    views = Views.numbered(problem.views.of_scan[keep])
+    return replace(own, patches=fewer, relative=problem.relative[seen], views=views), poses
 
 
 def _on(prior: PosePrior, poses: IntArray) -> PosePrior:

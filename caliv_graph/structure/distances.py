@@ -22,6 +22,7 @@ from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
 from caliv_graph.structure.problem import (
     Problem,
+    alike,
     geometry_at,
     groups_of,
     layout_of,
@@ -282,7 +283,10 @@ def _measured(
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
-    rows = whitened(geometry, sightings, group, repeated, other.nuisances, weights, layout.size)
+    same = alike(problem, sightings)
+    rows = whitened(
+        geometry, sightings, group, repeated, same, other.nuisances, weights, layout.size
+    )
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
     thickness = thickness_m(geometry, sightings, weights, offsets, strips.count)

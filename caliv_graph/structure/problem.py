@@ -175,6 +175,13 @@ def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
     return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
 
 
+def alike(problem: Problem, sightings: Sightings) -> IntArray:
+    """(Q,) number of sightings that the LiDAR of each has of its strip."""
+    lidars = len(problem.patches.lidars)
+    both = sightings.strip * lidars + problem.patches.scan_lidar[sightings.scan]
+    return np.asarray(np.bincount(both)[both])
+
+
 def geometry_at(
     problem: Problem, state: State, sightings: Sightings, layout: Layout, dents: bool = True
 ) -> Geometry:

@@ -22,6 +22,7 @@ from caliv_graph.structure.noise import (
 )
 from caliv_graph.structure.problem import (
     Problem,
+    alike,
     first_state,
     geometry_at,
     groups_of,
@@ -95,6 +96,7 @@ class Estimate:
             sightings,
             group,
             repeated,
+            alike(problem, sightings),
             self.nuisances,
             self.weights,
             self.layout.size,

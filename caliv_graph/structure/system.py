@@ -277,6 +277,7 @@ def whitened(
     sightings: Sightings,
     group: IntArray,
     repeated: IntArray,
+    alike: IntArray,
     nuisances: Nuisances,
     weights: Array,
     size: int,
@@ -284,13 +285,14 @@ def whitened(
     """Residuals by the noise of points and sightings, the latter eliminated.
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
-    view: what these share counts as often, so that their mean has the error of one. `weights` (Q,)
-    are robust, `size` is D.
+    view: what these share counts as often, so that their mean has the error of one. `alike` (Q,) says
+    how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
     """
     more = repetition(nuisances, repeated)
     own = nuisances.sighting[sightings.strip] * more
-    # A strip that two LiDARs see apart they see tilted against each other, too.
-    tilt = np.sqrt(own**2 + (repeated - 1.0) * nuisances.strip[sightings.strip] ** 2)
+    # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
+    # scans: bumps within it. As often as it is seen, so often the error counts.
+    tilt = np.sqrt(own**2 + (alike - 1.0) * nuisances.strip[sightings.strip] ** 2)
     S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)

@@ -285,8 +285,8 @@ def whitened(
     """Residuals by the noise of points and sightings, the latter eliminated.
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
-    view: what these share counts as often, so that their mean has the error of one. `alike` (Q,) says
-    how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
+    view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
+    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
     """
     more = repetition(nuisances, repeated)
     own = nuisances.sighting[sightings.strip] * more

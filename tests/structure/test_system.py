@@ -196,7 +196,7 @@ def test_a_vehicle_stands_on_the_strip_below_it_only() -> None:
 
 def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them() -> None:
     rng = np.random.default_rng(0)
-    p = np.column_stack([rng.uniform(-1, 1, (200, 2)) + [6.0, 0.0], np.full(200, -2.0)])
+    p = np.column_stack([rng.uniform(-1, 1, (200, 2)) + np.array([6.0, 0.0]), np.full(200, -2.0)])
     h = np.column_stack([p, np.ones(200)])
     layout = Layout(1, 0, (), 1, (0,))
     state = State(
@@ -213,12 +213,19 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
     tilts = slice(layout.plane, layout.plane + 2)
     for count in (50, 200):
         of = np.zeros(count, np.int64)
-        moments = np.tile(1e4 * h.T @ h, (count, 1, 1))
+        moments = np.tile(1e7 * h.T @ h, (count, 1, 1))
         sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)))
         geometry = geometry_of(state, sightings, layout, of, of, None)
         own = np.ones(count, np.int64)
         rows = whitened(
-            geometry, sightings, np.arange(count), own, count * own, nuisances, own, layout.size
+            geometry,
+            sightings,
+            np.arange(count),
+            own,
+            count * own,
+            nuisances,
+            np.ones(count),
+            layout.size,
         )
         known = (rows.J.T @ rows.J).toarray()[tilts, tilts]
         # 0.4 mrad, and the own 0.2 mrad of each scan.

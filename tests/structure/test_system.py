@@ -196,7 +196,8 @@ def test_a_vehicle_stands_on_the_strip_below_it_only() -> None:
 
 def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them() -> None:
     rng = np.random.default_rng(0)
-    p = np.column_stack([rng.uniform(-1, 1, (200, 2)) + np.array([6.0, 0.0]), np.full(200, -2.0)])
+    p = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.zeros(200)])
+    p += np.array([6.0, 0.0, -2.0]) - p.mean(axis=0)
     h = np.column_stack([p, np.ones(200)])
     layout = Layout(1, 0, (), 1, (0,))
     state = State(

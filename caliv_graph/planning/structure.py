@@ -31,7 +31,8 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.solve import Levels, Problem, Solved, linearised
+from caliv_graph.structure.problem import Problem
+from caliv_graph.structure.solve import Levels, Solved, linearised
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import lidars_with_ground
 from caliv_graph.structure.views import views_of

@@ -20,11 +20,9 @@ import scipy.sparse
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
-from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.solve import (
-    GATES_M,
+from caliv_graph.structure.problem import (
     Problem,
-    Solved,
+    alike,
     geometry_at,
     groups_of,
     layout_of,
@@ -32,6 +30,8 @@ from caliv_graph.structure.solve import (
     placed_sightings,
     with_guesses,
 )
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
     PLACE_PRIOR_M,
@@ -283,7 +283,10 @@ def _measured(
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
-    rows = whitened(geometry, sightings, group, repeated, other.nuisances, weights, layout.size)
+    same = alike(problem, sightings)
+    rows = whitened(
+        geometry, sightings, group, repeated, same, other.nuisances, weights, layout.size
+    )
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
     thickness = thickness_m(geometry, sightings, weights, offsets, strips.count)

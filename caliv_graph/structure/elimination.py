@@ -71,32 +71,74 @@ class Surfaces:
 
 
 def eliminated(
-    H: scipy.sparse.csr_array, b: Array, rest: int, blocks: Sequence[IntArray]
+    H: scipy.sparse.csr_array,
+    V: scipy.sparse.csr_array,
+    b: Array,
+    rest: int,
+    blocks: Sequence[IntArray],
 ) -> tuple[Array, Array, Surfaces]:
-    """The quadratic on the first `rest` coordinates, those of each block eliminated.
+    """The quadratic `H - V V^T` on the first `rest` coordinates, those of each block eliminated.
 
-    No two blocks are coupled.
+    No two blocks are coupled, and no column of V touches two of them.
+
+    Args:
+        H: (D, D).
+        V: (D, G), of a few coordinates a column.
+        b: (D,).
+        rest: number of coordinates that remain.
+        blocks: the others, block by block.
 
     Raises:
         SolveError: a block is singular.
     """
-    out = H[:rest, :rest].toarray()
+    V_rest = V[:rest]
+    out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
     right = b[:rest].copy()
-    done = []
+    order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
+    rows, V_own, V_columns = H[order], V[order], V_rest.tocsc()
+    local = np.zeros(H.shape[0], dtype=np.int64)
+    done, end = [], 0
     for own in blocks:
-        rows = H[own]
-        inside = rows[:, own].toarray()
-        cross = rows[:, :rest].tocsc()
-        others = np.flatnonzero(np.diff(cross.indptr))
+        begin, end = end, end + len(own)
+        inside, cross, others = _dense_rows(rows[begin:end], own, rest, local)
+        of_columns = V_own[begin:end].tocoo()
+        columns, column = np.unique(of_columns.coords[1], return_inverse=True)
+        low = np.zeros((len(own), len(columns)))
+        low[of_columns.coords[0], column.ravel()] = of_columns.data
+        wide = V_columns[:, columns].tocoo()
+        inside -= low @ low.T
+        across = np.zeros((len(columns), len(others)))
+        across[wide.coords[1], local[wide.coords[0]]] = wide.data
+        cross -= low @ across
         try:
-            L = np.linalg.cholesky(inside)
+            L = np.asarray(np.linalg.cholesky(inside), np.float64)
         except np.linalg.LinAlgError:
             raise SolveError("structure: a surface has no information") from None
-        coupling = _lower(L, cross[:, others].toarray())
+        coupling = _lower(L, cross)
         out[np.ix_(others, others)] -= coupling.T @ coupling
         right[others] -= coupling.T @ _lower(L, b[own])
         done.append(_Block(own, others, L, coupling))
     return np.asarray(out), right, Surfaces(rest, tuple(done), b[rest:])
+
+
+def _dense_rows(
+    rows: scipy.sparse.csr_array, own: IntArray, rest: int, local: IntArray
+) -> tuple[Array, Array, IntArray]:
+    """The rows of a block: within it, with others of the first `rest`, and which these are.
+
+    `local` (D,) is overwritten: the places of `own` and of the others in the results.
+    """
+    row = np.repeat(np.arange(len(own)), np.diff(rows.indptr))
+    column, value = rows.indices, rows.data
+    across = column < rest
+    others = np.unique(column[across])
+    local[others] = np.arange(len(others))
+    local[own] = np.arange(len(own))
+    inside = np.zeros((len(own), len(own)))
+    cross = np.zeros((len(own), len(others)))
+    inside[row[~across], local[column[~across]]] = value[~across]
+    cross[row[across], local[column[across]]] = value[across]
+    return inside, cross, np.asarray(others, dtype=np.int64)
 
 
 def _lower(L: Array, right: Array) -> Array:
@@ -128,3 +170,10 @@ def solved(factor: tuple[Array, Array], right: Array) -> Array:
     return np.asarray(
         scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
     )
+
+
+def covariance_of(factor: tuple[Array, Array], own: IntArray) -> Array:
+    """(n, n) block of H^-1 of n coordinates, from `factor_of(H)`."""
+    unit = np.zeros((len(factor[0]), len(own)))
+    unit[own, np.arange(len(own))] = 1.0
+    return solved(factor, unit)[own]

@@ -16,7 +16,7 @@ import numpy as np
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config, FoundLidarConfig
 from caliv_graph.products import Array
-from caliv_graph.structure.solve import Problem
+from caliv_graph.structure.problem import Problem
 from caliv_graph.trajectory.odometry import OdometryPoses
 
 HELD_RAD, HELD_M = 1e-7, 1e-6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,9 +10,8 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
-from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -20,34 +20,47 @@ from caliv_graph.structure.noise import (
     range_sigmas,
     robust_weights,
 )
-from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
-from caliv_graph.structure.standing import Standing, stands_of
+from caliv_graph.structure.problem import (
+    Problem,
+    alike,
+    first_state,
+    geometry_at,
+    groups_of,
+    layout_of,
+    placed_patches,
+    placed_sightings,
+    with_guesses,
+)
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.standing import stands_of
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
     Geometry,
     Layout,
     Nuisances,
-    Rows,
     State,
     System,
-    geometry_of,
-    lidar_poses,
     stepped,
     system_of,
     whitened,
 )
-from caliv_graph.structure.views import Views
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.structure.thinning import (
+    on_all_coordinates,
+    on_all_poses,
+    some_scans,
+    with_scans,
+)
 
-GATES_M = (0.3, 0.15, 0.08, 0.06, 0.06)
+ROUGH_GATES_M = (0.3, 0.15, 0.08)
+GATES_M = (0.06, 0.06)
 """Distance of a patch from its strip at most, from round to round: from the error of guesses
-aligned roughly to a few sigmas of patches and bumps. Not narrower: two real LiDARs saw a wall 20 to
-40 mm apart, and would pass for agreeing with those walls alone where they do."""
+aligned roughly, with some of the scans, to a few sigmas of patches and bumps, with all. Not
+narrower: two real LiDARs saw a wall 20 to 40 mm apart, and would pass for agreeing with those walls
+alone where they do."""
 
 LAST_STEPS = 5
-"""Steps after the last round of strips at most."""
+STEPS = (2, LAST_STEPS)
+"""Steps at most in each of the rounds with all scans, and after stamps were found to jitter."""
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
@@ -60,35 +73,40 @@ which is of one colour: the accuracy that data sheets state, 1 to 3 cm at most, 
 
 
 @dataclass(frozen=True)
-class Problem:
-    """What the solve of one drive is given.
+class Estimate:
+    """An estimate of a drive, its strips, and the noise at which it is to be linearised."""
 
-    Attributes:
-        patches: of the drive.
-        prior: what the motion data say of the poses.
-        pose_of_scan: (S,) index of the pose of each scan.
-        relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
-            time.
-        twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
-        offsets: indices of the LiDARs with a free time offset.
-        guesses: n guesses of T_vehicle_lidar.
-        guess_information: (6 n, 6 n) of them, vehicle axes.
-        range_sigma_m: noise along the beam as stated.
-        standing: what is known of how the vehicle stands on the ground.
-        views: which scans are from one place.
-    """
+    problem: Problem
+    state: State
+    strips: Strips
+    sightings: Sightings
+    weights: Array
+    nuisances: Nuisances
+    layout: Layout
+    geometry: Geometry
+    converged: bool
 
-    patches: DrivePatches
-    prior: PosePrior
-    pose_of_scan: IntArray
-    relative: Array
-    twists: Array | None
-    offsets: tuple[int, ...]
-    guesses: tuple[gtsam.Pose3, ...]
-    guess_information: Array
-    range_sigma_m: float
-    standing: Standing
-    views: Views
+    def system(self) -> System:
+        """The linearised system there. It takes most of the memory: nobody keeps two."""
+        problem, sightings = self.problem, self.sightings
+        group = groups_of(sightings, self.strips)
+        repeated = problem.views.count[sightings.scan]
+        rows = whitened(
+            self.geometry,
+            sightings,
+            group,
+            repeated,
+            alike(problem, sightings),
+            self.nuisances,
+            self.weights,
+            self.layout.size,
+        )
+        state = self.state
+        stands = stands_of(state.t_map_vehicle, self.strips.centres_map, self.strips.normals_map)
+        stands = stands.only(np.isin(stands.pose, problem.pose_of_scan))
+        return system_of(
+            rows, state, self.layout, problem.prior, self.nuisances, problem.standing, stands
+        )
 
 
 @dataclass(frozen=True)
@@ -103,7 +121,6 @@ class Solved:
     nuisances: Nuisances
     layout: Layout
     geometry: Geometry
-    rows: Rows
     system: System
     converged: bool
 
@@ -128,26 +145,6 @@ class Levels:
         )
 
 
-def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
-    """(N, 4, 4) T of the vehicle at each patch's time in the vehicle frame at the scan's stamp."""
-    stamps = patches.stamps_ns[patches.scan]
-    begin, end = trajectory.span_ns
-    own = np.clip(stamps + np.round(1e9 * patches.time_s).astype(np.int64), begin, end)
-    # Thousands of patches share a time to a millisecond.
-    times, inverse = np.unique(own // 200_000, return_inverse=True)
-    R, t = trajectory.poses_at(np.clip(times * 200_000, begin, end))
-    R, t = R[inverse.ravel()], t[inverse.ravel()]
-    R_s, t_s = trajectory.poses_at(patches.stamps_ns)
-    R_s, t_s = R_s[patches.scan], t_s[patches.scan]
-    out = np.zeros((len(stamps), 4, 4))
-    out[:, :3, :3] = np.swapaxes(R_s, 1, 2) @ R
-    out[:, :3, 3] = np.einsum("nji,nj->ni", R_s, t - t_s)
-    out[:, 3, 3] = 1.0
-    still = patches.time_s == 0.0
-    out[still] = np.eye(4)
-    return out
-
-
 def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
     """Solves one drive from rough extrinsics; None if there is no structure.
 
@@ -158,26 +155,46 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     Raises:
         SolveError: the system is singular.
     """
-    state = first_state(problem, start)
+    own, poses = with_scans(problem, np.ones(len(problem.pose_of_scan), dtype=bool))
     range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
-    found: Solved | None = None
-    levels = Levels(FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M)
-    for gate in GATES_M:
-        found = _round(problem, state, range_sigma, gate, levels)
+    state, levels = _rough(own, start, range_sigma)
+    found: Estimate | None = None
+    for gate, steps in zip(GATES_M, STEPS, strict=True):
+        found = _round(own, state, range_sigma, gate, levels)
         if found is None:
             return None
-        found = _settled(found, steps=2)
-        levels = Levels.of(found.nuisances)
-        state = found.state
+        found = _settled(found, steps)
+        levels, state = Levels.of(found.nuisances), found.state
     if found is None:
         return None
-    found = _settled(found, steps=LAST_STEPS)
     jittering = _with_jitter(found)
-    return _without_dents(found if jittering is None else _settled(jittering, steps=LAST_STEPS))
+    if jittering is not None:
+        found = _settled(*jittering)
+    return _on_all_poses(found, problem, poses)
 
 
-def _with_jitter(found: Solved) -> Solved | None:
-    """The same estimate with a jitter of every scan's stamp; None where the data show none."""
+def _rough(
+    problem: Problem, start: Mapping[str, gtsam.Pose3], range_sigma: Array
+) -> tuple[State, Levels]:
+    """The estimate after the rounds with wide gates, of some of the scans, and noise levels."""
+    some, poses = with_scans(problem, some_scans(problem.patches))
+    rough = first_state(some, start)
+    levels = Levels(FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M)
+    for gate in ROUGH_GATES_M:
+        found = _round(some, rough, range_sigma, gate, levels)
+        if found is None:
+            break
+        found = _settled(found, steps=2)
+        levels = Levels.of(found.nuisances)
+        rough = found.state
+    return on_all_poses(problem.prior, poses, rough), levels
+
+
+def _with_jitter(found: Estimate) -> tuple[Estimate, int, System] | None:
+    """The same estimate with a jitter of every scan's stamp; None where the data show none.
+
+    With the number of steps to go on with, and its system.
+    """
     problem = found.problem
     if problem.twists is None:
         return None
@@ -186,55 +203,31 @@ def _with_jitter(found: Solved) -> Solved | None:
     errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
     state = replace(found.state, errors=errors)
     geometry = geometry_at(problem, state, found.sightings, layout)
-
-    def at(nuisances: Nuisances) -> tuple[Rows, System]:
-        return _whitened(
-            problem,
-            state,
-            geometry,
-            found.strips,
-            found.sightings,
-            found.weights,
-            nuisances,
-            layout,
-        )
-
-    _, system = at(found.nuisances)
+    jittering = replace(found, state=state, layout=layout, geometry=geometry)
+    system = jittering.system()
     H, b = with_guesses(problem, state, system)
     sigma_s = jitter_sigma_s(H, b, layout)
     if sigma_s == 0.0:
         return None
-    nuisances = replace(found.nuisances, jitter_s=sigma_s)
-    rows, system = at(nuisances)
-    return replace(
-        found,
-        state=state,
-        nuisances=nuisances,
-        layout=layout,
-        geometry=geometry,
-        rows=rows,
-        system=system,
-    )
+    own = np.arange(layout.jitter, layout.plane)
+    known = system.H.copy()
+    known[own, own] += sigma_s**-2.0
+    jittering = replace(jittering, nuisances=replace(found.nuisances, jitter_s=sigma_s))
+    return jittering, LAST_STEPS, replace(system, H=known)
 
 
-def _without_dents(found: Solved) -> Solved:
-    """The same estimate, its information without what dents of the ground tell.
+def _on_all_poses(found: Estimate, problem: Problem, poses: IntArray) -> Solved:
+    """The same estimate with all poses of a drive, of which it has some (p,).
 
-    The steps use them: derivatives that are not those of the residuals do not lead to the estimate.
+    Its information is without what dents of the ground tell. The steps use them: derivatives that
+    are not those of the residuals do not lead to the estimate.
     """
-    problem, state, sightings = found.problem, found.state, found.sightings
-    geometry = geometry_at(problem, state, sightings, found.layout, dents=False)
-    rows, system = _whitened(
-        problem,
-        state,
-        geometry,
-        found.strips,
-        sightings,
-        found.weights,
-        found.nuisances,
-        found.layout,
-    )
-    return replace(found, rows=rows, system=replace(system, b=found.system.b))
+    b = on_all_coordinates(found.system().b, problem.prior, poses)
+    state = on_all_poses(problem.prior, poses, found.state)
+    layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
+    geometry = geometry_at(problem, state, found.sightings, layout, dents=False)
+    found = replace(found, problem=problem, state=state, layout=layout, geometry=geometry)
+    return Solved(**vars(found), system=replace(found.system(), b=b))
 
 
 def linearised(
@@ -256,28 +249,8 @@ def linearised(
     """
     state = first_state(problem, T_vehicle_lidar)
     found = _round(problem, state, range_sigma_m, GATES_M[-1], levels)
-    return None if found is None else _without_dents(found)
-
-
-def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
-    """The poses of the motion data, some T_vehicle_lidar, and no strips yet."""
-    names = problem.patches.lidars
-    R, t = stack(problem.prior.T_map_vehicle)
-    return State(
-        R_map_vehicle=R,
-        t_map_vehicle=t,
-        moved=np.zeros(len(problem.prior.gradient)),
-        T_vehicle_lidar=tuple(start[name] for name in names),
-        offsets_s=np.zeros(len(names)),
-        centres_map=np.zeros((0, 3)),
-        normals_map=np.zeros((0, 3)),
-        errors=np.zeros(0),
-    )
-
-
-def part_of(problem: Problem, keep: BoolArray) -> Problem:
-    """The same drive with some of its patches (N,)."""
-    return replace(problem, patches=problem.patches.part(keep), relative=problem.relative[keep])
+    every = np.arange(len(problem.prior.stamps_ns))
+    return None if found is None else _on_all_poses(found, problem, every)
 
 
 def _round(
@@ -286,7 +259,7 @@ def _round(
     range_sigma: Array,
     gate_m: float,
     levels: Levels,
-) -> Solved | None:
+) -> Estimate | None:
     """New strips and sightings at an estimate."""
     placed = placed_patches(problem, state)
     strips = find_strips(placed.moments_map, placed.normals_map, problem.patches.scan, gate_m)
@@ -313,185 +286,51 @@ def _round(
     )
     weights = np.ones(sightings.count)
     geometry = geometry_at(problem, state, sightings, layout)
-    rows, system = _whitened(
-        problem, state, geometry, strips, sightings, weights, nuisances, layout
-    )
-    return Solved(
-        problem, state, strips, sightings, weights, nuisances, layout, geometry, rows, system, False
+    return Estimate(
+        problem, state, strips, sightings, weights, nuisances, layout, geometry, converged=False
     )
 
 
-@dataclass(frozen=True)
-class PlacedPatches:
-    """All N patches of a drive at an estimate.
+def _settled(found: Estimate, steps: int, first: System | None = None) -> Estimate:
+    """Gauss-Newton steps; after each one the noise levels and the robust weights.
 
-    Attributes:
-        moments_at_stamp: (N, 4, 4) in the lidar frame at the stamps of their scans.
-        normals_at_stamp: (N, 3) likewise.
-        R_map_lidar: (N, 3, 3) at these stamps.
-        t_map_lidar: (N, 3) metres.
+    `first` is the system of the first step, where there is one.
     """
-
-    moments_at_stamp: Array
-    normals_at_stamp: Array
-    R_map_lidar: Array
-    t_map_lidar: Array
-
-    @property
-    def moments_map(self) -> Array:
-        """(N, 4, 4)."""
-        return moved_moments(self.moments_at_stamp, self.R_map_lidar, self.t_map_lidar)
-
-    @property
-    def normals_map(self) -> Array:
-        """(N, 3)."""
-        return np.asarray(np.einsum("nij,nj->ni", self.R_map_lidar, self.normals_at_stamp))
-
-
-def placed_patches(problem: Problem, state: State) -> PlacedPatches:
-    """The patches of a drive at an estimate."""
-    scan = problem.patches.scan
-    lidar = problem.patches.scan_lidar[scan]
-    moments, normals = _at_stamp(problem, state, lidar)
-    R, t = lidar_poses(state, lidar, problem.pose_of_scan[scan], problem.twists)
-    return PlacedPatches(moments, normals, R, t)
-
-
-def placed_sightings(
-    problem: Problem, placed: PlacedPatches, strips: Strips, range_sigma_m: Array
-) -> Sightings:
-    """Sightings of strips; `range_sigma_m` (L,) is the noise along the beam of each LiDAR."""
-    own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
-    normals = np.einsum("nji,nj->ni", placed.R_map_lidar, strips.normals_map[own])
-    return sightings_of(problem.patches, placed.moments_at_stamp, normals, strips, range_sigma_m)
-
-
-def layout_of(problem: Problem, strips: Strips) -> Layout:
-    """The coordinates of a drive with some strips."""
-    return Layout(
-        poses=len(problem.prior.stamps_ns),
-        parameters=len(problem.prior.parameter_information),
-        offsets=problem.offsets,
-        lidars=len(problem.patches.lidars),
-        surface_of=tuple(strips.surface.tolist()),
-    )
-
-
-def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array]:
-    """Moments and normals of all patches in the lidar frame at their scans' stamps."""
-    patches = problem.patches
-    if not patches.time_s.any():
-        return patches.moments, patches.normal_lidar
-    T = np.array([T.matrix() for T in state.T_vehicle_lidar])
-    inverse = np.array([T.inverse().matrix() for T in state.T_vehicle_lidar])
-    moved = inverse[lidar] @ problem.relative @ T[lidar]
-    R, t = moved[:, :3, :3], moved[:, :3, 3]
-    normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
-    return moved_moments(patches.moments, R, t), normals
-
-
-def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
-    """(Q,) a number for scan and surface of each sighting."""
-    surface = strips.surface[sightings.strip]
-    return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
-
-
-def geometry_at(
-    problem: Problem, state: State, sightings: Sightings, layout: Layout, dents: bool = True
-) -> Geometry:
-    """Residuals of the sightings at an estimate."""
-    scan = sightings.scan
-    return geometry_of(
-        state,
-        sightings,
-        layout,
-        problem.patches.scan_lidar[scan],
-        problem.pose_of_scan[scan],
-        problem.twists,
-        dents,
-    )
-
-
-def _whitened(
-    problem: Problem,
-    state: State,
-    geometry: Geometry,
-    strips: Strips,
-    sightings: Sightings,
-    weights: Array,
-    nuisances: Nuisances,
-    layout: Layout,
-) -> tuple[Rows, System]:
-    group = groups_of(sightings, strips)
-    repeated = problem.views.count[sightings.scan]
-    rows = whitened(geometry, sightings, group, repeated, nuisances, weights, layout.size)
-    stands = stands_of(state.t_map_vehicle, strips.centres_map, strips.normals_map)
-    system = system_of(rows, state, layout, problem.prior, nuisances, problem.standing, stands)
-    return rows, system
-
-
-def _settled(found: Solved, steps: int) -> Solved:
-    """Gauss-Newton steps; after each one the noise levels and the robust weights."""
-    problem, layout, sightings = found.problem, found.layout, found.sightings
-    converged = False
     for number in range(steps):
-        H, b = with_guesses(problem, found.state, found.system)
-        factor = factor_of(H)
-        solve = partial(found.system.surfaces.solve, factor)
-        d = found.system.surfaces.follow(solved(factor, b))
-        state = stepped(found.state, layout, d)
-        geometry = geometry_at(problem, state, sightings, layout)
-        nuisances = fitted_noise(
-            geometry,
-            found.geometry,
-            sightings,
-            groups_of(sightings, found.strips),
-            problem.views,
-            found.weights,
-            solve,
-            layout,
-            found.nuisances,
-            state.errors,
-        )
-        weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-        rows, system = _whitened(
-            problem, state, geometry, found.strips, sightings, weights, nuisances, layout
-        )
-        own = slice(layout.extrinsic, layout.error)
-        converged = number > 0 and float(d[own] @ H[own, own] @ d[own]) < SMALL_SIGMAS**2
-        found = replace(
-            found,
-            state=state,
-            weights=weights,
-            nuisances=nuisances,
-            geometry=geometry,
-            rows=rows,
-            system=system,
-            converged=converged,
-        )
-        if converged:
-            break
-    return found
+        found, size = _stepped(found, first if number == 0 else None)
+        if number > 0 and size < SMALL_SIGMAS:
+            return replace(found, converged=True)
+    return replace(found, converged=False)
 
 
-def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
-    """The system's H and b with the guesses: they hold what structure does not determine."""
-    layout = system.layout
-    H, b = system.H.copy(), system.b.copy()
-    own = slice(layout.extrinsic, layout.error)
-    axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
-    away = np.zeros(6 * layout.lidars)
-    pairs = zip(state.T_vehicle_lidar, problem.guesses, strict=True)
-    for i, (T, guess) in enumerate(pairs):
-        part = slice(6 * i, 6 * i + 6)
-        axes[part, part] = right_to_vehicle_axes(T)
-        away[part] = vehicle_axes_difference(T, guess)
-    H[own, own] += axes.T @ problem.guess_information @ axes
-    b[own] -= axes.T @ problem.guess_information @ away
-    for i in range(layout.offset, layout.extrinsic):
-        H[i, i] += OFFSET_SIGMA_S**-2.0
-    return H, b
+def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
+    """The estimate after a step, and the size of the step in sigmas of the extrinsics."""
+    problem, layout, sightings = found.problem, found.layout, found.sightings
+    system = system or found.system()
+    factor, b = _factor(found, system)
+    d = system.surfaces.follow(solved(factor, b))
+    state = stepped(found.state, layout, d)
+    geometry = geometry_at(problem, state, sightings, layout)
+    nuisances = fitted_noise(
+        geometry,
+        found.geometry,
+        sightings,
+        groups_of(sightings, found.strips),
+        problem.views,
+        found.weights,
+        partial(system.surfaces.solve, factor),
+        layout,
+        found.nuisances,
+        state.errors,
+    )
+    weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
+    step = d[layout.extrinsic : layout.error]
+    cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
+    after = replace(found, state=state, weights=weights, nuisances=nuisances, geometry=geometry)
+    return after, math.sqrt(float(step @ np.linalg.solve(cov, step)))
 
 
-OFFSET_SIGMA_S = 0.05
-"""1 sigma of a time offset: half a revolution at 10 Hz."""
+def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:
+    """Factor of the system with the guesses, and its right-hand side."""
+    H, b = with_guesses(found.problem, found.state, system)
+    return factor_of(H), b

@@ -9,7 +9,7 @@ import scipy.sparse
 from scipy.spatial import cKDTree
 
 from caliv_graph.geometry.se3 import skew, tangent_axes
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.strips import CELL_M, LEVEL
 
 UNEVEN_M = 0.005
@@ -50,6 +50,10 @@ class Stands:
 
     pose: IntArray
     strip: IntArray
+
+    def only(self, keep: BoolArray) -> Stands:
+        """Those of a mask (S,)."""
+        return Stands(self.pose[keep], self.strip[keep])
 
 
 def stands_of(t_map_vehicle: Array, centres_map: Array, normals_map: Array) -> Stands:

@@ -23,8 +23,8 @@ where extrinsics are degrees off, and at the narrowest. A patch knows its normal
 that straddle a kerb lean towards the LiDAR, and pull the pitch of LiDARs that look ahead and behind
 apart."""
 
-STRIPS_OF_A_CELL = 4
-"""Most strips of a cell: the two faces of each of two walls that meet."""
+STRIPS_OF_A_CELL = 16
+"""Most strips of a column: fronts behind each other that face the same way."""
 
 MIN_SCANS = 6
 """Fewest scans that see a strip. What fewer see may have been moving."""
@@ -81,7 +81,7 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     normals: list[Array] = []
     points = moments_map[:, 3, 3]
     positions = moments_map[:, :3, 3] / points[:, None]
-    for members in _cells(positions):
+    for members in _cells(positions, normals_map):
         for strip in _strips_of(members, moments_map, positions, normals_map, scan, gate_m):
             own, centre, normal = strip
             of_patch[own] = len(centres)
@@ -97,12 +97,21 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     )
 
 
-def _cells(positions: Array) -> list[IntArray]:
-    """Indices of the patches of each cell of the map, cells in a fixed order."""
+def _cells(positions: Array, normals: Array) -> list[IntArray]:
+    """Indices of the patches of each column of the map, columns in a fixed order.
+
+    Patches whose normals are nearest to the same axis of the map and point the same way share a
+    column along it. A surface must not be cut where it lies: ground at the height of a boundary
+    would be two strips, of patches whose errors have the same sign.
+    """
     if not len(positions):
         return []
+    axis = np.abs(normals).argmax(axis=1)
+    each = np.arange(len(axis))
     cell = np.floor(positions / CELL_M).astype(np.int64)
-    _, inverse = np.unique(cell, axis=0, return_inverse=True)
+    cell[each, axis] = 0
+    side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
+    _, inverse = np.unique(np.column_stack([side, cell]), axis=0, return_inverse=True)
     inverse = inverse.ravel()
     order = np.argsort(inverse, kind="stable")
     ends = np.flatnonzero(np.diff(inverse[order])) + 1
@@ -125,13 +134,13 @@ def _strips_of(
             break
         seed = left[np.argmax(moments[left, 3, 3])]
         centre, normal = positions[seed], normals[seed]
-        own = left[:0]
+        at, facing = positions[left], normals[left]
         for _ in range(3):
-            own = left[_on_plane(positions[left], normals[left], centre, normal, gate_m)]
+            taken = _on_plane(at, facing, centre, normal, gate_m)
+            own = left[taken]
             if len(own) < MIN_SCANS:
                 break
             centre, normal = plane_of_moments(moments[own].sum(axis=0), normals[own].mean(axis=0))
-        taken = np.isin(left, own)
         taken[left == seed] = True
         if len(own) >= MIN_SCANS and len(np.unique(scan[own])) >= MIN_SCANS:
             out.append((own, centre, normal))

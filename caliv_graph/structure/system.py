@@ -221,10 +221,15 @@ class Geometry:
     def offset_rows(self, sightings: Sightings, size: int) -> scipy.sparse.csr_array:
         """(Q, `size`) derivatives of `offsets_m`."""
         data = np.einsum("qci,qi->qc", self.by, _middles(sightings))
-        row = np.broadcast_to(np.arange(len(data))[:, None], data.shape)
-        return scipy.sparse.csr_array(
-            (data.ravel(), (row.ravel(), self.columns.ravel())), shape=(len(data), size)
-        )
+        return _rows_of(data[:, None], self.columns, size)
+
+
+def _rows_of(data: Array, columns: IntArray, size: int) -> scipy.sparse.csr_array:
+    """A sparse matrix (r q, `size`) of r rows (q, r, C) each with the same columns (q, C)."""
+    q, r, c = data.shape
+    column = np.repeat(columns.astype(np.int32), r, axis=0).ravel()
+    ends = np.arange(0, q * r * c + 1, c, dtype=np.int32)
+    return scipy.sparse.csr_array((data.ravel(), column, ends), shape=(q * r, size))
 
 
 def _middles(sightings: Sightings) -> Array:
@@ -250,15 +255,21 @@ class Rows:
     of_noise: Array
     shared_noise: Array
 
-    def normal_equations(self) -> tuple[scipy.sparse.csr_array, Array]:
-        """H (D, D) and b (D,), the shared offsets eliminated."""
+    def normal_equations(
+        self,
+    ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array, Array]:
+        """H and V with H - V V^T of the system, (D, D) and (D, G), and its b (D,).
+
+        The shared offsets are eliminated; V has their couplings. The product would couple all
+        strips of a surface with each other: most of the memory of the solve.
+        """
         B = self.shared
-        V = (self.J.T @ B).tocsr()
+        J_t = self.J.T.tocsr()
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
-        H = self.J.T @ self.J - V @ (scipy.sparse.diags_array(inner) @ V.T)
-        b = self.of_noise - self.J.T @ self.r
-        b += V @ (inner * (B.T @ self.r - self.shared_noise))
-        return H.tocsr(), np.asarray(b)
+        V = (J_t @ (B @ scipy.sparse.diags_array(np.sqrt(inner)))).tocsr()
+        b = self.of_noise - J_t @ self.r
+        b += V @ (np.sqrt(inner) * (B.T @ self.r - self.shared_noise))
+        return (J_t @ self.J).tocsr(), V, np.asarray(b)
 
 
 def whitened(
@@ -266,6 +277,7 @@ def whitened(
     sightings: Sightings,
     group: IntArray,
     repeated: IntArray,
+    alike: IntArray,
     nuisances: Nuisances,
     weights: Array,
     size: int,
@@ -273,22 +285,21 @@ def whitened(
     """Residuals by the noise of points and sightings, the latter eliminated.
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
-    view: what these share counts as often, so that their mean has the error of one. `weights` (Q,)
-    are robust, `size` is D.
+    view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
+    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
     """
     more = repetition(nuisances, repeated)
     own = nuisances.sighting[sightings.strip] * more
-    # A strip that two LiDARs see apart they see tilted against each other, too.
-    tilt = np.sqrt(own**2 + (repeated - 1.0) * nuisances.strip[sightings.strip] ** 2)
+    # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
+    # scans: bumps within it. As often as it is seen, so often the error counts.
+    tilt = np.sqrt(own**2 + (alike - 1.0) * nuisances.strip[sightings.strip] ** 2)
     S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)
     C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     data = np.swapaxes(geometry.by @ C, 1, 2)
     q = sightings.count
-    row = np.broadcast_to(np.arange(4 * q).reshape(q, 4, 1), data.shape)
-    column = np.broadcast_to(geometry.columns[:, None, :], data.shape)
-    J = scipy.sparse.csr_array((data.ravel(), (row.ravel(), column.ravel())), shape=(4 * q, size))
+    J = _rows_of(data, geometry.columns, size)
     groups, number = np.unique(group, return_inverse=True)
     by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
     own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
@@ -490,7 +501,7 @@ def system_of(
     stands: Stands,
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
-    sparse, right = rows.normal_equations()
+    sparse, less, right = rows.normal_equations()
     own_errors = slice(layout.standing, layout.jitter)
     J, r = standing_rows(
         standing,
@@ -518,7 +529,7 @@ def system_of(
     right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = 6 * layout.poses + layout.parameters
-    H, b, surfaces = eliminated(sparse, right, layout.plane, layout.of_surfaces())
+    H, b, surfaces = eliminated(sparse, less, right, layout.plane, layout.of_surfaces())
     b_prior = prior.gradient - prior.information @ state.moved
     H[:size, :size] += prior.information
     b[:size] += b_prior

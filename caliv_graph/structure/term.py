@@ -17,6 +17,7 @@ from caliv_graph.structure.align import align_patches
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.problem import Problem, relative_motions
 from caliv_graph.structure.read import level
 from caliv_graph.structure.relative import (
     held_sigmas,
@@ -24,12 +25,7 @@ from caliv_graph.structure.relative import (
     relative_quadratic,
     start_about,
 )
-from caliv_graph.structure.solve import (
-    Problem,
-    Solved,
-    relative_motions,
-    solve_structure,
-)
+from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.structure.thickness import (

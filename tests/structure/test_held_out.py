@@ -17,13 +17,8 @@ from caliv_graph.structure.distances import (
 )
 from caliv_graph.structure.held_out import HeldOut, hold_out
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.solve import (
-    Problem,
-    first_state,
-    part_of,
-    placed_patches,
-    solve_structure,
-)
+from caliv_graph.structure.problem import Problem, first_state, part_of, placed_patches
+from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.strips import TILE_M
 from caliv_graph.structure.term import strips_of
 from tests.structure.test_solve import problem_of

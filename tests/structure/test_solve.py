@@ -11,7 +11,8 @@ import pytest
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
-from caliv_graph.structure.solve import Problem, Solved, solve_structure
+from caliv_graph.structure.problem import Problem, part_of
+from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import term_of
 from caliv_graph.structure.views import Views
@@ -221,5 +222,5 @@ def test_between_parallel_walls_what_lies_along_them_is_unknown() -> None:
 
 def test_nothing_to_see_is_said() -> None:
     problem = problem_of(PARALLEL, _straight(24), 3)
-    few = problem.patches.part(np.arange(len(problem.patches.scan)) < 5)
-    assert solve_structure(replace(problem, patches=few), dict(TRUE)) is None
+    few = part_of(problem, np.arange(len(problem.patches.scan)) < 5)
+    assert solve_structure(few, dict(TRUE)) is None

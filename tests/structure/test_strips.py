@@ -52,6 +52,28 @@ def test_a_long_wall_is_one_surface_of_several_strips() -> None:
     assert len(set(strips.surface)) == 1
 
 
+def test_a_surface_on_the_boundary_of_cells_is_one_strip() -> None:
+    """Two would have patches whose errors have the same sign."""
+    along = np.linspace(0.3, 1.7, 8)
+    around = np.where(EIGHT % 2, 0.001, -0.001)
+    ground = np.column_stack([along, np.full(8, 1.0), around])
+    wall = np.column_stack([4.0 + around, along, np.full(8, 1.0)])
+    for centres, normal in ((ground, [0.0, 0.0, 1.0]), (wall, [-1.0, 0.0, 0.0])):
+        strips = find_strips(*patches(centres, np.tile(normal, (8, 1))), EIGHT, 0.1)
+        assert strips.count == 1
+        assert (strips.of_patch == 0).all()
+
+
+def test_fronts_behind_each_other_are_strips_of_their_own() -> None:
+    along = np.linspace(0.3, 1.7, 8)
+    wall = np.column_stack([np.zeros(8), along, np.full(8, 1.0)])
+    centres = np.vstack([wall + np.array([x, 0.0, 0.0]) for x in (1.0, 3.0, 3.5, 9.0)])
+    strips = find_strips(
+        *patches(centres, np.tile([1.0, 0.0, 0.0], (32, 1))), np.tile(EIGHT, 4), 0.06
+    )
+    assert sorted(strips.centres_map[:, 0].round(2).tolist()) == [1.0, 3.0, 3.5, 9.0]
+
+
 def test_what_few_scans_see_is_no_strip() -> None:
     centres = np.column_stack([np.full(8, 1.0), np.linspace(0.3, 1.7, 8), np.full(8, 1.0)])
     normals = np.tile([1.0, 0.0, 0.0], (8, 1))

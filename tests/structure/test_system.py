@@ -13,9 +13,11 @@ from caliv_graph.structure.standing import Standing, Stands, standing_rows, stan
 from caliv_graph.structure.system import (
     Geometry,
     Layout,
+    Nuisances,
     State,
     geometry_of,
     stepped,
+    whitened,
 )
 
 LAYOUT = Layout(poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2)
@@ -124,8 +126,13 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
         rows = slice(30 * i, 30 * i + 30)
         J[rows, :rest] = rng.standard_normal((30, rest))
         J[rows, own] = rng.standard_normal((30, len(own)))
-    H, b = J.T @ J, rng.standard_normal(12)
-    reduced, right, surfaces = eliminated(scipy.sparse.csr_array(H), b, rest, blocks)
+    V = np.zeros((12, 3))
+    for k, own in enumerate((blocks[0], blocks[1], blocks[1])):
+        touched = np.concatenate([[k, k + 2], own[:2]])
+        V[touched, k] = rng.standard_normal(4)
+    H, b = J.T @ J - V @ V.T, rng.standard_normal(12)
+    sparse, less = scipy.sparse.csr_array(J.T @ J), scipy.sparse.csr_array(V)
+    reduced, right, surfaces = eliminated(sparse, less, b, rest, blocks)
     factor = factor_of(reduced)
     whole = np.linalg.solve(H, b)
     assert surfaces.follow(solved(factor, right)) == pytest.approx(whole, rel=1e-8)
@@ -134,8 +141,9 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
 
 
 def test_a_surface_without_information_is_named() -> None:
+    none = scipy.sparse.csr_array((3, 3))
     with pytest.raises(SolveError, match="surface"):
-        eliminated(scipy.sparse.csr_array((3, 3)), np.zeros(3), 1, [np.array([1, 2])])
+        eliminated(none, none, np.zeros(3), 1, [np.array([1, 2])])
 
 
 STANDING = Standing(
@@ -184,3 +192,42 @@ def test_a_vehicle_stands_on_the_strip_below_it_only() -> None:
     stands = stands_of(at, centres, normals)
     assert stands.pose.tolist() == [0, 1]
     assert stands.strip.tolist() == [0, 1]
+
+
+def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them() -> None:
+    rng = np.random.default_rng(0)
+    p = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.zeros(200)])
+    p += np.array([6.0, 0.0, -2.0]) - p.mean(axis=0)
+    h = np.column_stack([p, np.ones(200)])
+    layout = Layout(1, 0, (), 1, (0,))
+    state = State(
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.zeros(6),
+        (gtsam.Pose3(),),
+        np.zeros(1),
+        np.array([[6.0, 0.0, -2.0]]),
+        np.array([[0.0, 0.0, 1.0]]),
+        np.zeros(layout.size),
+    )
+    nuisances = Nuisances(0.005, 0.003, 0.003, 0.003, np.array([4e-4]), np.array([2e-4]), 2e-4, 0.0)
+    tilts = slice(layout.plane, layout.plane + 2)
+    for count in (50, 200):
+        of = np.zeros(count, np.int64)
+        moments = np.tile(1e7 * h.T @ h, (count, 1, 1))
+        sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)))
+        geometry = geometry_of(state, sightings, layout, of, of, None)
+        own = np.ones(count, np.int64)
+        rows = whitened(
+            geometry,
+            sightings,
+            np.arange(count),
+            own,
+            count * own,
+            nuisances,
+            np.ones(count),
+            layout.size,
+        )
+        known = (rows.J.T @ rows.J).toarray()[tilts, tilts]
+        # 0.4 mrad, and the own 0.2 mrad of each scan.
+        assert np.sqrt(1.0 / np.diag(known)) == pytest.approx(4e-4, rel=0.02)

@@ -1,0 +1,217 @@
+"""What the solve of one drive is given, and where its patches and residuals are at an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
+from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
+from caliv_graph.structure.standing import Standing
+from caliv_graph.structure.strips import Strips
+from caliv_graph.structure.system import Geometry, Layout, State, System, geometry_of, lidar_poses
+from caliv_graph.structure.views import Views
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+OFFSET_SIGMA_S = 0.05
+"""1 sigma of a time offset: half a revolution at 10 Hz."""
+
+SAME_TIME_NS = 200_000
+"""Times of patches this near have one pose: 0.1 ms at most from their own, 0.2 mm at 2 m/s."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What the solve of one drive is given.
+
+    Attributes:
+        patches: of the drive.
+        prior: what the motion data say of the poses.
+        pose_of_scan: (S,) index of the pose of each scan.
+        relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
+            time.
+        twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
+        offsets: indices of the LiDARs with a free time offset.
+        guesses: n guesses of T_vehicle_lidar.
+        guess_information: (6 n, 6 n) of them, vehicle axes.
+        range_sigma_m: noise along the beam as stated.
+        standing: what is known of how the vehicle stands on the ground.
+        views: which scans are from one place.
+    """
+
+    patches: DrivePatches
+    prior: PosePrior
+    pose_of_scan: IntArray
+    relative: Array
+    twists: Array | None
+    offsets: tuple[int, ...]
+    guesses: tuple[gtsam.Pose3, ...]
+    guess_information: Array
+    range_sigma_m: float
+    standing: Standing
+    views: Views
+
+
+def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
+    """(N, 4, 4) T of the vehicle at each patch's time in the vehicle frame at the scan's stamp."""
+    stamps = patches.stamps_ns[patches.scan]
+    begin, end = trajectory.span_ns
+    own = np.clip(stamps + np.round(1e9 * patches.time_s).astype(np.int64), begin, end)
+    # Thousands of patches share a time to a tenth of a millisecond. Rounded, not cut off: a time
+    # that is too early by the mean shifts all LiDARs along the motion.
+    times, inverse = np.unique((own + SAME_TIME_NS // 2) // SAME_TIME_NS, return_inverse=True)
+    R, t = trajectory.poses_at(np.clip(times * SAME_TIME_NS, begin, end))
+    R, t = R[inverse.ravel()], t[inverse.ravel()]
+    R_s, t_s = trajectory.poses_at(patches.stamps_ns)
+    R_s, t_s = R_s[patches.scan], t_s[patches.scan]
+    out = np.zeros((len(stamps), 4, 4))
+    out[:, :3, :3] = np.swapaxes(R_s, 1, 2) @ R
+    out[:, :3, 3] = np.einsum("nji,nj->ni", R_s, t - t_s)
+    out[:, 3, 3] = 1.0
+    still = patches.time_s == 0.0
+    out[still] = np.eye(4)
+    return out
+
+
+def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
+    """The poses of the motion data, some T_vehicle_lidar, and no strips yet."""
+    names = problem.patches.lidars
+    R, t = stack(problem.prior.T_map_vehicle)
+    return State(
+        R_map_vehicle=R,
+        t_map_vehicle=t,
+        moved=np.zeros(len(problem.prior.gradient)),
+        T_vehicle_lidar=tuple(start[name] for name in names),
+        offsets_s=np.zeros(len(names)),
+        centres_map=np.zeros((0, 3)),
+        normals_map=np.zeros((0, 3)),
+        errors=np.zeros(0),
+    )
+
+
+def part_of(problem: Problem, keep: BoolArray) -> Problem:
+    """The same drive with some of its patches (N,)."""
+    return replace(problem, patches=problem.patches.part(keep), relative=problem.relative[keep])
+
+
+@dataclass(frozen=True)
+class PlacedPatches:
+    """All N patches of a drive at an estimate.
+
+    Attributes:
+        moments_at_stamp: (N, 4, 4) in the lidar frame at the stamps of their scans.
+        normals_at_stamp: (N, 3) likewise.
+        R_map_lidar: (N, 3, 3) at these stamps.
+        t_map_lidar: (N, 3) metres.
+    """
+
+    moments_at_stamp: Array
+    normals_at_stamp: Array
+    R_map_lidar: Array
+    t_map_lidar: Array
+
+    @property
+    def moments_map(self) -> Array:
+        """(N, 4, 4)."""
+        return moved_moments(self.moments_at_stamp, self.R_map_lidar, self.t_map_lidar)
+
+    @property
+    def normals_map(self) -> Array:
+        """(N, 3)."""
+        return np.asarray(np.einsum("nij,nj->ni", self.R_map_lidar, self.normals_at_stamp))
+
+
+def placed_patches(problem: Problem, state: State) -> PlacedPatches:
+    """The patches of a drive at an estimate."""
+    scan = problem.patches.scan
+    lidar = problem.patches.scan_lidar[scan]
+    moments, normals = _at_stamp(problem, state, lidar)
+    R, t = lidar_poses(state, lidar, problem.pose_of_scan[scan], problem.twists)
+    return PlacedPatches(moments, normals, R, t)
+
+
+def placed_sightings(
+    problem: Problem, placed: PlacedPatches, strips: Strips, range_sigma_m: Array
+) -> Sightings:
+    """Sightings of strips; `range_sigma_m` (L,) is the noise along the beam of each LiDAR."""
+    own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
+    normals = np.einsum("nji,nj->ni", placed.R_map_lidar, strips.normals_map[own])
+    return sightings_of(problem.patches, placed.moments_at_stamp, normals, strips, range_sigma_m)
+
+
+def layout_of(problem: Problem, strips: Strips) -> Layout:
+    """The coordinates of a drive with some strips."""
+    return Layout(
+        poses=len(problem.prior.stamps_ns),
+        parameters=len(problem.prior.parameter_information),
+        offsets=problem.offsets,
+        lidars=len(problem.patches.lidars),
+        surface_of=tuple(strips.surface.tolist()),
+    )
+
+
+def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array]:
+    """Moments and normals of all patches in the lidar frame at their scans' stamps."""
+    patches = problem.patches
+    if not patches.time_s.any():
+        return patches.moments, patches.normal_lidar
+    T = np.array([T.matrix() for T in state.T_vehicle_lidar])
+    inverse = np.array([T.inverse().matrix() for T in state.T_vehicle_lidar])
+    moved = inverse[lidar] @ problem.relative @ T[lidar]
+    R, t = moved[:, :3, :3], moved[:, :3, 3]
+    normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
+    return moved_moments(patches.moments, R, t), normals
+
+
+def groups_of(sightings: Sightings, strips: Strips) -> IntArray:
+    """(Q,) a number for scan and surface of each sighting."""
+    surface = strips.surface[sightings.strip]
+    return np.asarray(sightings.scan * (int(strips.surface.max()) + 1) + surface)
+
+
+def alike(problem: Problem, sightings: Sightings) -> IntArray:
+    """(Q,) number of sightings that the LiDAR of each has of its strip."""
+    lidars = len(problem.patches.lidars)
+    both = sightings.strip * lidars + problem.patches.scan_lidar[sightings.scan]
+    return np.asarray(np.bincount(both)[both])
+
+
+def geometry_at(
+    problem: Problem, state: State, sightings: Sightings, layout: Layout, dents: bool = True
+) -> Geometry:
+    """Residuals of the sightings at an estimate."""
+    scan = sightings.scan
+    return geometry_of(
+        state,
+        sightings,
+        layout,
+        problem.patches.scan_lidar[scan],
+        problem.pose_of_scan[scan],
+        problem.twists,
+        dents,
+    )
+
+
+def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
+    """The system's H and b with the guesses: they hold what structure does not determine."""
+    layout = system.layout
+    H, b = system.H.copy(), system.b.copy()
+    own = slice(layout.extrinsic, layout.error)
+    axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
+    away = np.zeros(6 * layout.lidars)
+    pairs = zip(state.T_vehicle_lidar, problem.guesses, strict=True)
+    for i, (T, guess) in enumerate(pairs):
+        part = slice(6 * i, 6 * i + 6)
+        axes[part, part] = right_to_vehicle_axes(T)
+        away[part] = vehicle_axes_difference(T, guess)
+    H[own, own] += axes.T @ problem.guess_information @ axes
+    b[own] -= axes.T @ problem.guess_information @ away
+    for i in range(layout.offset, layout.extrinsic):
+        H[i, i] += OFFSET_SIGMA_S**-2.0
+    return H, b

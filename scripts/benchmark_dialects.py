@@ -13,6 +13,8 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     inspvax      poses as novatel_oem7_msgs/INSPVAX instead of IMU, GNSS and velocity
     tum          poses as a TUM file beside the bag
     navpvt       fixes as ublox_msgs/NavPVT
+    odometry     no IMU: fixes, and wheel odometry (speed and yaw rate) as nav_msgs/Odometry
+    speed        no IMU: fixes, and speeds as geometry_msgs/TwistStamped
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import argparse
 import datetime
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,9 @@ import pymap3d
 import yaml
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # imports the module beside this one from any folder
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
@@ -42,8 +47,9 @@ from caliv_graph.readers.pose_file import read_poses
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._dialects_motion import Message, drawn, odometry, turned
 
-SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "distorted.yaml"
+SCENARIO = ROOT / "configs" / "scenarios" / "distorted.yaml"
 PACKET_S = 24 * 55.296e-6
 SWEEPS: dict[str, dict[str, Any]] = {
     "plain": {"time_field": "t"},
@@ -56,8 +62,15 @@ SWEEPS: dict[str, dict[str, Any]] = {
         "packet_s": PACKET_S,
     },
 }
-WRITTEN = {"as start": "end", "inspvax": "plain", "tum": "plain", "navpvt": "plain"}
-ROWS = ("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets")
+WRITTEN = {
+    "as start": "end",
+    **dict.fromkeys(("inspvax", "tum", "navpvt", "odometry", "speed"), "plain"),
+}
+ROWS = (
+    *("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets"),
+    *("odometry", "speed"),
+)
+NO_IMU = ("odometry", "speed")
 POSITION_M, ROTATION_RAD = 0.01, 1e-3
 """White noise of the poses of INSPVAX and TUM."""
 
@@ -91,13 +104,20 @@ def result(row: str, seed: int, out: Path) -> str:
     except CalivError as e:
         return str(e)
     truth = {name: model.mounting.pose() for name, model in scenario.lidars.items()}
+    if row in NO_IMU:
+        truth = {name: turned(T, seed) for name, T in truth.items()}
     found = evaluate(calibration, truth)
     rows = [item["s2v"] for item in found["lidars"].values()]
     nees = " ".join(f"{item['nees']:9.1f}" for item in rows)
     pair = found["pairs"][0]
     mm = 1e3 * max(np.abs(item["translation_m"]).max() for item in (*rows, pair))
     mrad = 1e3 * max(np.abs(item["rotation_rad"]).max() for item in (*rows, pair))
-    return f"{calibration.status:13}{nees:>20}{pair['nees']:8.1f}   {mm:8.1f} {mrad:8.2f}"
+    line = f"{calibration.status:13}{nees:>20}{pair['nees']:8.1f}   {mm:8.1f} {mrad:8.2f}"
+    scale = calibration.vehicle.get("speed_scale")
+    if scale is not None:
+        off = float(scale.value[0]) - drawn(seed).scale
+        line += f"   scale {1e4 * off:+.1f}e-4, sigma {1e4 * float(scale.sigma[0]):.1f}e-4"
+    return line
 
 
 def described(kind: str) -> dict[str, Any]:
@@ -136,6 +156,14 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
             raw["topics"] = {"pose": "/inspvax"}
         else:
             raw["topics"]["gnss"] = "/navpvt"
+    elif row in NO_IMU:
+        path = folder / row
+        if not path.exists():
+            messages = odometry(folder, seed, yaw_rate=row == "odometry")
+            with_messages(folder / "drive", path, messages, ("/imu/data", "/vehicle/twist"))
+        raw["data"]["path"] = row
+        twist = "/odom" if row == "odometry" else "/vehicle/speed"
+        raw["topics"] = {"gnss": "/gnss/fix", "twist": twist}
 
 
 def noisy_poses(folder: Path, seed: int) -> tuple[list[int], list[Any], Any]:
@@ -203,6 +231,26 @@ def rewritten(source: Path, target: Path, more: Any) -> None:
                 w.write(to[connection.id], stamp, data)
 
 
+def with_messages(
+    source: Path, target: Path, messages: Iterator[Message], without: Collection[str]
+) -> None:
+    """Copies a bag without some topics and with more messages."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with (
+        Reader(source) as reader,
+        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
+    ):
+        kept = [c for c in reader.connections if c.topic not in without]
+        to = {c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in kept}
+        own: dict[str, Any] = {}
+        for stamp, topic, kind, fields in messages:
+            if topic not in own:
+                own[topic] = w.add_connection(topic, kind, typestore=store)
+            w.write(own[topic], stamp, serialised(store, kind, stamp, fields))
+        for connection, stamp, data in reader.messages(connections=kept):
+            w.write(to[connection.id], stamp, data)
+
+
 def navpvt(fix: Any, stamp: int) -> dict[str, Any]:
     """A NavSatFix as the receiver would report it."""
     t = datetime.datetime.fromtimestamp(stamp // 10**9, tz=datetime.UTC)
@@ -229,7 +277,7 @@ def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> byt
             elif int(node) == 1:
                 values[field] = given.get(field, "" if detail[0] == "string" else 0)
             else:
-                values[field] = np.zeros(detail[1], detail[0][1][0])
+                values[field] = given.get(field, np.zeros(detail[1], detail[0][1][0]))
         return store.types[name](**values)
 
     if kind.endswith("INSPVAX"):

@@ -15,24 +15,42 @@ from scipy.linalg import block_diag
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
-from caliv_graph.conventions import key_imu_rotation, key_lever_arm
+from caliv_graph.config.wheels import SPEED_SCALE_SIGMA
+from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_wheels_rotation
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.parameters import (
+    IMU_ROTATION,
+    LEVER_ARM,
+    SPEED_SCALE,
+    WHEELS_ROTATION,
+    mount_rotation,
+)
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
 ParameterValue = Array | gtsam.Rot3
 
-KEYS = {LEVER_ARM.name: key_lever_arm(), IMU_ROTATION.name: key_imu_rotation()}
-"""Parameter of the input -> its key: (3,) metres in the vehicle frame, and R_vehicle_imu."""
+KEYS = {
+    LEVER_ARM.name: key_lever_arm(),
+    IMU_ROTATION.name: key_imu_rotation(),
+    WHEELS_ROTATION.name: key_wheels_rotation(),
+}
+"""Parameter of the input -> its key: (3,) metres in the vehicle frame, R_vehicle_imu, and
+R_vehicle_wheels."""
 
-NAMES = {LEVER_ARM.name: "lever_arm", IMU_ROTATION.name: "imu_rotation"}
+NAMES = {
+    LEVER_ARM.name: "lever_arm",
+    IMU_ROTATION.name: "imu_rotation",
+    WHEELS_ROTATION.name: "wheels_rotation",
+}
 """What they are called in a result."""
 
 USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
+    WHEELS_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
 }
 """A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
@@ -147,6 +165,26 @@ def estimated_parameters(
     return out
 
 
+def speed_scales(trajectories: Sequence[VehicleTrajectory]) -> dict[str, VehicleParameter]:
+    """Measured over true speeds of the drives on which that was estimated; by motion data alone."""
+    found: list[tuple[float, float, bool]] = []
+    for trajectory in trajectories:
+        if not isinstance(trajectory, SmoothedTrajectory):
+            continue
+        sigmas = trajectory.sigmas_of(SPEED_SCALE.name)
+        if sigmas is not None:
+            with_imu = trajectory.data.wheels is None
+            prior = trajectory.data.config.wheels.scale_sigma(with_imu) or SPEED_SCALE_SIGMA
+            sigma = float(sigmas[0])
+            by_drive = max(sigma**-2 - prior**-2, 0.0)
+            told = by_drive > (UNDETERMINED_RATIO * prior) ** -2
+            found.append((trajectory.data.speed_scale, sigma, told))
+    if not found:
+        return {}
+    value, sigma_of, determined = zip(*found, strict=True)
+    return {"speed_scale": VehicleParameter(np.array(value), np.array(sigma_of), determined)}
+
+
 def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]:
     """Sigmas of the prior, and the offset from its mean, of each parameter that has one."""
     return {
@@ -164,11 +202,12 @@ def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
 
 def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> JointInformation:
     """The same, a rotation of the IMU as a right perturbation instead of one in vehicle axes."""
-    if IMU_ROTATION.name not in joint.parameters:
+    rotation = mount_rotation(trajectory.data).name
+    if rotation not in joint.parameters:
         return joint
     m = len(joint.T_map_vehicle)
     R_vehicle_imu = trajectory.data.T_vehicle_imu.rotation().matrix()
-    blocks = [R_vehicle_imu if n == IMU_ROTATION.name else np.eye(3) for n in joint.parameters]
+    blocks = [R_vehicle_imu if n == rotation else np.eye(3) for n in joint.parameters]
     turn = np.asarray(block_diag(*blocks))
     information, gradient = joint.information.copy(), joint.gradient.copy()
     information[:, POSE * m :] = information[:, POSE * m :] @ turn

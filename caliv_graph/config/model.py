@@ -24,6 +24,7 @@ from caliv_graph.config.sections import (
     Section,
     Triple,
 )
+from caliv_graph.config.wheels import WheelsConfig
 from caliv_graph.errors import ConfigError
 
 _LEAST_SIGMA = 1e-6
@@ -333,6 +334,9 @@ class NoiseConfig(Section):
         "scan; absent: estimated",
     )
     velocity_m_s: Positive | None = None
+    yaw_rate_rad_s: Positive | None = Field(
+        None, description="rad/s, yaw rate of the odometry, used where there is no IMU"
+    )
     orientation_deg: Positive | None = None
 
 
@@ -436,6 +440,7 @@ class Config(Section):
     structure: StructureConfig = StructureConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()
+    wheels: WheelsConfig = WheelsConfig()
     noise: NoiseConfig = NoiseConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()

@@ -36,6 +36,9 @@ _SECONDARY = re.compile(r"raw|livox|ouster|os_cloud|os\d|velodyne|camera|realsen
 """Words in the names of topics that are probably not the vehicle's own IMU, velocity or pose."""
 
 
+_ODOMETRY = "nav_msgs/msg/Odometry"
+
+
 @dataclass(frozen=True)
 class MotionTopics:
     """Topics of a bag with the vehicle's motion.
@@ -258,7 +261,8 @@ def first_frame(bag: Bag, topic: str) -> str | None:
 def choose_motion_topics(bag: Bag) -> MotionTopics:
     """The topics of a bag that are probably the best for the vehicle's motion.
 
-    IMU and GNSS with a velocity if there are both; else poses, with the IMU if there is one.
+    IMU and GNSS with a velocity if there are both; else poses, but for those of wheels, which drift
+    away: GNSS and the velocity of the wheels are better.
 
     Raises:
         RecordingError: the bag is damaged.
@@ -281,7 +285,12 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         ranked[kind] = [t.name for t in fitting]
     # Transforms without a vehicle frame hold no pose of the vehicle.
     ranked["pose"] = [name for name in ranked["pose"] if _has_poses(bag, name)]
-    if ranked["imu"] and ranked["gnss"]:
+    ranked["pose"].sort(key=lambda name: _drifts(bag, name))
+    if not ranked["imu"]:
+        # Wheels tell a yaw rate; another twist may be that of a GNSS receiver, in map axes.
+        ranked["twist"].sort(key=lambda name: bag.topics[name].type != _ODOMETRY)
+    drifting = all(_drifts(bag, name) for name in ranked["pose"])
+    if ranked["gnss"] and (ranked["imu"] or (ranked["twist"] and drifting)):
         keys = ["imu", "gnss", "twist"]
     elif ranked["pose"]:
         keys = ["pose"]
@@ -293,6 +302,15 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         for kind, names in ranked.items()
     }
     return MotionTopics(chosen, others)
+
+
+def _drifts(bag: Bag, topic: str) -> bool:
+    """Whether poses are those of an odometry: by REP 105 they drift in the frame `odom`."""
+    from caliv_graph.readers.frames import TF_TYPES
+
+    if bag.topics[topic].type in TF_TYPES:
+        return False
+    return (first_frame(bag, topic) or "").rpartition("/")[2] == "odom"
 
 
 def _has_poses(bag: Bag, topic: str) -> bool:

@@ -74,6 +74,9 @@ than m/s^2 more."""
 _FAST_RAD_S = 6.0
 """Degrees per second exceed it; no road vehicle turns as fast for a twentieth of a drive."""
 
+_UNKNOWN_RATE_VAR = 100.0
+"""(rad/s)^2: no vehicle turns at 10 rad/s. By a larger variance drivers say that it is unknown."""
+
 _MOST_RAD_S = 200.0
 _MOST_M_S2 = 2000.0
 _MOST_M_S = 1000.0
@@ -343,8 +346,9 @@ class TwistCollector(RowCollector):
     frame of the others.
     """
 
-    _WIDTH = 12
+    _WIDTH = 14
     _LINEAR: ClassVar[list[int]] = [0, 1, 2, 6, 7, 8, 12, 13, 14]
+    _YAW_RATE = 35
 
     def __init__(self) -> None:
         super().__init__()
@@ -353,12 +357,13 @@ class TwistCollector(RowCollector):
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
         twist = message.twist
-        cov = np.zeros(9)
+        cov, yaw_rate_var = np.zeros(9), 0.0
         if hasattr(twist, "covariance"):
+            yaw_rate_var = float(twist.covariance[self._YAW_RATE])
             cov, twist = twist.covariance[self._LINEAR], twist.twist
         self._frames.add(getattr(message, "child_frame_id", message.header.frame_id))
         v = twist.linear
-        self._rows.add(stamp_ns, (v.x, v.y, v.z, *cov.tolist()))
+        self._rows.add(stamp_ns, (v.x, v.y, v.z, *cov.tolist(), twist.angular.z, yaw_rate_var))
 
     def finish(self) -> TwistSamples | None:
         """The velocities; None if there are none."""
@@ -374,7 +379,23 @@ class TwistCollector(RowCollector):
                 )
         if not len(stamps):
             return None
-        return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
+        cov = _or_none(_covariances(rows[:, 3:12]))
+        return TwistSamples(stamps, rows[:, :3], cov, *_yaw_rates(rows[:, 12], rows[:, 13]))
+
+
+def _yaw_rates(rate: Array, variance: Array) -> tuple[Array | None, Array | None]:
+    """Yaw rates (n,) and their variances, NaN where unknown; None where no message knows any.
+
+    A driver without one leaves zeros, and may say so by a variance.
+    """
+    known = np.isfinite(rate) & (np.abs(rate) <= _MOST_RAD_S) & ~(variance > _UNKNOWN_RATE_VAR)
+    if not (known & (rate != 0.0)).any():
+        return None, None
+    stated = known & (variance > 0.0)
+    return (
+        np.where(known, rate, np.nan),
+        np.where(stated, variance, np.nan) if stated.any() else None,
+    )
 
 
 class PoseCollector(RowCollector):

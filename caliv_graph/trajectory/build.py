@@ -17,6 +17,7 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import IntArray
 from caliv_graph.trajectory.factors import (
     biased_orientation_factor,
+    level_factor,
     orientation_factor,
     position_factor,
     velocity_factor,
@@ -26,6 +27,7 @@ from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.wheels import level_sigmas, normal_of
 
 GAUGE_M = 1e-4
 GAUGE_RAD = 1e-4
@@ -35,7 +37,7 @@ and large enough that the graph stays well conditioned."""
 
 @dataclass
 class TrajectoryGraph:
-    """The factors, and the kind of each: `imu`, `gnss`, `orientation`, `velocity`, or `prior`."""
+    """The factors, and the kind of each, of `KINDS`."""
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)
@@ -54,7 +56,7 @@ class TrajectoryGraph:
         return out
 
 
-KINDS = frozenset({"imu", "gnss", "orientation", "velocity", "prior"})
+KINDS = frozenset({"imu", "gnss", "orientation", "velocity", "level", "prior"})
 """Kinds of the factors of a trajectory."""
 
 
@@ -82,6 +84,8 @@ def build_graph(
         _add_orientations(graph, data, carried.orientations)
     if carried.velocities is not None:
         _add_velocities(graph, data, carried.velocities)
+    if data.wheels is not None and "level" in kinds:
+        _add_level(graph, data, nodes)
     if data.positions is None:
         _add_gauge_prior(graph, data, states)
     return graph if kinds == KINDS else graph.only(kinds)
@@ -99,7 +103,7 @@ def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, state
         poses = key_imu(i), key_velocity(i), key_imu(i + 1), key_velocity(i + 1)
         factor = gtsam.CombinedImuFactor(*poses, key_bias(i), key_bias(i + 1), measured)
         graph.add("imu", factor)
-    bias_sigmas = np.array([noise.force_bias] * 3 + [noise.gyro_bias] * 3)
+    bias_sigmas = np.concatenate([noise.force_bias, noise.gyro_bias])
     model = gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
     no_bias = gtsam.imuBias.ConstantBias()
     graph.add("prior", gtsam.PriorFactorConstantBias(key_bias(0), no_bias, model))
@@ -154,9 +158,23 @@ def _add_velocities(
         gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
         noise = gtsam.noiseModel.Gaussian.Covariance(velocities.cov[k])
         factor = velocity_factor(
-            key_imu(i), key_velocity(i), velocities.velocity_imu[k], gained, noise
+            key_imu(i),
+            key_velocity(i),
+            velocities.velocity_imu[k],
+            gained,
+            noise,
+            data.speed_scale,
         )
         graph.add("velocity", factor)
+
+
+def _add_level(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray) -> None:
+    """The road under an axle is level, but for its slope and bumps."""
+    assert data.wheels is not None
+    up_map = normal_of(data.slope)
+    for i, sigma in enumerate(level_sigmas(nodes, data.wheels).tolist()):
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+        graph.add("level", level_factor(key_imu(i), up_map, noise))
 
 
 def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States) -> None:

@@ -111,7 +111,7 @@ def _gyro_bias(data: SmootherInput) -> Array:
         finite = np.isfinite(twist.velocity).all(axis=1)
         speeds = twist.stamps_ns[finite], np.linalg.norm(twist.velocity[finite], axis=1)
     bias = standing_gyro(data.inertial, data.positions, speeds)
-    most = MAX_STANDING_BIAS_SIGMAS * data.noise.gyro_bias
+    most = MAX_STANDING_BIAS_SIGMAS * float(data.noise.gyro_bias.max())
     if bias is None or np.linalg.norm(bias) > most:
         return np.zeros(3)
     return bias

@@ -21,6 +21,13 @@ from caliv_graph.trajectory.noise import (
     orientation_covariances,
     velocity_covariances,
 )
+from caliv_graph.trajectory.wheels import (
+    WheelModel,
+    scaled_wheel_noise,
+    wheel_model,
+    wheel_noise,
+    wheel_samples,
+)
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """Conventional value, used without GNSS. It differs from gravity on Earth by at most 0.03 m/s^2,
@@ -50,6 +57,10 @@ class SmootherInput:
             None: it is exact, or still to be guessed (`mounting.py`).
         scales: name of `variances.COMPONENTS` -> factor on the stated sigmas that is in use, of
             those that the data contradict.
+        wheels: what is known of the axle where there is no IMU; `T_vehicle_imu` is then that of its
+            frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
+        slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
+        speed_scale: measured over true velocities.
     """
 
     name: str
@@ -64,6 +75,15 @@ class SmootherInput:
     gravity_m_s2: float
     rotation_sigmas: Array | None = None
     scales: Mapping[str, float] = field(default_factory=dict)
+    wheels: WheelModel | None = None
+    slope: Array = field(default_factory=lambda: np.zeros(2))
+    speed_scale: float = 1.0
+
+    @property
+    def T_vehicle_twist(self) -> gtsam.Pose3:
+        """The frame in which velocities are measured."""
+        planar = self.wheels is not None and self.wheels.planar
+        return self.T_vehicle_imu if planar else gtsam.Pose3()
 
     @property
     def arm_imu(self) -> Array:
@@ -83,13 +103,21 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         TrajectoryError: a sensor that is needed is missing, or its data contradict themselves.
     """
     name = motion.name
-    if motion.imu is None:
-        raise TrajectoryError(
-            f"{name}: no IMU: set topics.imu to a topic of sensor_msgs/Imu, or topics.pose to one "
-            "with the vehicle's poses"
-        )
     no_twist = motion.twist is None or not np.isfinite(motion.twist.velocity).all(axis=1).any()
     no_gnss = motion.gnss is None or not len(motion.gnss.stamps_ns)
+    if motion.imu is None:
+        if config.topics.imu is not None:
+            raise TrajectoryError(
+                f"{name}: no IMU: topics.imu '{config.topics.imu}' holds nothing that can be used. "
+                "Choose another one, or leave it out: GNSS and the speeds of the wheels suffice"
+            )
+        if no_twist:
+            raise TrajectoryError(
+                f"{name}: no IMU and no velocities: set topics.imu (sensor_msgs/Imu), topics.twist "
+                "(nav_msgs/Odometry or a twist: speed and yaw rate of the wheels), or topics.pose "
+                "(the vehicle's poses)"
+            )
+        return _wheel_input(motion, config, no_gnss)
     if no_twist and no_gnss:
         raise TrajectoryError(
             f"{name}: neither GNSS fixes nor velocities: an IMU alone drifts away within seconds. "
@@ -129,6 +157,39 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
     return data, warnings
 
 
+def _wheel_input(
+    motion: MotionData, config: Config, no_gnss: bool
+) -> tuple[SmootherInput, list[str]]:
+    """As `check_input`, of velocities without an IMU."""
+    assert motion.twist is not None
+    inertial, lines = wheel_samples(motion.twist, motion.name)
+    model, warnings, positions = wheel_model(motion.twist, config), list(lines), None
+    if not no_gnss:
+        positions, _, notes = _positions(motion, config, inertial, not model.yaw_rate)
+        warnings += notes
+    if positions is None and not model.yaw_rate:
+        raise TrajectoryError(
+            f"{motion.name}: speeds alone do not tell where the vehicle goes: set topics.gnss "
+            "(sensor_msgs/NavSatFix), topics.imu, or topics.twist to odometry with a yaw rate"
+        )
+    arm = config.gnss.lever_arm
+    data = SmootherInput(
+        name=motion.name,
+        config=config,
+        motion=motion,
+        inertial=inertial,
+        noise=wheel_noise(motion.twist, config),
+        positions=positions,
+        orientation=False,
+        T_vehicle_imu=config.wheels.T_vehicle_wheels.pose(),
+        lever_arm=np.zeros(3) if arm is None else np.array(arm),
+        gravity_m_s2=0.0,
+        rotation_sigmas=np.array(config.wheels.rotation_sigmas_rad()),
+        wheels=model,
+    )
+    return data, warnings
+
+
 def _positions(
     motion: MotionData, config: Config, inertial: Inertial, needed: bool
 ) -> tuple[Positions | None, float, list[str]]:
@@ -140,13 +201,14 @@ def _positions(
     begin, end = inertial.begin_ns, inertial.end_ns
     if ((stamps >= begin) & (stamps <= end)).any():
         return positions, gravity, list(lines)
+    span = "the IMU's span" if motion.imu is not None else "the span of the velocities"
     if needed:
         raise TrajectoryError(
-            f"{motion.name}: no GNSS fix lies within the IMU's span, {begin * 1e-9:.3f} s to "
+            f"{motion.name}: no GNSS fix lies within {span}, {begin * 1e-9:.3f} s to "
             f"{end * 1e-9:.3f} s; fixes from {stamps[0] * 1e-9:.3f} s to {stamps[-1] * 1e-9:.3f} "
             "s. Do their clocks agree?"
         )
-    unused = f"{motion.name}: no GNSS fix lies within the IMU's span: GNSS is not used"
+    unused = f"{motion.name}: no GNSS fix lies within {span}: GNSS is not used"
     return None, gravity, [*lines, unused]
 
 
@@ -182,8 +244,14 @@ def scaled(data: SmootherInput, scales: Mapping[str, float]) -> SmootherInput:
         gyro_density=noise.gyro_density * scales.get("gyroscope", 1.0) ** 2,
         force_density=noise.force_density * scales.get("accelerometer", 1.0) ** 2,
     )
+    if data.wheels is not None:
+        noise = scaled_wheel_noise(noise, scales)
     every = {name: data.scales.get(name, 1.0) * scale for name, scale in scales.items()}
     return replace(data, noise=noise, positions=positions, scales={**data.scales, **every})
+
+
+PARTS = {"speed": "velocity_forward", "yaw_rate": "yaw rate"}
+"""Noise levels that are not called by their sensor -> sensor and part."""
 
 
 def noise_sources(data: SmootherInput) -> dict[str, str]:
@@ -197,7 +265,7 @@ def noise_sources(data: SmootherInput) -> dict[str, str]:
     if data.motion.twist is not None:
         out["velocity"] = velocity_covariances(data.motion.twist, data.config)[1]
     for name, scale in data.scales.items():
-        sensor, _, part = name.partition("_")
+        sensor, _, part = PARTS.get(name, name).partition("_")
         what = f", {part}" if part else ""
         out[sensor] = f"{out[sensor]}{what} times {scale:.2f} by the residuals"
     return out

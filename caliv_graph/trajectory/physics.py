@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Array, IntArray, MotionData
+from caliv_graph.products import Array, IntArray, MotionData, TwistSamples
 from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.axes import SIGMAS, Axes, accelerometer_axes
 from caliv_graph.trajectory.gnss import Positions, positions_in_map
@@ -26,6 +26,7 @@ from caliv_graph.trajectory.kinematics import (
     means_over,
 )
 from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
+from caliv_graph.trajectory.wheels import wheel_samples
 
 MIN_SPEED_M_S = 0.5
 """Below, the course of a GNSS antenna is noise: 15 mm/s of it are 2 degrees."""
@@ -80,17 +81,19 @@ class MotionPhysics:
 
     Attributes:
         name: of the recording.
-        gravity: its direction.
+        gravity: its direction; None without an IMU.
         gyroscope: its rate about the vertical over the true one, by each source.
+        yaw_rate: that of the odometry over that of the course, without an IMU.
         speed: of the velocities over that of the GNSS.
         axes: of the accelerometer.
     """
 
     name: str
-    gravity: Gravity
+    gravity: Gravity | None
     gyroscope: tuple[Ratio, ...] = ()
     speed: Ratio | None = None
     axes: Axes | None = None
+    yaw_rate: Ratio | None = None
 
 
 def known_rotation(config: Config) -> Array | None:
@@ -100,14 +103,14 @@ def known_rotation(config: Config) -> Array | None:
 
 
 def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
-    """Compares the raw sensors of a drive; None without an IMU.
+    """Compares the raw sensors of a drive; None with neither an IMU nor velocities.
 
     Raises:
         TrajectoryError: the IMU's samples or the fixes are unusable, or its orientation and its
             accelerometer disagree on where up is.
     """
     if motion.imu is None:
-        return None
+        return None if motion.twist is None else _wheel_physics(motion, motion.twist, config)
     inertial, _ = clean_inertial(motion.imu, motion.name)
     has_orientation(motion.imu, inertial, motion.name)
     mean = inertial.force.mean(axis=0)
@@ -131,6 +134,19 @@ def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
     speed = _speed(motion, moving)
     axes = accelerometer_axes(moving, inertial, motion, R_vehicle_imu, config)
     return MotionPhysics(motion.name, gravity, tuple(ratios), speed, axes)
+
+
+def _wheel_physics(motion: MotionData, twist: TwistSamples, config: Config) -> MotionPhysics | None:
+    """Speed and yaw rate of wheels against the fixes; None without enough of them."""
+    samples, _ = wheel_samples(twist, motion.name)
+    windows = _windows(motion, config, samples)
+    if windows is None:
+        return None
+    moving = windows.where(windows.speed_m_s > MIN_SPEED_M_S)
+    turn = None
+    if twist.yaw_rate is not None:
+        turn = _gyro_by_course(moving, samples, samples.gyro[:, 2:], config)
+    return MotionPhysics(motion.name, None, speed=_speed(motion, moving), yaw_rate=turn)
 
 
 def _windows(motion: MotionData, config: Config, inertial: Inertial) -> Windows | None:

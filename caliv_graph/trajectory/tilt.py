@@ -17,7 +17,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
 from caliv_graph.trajectory.imu import exp_so3
 from caliv_graph.trajectory.noise import stated
-from caliv_graph.trajectory.parameters import IMU_ROTATION
+from caliv_graph.trajectory.parameters import IMU_ROTATION, WHEELS_ROTATION
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -76,7 +76,8 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     """Roll and pitch of the vehicle's axes over a drive, least squares with priors."""
     begin, end = trajectory.span_ns
     count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
-    at = np.linspace(begin, end, count).astype(np.int64)
+    # From the first on: a float does not hold the nanoseconds of a stamp.
+    at = begin + np.linspace(0, end - begin, count).astype(np.int64)
     R, _ = trajectory.poses_at(at)
     R = R @ _as_configured(trajectory)
     up = R[:, 2, :]  # e_z of the map in vehicle axes
@@ -134,7 +135,7 @@ def _as_configured(trajectory: VehicleTrajectory) -> Array:
     """
     uncertain = trajectory.parameters if isinstance(trajectory, SmoothedTrajectory) else ()
     for each in uncertain:
-        if each.parameter is IMU_ROTATION and each.offset is not None:
+        if each.parameter in (IMU_ROTATION, WHEELS_ROTATION) and each.offset is not None:
             return np.asarray(exp_so3(each.offset[None])[0])
     return np.eye(3)
 

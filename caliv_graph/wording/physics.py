@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import gtsam
@@ -54,6 +55,8 @@ SPEED_UNITS = {3.6: "km/h", 2.23694: "miles per hour", 1.94384: "knots"}
 def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]:
     """What the raw sensors of a drive say against each other and against `T_vehicle_imu`."""
     axes = found.axes
+    if found.gravity is None:
+        return tuple(_rates(found))
     if found.gravity.tilt_rad > MAX_GRAVITY_TILT_RAD:
         # Nothing else can be judged about wrong axes, but units can.
         return (_gravity(found, config), *_rates(found))
@@ -90,7 +93,8 @@ def _rpy(values: Sequence[float], digits: int = 0) -> str:
 
 
 def _gravity(found: MotionPhysics, config: Config) -> Finding:
-    gravity: Gravity = found.gravity
+    gravity = found.gravity
+    assert gravity is not None
     given = config.imu.T_vehicle_imu
     value: tuple[float, ...] = ()
     sentence = gravity_problem(gravity.up_imu, given.pose().rotation().matrix())
@@ -128,6 +132,9 @@ def _rates(found: MotionPhysics) -> Iterator[Finding]:
         for ratio in by_orientation:
             if abs(ratio.value - 1.0) > GROSS_RATIO:
                 yield from _ratio(found.name, ratio, "topics.imu", {})
+    if found.yaw_rate is not None:
+        turn = replace(found.yaw_rate, against="turn")
+        yield from _ratio(found.name, turn, "topics.twist", GYRO_UNITS)
     if found.speed is not None:
         yield from _ratio(found.name, found.speed, "topics.twist", SPEED_UNITS)
 
@@ -141,6 +148,10 @@ _RATIOS = {
         "the gyroscope turns {value} times as fast as the orientation of the same messages",
         "One of the two is wrong: choose another topics.imu, or set its orientation_covariance[0] "
         "to -1",
+    ),
+    "turn": (
+        "the yaw rate of the velocities is {value} times that of the course over ground",
+        "Check the yaw rate in topics.twist",
     ),
     "gnss": (
         "the velocities are {value} times those of the GNSS",
@@ -162,7 +173,7 @@ def _ratio(name: str, ratio: Ratio, key: str, units: dict[float, str]) -> Iterat
         remedy = (
             f"This is {unit}: convert them"
             if "sign" not in unit
-            else ("They have the opposite sign: check the axes of the IMU")
+            else f"They have the opposite sign: check the axes of {key}"
         )
     gross: Literal["contradiction", "warning"] = "contradiction" if off > GROSS_RATIO else "warning"
     value = f"{ratio.value:.3g} +- {ratio.sigma:.1g}"

@@ -145,6 +145,15 @@ imu:
 
 """
 
+WHEELS_TEMPLATE = """\
+wheels:\t# there is no IMU: the wheels tell the motion between the fixes
+  T_vehicle_wheels:\t# middle of the axle that does not steer, x where the vehicle goes straight
+    xyz: [0.0, 0.0, 0.0]\t# metres; zeros: the vehicle frame is there
+    rpy_deg: [0.0, 0.0, 0.0]\t# degrees
+  speed_scale_sigma: 0.02\t# 1 sigma of the scale of the speeds, which is estimated
+
+"""
+
 GROUND_TEMPLATE = """\
 ground:\t# the ground under the wheels: roll, pitch and z of the LiDARs
   vehicle_height: {height}\t# metres, {origin}

@@ -124,6 +124,21 @@ class TwistSamples:
 
 
 @dataclass(frozen=True)
+class HeadingSamples:
+    """Angles of a baseline of two antennas over ground, as the messages have them.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        yaw_rad: (n,) about the vertical; the config says from where it counts.
+        var: (n,) rad^2 as the messages state it, NaN where unknown, or None.
+    """
+
+    stamps_ns: IntArray
+    yaw_rad: Array
+    var: Array | None = None
+
+
+@dataclass(frozen=True)
 class MotionData:
     """All measurements of the vehicle's motion in a recording; None: it is not there.
 
@@ -133,6 +148,7 @@ class MotionData:
         imu: inertial measurements.
         gnss: positions.
         twist: velocities.
+        heading: by two antennas: angles, or the fixes of the second one.
     """
 
     name: str
@@ -140,6 +156,7 @@ class MotionData:
     imu: ImuSamples | None = None
     gnss: GnssFixes | None = None
     twist: TwistSamples | None = None
+    heading: HeadingSamples | GnssFixes | None = None
 
 
 class Recording(Protocol):
@@ -519,7 +536,7 @@ class LinearisedGraph:
     to_vehicle_axes: Array
 
 
-TURNS = ("imu_rotation", "wheels_rotation")
+TURNS = ("imu_rotation", "wheels_rotation", "heading_yaw")
 """Names of parameters of the vehicle that are rotations: radians here, degrees in files."""
 
 
@@ -529,7 +546,8 @@ class VehicleParameter:
 
     Attributes:
         value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu or
-            T_vehicle_wheels in rad; or (drives,) measured over true speeds.
+            T_vehicle_wheels in rad; or (drives,) measured over true speeds, or the direction of
+            the baseline of two antennas in rad.
         sigma: (3,) or (drives,) in the same unit; of a rotation about the vehicle's axes. The
             user's own sigma is part of it.
         determined: per coordinate whether the drive alone determines it.
@@ -567,8 +585,7 @@ class Solution:
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
         held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
-        vehicle: `lever_arm`, `imu_rotation`, `wheels_rotation` and `speed_scale`, where they are
-            uncertain.
+        vehicle: `lever_arm`, `imu_rotation` and `wheels_rotation`, where they are uncertain.
         information_knowing: of `vehicle`, (6n, 6n) of the data if that were known exactly.
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
@@ -801,8 +818,8 @@ class Calibration:
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
         suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
-        vehicle: `lever_arm`, `imu_rotation`, `wheels_rotation` and `speed_scale`, where they were
-            estimated.
+        vehicle: `lever_arm`, `imu_rotation`, `wheels_rotation`, `speed_scale` and `heading_yaw`,
+            where they were estimated.
         structure: the structure that was used; None: none.
     """
 

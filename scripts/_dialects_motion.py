@@ -14,6 +14,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import pymap3d
 
 from caliv_graph.readers.pose_file import read_poses
 
@@ -28,17 +29,36 @@ AXES_RAD = np.radians([0.3, 0.3, 0.1])
 HALF_STEP_S = 0.01
 """Of the differences of the true poses, which are every 10 ms."""
 
+HEADING_HZ = 10
+HEADING_RAD, BASELINE_RAD = math.radians(0.2), math.radians(1.0)
+"""White noise of a heading, and 1 sigma of the direction of the baseline, which is drawn."""
+
+BASELINE_DEG = 90.0
+"""Direction of the baseline as the config has it: to the left."""
+
+SECOND_ARM, ARM_M = (-1.2, 0.4, 0.0), 0.01
+"""The second antenna as the config has it, and 1 sigma of it, which is drawn."""
+
+FIX_M = (0.0167, 0.0167, 0.02)
+"""White noise of its fixes, that of the first."""
+
 Message = tuple[int, str, str, dict[str, Any]]
 """Stamp, topic, type and fields of a message."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Errors of one drive: the scale of the speeds, and (3,) the turn of the vehicle's axes."""
+    """Errors of one drive.
+
+    The scale of the speeds; bias of the yaw rate; (3,) turn of the vehicle's axes; error of the
+    direction of the baseline; (3,) error of the place of the second antenna.
+    """
 
     scale: float
     yaw_rate_bias: float
     axes_rad: np.typing.NDArray[np.float64]
+    baseline_rad: float
+    arm_m: np.typing.NDArray[np.float64]
 
 
 def drawn(seed: int) -> Drawn:
@@ -48,6 +68,8 @@ def drawn(seed: int) -> Drawn:
         1.0 + SCALE * float(rng.standard_normal()),
         YAW_RATE_BIAS_RAD_S * float(rng.standard_normal()),
         AXES_RAD * rng.standard_normal(3),
+        BASELINE_RAD * float(rng.standard_normal()),
+        ARM_M * rng.standard_normal(3),
     )
 
 
@@ -94,3 +116,56 @@ def odometry(folder: Path, seed: int, yaw_rate: bool = True) -> Iterator[Message
                 "twist": {"twist": twist, "covariance": cov},
             },
         )
+
+
+def headings(folder: Path, seed: int, as_imu: bool = False) -> Iterator[Message]:
+    """Headings of a baseline to the left.
+
+    As nmea_navsat_driver writes them (`QuaternionStamped`, from north to the right), or as
+    ublox_gps does (`Imu`, from east to the left, with a variance).
+    """
+    truth = read_poses(folder / "trajectory.tum")
+    rng = np.random.default_rng([seed, 3])
+    direction = math.radians(BASELINE_DEG) + drawn(seed).baseline_rad
+    every = round(1.0 / HALF_STEP_S / HEADING_HZ)
+    for i in range(3, len(truth.stamps_ns), every):
+        R = truth.T_map_vehicle[i].rotation().matrix()
+        x, y, _ = R @ [math.cos(direction), math.sin(direction), 0.0]
+        azimuth = math.atan2(y, x) + HEADING_RAD * rng.standard_normal()
+        yaw = azimuth if as_imu else 0.5 * math.pi - azimuth
+        q = {"z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}
+        stamp = int(truth.stamps_ns[i])
+        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "gnss"}
+        if not as_imu:
+            fields = {"header": header, "quaternion": q}
+            yield stamp, "/heading", "geometry_msgs/msg/QuaternionStamped", fields
+            continue
+        cov = np.diag([1e3, 1e3, HEADING_RAD**2]).ravel()
+        unknown = np.array([-1.0] + [0.0] * 8)
+        fields = {
+            **{"header": header, "orientation": q, "orientation_covariance": cov},
+            **{"angular_velocity_covariance": unknown, "linear_acceleration_covariance": unknown},
+        }
+        yield stamp, "/navheading", "sensor_msgs/msg/Imu", fields
+
+
+def second_fixes(folder: Path, seed: int, origin: tuple[float, float, float]) -> Iterator[Message]:
+    """Fixes of a second antenna, as NavSatFix; `origin` (degrees, m) is that of the map."""
+    truth = read_poses(folder / "trajectory.tum")
+    rng = np.random.default_rng([seed, 4])
+    arm = np.array(SECOND_ARM) + drawn(seed).arm_m
+    every = round(1.0 / HALF_STEP_S / HEADING_HZ)
+    for i in range(0, len(truth.stamps_ns), every):
+        place = truth.T_map_vehicle[i].transformFrom(arm) + FIX_M * rng.standard_normal(3)
+        east, north, up = place
+        latitude, longitude, altitude = pymap3d.enu2geodetic(east, north, up, *origin)
+        stamp = int(truth.stamps_ns[i])
+        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "gnss_2"}
+        fields = {
+            **{"header": header, "status": {"status": 2, "service": 1}},
+            **{"latitude": float(latitude), "longitude": float(longitude)},
+            "altitude": float(altitude),
+            "position_covariance": np.diag(np.square(FIX_M)).ravel(),
+            "position_covariance_type": 2,
+        }
+        yield stamp, "/gnss/second/fix", "sensor_msgs/msg/NavSatFix", fields

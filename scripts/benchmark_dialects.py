@@ -15,6 +15,10 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     navpvt       fixes as ublox_msgs/NavPVT
     odometry     no IMU: fixes, and wheel odometry (speed and yaw rate) as nav_msgs/Odometry
     speed        no IMU: fixes, and speeds as geometry_msgs/TwistStamped
+    heading      IMU without orientation, fixes, heading of two antennas as QuaternionStamped
+    imu heading  the same as an Imu
+    two fixes    the same as the fixes of a second antenna
+    wheels       no IMU: as speed, with that heading
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ import argparse
 import datetime
 import math
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +51,17 @@ from caliv_graph.readers.pose_file import read_poses
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
-from scripts._dialects_motion import Message, drawn, odometry, turned
+from scripts._dialects_motion import (
+    ARM_M,
+    BASELINE_DEG,
+    SECOND_ARM,
+    Message,
+    drawn,
+    headings,
+    odometry,
+    second_fixes,
+    turned,
+)
 
 SCENARIO = ROOT / "configs" / "scenarios" / "distorted.yaml"
 PACKET_S = 24 * 55.296e-6
@@ -62,15 +76,16 @@ SWEEPS: dict[str, dict[str, Any]] = {
         "packet_s": PACKET_S,
     },
 }
+MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels")
 WRITTEN = {
     "as start": "end",
-    **dict.fromkeys(("inspvax", "tum", "navpvt", "odometry", "speed"), "plain"),
+    **dict.fromkeys(("inspvax", "tum", "navpvt", *MORE), "plain"),
 }
 ROWS = (
     *("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets"),
-    *("odometry", "speed"),
+    *MORE,
 )
-NO_IMU = ("odometry", "speed")
+NO_IMU = ("odometry", "speed", "wheels")
 POSITION_M, ROTATION_RAD = 0.01, 1e-3
 """White noise of the poses of INSPVAX and TUM."""
 
@@ -156,14 +171,40 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
             raw["topics"] = {"pose": "/inspvax"}
         else:
             raw["topics"]["gnss"] = "/navpvt"
-    elif row in NO_IMU:
-        path = folder / row
+    elif row in MORE:
+        path = folder / row.replace(" ", "_")
         if not path.exists():
-            messages = odometry(folder, seed, yaw_rate=row == "odometry")
-            with_messages(folder / "drive", path, messages, ("/imu/data", "/vehicle/twist"))
-        raw["data"]["path"] = row
-        twist = "/odom" if row == "odometry" else "/vehicle/speed"
-        raw["topics"] = {"gnss": "/gnss/fix", "twist": twist}
+            with_messages(folder / "drive", path, more_messages(row, folder, seed), row in NO_IMU)
+        raw["data"]["path"] = path.name
+        raw["topics"] = {"gnss": "/gnss/fix"} | TOPICS[row]
+        if row in ("heading", "wheels"):
+            raw["heading"] = {"yaw_deg": BASELINE_DEG, "axes": "ned"}
+        elif row == "imu heading":
+            raw["heading"] = {"yaw_deg": BASELINE_DEG}
+        elif row == "two fixes":
+            raw["heading"] = {"lever_arm": list(SECOND_ARM), "lever_arm_sigma": ARM_M}
+
+
+TOPICS = {
+    "odometry": {"twist": "/odom"},
+    "speed": {"twist": "/vehicle/speed"},
+    "heading": {"imu": "/imu/data", "heading": "/heading"},
+    "imu heading": {"imu": "/imu/data", "heading": "/navheading"},
+    "two fixes": {"imu": "/imu/data", "heading": "/gnss/second/fix"},
+    "wheels": {"twist": "/vehicle/speed", "heading": "/heading"},
+}
+
+
+def more_messages(row: str, folder: Path, seed: int) -> Iterator[Message]:
+    """What the bag of a row has beside the drive's."""
+    gnss = load_scenario(SCENARIO).gnss
+    origin = (gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m)
+    if row in NO_IMU:
+        yield from odometry(folder, seed, yaw_rate=row == "odometry")
+    if row in ("heading", "imu heading", "wheels"):
+        yield from headings(folder, seed, as_imu=row == "imu heading")
+    if row == "two fixes":
+        yield from second_fixes(folder, seed, origin)
 
 
 def noisy_poses(folder: Path, seed: int) -> tuple[list[int], list[Any], Any]:
@@ -232,10 +273,11 @@ def rewritten(source: Path, target: Path, more: Any) -> None:
 
 
 def with_messages(
-    source: Path, target: Path, messages: Iterator[Message], without: Collection[str]
+    source: Path, target: Path, messages: Iterator[Message], without_imu: bool
 ) -> None:
-    """Copies a bag without some topics and with more messages."""
+    """Copies a bag without its velocities and orientations, or IMU, and with more messages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
+    without = ("/vehicle/twist", *(("/imu/data",) if without_imu else ()))
     with (
         Reader(source) as reader,
         Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
@@ -248,7 +290,12 @@ def with_messages(
                 own[topic] = w.add_connection(topic, kind, typestore=store)
             w.write(own[topic], stamp, serialised(store, kind, stamp, fields))
         for connection, stamp, data in reader.messages(connections=kept):
-            w.write(to[connection.id], stamp, data)
+            if connection.topic == "/imu/data":
+                message: Any = store.deserialize_cdr(data, connection.msgtype)
+                message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
+                w.write(to[connection.id], stamp, store.serialize_cdr(message, connection.msgtype))
+            else:
+                w.write(to[connection.id], stamp, data)
 
 
 def navpvt(fix: Any, stamp: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 import caliv_graph
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure import lidars_with_structure
-from caliv_graph.calibration.vehicle_parameters import speed_scales
+from caliv_graph.calibration.vehicle_parameters import drive_parameters
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
@@ -81,7 +81,7 @@ def assemble(
     result = replace(
         draft,
         provenance=provenance,
-        vehicle={**_vehicle(solution), **speed_scales(trajectories)},
+        vehicle={**_vehicle(solution), **drive_parameters(trajectories)},
         structure=structure_summary(solution.structure, tuple(guesses)),
     )
     return unmet_requirements(result, config)

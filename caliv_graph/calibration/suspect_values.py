@@ -16,7 +16,13 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array, BoolArray, Guess, MotionData, Solution, Suspect
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, WHEELS_ROTATION
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    IMU_ROTATION,
+    LEVER_ARM,
+    SECOND_ARM,
+    WHEELS_ROTATION,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -213,6 +219,12 @@ def _quantity(name: str, freed: Freed, config: Config, guesses: Mapping[str, Gue
         return _Quantity(now, change, sigma, ("m",), known)
     if name == IMU_ROTATION.name:
         return _rotation(freed, config.imu.T_vehicle_imu.rpy_deg)
+    if name == HEADING_YAW.name:
+        now, off = np.array([config.heading.yaw_deg]), np.degrees(change)
+        return _Quantity(now, off, np.degrees(sigma), ("deg",), known)
+    if name == SECOND_ARM.name:
+        now = np.array(config.heading.lever_arm or (0.0, 0.0, 0.0))
+        return _Quantity(now, np.where(known, change, 0.0), sigma, ("m",) * 3, known)
     if name == WHEELS_ROTATION.name:
         return _rotation(freed, config.wheels.T_vehicle_wheels.rpy_deg)
     if name.endswith(".drift") or ".drift." in name:

@@ -15,11 +15,11 @@ from scipy.linalg import block_diag
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
-from caliv_graph.config.wheels import SPEED_SCALE_SIGMA
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_wheels_rotation
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
 from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
     IMU_ROTATION,
     LEVER_ARM,
     SPEED_SCALE,
@@ -165,24 +165,34 @@ def estimated_parameters(
     return out
 
 
-def speed_scales(trajectories: Sequence[VehicleTrajectory]) -> dict[str, VehicleParameter]:
-    """Measured over true speeds of the drives on which that was estimated; by motion data alone."""
-    found: list[tuple[float, float, bool]] = []
+def drive_parameters(trajectories: Sequence[VehicleTrajectory]) -> dict[str, VehicleParameter]:
+    """Scale of the speeds and yaw of a baseline, of the drives on which they were estimated.
+
+    Every drive has its own, by its motion data alone.
+    """
+    found: dict[str, list[tuple[float, float, bool]]] = {}
     for trajectory in trajectories:
         if not isinstance(trajectory, SmoothedTrajectory):
             continue
-        sigmas = trajectory.sigmas_of(SPEED_SCALE.name)
-        if sigmas is not None:
-            with_imu = trajectory.data.wheels is None
-            prior = trajectory.data.config.wheels.scale_sigma(with_imu) or SPEED_SCALE_SIGMA
-            sigma = float(sigmas[0])
-            by_drive = max(sigma**-2 - prior**-2, 0.0)
-            told = by_drive > (UNDETERMINED_RATIO * prior) ** -2
-            found.append((trajectory.data.speed_scale, sigma, told))
-    if not found:
-        return {}
-    value, sigma_of, determined = zip(*found, strict=True)
-    return {"speed_scale": VehicleParameter(np.array(value), np.array(sigma_of), determined)}
+        for p in trajectory.parameters:
+            name = PER_DRIVE.get(p.parameter.name)
+            sigmas = trajectory.sigmas_of(p.parameter.name)
+            if name is None or p.sigmas is None or sigmas is None:
+                continue
+            data = trajectory.data
+            value = data.speed_scale if name == "speed_scale" else data.heading_yaw
+            sigma, prior = float(sigmas[0]), float(p.sigmas[0])
+            told = max(sigma**-2 - prior**-2, 0.0) > (UNDETERMINED_RATIO * prior) ** -2
+            found.setdefault(name, []).append((value, sigma, told))
+    out = {}
+    for name, rows in found.items():
+        values, spread, determined = zip(*rows, strict=True)
+        out[name] = VehicleParameter(np.array(values), np.array(spread), determined)
+    return out
+
+
+PER_DRIVE = {SPEED_SCALE.name: "speed_scale", HEADING_YAW.name: "heading_yaw"}
+"""Parameters that every drive has of its own -> what they are called in a result."""
 
 
 def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from caliv_graph.config.heading import HeadingConfig
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.config.mounting import PoseConfig as PoseConfig
 from caliv_graph.config.sections import (
@@ -213,11 +214,12 @@ class DataConfig(Section):
 
 
 class TopicsConfig(Section):
-    """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
+    """Topics of what moves the vehicle: either `pose`, or IMU, GNSS, velocities and heading."""
 
     imu: str | None = None
     gnss: str | None = None
     twist: str | None = None
+    heading: str | None = None
     pose: str | None = None
 
 
@@ -337,6 +339,9 @@ class NoiseConfig(Section):
     yaw_rate_rad_s: Positive | None = Field(
         None, description="rad/s, yaw rate of the odometry, used where there is no IMU"
     )
+    heading_deg: Positive | None = Field(
+        None, description="degrees, each heading of topics.heading; absent: its message, or 0.3"
+    )
     orientation_deg: Positive | None = None
 
 
@@ -441,6 +446,7 @@ class Config(Section):
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()
     wheels: WheelsConfig = WheelsConfig()
+    heading: HeadingConfig = HeadingConfig()
     noise: NoiseConfig = NoiseConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()

@@ -15,7 +15,7 @@ from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import POSES_FILE, CalivFolder
 
 if TYPE_CHECKING:
-    from caliv_graph.readers.bag import Bag
+    from caliv_graph.readers.bag import Bag, Topic
 
 _ANY_RANGE_M = 1e6
 """Farther than any return: no point is dropped for its range."""
@@ -36,6 +36,9 @@ _SECONDARY = re.compile(r"raw|livox|ouster|os_cloud|os\d|velodyne|camera|realsen
 """Words in the names of topics that are probably not the vehicle's own IMU, velocity or pose."""
 
 
+_HEADING = re.compile(r"heading|hdt|hehdt|azimuth|dual")
+"""Words in the names of topics that hold the heading of two antennas."""
+
 _ODOMETRY = "nav_msgs/msg/Odometry"
 
 
@@ -44,7 +47,7 @@ class MotionTopics:
     """Topics of a bag with the vehicle's motion.
 
     Attributes:
-        chosen: by key of `topics` in the config: imu, gnss, twist, pose.
+        chosen: by key of `topics` in the config: imu, gnss, twist, heading, pose.
         others: further topics that fit, by the same keys.
     """
 
@@ -274,10 +277,15 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         fitting = [t for t in bag.topics.values() if t.type in types and t.messages]
         # A command is not a measurement, and a static link is not a pose of the vehicle.
         fitting = [t for t in fitting if "cmd" not in t.name and not t.name.endswith("/tf_static")]
+        if kind == "heading":
+            # Headings also come as Imu: of an Imu by its name.
+            fitting = [t for t in bag.topics.values() if t.messages and _is_heading(t)]
+        elif kind == "imu":
+            fitting = [t for t in fitting if not _is_heading(t)]
         fitting.sort(
             key=lambda t: (
                 bool(_SECONDARY.search(t.name.lower())),
-                types.index(t.type),
+                types.index(t.type) if t.type in types else len(types),
                 -t.messages,
                 t.name,
             )
@@ -290,18 +298,26 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         # Wheels tell a yaw rate; another twist may be that of a GNSS receiver, in map axes.
         ranked["twist"].sort(key=lambda name: bag.topics[name].type != _ODOMETRY)
     drifting = all(_drifts(bag, name) for name in ranked["pose"])
-    if ranked["gnss"] and (ranked["imu"] or (ranked["twist"] and drifting)):
-        keys = ["imu", "gnss", "twist"]
-    elif ranked["pose"]:
+    raw = ["imu", "gnss", "twist", "heading"]
+    if ranked["pose"] and not (
+        ranked["gnss"] and (ranked["imu"] or (ranked["twist"] and drifting))
+    ):
         keys = ["pose"]
     else:
-        keys = ["imu", "gnss", "twist"]
+        keys = raw
     chosen = {key: ranked[key][0] for key in keys if ranked[key]}
     others = {
         kind: tuple(name for name in names if chosen.get(kind) != name)
         for kind, names in ranked.items()
     }
     return MotionTopics(chosen, others)
+
+
+def _is_heading(topic: Topic) -> bool:
+    """Whether a topic has the heading of two antennas, by its type and name."""
+    from caliv_graph.readers.heading import IMU, QUATERNION
+
+    return topic.type in (QUATERNION, IMU) and bool(_HEADING.search(topic.name.lower()))
 
 
 def _drifts(bag: Bag, topic: str) -> bool:

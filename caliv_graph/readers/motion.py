@@ -44,7 +44,7 @@ PVT_GEODETIC = "septentrio_gnss_driver/msg/PVTGeodetic"
 POSITION_TYPES = ("geometry_msgs/msg/PointStamped", "geometry_msgs/msg/PoseStamped")
 
 _IMU = "sensor_msgs/msg/Imu"
-_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
+NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TWIST = "geometry_msgs/msg/TwistStamped"
 _TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -53,16 +53,20 @@ _POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 MOTION_TYPES: Mapping[str, tuple[str, ...]] = {
     "imu": (_IMU,),
-    "gnss": (_NAVSATFIX, NAVPVT, PVT_GEODETIC),
+    "gnss": (NAVSATFIX, NAVPVT, PVT_GEODETIC),
     "twist": (_TWIST_WITH_COVARIANCE, _TWIST, _ODOMETRY),
+    "heading": ("geometry_msgs/msg/QuaternionStamped",),
     "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES, *INSPVAX_TYPES),
 }
 """Types that fit each key of `topics`, the most informative first."""
 
-ON_REQUEST: Mapping[str, tuple[str, ...]] = {"gnss": POSITION_TYPES}
+ON_REQUEST: Mapping[str, tuple[str, ...]] = {
+    "gnss": POSITION_TYPES,
+    "heading": (_IMU, NAVSATFIX, NAVPVT, PVT_GEODETIC),
+}
 """Types that fit a key as well, if the config says so: mostly they are something else."""
 
-_NORM_TOLERANCE = 1e-2
+NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision is off by less."""
 
 GRAVITY_M_S2 = 9.81
@@ -277,7 +281,7 @@ class ImuCollector(RowCollector):
         """Unit quaternions (n, 4) and their covariances, from the kinds (d, 9) of the latter."""
         has_any = (stated[:, 0] != -1.0)[which]
         norms = np.linalg.norm(q, axis=1)
-        is_rotation = np.abs(norms - 1.0) <= _NORM_TOLERANCE  # False for NaN
+        is_rotation = np.abs(norms - 1.0) <= NORM_TOLERANCE  # False for NaN
         broken = int(np.count_nonzero(has_any & ~is_rotation))
         if broken:
             self._losses.say(
@@ -422,7 +426,7 @@ class PoseCollector(RowCollector):
             (f"beyond {MOST_M:g} m from the origin", lambda r: below(r[:, :3], MOST_M)),
             (
                 "whose orientation is not a unit quaternion",
-                lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
+                lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= NORM_TOLERANCE,
             ),
         )
         if not len(stamps):

@@ -39,7 +39,8 @@ _HEADER = """\
 # LiDAR's origin. `determined` of a pair: the axes of `to`.
 # vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna in the vehicle's
 # axes. imu_rotation, wheels_rotation: roll, pitch, yaw of T_vehicle_imu or T_vehicle_wheels, sigmas
-# about the vehicle's axes. speed_scale: measured over true speeds, one per drive.
+# about the vehicle's axes. One per drive: speed_scale, measured over true speeds; heading_yaw, the
+# direction of the baseline of two antennas.
 """
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sized
 
 import numpy as np
 from pydantic import Field, StrictBool, model_validator
@@ -21,17 +21,35 @@ class _ArmPart(_MeasuredPart):
     sigma: tuple[Sigma, Sigma, Sigma]
 
 
-class _ScalesPart(Part):
-    value: Annotated[tuple[Finite, ...], Field(min_length=1)]
-    sigma: tuple[Sigma, ...]
-    determined: tuple[StrictBool, ...]
+class _PerDrivePart(Part):
+    determined: tuple[StrictBool, ...] = Field(min_length=1)
     limits: tuple[Text, ...] = ()
 
+
+class _ScalesPart(_PerDrivePart):
+    value: tuple[Finite, ...]
+    sigma: tuple[Sigma, ...]
+
     @model_validator(mode="after")
-    def _one_of_each(self) -> _ScalesPart:
-        if not len(self.value) == len(self.sigma) == len(self.determined):
-            raise ValueError("value, sigma and determined must have one number per drive")
+    def _one_per_drive(self) -> _ScalesPart:
+        check_lengths(self.determined, self.value, self.sigma)
         return self
+
+
+class _AnglesPart(_PerDrivePart):
+    value_deg: tuple[Finite, ...]
+    sigma_deg: tuple[Sigma, ...]
+
+    @model_validator(mode="after")
+    def _one_per_drive(self) -> _AnglesPart:
+        check_lengths(self.determined, self.value_deg, self.sigma_deg)
+        return self
+
+
+def check_lengths(determined: Sized, value: Sized, sigma: Sized) -> None:
+    """Raises ValueError unless there is one of each per drive."""
+    if not len(determined) == len(value) == len(sigma):
+        raise ValueError("value, sigma and determined must have one entry per drive")
 
 
 class _TurnPart(_MeasuredPart):
@@ -46,6 +64,7 @@ class VehiclePart(Part):
     imu_rotation: _TurnPart | None = None
     wheels_rotation: _TurnPart | None = None
     speed_scale: _ScalesPart | None = None
+    heading_yaw: _AnglesPart | None = None
 
     def parameters(self) -> dict[str, VehicleParameter]:
         """In metres and radians."""
@@ -55,7 +74,7 @@ class VehiclePart(Part):
             value, sigma = np.array(arm.value), np.array(arm.sigma)
             out["lever_arm"] = VehicleParameter(value, sigma, arm.determined, arm.limits)
         for name in TURNS:
-            turn: _TurnPart | None = getattr(self, name)
+            turn: _TurnPart | _AnglesPart | None = getattr(self, name)
             if turn is not None:
                 value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
                 out[name] = VehicleParameter(value, sigma, turn.determined, turn.limits)

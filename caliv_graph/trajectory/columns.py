@@ -57,6 +57,8 @@ def parameter_columns(
             ahead, behind = (parameter.stepped(data, k, sign) for sign in (1.0, -1.0))
             for kind in moving:
                 white = whites[kind]
+                if not white.factors:
+                    continue
                 after, before = (residuals.of(kind, moved) for moved in (ahead, behind))
                 if not len(after) == len(before) == len(white.factors):
                     raise ValueError(f"{parameter.name}: moved by a step, it has other factors")

@@ -7,6 +7,7 @@ the map. All Jacobians are analytic; the tests check them numerically.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import gtsam
@@ -166,6 +167,48 @@ def level_factor(key_imu: int, up_map: Array, noise: NoiseModel) -> gtsam.Custom
             J[:, :3] = skew(up)[:2]
             jacobians[0] = J
         return np.asarray(up[:2])
+
+    return gtsam.CustomFactor(noise, [key_imu], error)
+
+
+def heading_factor(
+    key_imu: int, direction_imu: Array, azimuth_rad: float, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """The azimuth of a direction: `r = atan2(d_y, d_x) - z`, `d = R u`, u (3,) of the imu frame.
+
+    Within half a turn; z counts from the map's x to the left. `noise` has the 1 dimension of r.
+    """
+    turn = skew(direction_imu)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(key_imu).rotation().matrix()
+        x, y, _z = R @ direction_imu
+        if jacobians is not None:
+            across = np.array([-y, x, 0.0]) / (x * x + y * y)
+            J = np.zeros((1, 6))
+            J[0, :3] = -across @ R @ turn
+            jacobians[0] = J
+        return np.array([math.remainder(math.atan2(y, x) - azimuth_rad, math.tau)])
+
+    return gtsam.CustomFactor(noise, [key_imu], error)
+
+
+def baseline_factor(
+    key_imu: int, baseline_imu: Array, vector_map: Array, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """A vector between two antennas: `r = R b - z`, metres, map axes; b (3,) of the imu frame.
+
+    `vector_map` (3,) is z; `noise` has the 3 dimensions of r.
+    """
+    turn = skew(baseline_imu)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(key_imu).rotation().matrix()
+        if jacobians is not None:
+            J = np.zeros((3, 6))
+            J[:, :3] = -R @ turn
+            jacobians[0] = J
+        return np.asarray(R @ baseline_imu - vector_map)
 
     return gtsam.CustomFactor(noise, [key_imu], error)
 

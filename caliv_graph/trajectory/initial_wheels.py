@@ -7,7 +7,7 @@ import numpy as np
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate
-from caliv_graph.trajectory.initial import positions_and_velocities
+from caliv_graph.trajectory.initial import positions_and_velocities, turned_to_antennas
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.kinematics import Windows, antenna_windows
 from caliv_graph.trajectory.measurements import nearest_node
@@ -31,7 +31,8 @@ def first_wheel_states(data: SmootherInput, nodes: IntArray) -> States:
     dead = DeadReckoning(data.inertial.stamps_ns, data.inertial.gyro, data.inertial.force)
     turned = _integrated(dead, nodes)
     rate = np.zeros(len(nodes))
-    if data.positions is None:
+    told = data.headings is not None or data.baselines is not None
+    if data.positions is None or (data.wheels.yaw_rate and told):
         yaw = turned
     else:
         at, course = _courses(data)
@@ -42,7 +43,7 @@ def first_wheel_states(data: SmootherInput, nodes: IntArray) -> States:
         else:
             yaw = interpolate(nodes, at, np.unwrap(course)[:, None])[:, 0]
             rate = np.gradient(yaw, (nodes - nodes[0]) * 1e-9)
-    R = exp_so3(np.outer(yaw, [0.0, 0.0, 1.0]))
+    R = turned_to_antennas(data, exp_so3(np.outer(yaw, [0.0, 0.0, 1.0])), nodes, dead)
     bias = np.outer(-rate, [0.0, 0.0, 1.0])
     velocities = carry_to_nodes(data, nodes, dead, frozenset({"velocity"})).velocities
     p, v = positions_and_velocities(R, nodes, data.positions, velocities, data.arm_imu)

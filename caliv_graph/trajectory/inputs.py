@@ -12,6 +12,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, ImuSamples, MotionData
+from caliv_graph.trajectory.antennas import Baselines, Headings, directions_of
 from caliv_graph.trajectory.gnss import Positions, normal_gravity, positions_in_map
 from caliv_graph.trajectory.imu import Inertial, clean_inertial
 from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
@@ -61,6 +62,10 @@ class SmootherInput:
             frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
         slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
         speed_scale: measured over true velocities.
+        headings: directions of a baseline as angles; None: there are none.
+        baselines: the same as vectors between two antennas.
+        heading_yaw: direction of that baseline in the vehicle frame, to the left of x, radians.
+        second_arm: (3,) the second antenna in the vehicle frame, metres.
     """
 
     name: str
@@ -78,6 +83,22 @@ class SmootherInput:
     wheels: WheelModel | None = None
     slope: Array = field(default_factory=lambda: np.zeros(2))
     speed_scale: float = 1.0
+    headings: Headings | None = None
+    baselines: Baselines | None = None
+    heading_yaw: float = 0.0
+    second_arm: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def heading_imu(self) -> Array:
+        """(3,) unit vector along the baseline of `headings`, imu frame."""
+        ahead = np.array([math.cos(self.heading_yaw), math.sin(self.heading_yaw), 0.0])
+        return np.asarray(self.T_vehicle_imu.rotation().unrotate(ahead))
+
+    @property
+    def baseline_imu(self) -> Array:
+        """(3,) from the first to the second antenna, imu frame, metres."""
+        baseline = self.second_arm - self.lever_arm
+        return np.asarray(self.T_vehicle_imu.rotation().unrotate(baseline))
 
     @property
     def T_vehicle_twist(self) -> gtsam.Pose3:
@@ -154,7 +175,7 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
         rotation_sigmas=None if rotation_sigma is None else np.full(3, rotation_sigma),
     )
-    return data, warnings
+    return _with_heading(data), warnings
 
 
 def _wheel_input(
@@ -187,7 +208,21 @@ def _wheel_input(
         rotation_sigmas=np.array(config.wheels.rotation_sigmas_rad()),
         wheels=model,
     )
-    return data, warnings
+    return _with_heading(data), warnings
+
+
+def _with_heading(data: SmootherInput) -> SmootherInput:
+    """The input with what `topics.heading` says."""
+    config = data.config.heading
+    headings, baselines = directions_of(data.motion, data.positions, data.config)
+    arm = np.zeros(3) if config.lever_arm is None else np.array(config.lever_arm)
+    return replace(
+        data,
+        headings=headings,
+        baselines=baselines,
+        heading_yaw=config.yaw_rad,
+        second_arm=arm,
+    )
 
 
 def _positions(
@@ -239,6 +274,12 @@ def scaled(data: SmootherInput, scales: Mapping[str, float]) -> SmootherInput:
         horizontal, vertical = (scales.get(f"gnss_{s}", 1.0) for s in ("horizontal", "vertical"))
         axes = np.array([horizontal, horizontal, vertical])
         positions = replace(positions, cov_map=positions.cov_map * np.outer(axes, axes))
+    headings, baselines = data.headings, data.baselines
+    if headings is not None:
+        headings = replace(headings, var=headings.var * scales.get("heading", 1.0) ** 2)
+    if baselines is not None:
+        cov = baselines.cov_map * scales.get("baseline", 1.0) ** 2
+        baselines = replace(baselines, cov_map=cov)
     noise = replace(
         noise,
         gyro_density=noise.gyro_density * scales.get("gyroscope", 1.0) ** 2,
@@ -247,7 +288,14 @@ def scaled(data: SmootherInput, scales: Mapping[str, float]) -> SmootherInput:
     if data.wheels is not None:
         noise = scaled_wheel_noise(noise, scales)
     every = {name: data.scales.get(name, 1.0) * scale for name, scale in scales.items()}
-    return replace(data, noise=noise, positions=positions, scales={**data.scales, **every})
+    return replace(
+        data,
+        noise=noise,
+        positions=positions,
+        headings=headings,
+        baselines=baselines,
+        scales={**data.scales, **every},
+    )
 
 
 PARTS = {"speed": "velocity_forward", "yaw_rate": "yaw rate"}
@@ -264,6 +312,10 @@ def noise_sources(data: SmootherInput) -> dict[str, str]:
         out["gnss"] = data.positions.source
     if data.motion.twist is not None:
         out["velocity"] = velocity_covariances(data.motion.twist, data.config)[1]
+    if data.headings is not None:
+        out["heading"] = data.headings.source
+    if data.baselines is not None:
+        out["baseline"] = data.baselines.source
     for name, scale in data.scales.items():
         sensor, _, part = PARTS.get(name, name).partition("_")
         what = f", {part}" if part else ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
+from caliv_graph.trajectory.antennas import NodeDirections, directions_at_nodes
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import (
@@ -42,6 +43,8 @@ class NodeMeasurements:
     positions: NodePositions | None
     orientations: NodeOrientations | None
     velocities: NodeVelocities | None
+    headings: NodeDirections | None = None
+    baselines: NodeDirections | None = None
 
 
 def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
@@ -66,7 +69,7 @@ def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
     return np.concatenate([*pieces, fixed[-1:]]).astype(np.int64)
 
 
-CARRIED = frozenset({"gnss", "orientation", "velocity"})
+CARRIED = frozenset({"gnss", "orientation", "velocity", "heading", "baseline"})
 """Kinds of measurements that are carried to nodes."""
 
 
@@ -92,7 +95,12 @@ def carry_to_nodes(
             data.T_vehicle_twist.between(data.T_vehicle_imu),
             data.speed_scale,
         )
-    return NodeMeasurements(positions, orientations, velocities)
+    headings = baselines = None
+    if data.headings is not None and "heading" in kinds:
+        headings = directions_at_nodes(data.headings.stamps_ns, data.heading_imu, nodes, dead)
+    if data.baselines is not None and "baseline" in kinds:
+        baselines = directions_at_nodes(data.baselines.stamps_ns, data.baseline_imu, nodes, dead)
+    return NodeMeasurements(positions, orientations, velocities, headings, baselines)
 
 
 def _velocity_covariances(data: SmootherInput) -> Array:

@@ -85,7 +85,7 @@ def _imu_turned(data: SmootherInput, d: Array) -> SmootherInput:
 
 
 LEVER_ARM = InputParameter(
-    "gnss.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"gnss"}), _arm_moved
+    "gnss.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"gnss", "baseline"}), _arm_moved
 )
 """The GNSS antenna in the vehicle frame. The residuals are linear in it."""
 
@@ -104,12 +104,20 @@ def _scale_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, speed_scale=scale, noise=noise)
 
 
+def _heading_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, heading_yaw=data.heading_yaw + float(d[0]))
+
+
+def _second_arm_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, second_arm=data.second_arm + d)
+
+
 IMU_ROTATION = InputParameter(
     "imu.T_vehicle_imu",
     ("roll", "pitch", "yaw"),
     "rad",
     np.full(3, 1e-3),
-    frozenset({"gnss", "velocity"}),
+    frozenset({"gnss", "velocity", "heading", "baseline"}),
     _imu_turned,
 )
 """Rotation of T_vehicle_imu about the vehicle's axes, the IMU's origin fixed: Exp(d) R. Of a step
@@ -133,6 +141,17 @@ WHEEL_SCALE = replace(SPEED_SCALE, kinds=frozenset({"velocity", "imu"}))
 """The same without an IMU. The prior of the motion is then one of what the wheels measure: walks of
 the acceleration are in their unit. In metres it would prefer a vehicle that moves less, and with it
 a larger scale (`README.md`, section 15)."""
+
+
+HEADING_YAW = InputParameter(
+    "heading.yaw_deg", ("value",), "rad", np.full(1, 1e-3), frozenset({"heading"}), _heading_moved
+)
+"""Direction of the baseline of two antennas in the vehicle frame."""
+
+SECOND_ARM = InputParameter(
+    "heading.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"baseline"}), _second_arm_moved
+)
+"""The second antenna in the vehicle frame. The residuals are linear in it."""
 
 
 def speed_scale(data: SmootherInput) -> InputParameter:

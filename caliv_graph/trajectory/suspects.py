@@ -19,7 +19,9 @@ from caliv_graph.products import Array, ImuSamples
 from caliv_graph.trajectory.imu import interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
     LEVER_ARM,
+    SECOND_ARM,
     InputParameter,
     mount_rotation,
     speed_scale,
@@ -85,6 +87,10 @@ def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, 
         out.append(_known(smoothed, mount_rotation(data), ROTATION_RAD, 0.5))
     if data.motion.twist is not None:
         out.append(_known(smoothed, speed_scale(data), SPEED_SCALE_SIGMA, 1.0))
+    if data.headings is not None:
+        out.append(_known(smoothed, HEADING_YAW, HEADING_RAD, 0.5))
+    if data.baselines is not None:
+        out.append(_known(smoothed, SECOND_ARM, ARM_M, ARM_KNOWN_M))
     if data.orientation and not data.yaw_bias:
         out.append(_plain(_HEADING, HEADING_RAD, 1.0))
     if data.wheels is not None:

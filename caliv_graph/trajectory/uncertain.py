@@ -22,8 +22,10 @@ from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
     IMU_ROTATION,
     LEVER_ARM,
+    SECOND_ARM,
     SLOPE,
     SPEED_SCALE,
     WHEELS_ROTATION,
@@ -87,6 +89,13 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     scale = wheels.scale_sigma(with_imu=data.wheels is None)
     if scale is not None and data.motion.twist is not None:
         out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))
+    heading = data.config.heading
+    if data.headings is not None:
+        sigma = np.full(1, np.radians(heading.sigma_deg))
+        out.append(UncertainParameter(HEADING_YAW, sigma, np.zeros(1)))
+    if data.baselines is not None:
+        arms = np.full(3, heading.lever_arm_sigma)
+        out.append(UncertainParameter(SECOND_ARM, arms, np.zeros(3)))
     return tuple(out)
 
 

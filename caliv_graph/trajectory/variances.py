@@ -31,7 +31,13 @@ from caliv_graph.trajectory.correlated import (
     linearised,
 )
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.parameters import LEVER_ARM, mount_rotation, speed_scale
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    LEVER_ARM,
+    SECOND_ARM,
+    mount_rotation,
+    speed_scale,
+)
 from caliv_graph.trajectory.smoothed import States, first_nodes
 
 COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {
@@ -42,6 +48,8 @@ COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {
     "accelerometer": ("imu", (3, 4, 5, 6, 7, 8)),
     "orientation": ("orientation", (0, 1, 2)),
     "velocity": ("velocity", (0, 1, 2)),
+    "heading": ("heading", (0,)),
+    "baseline": ("baseline", (0, 1, 2)),
     # Without an IMU: what odometry measures, and how its acceleration and its yaw rate change.
     "yaw_rate": ("imu", (2,)),
     "speed": ("velocity", (0,)),
@@ -83,6 +91,8 @@ def free_components(data: SmootherInput) -> list[str]:
         "accelerometer": noise.accelerometer_density_m_s2_sqrthz,
         "orientation": noise.orientation_deg,
         "velocity": noise.velocity_m_s,
+        "heading": noise.heading_deg,
+        "baseline": noise.gnss_horizontal_m,
     }
     if data.wheels is not None:
         for name in ("gyroscope", "accelerometer", *(["velocity"] if data.wheels.planar else [])):
@@ -120,6 +130,8 @@ def estimated_scales(
     typed = [rotation] if data.positions is None else [LEVER_ARM, rotation]
     if data.motion.twist is not None and data.config.wheels.scale_sigma(data.wheels is None):
         typed.append(speed_scale(data))
+    typed += [HEADING_YAW] if data.headings is not None else []
+    typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)
     likelihood = NoiseLikelihood(
         graph.factors.linearize(values),

@@ -30,6 +30,7 @@ PARAMETER_KEYS = {
     "lever_arm": "gnss.lever_arm",
     "imu_rotation": "imu.T_vehicle_imu",
     "wheels_rotation": "wheels.T_vehicle_wheels",
+    "heading_yaw": "heading.yaw_deg",
     "speed_scale": "scale of the speeds in topics.twist",
 }
 """What was measured by hand on the vehicle -> its key in the config."""

@@ -13,6 +13,9 @@ def vehicle_text(name: str, found: VehicleParameter) -> str:
     if name == "speed_scale":
         scales, sigmas = _numbers(found.value, 4), _numbers(found.sigma, 5)
         return f"{PARAMETER_KEYS[name]}: ({scales}), sigma ({sigmas}), one per drive"
+    if name == "heading_yaw":
+        turns, sigmas = (_numbers(np.degrees(v), 3) for v in (found.value, found.sigma))
+        return f"{PARAMETER_KEYS[name]}: ({turns}), sigma ({sigmas}) degrees, one per drive"
     turn = name in TURNS
     unit, digits = ("degrees", 2) if turn else ("m", 3)
     value, sigma = (

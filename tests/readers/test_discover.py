@@ -135,6 +135,22 @@ def test_without_an_imu_gnss_and_wheels_are_preferred_to_poses_that_drift(tmp_pa
     assert choose_motion_topics(bag).chosen == {"pose": "/state"}
 
 
+def test_headings_are_known_by_type_and_name(tmp_path: Path) -> None:
+    turn = {"_type": "geometry_msgs/msg/QuaternionStamped", "header": header(START, "gnss")}
+    sensors = [("/imu", imu(START)), ("/fix", fix(START))]
+    bag = bag_of(tmp_path / "a", *sensors, ("/heading", turn), ("/attitude", turn))
+    assert choose_motion_topics(bag).chosen == {
+        "imu": "/imu",
+        "gnss": "/fix",
+        "heading": "/heading",
+    }
+
+    bag = bag_of(tmp_path / "b", *sensors, ("/a/navheading", imu(START)))
+    topics = choose_motion_topics(bag)
+    assert topics.chosen == {"imu": "/imu", "gnss": "/fix", "heading": "/a/navheading"}
+    assert topics.others["imu"] == ()
+
+
 def test_poses_where_imu_or_gnss_is_missing(tmp_path: Path) -> None:
     link = ("odom", "base_link", (0, 0, 0), (0, 0, 0, 1))
     other = ("base_link", "wheel", (0, 0, 0), (0, 0, 0, 1))

@@ -19,6 +19,7 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     imu heading  the same as an Imu
     two fixes    the same as the fixes of a second antenna
     wheels       no IMU: as speed, with that heading
+    scale        IMU without orientation, fixes, speeds whose scale is estimated
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ from caliv_graph.uncertainty.evaluation import evaluate
 from scripts._dialects_motion import (
     ARM_M,
     BASELINE_DEG,
+    SCALE,
     SECOND_ARM,
     Message,
     drawn,
@@ -76,7 +78,7 @@ SWEEPS: dict[str, dict[str, Any]] = {
         "packet_s": PACKET_S,
     },
 }
-MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels")
+MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels", "scale")
 WRITTEN = {
     "as start": "end",
     **dict.fromkeys(("inspvax", "tum", "navpvt", *MORE), "plain"),
@@ -181,6 +183,8 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
             raw["heading"] = {"yaw_deg": BASELINE_DEG, "axes": "ned"}
         elif row == "imu heading":
             raw["heading"] = {"yaw_deg": BASELINE_DEG}
+        elif row == "scale":
+            raw["wheels"] = {"speed_scale_sigma": SCALE}
         elif row == "two fixes":
             raw["heading"] = {"lever_arm": list(SECOND_ARM), "lever_arm_sigma": ARM_M}
 
@@ -191,6 +195,7 @@ TOPICS = {
     "heading": {"imu": "/imu/data", "heading": "/heading"},
     "imu heading": {"imu": "/imu/data", "heading": "/navheading"},
     "two fixes": {"imu": "/imu/data", "heading": "/gnss/second/fix"},
+    "scale": {"imu": "/imu/data", "twist": "/vehicle/speed"},
     "wheels": {"twist": "/vehicle/speed", "heading": "/heading"},
 }
 
@@ -199,7 +204,7 @@ def more_messages(row: str, folder: Path, seed: int) -> Iterator[Message]:
     """What the bag of a row has beside the drive's."""
     gnss = load_scenario(SCENARIO).gnss
     origin = (gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m)
-    if row in NO_IMU:
+    if row in (*NO_IMU, "scale"):
         yield from odometry(folder, seed, yaw_rate=row == "odometry")
     if row in ("heading", "imu heading", "wheels"):
         yield from headings(folder, seed, as_imu=row == "imu heading")

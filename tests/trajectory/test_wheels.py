@@ -87,6 +87,20 @@ def test_the_scale_of_the_wheels_is_found() -> None:
     assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
 
 
+def test_with_an_imu_the_scale_is_found_if_it_is_asked_for() -> None:
+    motion, inertial = wheels(3), record(DRIVE, ANTENNA, 3)
+    motion = replace(motion, imu=inertial.imu)
+    wanted = stamps(DRIVE.duration_s, 2.0)
+    found = smooth_trajectory(motion, settings(speed_scale_sigma=0.02), wanted)
+    sigmas = found.sigmas_of("twist.scale")
+    assert sigmas is not None
+    assert sigmas[0] < 2e-3
+    assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
+    exact = smooth_trajectory(motion, settings(), wanted)
+    assert exact.data.speed_scale == 1.0
+    assert exact.sigmas_of("twist.scale") is None
+
+
 def test_without_fixes_nothing_pulls_the_scale() -> None:
     motion = replace(wheels(2), gnss=None)
     found = smooth_trajectory(motion, settings(), stamps(DRIVE.duration_s, 2.0))

@@ -176,8 +176,8 @@ def _within_span(
     if not inside.any():
         sensor = "IMU" if data.wheels is None else "velocities"
         raise TrajectoryError(
-            f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: {sensor} from "
-            f"{inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
+            f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: {sensor} "
+            f"from {inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
             f"{wanted[0] * 1e-9:.3f} s to {wanted[-1] * 1e-9:.3f} s. Do their clocks agree?"
         )
     line = (

@@ -30,7 +30,7 @@ from tests.trajectory.motions import (
     stamps,
 )
 
-DRIVE = Course(eight_drive(20.0))
+DRIVE = Course(eight_drive(14.0))
 ANTENNA = replace(Sensors(), lever_arm=(0.3, 0.5, 1.8))
 SCALE = 1.03
 

@@ -79,6 +79,11 @@ def key_imu_rotation() -> int:
     return int(gtsam.symbol("r", 0))
 
 
+def key_wheels_rotation() -> int:
+    """Key of R_vehicle_wheels, a `gtsam.Rot3`, right perturbation, one for all drives."""
+    return int(gtsam.symbol("w", 0))
+
+
 def key_extrinsic() -> int:
     """Key of E = T_vehicle_ref, the extrinsic of the reference LiDAR."""
     return int(gtsam.symbol("e", 0))

@@ -71,14 +71,20 @@ def smoothed_findings(
     """
     out: list[Finding] = []
     for index, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
-        tilt = vehicle_tilt(trajectory, motions[index].name, config)
-        found = tilt_finding(tilt, config)
-        if found is not None:
-            out.append(found)
+        if not _is_of_wheels(trajectory):
+            tilt = vehicle_tilt(trajectory, motions[index].name, config)
+            found = tilt_finding(tilt, config)
+            if found is not None:
+                out.append(found)
         if config.ground.use:
             grounds = lidar_grounds(recording, trajectory, config, progress)
             out += guess_findings(recording.name, misfits(grounds, config), config)
     return tuple(out)
+
+
+def _is_of_wheels(trajectory: VehicleTrajectory) -> bool:
+    """Whether roll and pitch are those of level ground: there was no IMU."""
+    return isinstance(trajectory, SmoothedTrajectory) and trajectory.data.wheels is not None
 
 
 def heading_findings(

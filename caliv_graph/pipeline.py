@@ -404,7 +404,7 @@ def _calibrate(
         raise without_anything(prepared, error) from error
     with progress.stage("checking the result", None):
         calibration = assemble(
-            solution, with_found_of(config, prepared.config), recordings, digests
+            solution, with_found_of(config, prepared.config), recordings, digests, trajectories
         )
         calibration, doubts = check(
             calibration,

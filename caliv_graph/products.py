@@ -111,11 +111,31 @@ class TwistSamples:
         stamps_ns: (n,) strictly increasing.
         velocity: (n, 3) m/s, vehicle frame.
         velocity_cov: (n, 3, 3) (m/s)^2 as the messages state it, NaN where unknown, or None.
+        yaw_rate: (n,) rad/s about the vehicle's z, NaN where a message has none; None: no message
+            has one.
+        yaw_rate_var: (n,) (rad/s)^2 as the messages state it, NaN where unknown, or None.
     """
 
     stamps_ns: IntArray
     velocity: Array
     velocity_cov: Array | None = None
+    yaw_rate: Array | None = None
+    yaw_rate_var: Array | None = None
+
+
+@dataclass(frozen=True)
+class HeadingSamples:
+    """Angles of a baseline of two antennas over ground, as the messages have them.
+
+    Attributes:
+        stamps_ns: (n,) strictly increasing.
+        yaw_rad: (n,) about the vertical; the config says from where it counts.
+        var: (n,) rad^2 as the messages state it, NaN where unknown, or None.
+    """
+
+    stamps_ns: IntArray
+    yaw_rad: Array
+    var: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +148,7 @@ class MotionData:
         imu: inertial measurements.
         gnss: positions.
         twist: velocities.
+        heading: by two antennas: angles, or the fixes of the second one.
     """
 
     name: str
@@ -135,6 +156,7 @@ class MotionData:
     imu: ImuSamples | None = None
     gnss: GnssFixes | None = None
     twist: TwistSamples | None = None
+    heading: HeadingSamples | GnssFixes | None = None
 
 
 class Recording(Protocol):
@@ -520,21 +542,27 @@ class LinearisedGraph:
     to_vehicle_axes: Array
 
 
+TURNS = ("imu_rotation", "wheels_rotation", "heading_yaw")
+"""Names of parameters of the vehicle that are rotations: radians here, degrees in files."""
+
+
 @dataclass(frozen=True)
 class VehicleParameter:
     """Something that the user measured on the vehicle, and the solve estimated.
 
     Attributes:
-        value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu in rad.
-        sigma: (3,) in the same unit; of a rotation about the vehicle's axes. The user's own sigma
-            is part of it.
+        value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu or
+            T_vehicle_wheels in rad; or (drives,) measured over true speeds, or the direction of
+            the baseline of two antennas in rad.
+        sigma: (3,) or (drives,) in the same unit; of a rotation about the vehicle's axes. The
+            user's own sigma is part of it.
         determined: per coordinate whether the drive alone determines it.
         limits: axes of S2V of which half the variance or more comes from it.
     """
 
     value: Array
     sigma: Array
-    determined: tuple[bool, bool, bool]
+    determined: tuple[bool, ...]
     limits: tuple[str, ...] = ()
 
 
@@ -563,7 +591,7 @@ class Solution:
         information_prior: (6n, 6n) of the initial guesses.
         cov: (6n, 6n) joint covariance of all extrinsics, priors included as the mode uses them.
         held: names of the axes of the LiDARs that the mode held at the guess (staged: x, y, z).
-        vehicle: `lever_arm` and `imu_rotation`, where they are uncertain.
+        vehicle: `lever_arm`, `imu_rotation` and `wheels_rotation`, where they are uncertain.
         information_knowing: of `vehicle`, (6n, 6n) of the data if that were known exactly.
         iterations: iterations of the outer loop.
         converged: whether the outer loop's last step was below its tolerance.
@@ -796,7 +824,8 @@ class Calibration:
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
         suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
-        vehicle: `lever_arm` and `imu_rotation`, where the solve estimated them.
+        vehicle: `lever_arm`, `imu_rotation`, `wheels_rotation`, `speed_scale` and `heading_yaw`,
+            where they were estimated.
         structure: the structure that was used; None: none.
     """
 

@@ -332,7 +332,7 @@ class Localiser:
         )
         still = gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_VELOCITY_M_S)
         graph.add(gtsam.PriorFactorVector(_v(0), np.zeros(3), still))
-        biases = np.array([self._noise.force_bias] * 3 + [self._noise.gyro_bias] * 3)
+        biases = np.concatenate([self._noise.force_bias, self._noise.gyro_bias])
         bias = gtsam.imuBias.ConstantBias()
         graph.add(
             gtsam.PriorFactorConstantBias(_b(0), bias, gtsam.noiseModel.Diagonal.Sigmas(biases))
@@ -477,10 +477,10 @@ def _imu_noise(scenario: Scenario) -> ImuNoise:
     return ImuNoise(
         gyro_density=np.eye(3) * imu.gyroscope_sigma_rad_s**2 / imu.rate_hz,
         force_density=np.eye(3) * imu.accelerometer_sigma_m_s2**2 / imu.rate_hz,
-        gyro_walk=imu.gyroscope_bias_walk_rad_s2_sqrthz,
-        force_walk=imu.accelerometer_bias_walk_m_s3_sqrthz,
-        gyro_bias=float(np.max(imu.gyroscope_bias_sigma_rad_s)),
-        force_bias=float(np.max(imu.accelerometer_bias_sigma_m_s2)),
+        gyro_walk=np.full(3, imu.gyroscope_bias_walk_rad_s2_sqrthz),
+        force_walk=np.full(3, imu.accelerometer_bias_walk_m_s3_sqrthz),
+        gyro_bias=np.full(3, np.max(imu.gyroscope_bias_sigma_rad_s)),
+        force_bias=np.full(3, np.max(imu.accelerometer_bias_sigma_m_s2)),
         sources={},
     )
 

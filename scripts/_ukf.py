@@ -154,8 +154,8 @@ def filter_trajectory(
             np.diagonal(noise.gyro_density),
             np.full(3, 1e-10),
             np.diagonal(noise.force_density),
-            np.full(3, noise.gyro_walk**2),
-            np.full(3, noise.force_walk**2),
+            noise.gyro_walk**2,
+            noise.force_walk**2,
         ]
     )
     start_velocity = twist.velocity[0] @ R_iv.T - np.cross(imu.angular_velocity[0], t_iv)
@@ -171,7 +171,7 @@ def filter_trajectory(
     state.cov[:3, :3] = orientation_cov[0]
     state.cov[3:6, 3:6] = positions.cov_map[0]
     state.cov[6:9, 6:9] = Z[0] @ R_iv @ velocity_cov[0] @ R_iv.T @ Z[0].T
-    state.cov[9:15, 9:15] = np.diag([noise.gyro_bias**2] * 3 + [noise.force_bias**2] * 3)
+    state.cov[9:15, 9:15] = np.diag(np.concatenate([noise.gyro_bias, noise.force_bias]) ** 2)
 
     begin = max(int(imu.stamps_ns[0]), int(positions.stamps_ns[0]), int(twist.stamps_ns[0]))
     events = np.unique(

@@ -13,6 +13,13 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     inspvax      poses as novatel_oem7_msgs/INSPVAX instead of IMU, GNSS and velocity
     tum          poses as a TUM file beside the bag
     navpvt       fixes as ublox_msgs/NavPVT
+    odometry     no IMU: fixes, and wheel odometry (speed and yaw rate) as nav_msgs/Odometry
+    speed        no IMU: fixes, and speeds as geometry_msgs/TwistStamped
+    heading      IMU without orientation, fixes, heading of two antennas as QuaternionStamped
+    imu heading  the same as an Imu
+    two fixes    the same as the fixes of a second antenna
+    wheels       no IMU: as speed, with that heading
+    scale        IMU without orientation, fixes, speeds whose scale is estimated
 """
 
 from __future__ import annotations
@@ -31,6 +38,9 @@ import yaml
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # imports the module beside this one from any folder
+
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
@@ -42,8 +52,20 @@ from caliv_graph.readers.pose_file import read_poses
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._dialects_motion import (
+    ARM_M,
+    BASELINE_DEG,
+    SCALE,
+    SECOND_ARM,
+    Message,
+    drawn,
+    headings,
+    odometry,
+    second_fixes,
+    turned,
+)
 
-SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "distorted.yaml"
+SCENARIO = ROOT / "configs" / "scenarios" / "distorted.yaml"
 PACKET_S = 24 * 55.296e-6
 SWEEPS: dict[str, dict[str, Any]] = {
     "plain": {"time_field": "t"},
@@ -56,8 +78,16 @@ SWEEPS: dict[str, dict[str, Any]] = {
         "packet_s": PACKET_S,
     },
 }
-WRITTEN = {"as start": "end", "inspvax": "plain", "tum": "plain", "navpvt": "plain"}
-ROWS = ("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets")
+MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels", "scale")
+WRITTEN = {
+    "as start": "end",
+    **dict.fromkeys(("inspvax", "tum", "navpvt", *MORE), "plain"),
+}
+ROWS = (
+    *("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets"),
+    *MORE,
+)
+NO_IMU = ("odometry", "speed", "wheels")
 POSITION_M, ROTATION_RAD = 0.01, 1e-3
 """White noise of the poses of INSPVAX and TUM."""
 
@@ -91,13 +121,20 @@ def result(row: str, seed: int, out: Path) -> str:
     except CalivError as e:
         return str(e)
     truth = {name: model.mounting.pose() for name, model in scenario.lidars.items()}
+    if row in NO_IMU:
+        truth = {name: turned(T, seed) for name, T in truth.items()}
     found = evaluate(calibration, truth)
     rows = [item["s2v"] for item in found["lidars"].values()]
     nees = " ".join(f"{item['nees']:9.1f}" for item in rows)
     pair = found["pairs"][0]
     mm = 1e3 * max(np.abs(item["translation_m"]).max() for item in (*rows, pair))
     mrad = 1e3 * max(np.abs(item["rotation_rad"]).max() for item in (*rows, pair))
-    return f"{calibration.status:13}{nees:>20}{pair['nees']:8.1f}   {mm:8.1f} {mrad:8.2f}"
+    line = f"{calibration.status:13}{nees:>20}{pair['nees']:8.1f}   {mm:8.1f} {mrad:8.2f}"
+    scale = calibration.vehicle.get("speed_scale")
+    if scale is not None:
+        off = float(scale.value[0]) - drawn(seed).scale
+        line += f"   scale {1e4 * off:+.1f}e-4, sigma {1e4 * float(scale.sigma[0]):.1f}e-4"
+    return line
 
 
 def described(kind: str) -> dict[str, Any]:
@@ -136,6 +173,43 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
             raw["topics"] = {"pose": "/inspvax"}
         else:
             raw["topics"]["gnss"] = "/navpvt"
+    elif row in MORE:
+        path = folder / row.replace(" ", "_")
+        if not path.exists():
+            with_messages(folder / "drive", path, more_messages(row, folder, seed), row in NO_IMU)
+        raw["data"]["path"] = path.name
+        raw["topics"] = {"gnss": "/gnss/fix"} | TOPICS[row]
+        if row in ("heading", "wheels"):
+            raw["heading"] = {"yaw_deg": BASELINE_DEG, "axes": "ned"}
+        elif row == "imu heading":
+            raw["heading"] = {"yaw_deg": BASELINE_DEG}
+        elif row == "scale":
+            raw["wheels"] = {"speed_scale_sigma": SCALE}
+        elif row == "two fixes":
+            raw["heading"] = {"lever_arm": list(SECOND_ARM), "lever_arm_sigma": ARM_M}
+
+
+TOPICS = {
+    "odometry": {"twist": "/odom"},
+    "speed": {"twist": "/vehicle/speed"},
+    "heading": {"imu": "/imu/data", "heading": "/heading"},
+    "imu heading": {"imu": "/imu/data", "heading": "/navheading"},
+    "two fixes": {"imu": "/imu/data", "heading": "/gnss/second/fix"},
+    "scale": {"imu": "/imu/data", "twist": "/vehicle/speed"},
+    "wheels": {"twist": "/vehicle/speed", "heading": "/heading"},
+}
+
+
+def more_messages(row: str, folder: Path, seed: int) -> Iterator[Message]:
+    """What the bag of a row has beside the drive's."""
+    gnss = load_scenario(SCENARIO).gnss
+    origin = (gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m)
+    if row in (*NO_IMU, "scale"):
+        yield from odometry(folder, seed, yaw_rate=row == "odometry")
+    if row in ("heading", "imu heading", "wheels"):
+        yield from headings(folder, seed, as_imu=row == "imu heading")
+    if row == "two fixes":
+        yield from second_fixes(folder, seed, origin)
 
 
 def noisy_poses(folder: Path, seed: int) -> tuple[list[int], list[Any], Any]:
@@ -203,6 +277,32 @@ def rewritten(source: Path, target: Path, more: Any) -> None:
                 w.write(to[connection.id], stamp, data)
 
 
+def with_messages(
+    source: Path, target: Path, messages: Iterator[Message], without_imu: bool
+) -> None:
+    """Copies a bag without its velocities and orientations, or IMU, and with more messages."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    without = ("/vehicle/twist", *(("/imu/data",) if without_imu else ()))
+    with (
+        Reader(source) as reader,
+        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
+    ):
+        kept = [c for c in reader.connections if c.topic not in without]
+        to = {c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in kept}
+        own: dict[str, Any] = {}
+        for stamp, topic, kind, fields in messages:
+            if topic not in own:
+                own[topic] = w.add_connection(topic, kind, typestore=store)
+            w.write(own[topic], stamp, serialised(store, kind, stamp, fields))
+        for connection, stamp, data in reader.messages(connections=kept):
+            if connection.topic == "/imu/data":
+                message: Any = store.deserialize_cdr(data, connection.msgtype)
+                message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
+                w.write(to[connection.id], stamp, store.serialize_cdr(message, connection.msgtype))
+            else:
+                w.write(to[connection.id], stamp, data)
+
+
 def navpvt(fix: Any, stamp: int) -> dict[str, Any]:
     """A NavSatFix as the receiver would report it."""
     t = datetime.datetime.fromtimestamp(stamp // 10**9, tz=datetime.UTC)
@@ -229,7 +329,7 @@ def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> byt
             elif int(node) == 1:
                 values[field] = given.get(field, "" if detail[0] == "string" else 0)
             else:
-                values[field] = np.zeros(detail[1], detail[0][1][0])
+                values[field] = given.get(field, np.zeros(detail[1], detail[0][1][0]))
         return store.types[name](**values)
 
     if kind.endswith("INSPVAX"):

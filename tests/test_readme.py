@@ -25,6 +25,7 @@ from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config, GroundConfig, LidarConfig
 from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.truth_file import read_truth
+from caliv_graph.results.vehicle import VehiclePart
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.simulation import load_scenario, simulate_caliv
 
@@ -134,7 +135,7 @@ def test_the_keys_of_a_result_are_those_of_the_table(
     # Only where a time offset was estimated, with --prior, where what was measured by hand has a
     # sigma, and where structure was used.
     written |= {"lidars.<name>.time_offset", "lidars.<name>.saw_structure", "joint.earlier"}
-    written |= {"vehicle.lever_arm", "vehicle.imu_rotation", "structure"}
+    written |= {f"vehicle.{name}" for name in VehiclePart.model_fields} | {"structure"}
 
     assert set(first_cells(RESULTS, "## Keys of calibration.yaml")) == written
 

@@ -13,6 +13,7 @@ import numpy as np
 import caliv_graph
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure import lidars_with_structure
+from caliv_graph.calibration.vehicle_parameters import drive_parameters
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
@@ -27,6 +28,7 @@ from caliv_graph.products import (
     StructureTerm,
     VehicleParameter,
 )
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess, limited_axes
 from caliv_graph.wording.directions import named, same_as_parameters
@@ -41,10 +43,12 @@ def assemble(
     config: Config,
     recordings: Sequence[Recording],
     digests: Sequence[str] = (),
+    trajectories: Sequence[VehicleTrajectory] = (),
 ) -> Calibration:
     """The reported result: every LiDAR of the config, in its order, in right perturbations.
 
-    `recordings` and their `digests` (`drive_digest`) go to the provenance.
+    `recordings` and their `digests` (`drive_digest`) go to the provenance. `trajectories` are those
+    of the drives.
     """
     uncertainty = named(
         assess(
@@ -77,7 +81,7 @@ def assemble(
     result = replace(
         draft,
         provenance=provenance,
-        vehicle=_vehicle(solution),
+        vehicle={**_vehicle(solution), **drive_parameters(trajectories)},
         structure=structure_summary(solution.structure, tuple(guesses)),
     )
     return unmet_requirements(result, config)

@@ -14,6 +14,7 @@ from dataclasses import replace
 import gtsam
 from threadpoolctl import threadpool_limits
 
+from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.no_target import (
     solution_without_target,
@@ -46,6 +47,7 @@ from caliv_graph.registration.register import JointRegistration, register_jointl
 from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 
 def estimate(
@@ -109,7 +111,9 @@ def _estimate(
     """The stages of `estimate_with_noise`, timed."""
     grounds, structure = surroundings
     limit = config.registration.max_iterations
-    rough = rough_solve(problem, observations, grounds, config, progress, limit)
+    guesses = {name: problem.guesses[name] for name in problem.lidars}
+    guessed = _held_grounds(grounds, guesses, trajectories)
+    rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         noise = estimated_noise(rough.state, rough.registrations, trajectories)
         trajectories = with_noise(noise, trajectories)
@@ -125,6 +129,7 @@ def _estimate(
     begun = time.perf_counter()
     lines = linearise_clouds(problem, rough.state.values)
     extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
+    grounds = _held_grounds(grounds, extrinsics, trajectories)
     states = [
         JointRegistration(
             _deskewed(o, extrinsics, trajectories),
@@ -178,6 +183,29 @@ def _estimate(
     warnings = (*rough.warnings, *alike, *said, *_unconverged(solution.registrations))
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
     return solution, tuple(trajectories)
+
+
+def _held_grounds(
+    grounds: Sequence[GroundObservation],
+    extrinsics: Mapping[str, gtsam.Pose3],
+    trajectories: Sequence[VehicleTrajectory],
+) -> tuple[GroundObservation, ...]:
+    """The ground put together with the extrinsics of the clouds, on drives without an IMU.
+
+    There roll of the LiDARs is known to milliradians. The ground's dependence on it would weigh as
+    much, and pull towards the extrinsics with which clouds were put together.
+    """
+    of_wheels = {
+        d
+        for d, t in enumerate(trajectories)
+        if isinstance(t, SmoothedTrajectory) and t.data.wheels is not None
+    }
+    return tuple(
+        held(o, extrinsics[o.lidar].rotation().matrix())
+        if o.drive in of_wheels and o.lidar in extrinsics
+        else o
+        for o in grounds
+    )
 
 
 def _deskewed(

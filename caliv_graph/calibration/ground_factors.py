@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -81,6 +82,29 @@ def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> tuple
     w = gtsam.Rot3.Logmap(turn)
     by_turn = observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(w)
     return said + observation.by_extrinsic @ w, np.asarray(by_turn)
+
+
+def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObservation:
+    """An observation as its motion is compensated with an extrinsic, whatever a solve makes of it.
+
+    Where clouds are put together with that extrinsic as well, both turn alike, and neither says
+    anything about it.
+    """
+    a, b, distance = compensated(observation, R_vehicle_lidar)[0].tolist()
+    u, v = observation.axes_lidar
+    normal = observation.normal_lidar + a * u + b * v
+    normal /= np.linalg.norm(normal)
+    u = u - (u @ normal) * normal
+    u /= np.linalg.norm(u)
+    v = v - (v @ normal) * normal - (v @ u) * u
+    return replace(
+        observation,
+        normal_lidar=normal,
+        distance_m=distance,
+        axes_lidar=np.stack([u, v / np.linalg.norm(v)]),
+        R_vehicle_lidar=None,
+        by_extrinsic=None,
+    )
 
 
 def ground_plane_factor(

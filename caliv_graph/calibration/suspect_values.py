@@ -16,7 +16,13 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array, BoolArray, Guess, MotionData, Solution, Suspect
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    IMU_ROTATION,
+    LEVER_ARM,
+    SECOND_ARM,
+    WHEELS_ROTATION,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -172,7 +178,7 @@ def freed_in_smoother(config: Config, name: str, change: Array) -> Config | None
 
 def _after(name: str, first: Array, second: Array) -> Array:
     """Two changes after each other, as one."""
-    if name != IMU_ROTATION.name:
+    if name not in (IMU_ROTATION.name, WHEELS_ROTATION.name):
         return first + second
     both = gtsam.Rot3.Expmap(second).compose(gtsam.Rot3.Expmap(first))
     return np.asarray(gtsam.Rot3.Logmap(both))
@@ -212,7 +218,15 @@ def _quantity(name: str, freed: Freed, config: Config, guesses: Mapping[str, Gue
         now = np.array([config.ground.vehicle_height or 0.0])
         return _Quantity(now, change, sigma, ("m",), known)
     if name == IMU_ROTATION.name:
-        return _imu_rotation(freed, config)
+        return _rotation(freed, config.imu.T_vehicle_imu.rpy_deg)
+    if name == HEADING_YAW.name:
+        now, off = np.array([config.heading.yaw_deg]), np.degrees(change)
+        return _Quantity(now, off, np.degrees(sigma), ("deg",), known)
+    if name == SECOND_ARM.name:
+        now = np.array(config.heading.lever_arm or (0.0, 0.0, 0.0))
+        return _Quantity(now, np.where(known, change, 0.0), sigma, ("m",) * 3, known)
+    if name == WHEELS_ROTATION.name:
+        return _rotation(freed, config.wheels.T_vehicle_wheels.rpy_deg)
     if name.endswith(".drift") or ".drift." in name:
         return _drift(change, sigma, known)
     if name.endswith("time_offset"):
@@ -239,9 +253,8 @@ def _pose(T: gtsam.Pose3) -> Array:
     return np.concatenate([T.translation(), np.degrees(T.rotation().rpy())])
 
 
-def _imu_rotation(freed: Freed, config: Config) -> _Quantity:
-    """rpy_deg of T_vehicle_imu; the sigmas are those about the vehicle's axes."""
-    rpy_deg = config.imu.T_vehicle_imu.rpy_deg
+def _rotation(freed: Freed, rpy_deg: tuple[float, float, float] | None) -> _Quantity:
+    """rpy_deg of a mount; the sigmas are those about the vehicle's axes."""
     now = np.radians(np.zeros(3) if rpy_deg is None else np.array(rpy_deg))
     R = gtsam.Rot3.Expmap(freed.change).compose(gtsam.Rot3.RzRyRx(*now))
     sigma = np.degrees(np.sqrt(np.diag(freed.cov)))

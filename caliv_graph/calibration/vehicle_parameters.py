@@ -15,24 +15,42 @@ from scipy.linalg import block_diag
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
-from caliv_graph.conventions import key_imu_rotation, key_lever_arm
+from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_wheels_rotation
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    IMU_ROTATION,
+    LEVER_ARM,
+    SPEED_SCALE,
+    WHEELS_ROTATION,
+    mount_rotation,
+)
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
 ParameterValue = Array | gtsam.Rot3
 
-KEYS = {LEVER_ARM.name: key_lever_arm(), IMU_ROTATION.name: key_imu_rotation()}
-"""Parameter of the input -> its key: (3,) metres in the vehicle frame, and R_vehicle_imu."""
+KEYS = {
+    LEVER_ARM.name: key_lever_arm(),
+    IMU_ROTATION.name: key_imu_rotation(),
+    WHEELS_ROTATION.name: key_wheels_rotation(),
+}
+"""Parameter of the input -> its key: (3,) metres in the vehicle frame, R_vehicle_imu, and
+R_vehicle_wheels."""
 
-NAMES = {LEVER_ARM.name: "lever_arm", IMU_ROTATION.name: "imu_rotation"}
+NAMES = {
+    LEVER_ARM.name: "lever_arm",
+    IMU_ROTATION.name: "imu_rotation",
+    WHEELS_ROTATION.name: "wheels_rotation",
+}
 """What they are called in a result."""
 
 USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
+    WHEELS_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
 }
 """A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
@@ -147,6 +165,36 @@ def estimated_parameters(
     return out
 
 
+def drive_parameters(trajectories: Sequence[VehicleTrajectory]) -> dict[str, VehicleParameter]:
+    """Scale of the speeds and yaw of a baseline, of the drives on which they were estimated.
+
+    Every drive has its own, by its motion data alone.
+    """
+    found: dict[str, list[tuple[float, float, bool]]] = {}
+    for trajectory in trajectories:
+        if not isinstance(trajectory, SmoothedTrajectory):
+            continue
+        for p in trajectory.parameters:
+            name = PER_DRIVE.get(p.parameter.name)
+            sigmas = trajectory.sigmas_of(p.parameter.name)
+            if name is None or p.sigmas is None or sigmas is None:
+                continue
+            data = trajectory.data
+            value = data.speed_scale if name == "speed_scale" else data.heading_yaw
+            sigma, prior = float(sigmas[0]), float(p.sigmas[0])
+            told = max(sigma**-2 - prior**-2, 0.0) > (UNDETERMINED_RATIO * prior) ** -2
+            found.setdefault(name, []).append((value, sigma, told))
+    out = {}
+    for name, rows in found.items():
+        values, spread, determined = zip(*rows, strict=True)
+        out[name] = VehicleParameter(np.array(values), np.array(spread), determined)
+    return out
+
+
+PER_DRIVE = {SPEED_SCALE.name: "speed_scale", HEADING_YAW.name: "heading_yaw"}
+"""Parameters that every drive has of its own -> what they are called in a result."""
+
+
 def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]:
     """Sigmas of the prior, and the offset from its mean, of each parameter that has one."""
     return {
@@ -164,11 +212,12 @@ def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
 
 def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> JointInformation:
     """The same, a rotation of the IMU as a right perturbation instead of one in vehicle axes."""
-    if IMU_ROTATION.name not in joint.parameters:
+    rotation = mount_rotation(trajectory.data).name
+    if rotation not in joint.parameters:
         return joint
     m = len(joint.T_map_vehicle)
     R_vehicle_imu = trajectory.data.T_vehicle_imu.rotation().matrix()
-    blocks = [R_vehicle_imu if n == IMU_ROTATION.name else np.eye(3) for n in joint.parameters]
+    blocks = [R_vehicle_imu if n == rotation else np.eye(3) for n in joint.parameters]
     turn = np.asarray(block_diag(*blocks))
     information, gradient = joint.information.copy(), joint.gradient.copy()
     information[:, POSE * m :] = information[:, POSE * m :] @ turn

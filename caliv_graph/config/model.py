@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from caliv_graph.config.heading import HeadingConfig
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.config.mounting import PoseConfig as PoseConfig
 from caliv_graph.config.sections import (
@@ -24,6 +25,7 @@ from caliv_graph.config.sections import (
     Section,
     Triple,
 )
+from caliv_graph.config.wheels import WheelsConfig
 from caliv_graph.errors import ConfigError
 
 _LEAST_SIGMA = 1e-6
@@ -212,11 +214,12 @@ class DataConfig(Section):
 
 
 class TopicsConfig(Section):
-    """Topics of what moves the vehicle: either `pose`, or IMU with GNSS and more."""
+    """Topics of what moves the vehicle: either `pose`, or IMU, GNSS, velocities and heading."""
 
     imu: str | None = None
     gnss: str | None = None
     twist: str | None = None
+    heading: str | None = None
     pose: str | None = None
 
 
@@ -333,6 +336,12 @@ class NoiseConfig(Section):
         "scan; absent: estimated",
     )
     velocity_m_s: Positive | None = None
+    yaw_rate_rad_s: Positive | None = Field(
+        None, description="rad/s, yaw rate of the odometry, used where there is no IMU"
+    )
+    heading_deg: Positive | None = Field(
+        None, description="degrees, each heading of topics.heading; absent: its message, or 0.3"
+    )
     orientation_deg: Positive | None = None
 
 
@@ -436,6 +445,8 @@ class Config(Section):
     structure: StructureConfig = StructureConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()
+    wheels: WheelsConfig = WheelsConfig()
+    heading: HeadingConfig = HeadingConfig()
     noise: NoiseConfig = NoiseConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()

@@ -15,7 +15,7 @@ from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import POSES_FILE, CalivFolder
 
 if TYPE_CHECKING:
-    from caliv_graph.readers.bag import Bag
+    from caliv_graph.readers.bag import Bag, Topic
 
 _ANY_RANGE_M = 1e6
 """Farther than any return: no point is dropped for its range."""
@@ -36,12 +36,18 @@ _SECONDARY = re.compile(r"raw|livox|ouster|os_cloud|os\d|velodyne|camera|realsen
 """Words in the names of topics that are probably not the vehicle's own IMU, velocity or pose."""
 
 
+_HEADING = re.compile(r"heading|hdt|hehdt|azimuth|dual")
+"""Words in the names of topics that hold the heading of two antennas."""
+
+_ODOMETRY = "nav_msgs/msg/Odometry"
+
+
 @dataclass(frozen=True)
 class MotionTopics:
     """Topics of a bag with the vehicle's motion.
 
     Attributes:
-        chosen: by key of `topics` in the config: imu, gnss, twist, pose.
+        chosen: by key of `topics` in the config: imu, gnss, twist, heading, pose.
         others: further topics that fit, by the same keys.
     """
 
@@ -258,7 +264,8 @@ def first_frame(bag: Bag, topic: str) -> str | None:
 def choose_motion_topics(bag: Bag) -> MotionTopics:
     """The topics of a bag that are probably the best for the vehicle's motion.
 
-    IMU and GNSS with a velocity if there are both; else poses, with the IMU if there is one.
+    IMU and GNSS with a velocity if there are both; else poses, but for those of wheels, which drift
+    away: GNSS and the velocity of the wheels are better.
 
     Raises:
         RecordingError: the bag is damaged.
@@ -270,10 +277,15 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         fitting = [t for t in bag.topics.values() if t.type in types and t.messages]
         # A command is not a measurement, and a static link is not a pose of the vehicle.
         fitting = [t for t in fitting if "cmd" not in t.name and not t.name.endswith("/tf_static")]
+        if kind == "heading":
+            # Headings also come as Imu: of an Imu by its name.
+            fitting = [t for t in bag.topics.values() if t.messages and _is_heading(t)]
+        elif kind == "imu":
+            fitting = [t for t in fitting if not _is_heading(t)]
         fitting.sort(
             key=lambda t: (
                 bool(_SECONDARY.search(t.name.lower())),
-                types.index(t.type),
+                types.index(t.type) if t.type in types else len(types),
                 -t.messages,
                 t.name,
             )
@@ -281,18 +293,40 @@ def choose_motion_topics(bag: Bag) -> MotionTopics:
         ranked[kind] = [t.name for t in fitting]
     # Transforms without a vehicle frame hold no pose of the vehicle.
     ranked["pose"] = [name for name in ranked["pose"] if _has_poses(bag, name)]
-    if ranked["imu"] and ranked["gnss"]:
-        keys = ["imu", "gnss", "twist"]
-    elif ranked["pose"]:
+    ranked["pose"].sort(key=lambda name: _drifts(bag, name))
+    if not ranked["imu"]:
+        # Wheels tell a yaw rate; another twist may be that of a GNSS receiver, in map axes.
+        ranked["twist"].sort(key=lambda name: bag.topics[name].type != _ODOMETRY)
+    drifting = all(_drifts(bag, name) for name in ranked["pose"])
+    raw = ["imu", "gnss", "twist", "heading"]
+    if ranked["pose"] and not (
+        ranked["gnss"] and (ranked["imu"] or (ranked["twist"] and drifting))
+    ):
         keys = ["pose"]
     else:
-        keys = ["imu", "gnss", "twist"]
+        keys = raw
     chosen = {key: ranked[key][0] for key in keys if ranked[key]}
     others = {
         kind: tuple(name for name in names if chosen.get(kind) != name)
         for kind, names in ranked.items()
     }
     return MotionTopics(chosen, others)
+
+
+def _is_heading(topic: Topic) -> bool:
+    """Whether a topic has the heading of two antennas, by its type and name."""
+    from caliv_graph.readers.heading import IMU, QUATERNION
+
+    return topic.type in (QUATERNION, IMU) and bool(_HEADING.search(topic.name.lower()))
+
+
+def _drifts(bag: Bag, topic: str) -> bool:
+    """Whether poses are those of an odometry: by REP 105 they drift in the frame `odom`."""
+    from caliv_graph.readers.frames import TF_TYPES
+
+    if bag.topics[topic].type in TF_TYPES:
+        return False
+    return (first_frame(bag, topic) or "").rpartition("/")[2] == "odom"
 
 
 def _has_poses(bag: Bag, topic: str) -> bool:

@@ -44,7 +44,7 @@ PVT_GEODETIC = "septentrio_gnss_driver/msg/PVTGeodetic"
 POSITION_TYPES = ("geometry_msgs/msg/PointStamped", "geometry_msgs/msg/PoseStamped")
 
 _IMU = "sensor_msgs/msg/Imu"
-_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
+NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TWIST = "geometry_msgs/msg/TwistStamped"
 _TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -53,16 +53,20 @@ _POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 MOTION_TYPES: Mapping[str, tuple[str, ...]] = {
     "imu": (_IMU,),
-    "gnss": (_NAVSATFIX, NAVPVT, PVT_GEODETIC),
+    "gnss": (NAVSATFIX, NAVPVT, PVT_GEODETIC),
     "twist": (_TWIST_WITH_COVARIANCE, _TWIST, _ODOMETRY),
+    "heading": ("geometry_msgs/msg/QuaternionStamped",),
     "pose": (_ODOMETRY, _POSE_WITH_COVARIANCE, _POSE, *TF_TYPES, *INSPVAX_TYPES),
 }
 """Types that fit each key of `topics`, the most informative first."""
 
-ON_REQUEST: Mapping[str, tuple[str, ...]] = {"gnss": POSITION_TYPES}
+ON_REQUEST: Mapping[str, tuple[str, ...]] = {
+    "gnss": POSITION_TYPES,
+    "heading": (_IMU, NAVSATFIX, NAVPVT, PVT_GEODETIC),
+}
 """Types that fit a key as well, if the config says so: mostly they are something else."""
 
-_NORM_TOLERANCE = 1e-2
+NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision is off by less."""
 
 GRAVITY_M_S2 = 9.81
@@ -73,6 +77,9 @@ than m/s^2 more."""
 
 _FAST_RAD_S = 6.0
 """Degrees per second exceed it; no road vehicle turns as fast for a twentieth of a drive."""
+
+_UNKNOWN_RATE_VAR = 100.0
+"""(rad/s)^2: no vehicle turns at 10 rad/s. By a larger variance drivers say that it is unknown."""
 
 _MOST_RAD_S = 200.0
 _MOST_M_S2 = 2000.0
@@ -274,7 +281,7 @@ class ImuCollector(RowCollector):
         """Unit quaternions (n, 4) and their covariances, from the kinds (d, 9) of the latter."""
         has_any = (stated[:, 0] != -1.0)[which]
         norms = np.linalg.norm(q, axis=1)
-        is_rotation = np.abs(norms - 1.0) <= _NORM_TOLERANCE  # False for NaN
+        is_rotation = np.abs(norms - 1.0) <= NORM_TOLERANCE  # False for NaN
         broken = int(np.count_nonzero(has_any & ~is_rotation))
         if broken:
             self._losses.say(
@@ -343,8 +350,9 @@ class TwistCollector(RowCollector):
     frame of the others.
     """
 
-    _WIDTH = 12
+    _WIDTH = 14
     _LINEAR: ClassVar[list[int]] = [0, 1, 2, 6, 7, 8, 12, 13, 14]
+    _YAW_RATE = 35
 
     def __init__(self) -> None:
         super().__init__()
@@ -353,12 +361,13 @@ class TwistCollector(RowCollector):
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
         twist = message.twist
-        cov = np.zeros(9)
+        cov, yaw_rate_var = np.zeros(9), 0.0
         if hasattr(twist, "covariance"):
+            yaw_rate_var = float(twist.covariance[self._YAW_RATE])
             cov, twist = twist.covariance[self._LINEAR], twist.twist
         self._frames.add(getattr(message, "child_frame_id", message.header.frame_id))
         v = twist.linear
-        self._rows.add(stamp_ns, (v.x, v.y, v.z, *cov.tolist()))
+        self._rows.add(stamp_ns, (v.x, v.y, v.z, *cov.tolist(), twist.angular.z, yaw_rate_var))
 
     def finish(self) -> TwistSamples | None:
         """The velocities; None if there are none."""
@@ -374,7 +383,23 @@ class TwistCollector(RowCollector):
                 )
         if not len(stamps):
             return None
-        return TwistSamples(stamps, rows[:, :3], _or_none(_covariances(rows[:, 3:])))
+        cov = _or_none(_covariances(rows[:, 3:12]))
+        return TwistSamples(stamps, rows[:, :3], cov, *_yaw_rates(rows[:, 12], rows[:, 13]))
+
+
+def _yaw_rates(rate: Array, variance: Array) -> tuple[Array | None, Array | None]:
+    """Yaw rates (n,) and their variances, NaN where unknown; None where no message knows any.
+
+    A driver without one leaves zeros, and may say so by a variance.
+    """
+    known = np.isfinite(rate) & (np.abs(rate) <= _MOST_RAD_S) & ~(variance > _UNKNOWN_RATE_VAR)
+    if not (known & (rate != 0.0)).any():
+        return None, None
+    stated = known & (variance > 0.0)
+    return (
+        np.where(known, rate, np.nan),
+        np.where(stated, variance, np.nan) if stated.any() else None,
+    )
 
 
 class PoseCollector(RowCollector):
@@ -401,7 +426,7 @@ class PoseCollector(RowCollector):
             (f"beyond {MOST_M:g} m from the origin", lambda r: below(r[:, :3], MOST_M)),
             (
                 "whose orientation is not a unit quaternion",
-                lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= _NORM_TOLERANCE,
+                lambda r: np.abs(np.linalg.norm(r[:, 3:7], axis=1) - 1.0) <= NORM_TOLERANCE,
             ),
         )
         if not len(stamps):

@@ -28,6 +28,7 @@ from caliv_graph.readers.motion import (
     INSPVAX_TYPES,
     MOST_M,
     NAVPVT,
+    NAVSATFIX,
     ON_EARTH,
     POSITION_TYPES,
     PVT_GEODETIC,
@@ -282,5 +283,8 @@ COLLECTORS: Mapping[tuple[str, str], type[Collector]] = {
     ("gnss", NAVPVT): NavPvtCollector,
     ("gnss", PVT_GEODETIC): PvtGeodeticCollector,
     **{("gnss", name): LocalPositionCollector for name in POSITION_TYPES},
+    ("heading", NAVSATFIX): GnssCollector,
+    ("heading", NAVPVT): NavPvtCollector,
+    ("heading", PVT_GEODETIC): PvtGeodeticCollector,
 }
 """Collectors of these types, by key of `topics` and type."""

@@ -27,6 +27,7 @@ from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
 from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
 from caliv_graph.readers.definitions import WITHOUT_HEADER
 from caliv_graph.readers.frames import TF_TYPES, clean_frame
+from caliv_graph.readers.heading import HeadingCollector
 from caliv_graph.readers.motion import (
     MOTION_TYPES,
     ON_REQUEST,
@@ -57,12 +58,19 @@ from caliv_graph.readers.sweeps import (
     times_warnings,
 )
 
-_KINDS = {"imu": "IMU", "gnss": "GNSS receiver", "twist": "velocity", "pose": "pose of the vehicle"}
+_KINDS = {
+    "imu": "IMU",
+    "gnss": "GNSS receiver",
+    "twist": "velocity",
+    "heading": "heading",
+    "pose": "pose of the vehicle",
+}
 
 _COLLECTORS: Mapping[str, type[Collector]] = {
     "imu": ImuCollector,
     "gnss": GnssCollector,
     "twist": TwistCollector,
+    "heading": HeadingCollector,
     "pose": PoseCollector,
 }
 
@@ -72,7 +80,7 @@ _JOIN_NS = NANOSECONDS_PER_SECOND // 2
 """Wanted clouds recorded within this time of each other are read in one go: reading on costs less
 than starting again."""
 
-_LONG_GAP_S = {"imu": 0.1, "gnss": 2.0, "twist": 1.0, "pose": 1.0}
+_LONG_GAP_S = {"imu": 0.1, "gnss": 2.0, "twist": 1.0, "heading": 2.0, "pose": 1.0}
 """Seconds without a message from which there is a warning. Integration over a gap of an IMU soon
 drifts."""
 
@@ -400,6 +408,7 @@ class RosbagRecording:
             imu=found.get("imu"),
             gnss=found.get("gnss"),
             twist=found.get("twist"),
+            heading=found.get("heading"),
         )
         if motion.imu is not None:
             where = f"{self._bag.name}: topics.imu '{self._used['imu']}'"

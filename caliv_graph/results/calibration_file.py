@@ -23,7 +23,7 @@ from caliv_graph.config.load import read_yaml, validated
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
-from caliv_graph.products import Array, Calibration, Direction, Guess, LidarResult
+from caliv_graph.products import TURNS, Array, Calibration, Direction, Guess, LidarResult
 from caliv_graph.results.model import SCHEMA, CalibrationModel
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 
@@ -38,7 +38,9 @@ _HEADER = """\
 # determined, sigma_vehicle_axes and the directions of observability: the vehicle's axes, at the
 # LiDAR's origin. `determined` of a pair: the axes of `to`.
 # vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna in the vehicle's
-# axes. imu_rotation: roll, pitch, yaw of T_vehicle_imu, its sigmas about the vehicle's axes.
+# axes. imu_rotation, wheels_rotation: roll, pitch, yaw of T_vehicle_imu or T_vehicle_wheels, sigmas
+# about the vehicle's axes. One per drive: speed_scale, measured over true speeds; heading_yaw, the
+# direction of the baseline of two antennas.
 """
 
 
@@ -186,7 +188,7 @@ def _vehicle_document(calibration: Calibration) -> dict[str, Any]:
     """Lever arm in metres, rotation of the IMU in degrees; nothing where both are exact."""
     out = {}
     for name, found in calibration.vehicle.items():
-        turn = name == "imu_rotation"
+        turn = name in TURNS
         unit, suffix = (180.0 / math.pi, "_deg") if turn else (1.0, "")
         out[name] = {
             f"value{suffix}": (unit * found.value).tolist(),

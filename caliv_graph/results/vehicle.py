@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydantic import StrictBool
+from collections.abc import Sized
 
-from caliv_graph.products import VehicleParameter
+import numpy as np
+from pydantic import Field, StrictBool, model_validator
+
+from caliv_graph.products import TURNS, VehicleParameter
 from caliv_graph.results.fields import Finite, Part, Sigma, Text
 
 
@@ -19,6 +21,37 @@ class _ArmPart(_MeasuredPart):
     sigma: tuple[Sigma, Sigma, Sigma]
 
 
+class _PerDrivePart(Part):
+    determined: tuple[StrictBool, ...] = Field(min_length=1)
+    limits: tuple[Text, ...] = ()
+
+
+class _ScalesPart(_PerDrivePart):
+    value: tuple[Finite, ...]
+    sigma: tuple[Sigma, ...]
+
+    @model_validator(mode="after")
+    def _one_per_drive(self) -> _ScalesPart:
+        check_lengths(self.determined, self.value, self.sigma)
+        return self
+
+
+class _AnglesPart(_PerDrivePart):
+    value_deg: tuple[Finite, ...]
+    sigma_deg: tuple[Sigma, ...]
+
+    @model_validator(mode="after")
+    def _one_per_drive(self) -> _AnglesPart:
+        check_lengths(self.determined, self.value_deg, self.sigma_deg)
+        return self
+
+
+def check_lengths(determined: Sized, value: Sized, sigma: Sized) -> None:
+    """Raises ValueError unless there is one of each per drive."""
+    if not len(determined) == len(value) == len(sigma):
+        raise ValueError("value, sigma and determined must have one entry per drive")
+
+
 class _TurnPart(_MeasuredPart):
     value_deg: tuple[Finite, Finite, Finite]
     sigma_deg: tuple[Sigma, Sigma, Sigma]
@@ -29,6 +62,9 @@ class VehiclePart(Part):
 
     lever_arm: _ArmPart | None = None
     imu_rotation: _TurnPart | None = None
+    wheels_rotation: _TurnPart | None = None
+    speed_scale: _ScalesPart | None = None
+    heading_yaw: _AnglesPart | None = None
 
     def parameters(self) -> dict[str, VehicleParameter]:
         """In metres and radians."""
@@ -37,8 +73,13 @@ class VehiclePart(Part):
             arm = self.lever_arm
             value, sigma = np.array(arm.value), np.array(arm.sigma)
             out["lever_arm"] = VehicleParameter(value, sigma, arm.determined, arm.limits)
-        if self.imu_rotation is not None:
-            turn = self.imu_rotation
-            value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
-            out["imu_rotation"] = VehicleParameter(value, sigma, turn.determined, turn.limits)
+        for name in TURNS:
+            turn: _TurnPart | _AnglesPart | None = getattr(self, name)
+            if turn is not None:
+                value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
+                out[name] = VehicleParameter(value, sigma, turn.determined, turn.limits)
+        if self.speed_scale is not None:
+            scale = self.speed_scale
+            value, sigma = np.array(scale.value), np.array(scale.sigma)
+            out["speed_scale"] = VehicleParameter(value, sigma, scale.determined, scale.limits)
         return out

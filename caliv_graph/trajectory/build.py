@@ -15,8 +15,12 @@ import numpy as np
 from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import IntArray
+from caliv_graph.trajectory.antennas import NodeDirections
 from caliv_graph.trajectory.factors import (
+    baseline_factor,
     biased_orientation_factor,
+    heading_factor,
+    level_factor,
     orientation_factor,
     position_factor,
     velocity_factor,
@@ -26,6 +30,7 @@ from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.wheels import level_sigmas, normal_of
 
 GAUGE_M = 1e-4
 GAUGE_RAD = 1e-4
@@ -35,7 +40,7 @@ and large enough that the graph stays well conditioned."""
 
 @dataclass
 class TrajectoryGraph:
-    """The factors, and the kind of each: `imu`, `gnss`, `orientation`, `velocity`, or `prior`."""
+    """The factors, and the kind of each, of `KINDS`."""
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)
@@ -54,7 +59,9 @@ class TrajectoryGraph:
         return out
 
 
-KINDS = frozenset({"imu", "gnss", "orientation", "velocity", "prior"})
+KINDS = frozenset(
+    {"imu", "gnss", "orientation", "velocity", "level", "heading", "baseline", "prior"}
+)
 """Kinds of the factors of a trajectory."""
 
 
@@ -82,6 +89,12 @@ def build_graph(
         _add_orientations(graph, data, carried.orientations)
     if carried.velocities is not None:
         _add_velocities(graph, data, carried.velocities)
+    if carried.headings is not None:
+        _add_headings(graph, data, carried.headings, kernel)
+    if carried.baselines is not None:
+        _add_baselines(graph, data, carried.baselines, kernel)
+    if data.wheels is not None and "level" in kinds:
+        _add_level(graph, data, nodes)
     if data.positions is None:
         _add_gauge_prior(graph, data, states)
     return graph if kinds == KINDS else graph.only(kinds)
@@ -99,7 +112,7 @@ def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, state
         poses = key_imu(i), key_velocity(i), key_imu(i + 1), key_velocity(i + 1)
         factor = gtsam.CombinedImuFactor(*poses, key_bias(i), key_bias(i + 1), measured)
         graph.add("imu", factor)
-    bias_sigmas = np.array([noise.force_bias] * 3 + [noise.gyro_bias] * 3)
+    bias_sigmas = np.concatenate([noise.force_bias, noise.gyro_bias])
     model = gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
     no_bias = gtsam.imuBias.ConstantBias()
     graph.add("prior", gtsam.PriorFactorConstantBias(key_bias(0), no_bias, model))
@@ -113,12 +126,8 @@ def _add_positions(
     kernel: str,
 ) -> None:
     keep = ~np.isin(positions.fixes, dropped)
-    threshold = data.config.robust.huber_k * math.sqrt(3.0)
     for k in np.flatnonzero(keep).tolist():
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(positions.cov_map[k])
-        if kernel == "huber":
-            estimator = gtsam.noiseModel.mEstimator.Huber.Create(threshold)
-            noise = gtsam.noiseModel.Robust.Create(estimator, noise)
+        noise = _robust(gtsam.noiseModel.Gaussian.Covariance(positions.cov_map[k]), data, kernel)
         i = int(positions.nodes[k])
         measured, offset = positions.position_map[k], positions.offset_imu[k]
         delay_s, gravity = float(positions.delay_s[k]), data.gravity_m_s2
@@ -154,17 +163,64 @@ def _add_velocities(
         gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
         noise = gtsam.noiseModel.Gaussian.Covariance(velocities.cov[k])
         factor = velocity_factor(
-            key_imu(i), key_velocity(i), velocities.velocity_imu[k], gained, noise
+            key_imu(i),
+            key_velocity(i),
+            velocities.velocity_imu[k],
+            gained,
+            noise,
+            data.speed_scale,
         )
         graph.add("velocity", factor)
 
 
+def _add_headings(
+    graph: TrajectoryGraph, data: SmootherInput, found: NodeDirections, kernel: str
+) -> None:
+    assert data.headings is not None
+    for i, k, u in zip(found.nodes.tolist(), found.measurements, found.direction_imu, strict=True):
+        variance = data.headings.var[k : k + 1, None]
+        noise = _robust(gtsam.noiseModel.Gaussian.Covariance(variance), data, kernel)
+        azimuth = float(data.headings.azimuth_rad[k])
+        graph.add("heading", heading_factor(key_imu(i), u, azimuth, noise))
+
+
+def _add_baselines(
+    graph: TrajectoryGraph, data: SmootherInput, found: NodeDirections, kernel: str
+) -> None:
+    assert data.baselines is not None
+    for i, k, b in zip(found.nodes.tolist(), found.measurements, found.direction_imu, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Covariance(data.baselines.cov_map[k])
+        robust = _robust(noise, data, kernel)
+        graph.add("baseline", baseline_factor(key_imu(i), b, data.baselines.vector_map[k], robust))
+
+
+def _robust(
+    noise: gtsam.noiseModel.Base, data: SmootherInput, kernel: str
+) -> gtsam.noiseModel.Base:
+    """A noise model under Huber's loss where that is the kernel."""
+    if kernel != "huber":
+        return noise
+    threshold = data.config.robust.huber_k * math.sqrt(noise.dim())
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(threshold), noise
+    )
+
+
+def _add_level(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray) -> None:
+    """The road under an axle is level, but for its slope and bumps."""
+    assert data.wheels is not None
+    up_map = normal_of(data.slope)
+    for i, sigma in enumerate(level_sigmas(nodes, data.wheels).tolist()):
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+        graph.add("level", level_factor(key_imu(i), up_map, noise))
+
+
 def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States) -> None:
-    """Without GNSS the start is the map's origin; without orientation it also fixes the yaw."""
+    """Without GNSS the start is the map's origin; if nothing tells the yaw, that is fixed, too."""
     start = gtsam.Pose3(gtsam.Rot3(states.R_map_imu[0]), states.p_map_imu[0])
     position_noise = gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_M)
     graph.add("prior", gtsam.PoseTranslationPrior3D(key_imu(0), start, position_noise))
-    if not data.orientation:
+    if not data.orientation and data.headings is None:
         R = states.R_map_imu[0]
         # 1 rad in roll and pitch, which gravity determines; rotated into the imu's axes, in which
         # the residual is.

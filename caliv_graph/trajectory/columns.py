@@ -57,6 +57,8 @@ def parameter_columns(
             ahead, behind = (parameter.stepped(data, k, sign) for sign in (1.0, -1.0))
             for kind in moving:
                 white = whites[kind]
+                if not white.factors:
+                    continue
                 after, before = (residuals.of(kind, moved) for moved in (ahead, behind))
                 if not len(after) == len(before) == len(white.factors):
                     raise ValueError(f"{parameter.name}: moved by a step, it has other factors")
@@ -127,6 +129,18 @@ class _Residuals:
             return self._of_positions(moved)
         if kind == "velocity":
             return self._of_velocities(moved)
+        if kind == "imu" and moved.wheels is not None:
+            # Lengths of the motion's prior are in the unit of the wheels; nothing else moves it.
+            by = np.ones(15)
+            by[3:12] = moved.speed_scale / self._data.speed_scale
+            return self._of_imu * by
+        return self._of_graph(kind, moved)
+
+    @cached_property
+    def _of_imu(self) -> Array:
+        return self._of_graph("imu", self._data)
+
+    def _of_graph(self, kind: str, moved: SmootherInput) -> Array:
         every = (moved, self._nodes, self._states, self._dropped)
         graph = build_graph(*every, "none", frozenset({kind})).factors
         factors: list[Any] = [graph.at(i) for i in range(graph.size())]
@@ -167,5 +181,10 @@ class _Residuals:
         if carried is None:
             return np.zeros((0, 3))
         return velocity_residuals(
-            self._at, carried.nodes, carried.velocity_imu, carried.delay_s, moved.gravity_m_s2
+            self._at,
+            carried.nodes,
+            carried.velocity_imu,
+            carried.delay_s,
+            moved.gravity_m_s2,
+            moved.speed_scale,
         )

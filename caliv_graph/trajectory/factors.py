@@ -7,6 +7,7 @@ the map. All Jacobians are analytic; the tests check them numerically.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import gtsam
@@ -65,22 +66,27 @@ def position_factor(
 
 
 def velocity_factor(
-    key_imu: int, key_velocity: int, velocity_imu: Array, gained_map: Array, noise: NoiseModel
+    key_imu: int,
+    key_velocity: int,
+    velocity_imu: Array,
+    gained_map: Array,
+    noise: NoiseModel,
+    scale: float = 1.0,
 ) -> gtsam.CustomFactor:
-    """A velocity of the IMU's origin, carried to the node: `r = R^T (V + u) - z`, imu axes.
+    """A velocity of the IMU's origin, carried to the node: `r = k R^T (V + u) - z`, imu axes.
 
     `velocity_imu` is z, (3,) m/s; `gained_map` is u, the velocity (3,) m/s that gravity adds until
-    the measurement; `noise` has the 3 dimensions of r.
+    the measurement; `noise` has the 3 dimensions of r; `scale` is k, measured over true velocity.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         back = values.atPose3(key_imu).rotation().matrix().T
-        predicted = back @ (values.atVector(key_velocity) + gained_map)
+        predicted = scale * (back @ (values.atVector(key_velocity) + gained_map))
         if jacobians is not None:
             J = np.zeros((3, 6))
             J[:, :3] = skew(predicted)
             jacobians[0] = J
-            jacobians[1] = back
+            jacobians[1] = scale * back
         return np.asarray(predicted - velocity_imu)
 
     return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
@@ -102,12 +108,18 @@ def position_residuals(
 
 
 def velocity_residuals(
-    states: States, nodes: IntArray, velocity_imu: Array, delay_s: Array, gravity_m_s2: float
+    states: States,
+    nodes: IntArray,
+    velocity_imu: Array,
+    delay_s: Array,
+    gravity_m_s2: float,
+    scale: float = 1.0,
 ) -> Array:
     """(m, 3) residuals of `velocity_factor` of m velocities at their `nodes` (m,), all at once."""
     velocity = states.velocity_map[nodes].copy()
     velocity[:, 2] -= gravity_m_s2 * delay_s
-    return np.asarray(np.einsum("mji,mj->mi", states.R_map_imu[nodes], velocity) - velocity_imu)
+    seen = scale * np.einsum("mji,mj->mi", states.R_map_imu[nodes], velocity)
+    return np.asarray(seen - velocity_imu)
 
 
 def biased_orientation_factor(
@@ -140,6 +152,65 @@ def orientation_factor(
 ) -> gtsam.NoiseModelFactor:
     """An orientation, `r = Log(Z^T R)`, 3 dimensions, imu axes; GTSAM's own factor."""
     return gtsam.PoseRotationPrior3D(key_imu, R_map_imu, noise)
+
+
+def level_factor(key_imu: int, up_map: Array, noise: NoiseModel) -> gtsam.CustomFactor:
+    """Level ground under the frame: `r = (R^T n)_xy`, n = `up_map` (3,) its normal in the map.
+
+    Nose up is positive x, left side up positive y, radians; `noise` has the 2 dimensions of r.
+    """
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        up = values.atPose3(key_imu).rotation().matrix().T @ up_map
+        if jacobians is not None:
+            J = np.zeros((2, 6))
+            J[:, :3] = skew(up)[:2]
+            jacobians[0] = J
+        return np.asarray(up[:2])
+
+    return gtsam.CustomFactor(noise, [key_imu], error)
+
+
+def heading_factor(
+    key_imu: int, direction_imu: Array, azimuth_rad: float, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """The azimuth of a direction: `r = atan2(d_y, d_x) - z`, `d = R u`, u (3,) of the imu frame.
+
+    Within half a turn; z counts from the map's x to the left. `noise` has the 1 dimension of r.
+    """
+    turn = skew(direction_imu)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(key_imu).rotation().matrix()
+        x, y, _z = R @ direction_imu
+        if jacobians is not None:
+            across = np.array([-y, x, 0.0]) / (x * x + y * y)
+            J = np.zeros((1, 6))
+            J[0, :3] = -across @ R @ turn
+            jacobians[0] = J
+        return np.array([math.remainder(math.atan2(y, x) - azimuth_rad, math.tau)])
+
+    return gtsam.CustomFactor(noise, [key_imu], error)
+
+
+def baseline_factor(
+    key_imu: int, baseline_imu: Array, vector_map: Array, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """A vector between two antennas: `r = R b - z`, metres, map axes; b (3,) of the imu frame.
+
+    `vector_map` (3,) is z; `noise` has the 3 dimensions of r.
+    """
+    turn = skew(baseline_imu)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(key_imu).rotation().matrix()
+        if jacobians is not None:
+            J = np.zeros((3, 6))
+            J[:, :3] = -R @ turn
+            jacobians[0] = J
+        return np.asarray(R @ baseline_imu - vector_map)
+
+    return gtsam.CustomFactor(noise, [key_imu], error)
 
 
 def tangent_size(value: gtsam.Pose3 | gtsam.Rot3 | Array) -> int:

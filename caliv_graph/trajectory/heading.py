@@ -63,8 +63,10 @@ def heading_disagreement(
 
     The motion in vehicle axes is compared with recorded velocities that have a lateral part.
     Without them the rear axle is assumed not to slip (`README.md`, section 10). None if the vehicle
-    hardly moves.
+    hardly moves, or if without an IMU the heading was made from the course.
     """
+    if smoothed.data.wheels is not None:
+        return None
     begin, end = smoothed.span_ns
     at = np.arange(begin, end, SPACING_NS, dtype=np.int64)
     velocity, rates = smoothed.velocities_at(at)

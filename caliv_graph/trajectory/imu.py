@@ -87,6 +87,10 @@ class Inertial:
         return int(self.stamps_ns[-1])
 
 
+NO_GAPS: IntArray = np.zeros((0, 2), np.int64)
+"""Of samples in which nobody has looked for gaps yet."""
+
+
 def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...]]:
     """Drops unusable samples and selects the longest piece without a long gap.
 
@@ -97,6 +101,20 @@ def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...
         TrajectoryError: too little is left, or the samples are not those of an IMU at all.
     """
     stamps, gyro, force, warnings = _finite_samples(imu, name)
+    inertial, more = longest_piece(Inertial(stamps, gyro, force, NO_GAPS), name, "IMU")
+    return inertial, (*warnings, *more)
+
+
+def longest_piece(samples: Inertial, name: str, sensor: str) -> tuple[Inertial, tuple[str, ...]]:
+    """The longest piece of the samples of a `sensor` without a gap that is too long to bridge.
+
+    Also what was left out or bridged, a line each.
+
+    Raises:
+        TrajectoryError: no two samples are close enough.
+    """
+    stamps, gyro, force = samples.stamps_ns, samples.gyro, samples.force
+    warnings: list[str] = []
     steps = np.diff(stamps)
     longest = max(GAP_S, 3e-9 * float(np.median(steps)))
     split = max(MAX_BRIDGE_S, longest)
@@ -107,18 +125,18 @@ def clean_inertial(imu: ImuSamples, name: str) -> tuple[Inertial, tuple[str, ...
     if len(pieces) > 1:
         warnings.append(
             f"{name}: {len(cuts)} gap(s) of more than {split:g} s in the "
-            f"IMU, the longest {steps.max() * 1e-9:.1f} s: only the longest piece is used, "
+            f"{sensor}, the longest {steps.max() * 1e-9:.1f} s: only the longest piece is used, "
             f"{duration_ns * 1e-9:.1f} s of {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
         )
     stamps, gyro, force = stamps[a:b], gyro[a:b], force[a:b]
     if b - a < 2:
-        raise TrajectoryError(f"{name}: the IMU's messages are all more than 2 s apart")
+        raise TrajectoryError(f"{name}: the {sensor}'s messages are all more than 2 s apart")
     at_gap = np.flatnonzero(np.diff(stamps) > 1e9 * longest)
     gaps = np.stack([stamps[at_gap], stamps[at_gap + 1]], axis=1).reshape(-1, 2)
     if len(gaps):
         lost_s = float((gaps[:, 1] - gaps[:, 0]).sum()) * 1e-9
         warnings.append(
-            f"{name}: {len(gaps)} gap(s) in the IMU, {lost_s:.2f} s together: bridged, poses "
+            f"{name}: {len(gaps)} gap(s) in the {sensor}, {lost_s:.2f} s together: bridged, poses "
             "there are less certain"
         )
     return Inertial(stamps, gyro, force, gaps), tuple(warnings)
@@ -313,6 +331,6 @@ def _parameters(
     parameters.setGyroscopeCovariance(gyro)
     parameters.setAccelerometerCovariance(force)
     parameters.setIntegrationCovariance(INTEGRATION_DENSITY_M**2 * np.eye(3))
-    parameters.setBiasOmegaCovariance(noise.gyro_walk**2 * np.eye(3))
-    parameters.setBiasAccCovariance(noise.force_walk**2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(np.diag(noise.gyro_walk**2))
+    parameters.setBiasAccCovariance(np.diag(noise.force_walk**2))
     return parameters

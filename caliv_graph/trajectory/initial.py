@@ -12,8 +12,9 @@ import numpy as np
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.alignment import align, heading_window
+from caliv_graph.trajectory.antennas import yaw_by_antennas
 from caliv_graph.trajectory.gnss import Positions
-from caliv_graph.trajectory.imu import DeadReckoning, Inertial, interpolate
+from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
@@ -69,10 +70,27 @@ def first_states(data: SmootherInput, nodes: IntArray) -> States:
         nodes = nodes[:keep]
         carried = carry_to_nodes(data, nodes, dead)
         R = R_start @ dead.between(np.full(keep, nodes[0]), nodes)[0]
+        R = turned_to_antennas(data, R, nodes, dead)
     p, v = positions_and_velocities(R, nodes, data.positions, carried.velocities, data.arm_imu)
     if data.positions is None:
         p = p + R[0] @ data.T_vehicle_imu.inverse().translation() * -1.0
     return States(R, p, v, np.zeros_like(p), np.broadcast_to(gyro_bias, p.shape).copy())
+
+
+def turned_to_antennas(
+    data: SmootherInput, R_map_imu: Array, nodes: IntArray, dead: DeadReckoning
+) -> Array:
+    """Rotations (n, 3, 3) turned about the vertical as two antennas say, if there are any."""
+    measured = []
+    if data.headings is not None:
+        measured.append((data.headings.stamps_ns, data.headings.azimuth_rad, data.heading_imu))
+    if data.baselines is not None:
+        x, y, _ = data.baselines.vector_map.T
+        measured.append((data.baselines.stamps_ns, np.arctan2(y, x), data.baseline_imu))
+    yaw = yaw_by_antennas(R_map_imu, nodes, dead, measured)
+    if yaw is None:
+        return R_map_imu
+    return np.asarray(exp_so3(np.array([[0.0, 0.0, yaw]]))[0] @ R_map_imu)
 
 
 def extended_states(data: SmootherInput, nodes: IntArray, states: States) -> States:
@@ -111,7 +129,7 @@ def _gyro_bias(data: SmootherInput) -> Array:
         finite = np.isfinite(twist.velocity).all(axis=1)
         speeds = twist.stamps_ns[finite], np.linalg.norm(twist.velocity[finite], axis=1)
     bias = standing_gyro(data.inertial, data.positions, speeds)
-    most = MAX_STANDING_BIAS_SIGMAS * data.noise.gyro_bias
+    most = MAX_STANDING_BIAS_SIGMAS * float(data.noise.gyro_bias.max())
     if bias is None or np.linalg.norm(bias) > most:
         return np.zeros(3)
     return bias

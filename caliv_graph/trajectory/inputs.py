@@ -12,6 +12,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, ImuSamples, MotionData
+from caliv_graph.trajectory.antennas import Baselines, Headings, directions_of
 from caliv_graph.trajectory.gnss import Positions, normal_gravity, positions_in_map
 from caliv_graph.trajectory.imu import Inertial, clean_inertial
 from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
@@ -20,6 +21,13 @@ from caliv_graph.trajectory.noise import (
     imu_noise,
     orientation_covariances,
     velocity_covariances,
+)
+from caliv_graph.trajectory.wheels import (
+    WheelModel,
+    scaled_wheel_noise,
+    wheel_model,
+    wheel_noise,
+    wheel_samples,
 )
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -50,6 +58,14 @@ class SmootherInput:
             None: it is exact, or still to be guessed (`mounting.py`).
         scales: name of `variances.COMPONENTS` -> factor on the stated sigmas that is in use, of
             those that the data contradict.
+        wheels: what is known of the axle where there is no IMU; `T_vehicle_imu` is then that of its
+            frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
+        slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
+        speed_scale: measured over true velocities.
+        headings: directions of a baseline as angles; None: there are none.
+        baselines: the same as vectors between two antennas.
+        heading_yaw: direction of that baseline in the vehicle frame, to the left of x, radians.
+        second_arm: (3,) the second antenna in the vehicle frame, metres.
     """
 
     name: str
@@ -64,6 +80,31 @@ class SmootherInput:
     gravity_m_s2: float
     rotation_sigmas: Array | None = None
     scales: Mapping[str, float] = field(default_factory=dict)
+    wheels: WheelModel | None = None
+    slope: Array = field(default_factory=lambda: np.zeros(2))
+    speed_scale: float = 1.0
+    headings: Headings | None = None
+    baselines: Baselines | None = None
+    heading_yaw: float = 0.0
+    second_arm: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def heading_imu(self) -> Array:
+        """(3,) unit vector along the baseline of `headings`, imu frame."""
+        ahead = np.array([math.cos(self.heading_yaw), math.sin(self.heading_yaw), 0.0])
+        return np.asarray(self.T_vehicle_imu.rotation().unrotate(ahead))
+
+    @property
+    def baseline_imu(self) -> Array:
+        """(3,) from the first to the second antenna, imu frame, metres."""
+        baseline = self.second_arm - self.lever_arm
+        return np.asarray(self.T_vehicle_imu.rotation().unrotate(baseline))
+
+    @property
+    def T_vehicle_twist(self) -> gtsam.Pose3:
+        """The frame in which velocities are measured."""
+        planar = self.wheels is not None and self.wheels.planar
+        return self.T_vehicle_imu if planar else gtsam.Pose3()
 
     @property
     def arm_imu(self) -> Array:
@@ -83,13 +124,21 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         TrajectoryError: a sensor that is needed is missing, or its data contradict themselves.
     """
     name = motion.name
-    if motion.imu is None:
-        raise TrajectoryError(
-            f"{name}: no IMU: set topics.imu to a topic of sensor_msgs/Imu, or topics.pose to one "
-            "with the vehicle's poses"
-        )
     no_twist = motion.twist is None or not np.isfinite(motion.twist.velocity).all(axis=1).any()
     no_gnss = motion.gnss is None or not len(motion.gnss.stamps_ns)
+    if motion.imu is None:
+        if config.topics.imu is not None:
+            raise TrajectoryError(
+                f"{name}: no IMU: topics.imu '{config.topics.imu}' holds nothing that can be used. "
+                "Choose another one, or leave it out: GNSS and the speeds of the wheels suffice"
+            )
+        if no_twist:
+            raise TrajectoryError(
+                f"{name}: no IMU and no velocities: set topics.imu (sensor_msgs/Imu), topics.twist "
+                "(nav_msgs/Odometry or a twist: speed and yaw rate of the wheels), or topics.pose "
+                "(the vehicle's poses)"
+            )
+        return _wheel_input(motion, config, no_gnss)
     if no_twist and no_gnss:
         raise TrajectoryError(
             f"{name}: neither GNSS fixes nor velocities: an IMU alone drifts away within seconds. "
@@ -126,7 +175,54 @@ def check_input(motion: MotionData, config: Config) -> tuple[SmootherInput, list
         gravity_m_s2=gravity or STANDARD_GRAVITY_M_S2,
         rotation_sigmas=None if rotation_sigma is None else np.full(3, rotation_sigma),
     )
-    return data, warnings
+    return _with_heading(data), warnings
+
+
+def _wheel_input(
+    motion: MotionData, config: Config, no_gnss: bool
+) -> tuple[SmootherInput, list[str]]:
+    """As `check_input`, of velocities without an IMU."""
+    assert motion.twist is not None
+    inertial, lines = wheel_samples(motion.twist, motion.name)
+    model, warnings, positions = wheel_model(motion.twist, config), list(lines), None
+    if not no_gnss:
+        positions, _, notes = _positions(motion, config, inertial, not model.yaw_rate)
+        warnings += notes
+    if positions is None and not model.yaw_rate:
+        raise TrajectoryError(
+            f"{motion.name}: speeds alone do not tell where the vehicle goes: set topics.gnss "
+            "(sensor_msgs/NavSatFix), topics.imu, or topics.twist to odometry with a yaw rate"
+        )
+    arm = config.gnss.lever_arm
+    data = SmootherInput(
+        name=motion.name,
+        config=config,
+        motion=motion,
+        inertial=inertial,
+        noise=wheel_noise(motion.twist, config),
+        positions=positions,
+        orientation=False,
+        T_vehicle_imu=config.wheels.T_vehicle_wheels.pose(),
+        lever_arm=np.zeros(3) if arm is None else np.array(arm),
+        gravity_m_s2=0.0,
+        rotation_sigmas=np.array(config.wheels.rotation_sigmas_rad()),
+        wheels=model,
+    )
+    return _with_heading(data), warnings
+
+
+def _with_heading(data: SmootherInput) -> SmootherInput:
+    """The input with what `topics.heading` says."""
+    config = data.config.heading
+    headings, baselines = directions_of(data.motion, data.positions, data.config)
+    arm = np.zeros(3) if config.lever_arm is None else np.array(config.lever_arm)
+    return replace(
+        data,
+        headings=headings,
+        baselines=baselines,
+        heading_yaw=config.yaw_rad,
+        second_arm=arm,
+    )
 
 
 def _positions(
@@ -140,13 +236,14 @@ def _positions(
     begin, end = inertial.begin_ns, inertial.end_ns
     if ((stamps >= begin) & (stamps <= end)).any():
         return positions, gravity, list(lines)
+    span = "the IMU's span" if motion.imu is not None else "the span of the velocities"
     if needed:
         raise TrajectoryError(
-            f"{motion.name}: no GNSS fix lies within the IMU's span, {begin * 1e-9:.3f} s to "
+            f"{motion.name}: no GNSS fix lies within {span}, {begin * 1e-9:.3f} s to "
             f"{end * 1e-9:.3f} s; fixes from {stamps[0] * 1e-9:.3f} s to {stamps[-1] * 1e-9:.3f} "
             "s. Do their clocks agree?"
         )
-    unused = f"{motion.name}: no GNSS fix lies within the IMU's span: GNSS is not used"
+    unused = f"{motion.name}: no GNSS fix lies within {span}: GNSS is not used"
     return None, gravity, [*lines, unused]
 
 
@@ -177,13 +274,32 @@ def scaled(data: SmootherInput, scales: Mapping[str, float]) -> SmootherInput:
         horizontal, vertical = (scales.get(f"gnss_{s}", 1.0) for s in ("horizontal", "vertical"))
         axes = np.array([horizontal, horizontal, vertical])
         positions = replace(positions, cov_map=positions.cov_map * np.outer(axes, axes))
+    headings, baselines = data.headings, data.baselines
+    if headings is not None:
+        headings = replace(headings, var=headings.var * scales.get("heading", 1.0) ** 2)
+    if baselines is not None:
+        cov = baselines.cov_map * scales.get("baseline", 1.0) ** 2
+        baselines = replace(baselines, cov_map=cov)
     noise = replace(
         noise,
         gyro_density=noise.gyro_density * scales.get("gyroscope", 1.0) ** 2,
         force_density=noise.force_density * scales.get("accelerometer", 1.0) ** 2,
     )
+    if data.wheels is not None:
+        noise = scaled_wheel_noise(noise, scales)
     every = {name: data.scales.get(name, 1.0) * scale for name, scale in scales.items()}
-    return replace(data, noise=noise, positions=positions, scales={**data.scales, **every})
+    return replace(
+        data,
+        noise=noise,
+        positions=positions,
+        headings=headings,
+        baselines=baselines,
+        scales={**data.scales, **every},
+    )
+
+
+PARTS = {"speed": "velocity_forward", "yaw_rate": "yaw rate"}
+"""Noise levels that are not called by their sensor -> sensor and part."""
 
 
 def noise_sources(data: SmootherInput) -> dict[str, str]:
@@ -196,8 +312,12 @@ def noise_sources(data: SmootherInput) -> dict[str, str]:
         out["gnss"] = data.positions.source
     if data.motion.twist is not None:
         out["velocity"] = velocity_covariances(data.motion.twist, data.config)[1]
+    if data.headings is not None:
+        out["heading"] = data.headings.source
+    if data.baselines is not None:
+        out["baseline"] = data.baselines.source
     for name, scale in data.scales.items():
-        sensor, _, part = name.partition("_")
+        sensor, _, part = PARTS.get(name, name).partition("_")
         what = f", {part}" if part else ""
         out[sensor] = f"{out[sensor]}{what} times {scale:.2f} by the residuals"
     return out

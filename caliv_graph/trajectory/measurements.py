@@ -182,31 +182,33 @@ def velocities_at_nodes(
     nodes_ns: IntArray,
     dead: DeadReckoning,
     noise: ImuNoise,
-    T_vehicle_imu: gtsam.Pose3,
+    T_twist_imu: gtsam.Pose3,
+    scale: float = 1.0,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
-    The lever from the vehicle's origin to the IMU enters with the gyroscope's rate and its noise.
+    They are those of the origin of the twist's frame, mostly the vehicle's; `scale` is measured
+    over true ones. The lever to the IMU enters with the gyroscope's rate and its noise.
     """
     usable = np.isfinite(twist.velocity).all(axis=1)
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
     if not usable.any():
         return None
     stamps = np.asarray(twist.stamps_ns, dtype=np.int64)[usable]
-    T_imu_vehicle = T_vehicle_imu.inverse()
-    R_imu_vehicle = T_imu_vehicle.rotation().matrix()
-    arm = T_imu_vehicle.translation()
+    T_imu_twist = T_twist_imu.inverse()
+    R_imu_twist = T_imu_twist.rotation().matrix()
+    arm = T_imu_twist.translation()
     rates = interpolate(stamps, dead.stamps_ns, dead.gyro)
-    at_imu = twist.velocity[usable] @ R_imu_vehicle.T - cross(rates, arm)
+    at_imu = twist.velocity[usable] @ R_imu_twist.T - scale * cross(rates, arm)
     sample_s = float(np.median(np.diff(dead.stamps_ns))) * 1e-9
     arm_cross = np.cross(np.eye(3), arm)
     arm_cov = arm_cross.T @ (noise.gyro_density / sample_s) @ arm_cross
-    cov_imu = R_imu_vehicle @ cov[usable] @ R_imu_vehicle.T + arm_cov
+    cov_imu = R_imu_twist @ cov[usable] @ R_imu_twist.T + arm_cov
     node = nearest_node(nodes_ns, stamps)
     at_node = nodes_ns[node]
     dR, dv, _ = dead.between(at_node, stamps)
     delay_s = (stamps - at_node) * 1e-9
-    carried = np.einsum("nij,nj->ni", dR, at_imu) - dv
+    carried = np.einsum("nij,nj->ni", dR, at_imu) - scale * dv
     cov_node = _rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
     weight = 1.0 / np.trace(cov_node, axis1=1, axis2=2)

@@ -51,7 +51,8 @@ def with_guessed_rotation(
     """The input with a rotation of the IMU, and its sigmas about the vehicle's axes.
 
     The IMU's own motion is smoothed first, by GNSS without a lever arm: the length of the arm is
-    added to the noise of the fixes. Velocities do not take part, their axes are the vehicle's.
+    added to the noise of the fixes. Velocities and headings do not take part, their axes are the
+    vehicle's.
 
     Args:
         data: the input; the rotation of its T_vehicle_imu is not used.
@@ -77,6 +78,8 @@ def with_guessed_rotation(
         T_vehicle_imu=origin,
         lever_arm=np.zeros(3),
         rotation_sigmas=None,
+        headings=None,
+        baselines=None,
     )
     states = smoothed(alone)
     R_vehicle_imu, yaw_sigma = _upright_and_ahead(data, nodes, states)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caliv_graph.products import IntArray
+from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
+from caliv_graph.trajectory.antennas import NodeDirections, directions_at_nodes
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import (
@@ -20,6 +21,7 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
+from caliv_graph.trajectory.wheels import wheel_covariances
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -41,6 +43,8 @@ class NodeMeasurements:
     positions: NodePositions | None
     orientations: NodeOrientations | None
     velocities: NodeVelocities | None
+    headings: NodeDirections | None = None
+    baselines: NodeDirections | None = None
 
 
 def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
@@ -65,7 +69,7 @@ def place_nodes(inertial: Inertial, wanted: IntArray) -> IntArray:
     return np.concatenate([*pieces, fixed[-1:]]).astype(np.int64)
 
 
-CARRIED = frozenset({"gnss", "orientation", "velocity"})
+CARRIED = frozenset({"gnss", "orientation", "velocity", "heading", "baseline"})
 """Kinds of measurements that are carried to nodes."""
 
 
@@ -73,18 +77,38 @@ def carry_to_nodes(
     data: SmootherInput, nodes: IntArray, dead: DeadReckoning, kinds: Set[str] = CARRIED
 ) -> NodeMeasurements:
     """Carries the measurements of some kinds to their nearest nodes; `dead`: IMU without bias."""
-    assert data.motion.imu is not None
     positions = orientations = velocities = None
     if data.positions is not None and "gnss" in kinds:
         positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
     if data.orientation and "orientation" in kinds:
+        assert data.motion.imu is not None
         cov, _ = orientation_covariances(data.motion.imu, data.config)
         cov = cov * data.scales.get("orientation", 1.0) ** 2
         orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
     if data.motion.twist is not None and "velocity" in kinds:
-        cov, _ = velocity_covariances(data.motion.twist, data.config)
-        cov = cov * data.scales.get("velocity", 1.0) ** 2
         velocities = velocities_at_nodes(
-            data.motion.twist, cov, nodes, dead, data.noise, data.T_vehicle_imu
+            data.motion.twist,
+            _velocity_covariances(data),
+            nodes,
+            dead,
+            data.noise,
+            data.T_vehicle_twist.between(data.T_vehicle_imu),
+            data.speed_scale,
         )
-    return NodeMeasurements(positions, orientations, velocities)
+    headings = baselines = None
+    if data.headings is not None and "heading" in kinds:
+        headings = directions_at_nodes(data.headings.stamps_ns, data.heading_imu, nodes, dead)
+    if data.baselines is not None and "baseline" in kinds:
+        baselines = directions_at_nodes(data.baselines.stamps_ns, data.baseline_imu, nodes, dead)
+    return NodeMeasurements(positions, orientations, velocities, headings, baselines)
+
+
+def _velocity_covariances(data: SmootherInput) -> Array:
+    """(n, 3, 3) (m/s)^2 of the velocities, in their axes, scaled as the data ask for."""
+    twist = data.motion.twist
+    assert twist is not None
+    if data.wheels is None:
+        return velocity_covariances(twist, data.config)[0] * data.scales.get("velocity", 1.0) ** 2
+    cov, _ = wheel_covariances(twist, data.wheels, data.config)
+    axes = np.array([data.scales.get("speed", 1.0), 1.0, 1.0])
+    return np.asarray(cov * np.outer(axes, axes))

@@ -48,19 +48,19 @@ class ImuNoise:
     Attributes:
         gyro_density: (3, 3) (rad/s)^2/Hz, white noise of the gyroscope.
         force_density: (3, 3) (m/s^2)^2/Hz, white noise of the accelerometer.
-        gyro_walk: rad/s^2/sqrt(Hz), random walk of the gyroscope's bias.
-        force_walk: m/s^3/sqrt(Hz), random walk of the accelerometer's bias.
-        gyro_bias: rad/s, 1 sigma of the gyroscope's bias at the start.
-        force_bias: m/s^2, 1 sigma of the accelerometer's bias at the start.
+        gyro_walk: (3,) rad/s^2/sqrt(Hz), random walk of the gyroscope's bias.
+        force_walk: (3,) m/s^3/sqrt(Hz), random walk of the accelerometer's bias.
+        gyro_bias: (3,) rad/s, 1 sigma of the gyroscope's bias at the start.
+        force_bias: (3,) m/s^2, 1 sigma of the accelerometer's bias at the start.
         sources: quantity -> where its figure is from.
     """
 
     gyro_density: Array
     force_density: Array
-    gyro_walk: float
-    force_walk: float
-    gyro_bias: float
-    force_bias: float
+    gyro_walk: Array
+    force_walk: Array
+    gyro_bias: Array
+    force_bias: Array
     sources: dict[str, str]
 
 
@@ -136,10 +136,10 @@ def imu_noise(imu: ImuSamples, config: Config) -> ImuNoise:
     return ImuNoise(
         gyro_density=gyro,
         force_density=force,
-        gyro_walk=noise.gyroscope_bias_walk_rad_s2_sqrthz or DEFAULT_GYRO_WALK_RAD_S2,
-        force_walk=noise.accelerometer_bias_walk_m_s3_sqrthz or DEFAULT_FORCE_WALK_M_S3,
-        gyro_bias=noise.gyroscope_bias_rad_s,
-        force_bias=noise.accelerometer_bias_m_s2,
+        gyro_walk=np.full(3, noise.gyroscope_bias_walk_rad_s2_sqrthz or DEFAULT_GYRO_WALK_RAD_S2),
+        force_walk=np.full(3, noise.accelerometer_bias_walk_m_s3_sqrthz or DEFAULT_FORCE_WALK_M_S3),
+        gyro_bias=np.full(3, noise.gyroscope_bias_rad_s),
+        force_bias=np.full(3, noise.accelerometer_bias_m_s2),
         sources=sources,
     )
 

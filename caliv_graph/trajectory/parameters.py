@@ -85,17 +85,80 @@ def _imu_turned(data: SmootherInput, d: Array) -> SmootherInput:
 
 
 LEVER_ARM = InputParameter(
-    "gnss.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"gnss"}), _arm_moved
+    "gnss.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"gnss", "baseline"}), _arm_moved
 )
 """The GNSS antenna in the vehicle frame. The residuals are linear in it."""
+
+
+def _slope_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, slope=data.slope + d)
+
+
+def _scale_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    scale = data.speed_scale + float(d[0])
+    noise = data.noise
+    if data.wheels is not None:
+        by = data.speed_scale / scale
+        density, walk = noise.force_density * by**2, noise.force_walk * by
+        noise = replace(noise, force_density=density, force_walk=walk)
+    return replace(data, speed_scale=scale, noise=noise)
+
+
+def _heading_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, heading_yaw=data.heading_yaw + float(d[0]))
+
+
+def _second_arm_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, second_arm=data.second_arm + d)
+
 
 IMU_ROTATION = InputParameter(
     "imu.T_vehicle_imu",
     ("roll", "pitch", "yaw"),
     "rad",
     np.full(3, 1e-3),
-    frozenset({"gnss", "velocity"}),
+    frozenset({"gnss", "velocity", "heading", "baseline"}),
     _imu_turned,
 )
 """Rotation of T_vehicle_imu about the vehicle's axes, the IMU's origin fixed: Exp(d) R. Of a step
 of 1 mrad the central difference neglects a part of 2e-7."""
+
+WHEELS_ROTATION = replace(IMU_ROTATION, name="wheels.T_vehicle_wheels")
+"""The same of the axle's frame, which stands in for that of an IMU."""
+
+SLOPE = InputParameter(
+    "wheels.slope", ("x", "y"), "rad", np.full(2, 1e-3), frozenset({"level"}), _slope_moved
+)
+"""Of the mean ground of a drive, along the map's axes."""
+
+SPEED_SCALE = InputParameter(
+    "twist.scale", ("value",), "", np.full(1, 1e-3), frozenset({"velocity"}), _scale_moved
+)
+"""Measured over true velocities, less one. It scales the estimated velocities, not the measured
+ones: these are noise times noise."""
+
+WHEEL_SCALE = replace(SPEED_SCALE, kinds=frozenset({"velocity", "imu"}))
+"""The same without an IMU. The prior of the motion is then one of what the wheels measure: walks of
+the acceleration are in their unit. In metres it would prefer a vehicle that moves less, and with it
+a larger scale (`README.md`, section 15)."""
+
+
+HEADING_YAW = InputParameter(
+    "heading.yaw_deg", ("value",), "rad", np.full(1, 1e-3), frozenset({"heading"}), _heading_moved
+)
+"""Direction of the baseline of two antennas in the vehicle frame."""
+
+SECOND_ARM = InputParameter(
+    "heading.lever_arm", XYZ, "m", np.full(3, 0.01), frozenset({"baseline"}), _second_arm_moved
+)
+"""The second antenna in the vehicle frame. The residuals are linear in it."""
+
+
+def speed_scale(data: SmootherInput) -> InputParameter:
+    """The scale of the velocities of an input."""
+    return SPEED_SCALE if data.wheels is None else WHEEL_SCALE
+
+
+def mount_rotation(data: SmootherInput) -> InputParameter:
+    """The rotation of `T_vehicle_imu` under the name that it has in the config."""
+    return IMU_ROTATION if data.wheels is None else WHEELS_ROTATION

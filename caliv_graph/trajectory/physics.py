@@ -12,11 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Array, IntArray, MotionData
+from caliv_graph.products import (
+    Array,
+    BoolArray,
+    HeadingSamples,
+    IntArray,
+    MotionData,
+    TwistSamples,
+)
 from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.axes import SIGMAS, Axes, accelerometer_axes
 from caliv_graph.trajectory.gnss import Positions, positions_in_map
-from caliv_graph.trajectory.imu import Inertial, clean_inertial, log_so3
+from caliv_graph.trajectory.imu import Inertial, clean_inertial, interpolate, log_so3
 from caliv_graph.trajectory.inputs import has_orientation
 from caliv_graph.trajectory.kinematics import (
     MIN_WINDOWS,
@@ -25,7 +32,12 @@ from caliv_graph.trajectory.kinematics import (
     antenna_windows,
     means_over,
 )
-from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
+from caliv_graph.trajectory.measurements import (
+    nearest_node,
+    rotations_of,
+    usable_orientations,
+)
+from caliv_graph.trajectory.wheels import wheel_samples
 
 MIN_SPEED_M_S = 0.5
 """Below, the course of a GNSS antenna is noise: 15 mm/s of it are 2 degrees."""
@@ -75,22 +87,43 @@ class Ratio:
 
 
 @dataclass(frozen=True)
+class Misheading:
+    """Angles of two antennas against the course of one of them.
+
+    Attributes:
+        off_rad: median of measured less true by the config's direction, to the left.
+        spread_rad: median deviation from it.
+        other_off_rad: the median if the angles counted the other way (`heading.axes`).
+        other_spread_rad: the deviation then.
+    """
+
+    off_rad: float
+    spread_rad: float
+    other_off_rad: float
+    other_spread_rad: float
+
+
+@dataclass(frozen=True)
 class MotionPhysics:
     """What the raw sensors say about each other; None: the drive does not say it.
 
     Attributes:
         name: of the recording.
-        gravity: its direction.
+        gravity: its direction; None without an IMU.
         gyroscope: its rate about the vertical over the true one, by each source.
+        yaw_rate: that of the odometry over that of the course, without an IMU.
         speed: of the velocities over that of the GNSS.
         axes: of the accelerometer.
+        heading: of two antennas against the course.
     """
 
     name: str
-    gravity: Gravity
+    gravity: Gravity | None
     gyroscope: tuple[Ratio, ...] = ()
     speed: Ratio | None = None
     axes: Axes | None = None
+    yaw_rate: Ratio | None = None
+    heading: Misheading | None = None
 
 
 def known_rotation(config: Config) -> Array | None:
@@ -100,14 +133,14 @@ def known_rotation(config: Config) -> Array | None:
 
 
 def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
-    """Compares the raw sensors of a drive; None without an IMU.
+    """Compares the raw sensors of a drive; None with neither an IMU nor velocities.
 
     Raises:
         TrajectoryError: the IMU's samples or the fixes are unusable, or its orientation and its
             accelerometer disagree on where up is.
     """
     if motion.imu is None:
-        return None
+        return None if motion.twist is None else _wheel_physics(motion, motion.twist, config)
     inertial, _ = clean_inertial(motion.imu, motion.name)
     has_orientation(motion.imu, inertial, motion.name)
     mean = inertial.force.mean(axis=0)
@@ -130,7 +163,55 @@ def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
         ratios.insert(0, by_course)
     speed = _speed(motion, moving)
     axes = accelerometer_axes(moving, inertial, motion, R_vehicle_imu, config)
-    return MotionPhysics(motion.name, gravity, tuple(ratios), speed, axes)
+    heading = _heading_by_course(motion, moving, config)
+    return MotionPhysics(motion.name, gravity, tuple(ratios), speed, axes, heading=heading)
+
+
+def _wheel_physics(motion: MotionData, twist: TwistSamples, config: Config) -> MotionPhysics | None:
+    """Speed and yaw rate of wheels against the fixes; None without enough of them."""
+    samples, _ = wheel_samples(twist, motion.name)
+    windows = _windows(motion, config, samples)
+    if windows is None:
+        return None
+    moving = windows.where(windows.speed_m_s > MIN_SPEED_M_S)
+    turn = None
+    if twist.yaw_rate is not None:
+        turn = _gyro_by_course(moving, samples, samples.gyro[:, 2:], config)
+    heading = _heading_by_course(motion, moving, config)
+    speed = _speed(motion, moving)
+    return MotionPhysics(motion.name, None, speed=speed, yaw_rate=turn, heading=heading)
+
+
+def _heading_by_course(motion: MotionData, moving: Windows, config: Config) -> Misheading | None:
+    """The angles of two antennas against the course; None without enough of either."""
+    samples = motion.heading
+    if not isinstance(samples, HeadingSamples) or len(moving.stamps_ns) < MIN_WINDOWS:
+        return None
+    begin, end = samples.stamps_ns[[0, -1]]
+    moving = moving.where((moving.stamps_ns >= begin) & (moving.stamps_ns <= end))
+    if len(moving.stamps_ns) < MIN_WINDOWS:
+        return None
+    v = moving.velocity_map
+    ahead = np.where(_backwards(motion, moving.stamps_ns), -1.0, 1.0)
+    course = np.arctan2(ahead * v[:, 1], ahead * v[:, 0]) + config.heading.yaw_rad
+    near = nearest_node(samples.stamps_ns, moving.stamps_ns)
+    out: list[float] = []
+    for axes in (config.heading.axes, "ned" if config.heading.axes == "enu" else "enu"):
+        yaw = samples.yaw_rad[near]
+        off = (yaw if axes == "enu" else 0.5 * math.pi - yaw) - course
+        mean = float(np.angle(np.exp(1j * off).sum()))
+        around = np.angle(np.exp(1j * (off - mean)))
+        middle = float(np.median(around))
+        out += [math.remainder(mean + middle, math.tau), float(np.median(np.abs(around - middle)))]
+    return Misheading(*out)
+
+
+def _backwards(motion: MotionData, stamps_ns: IntArray) -> BoolArray:
+    """(n,) whether velocities say that the vehicle reverses."""
+    twist = motion.twist
+    if twist is None or len(twist.stamps_ns) < MIN_WINDOWS:
+        return np.zeros(len(stamps_ns), dtype=bool)
+    return np.asarray(interpolate(stamps_ns, twist.stamps_ns, twist.velocity[:, :1])[:, 0] < 0.0)
 
 
 def _windows(motion: MotionData, config: Config, inertial: Inertial) -> Windows | None:

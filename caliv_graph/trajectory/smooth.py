@@ -19,6 +19,7 @@ from caliv_graph.products import Array, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
 from caliv_graph.trajectory.correlated_step import WithErrors, step_with_errors
 from caliv_graph.trajectory.initial import first_states
+from caliv_graph.trajectory.initial_wheels import first_wheel_states
 from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
@@ -54,6 +55,8 @@ def smooth_trajectory(
     correlated: Sequence[CorrelatedError] = (),
 ) -> SmoothedTrajectory:
     """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
+
+    Without an IMU: velocities of the wheels, and GNSS or a yaw rate (`wheels.py`).
 
     Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
     IMU are in `lost_ns` of the result. `correlated` are errors of sensors that the config does not
@@ -104,6 +107,7 @@ def smooth_trajectory(
         gnss_dropped=robust.dropped,
         factor_kinds=tuple(estimate.graph.kinds),
         parameters=last.settled.parameters,
+        parameter_cov=last.settled.cov,
         correlated=tuple(errors),
         errors=last.errors,
     )
@@ -113,13 +117,17 @@ def _begun(
     data: SmootherInput, nodes: IntArray
 ) -> tuple[SmootherInput, States, tuple[UncertainParameter, ...]]:
     """Input, states and uncertain parameters with all fixes, outliers among them."""
-    if needs_guess(data):
+    if data.wheels is None and needs_guess(data):
         data = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
-    states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    states = solve_from_the_start(data, nodes, _first_states(data, nodes))
     parameters = uncertain_parameters(data)
     if are_wide(parameters):
         return _roughly_settled(data, nodes, states, parameters)
     return data, states, parameters
+
+
+def _first_states(data: SmootherInput, nodes: IntArray) -> States:
+    return first_states(data, nodes) if data.wheels is None else first_wheel_states(data, nodes)
 
 
 def _last_step(
@@ -166,9 +174,10 @@ def _within_span(
     if not len(lost):
         return wanted, lost, []
     if not inside.any():
+        sensor = "IMU" if data.wheels is None else "velocities"
         raise TrajectoryError(
-            f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: IMU from "
-            f"{inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
+            f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: {sensor} "
+            f"from {inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
             f"{wanted[0] * 1e-9:.3f} s to {wanted[-1] * 1e-9:.3f} s. Do their clocks agree?"
         )
     line = (
@@ -191,7 +200,7 @@ def _at_wanted(
 
 def _solved_roughly(nodes: IntArray, data: SmootherInput) -> States:
     """The states of an input, outliers among its fixes."""
-    states = solve_from_the_start(data, nodes, first_states(data, nodes))
+    states = solve_from_the_start(data, nodes, _first_states(data, nodes))
     none = np.zeros(0, dtype=np.int64)
     return solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE).states
 
@@ -211,6 +220,8 @@ def _roughly_settled(
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:
     """A line for each sensor whose bias its prior does not explain."""
+    if data.wheels is not None:
+        return []  # the states are those of the vehicle's motion
     noise = data.noise
     sensors = (
         ("accelerometer", states.force_bias, noise.force_bias, "accelerometer_bias_m_s2", "m/s^2"),
@@ -218,10 +229,11 @@ def _bias_warnings(data: SmootherInput, states: States) -> list[str]:
     )
     out = []
     for sensor, bias, sigma, key, unit in sensors:
-        largest = float(np.abs(np.median(bias, axis=0)).max())
-        if largest > BIAS_SIGMAS * sigma:
+        typical = np.abs(np.median(bias, axis=0))
+        if (typical > BIAS_SIGMAS * sigma).any():
             out.append(
-                f"{data.name}: the {sensor}'s bias comes out as {largest:.3g} {unit}, noise.{key} "
-                f"is {sigma:.3g}: a wrong unit, or axes that are not those of the orientation"
+                f"{data.name}: the {sensor}'s bias comes out as {typical.max():.3g} {unit}, "
+                f"noise.{key} is {sigma.max():.3g}: a wrong unit, or axes that are not "
+                "those of the orientation"
             )
     return out

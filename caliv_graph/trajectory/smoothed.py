@@ -138,6 +138,7 @@ class SmoothedTrajectory:
         gnss_dropped: (k,) indices of the fixes that the graph is without.
         factor_kinds: of each factor of the graph, in order (`build.TrajectoryGraph`).
         parameters: of the input, in the chain after the yaw bias (`parameters.py`).
+        parameter_cov: (p, p) of the first p coordinates of `parameters`: those that were estimated.
         correlated: errors of sensors that are correlated over time. States and chain contain them,
             the chain as the last coordinates of every state; the graph does not.
         errors: (n, 3 e) their estimates at the nodes, metres or radians, map axes.
@@ -162,6 +163,7 @@ class SmoothedTrajectory:
     gnss_dropped: IntArray = field(repr=False)
     factor_kinds: tuple[str, ...] = field(default=(), repr=False)
     parameters: tuple[UncertainParameter, ...] = ()
+    parameter_cov: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     correlated: tuple[CorrelatedError, ...] = ()
     errors: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
@@ -230,6 +232,15 @@ class SmoothedTrajectory:
         arm = self.T_vehicle_imu.inverse().translation()
         at_origin = np.einsum("nji,nj->ni", R, v) + cross(rates, arm)
         return at_origin @ R_vi.T, rates @ R_vi.T
+
+    def sigmas_of(self, name: str) -> Array | None:
+        """(p,) 1 sigma of an estimated parameter, by the motion data alone and its prior."""
+        variances, first = np.diagonal(self.parameter_cov), 0
+        for p in self.parameters:
+            if p.parameter.name == name and first + p.parameter.size <= len(variances):
+                return np.asarray(np.sqrt(variances[first : first + p.parameter.size]))
+            first += p.parameter.size
+        return None
 
     def bias_sigmas(self) -> tuple[Array, Array]:
         """1 sigma of the biases at the nodes: (n, 3) m/s^2 and (n, 3) rad/s, imu frame."""

@@ -202,6 +202,8 @@ def covariances_of(
         if not data.orientation
         else "GNSS or velocities along the whole drive"
     )
+    if data.wheels is not None:
+        advice = "GNSS along the whole drive, the heading of two antennas, or an IMU"
     try:
         marginals = Marginals(linear, node_ordering(len(states.p_map_imu), data.yaw_bias))
         cov = marginals.covariances([key_imu(i) for i in range(len(states.p_map_imu))])

@@ -14,10 +14,18 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from caliv_graph.products import Array, ImuSamples, TwistSamples
+from caliv_graph.config.wheels import SPEED_SCALE_SIGMA
+from caliv_graph.products import Array, ImuSamples
 from caliv_graph.trajectory.imu import interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    LEVER_ARM,
+    SECOND_ARM,
+    InputParameter,
+    mount_rotation,
+    speed_scale,
+)
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.with_parameters import with_parameters
 
@@ -36,10 +44,6 @@ ROTATION_RAD = math.radians(0.1)
 GNSS_CLOCK_S = 5e-3
 """The same of the stamps of the fixes: half the sample period of an IMU at 100 Hz; at 2 m/s it is
 the centimetre of `ARM_M`."""
-
-SPEED_SCALE = 0.02
-"""The same of the scale of wheel speeds: tyres lose 1 to 2 % of their radius with pressure, load
-and wear."""
 
 SENSOR_SCALE = 0.01
 """The same of the scales of gyroscope and accelerometer: data sheets of MEMS sensors state 0.1 to
@@ -80,11 +84,17 @@ def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, 
         out.append(_known(smoothed, LEVER_ARM, ARM_M, ARM_KNOWN_M))
         out.append(_plain(_gnss_clock(smoothed), GNSS_CLOCK_S, 1.0))
     if data.positions is not None or data.motion.twist is not None:
-        out.append(_known(smoothed, IMU_ROTATION, ROTATION_RAD, 0.5))
+        out.append(_known(smoothed, mount_rotation(data), ROTATION_RAD, 0.5))
     if data.motion.twist is not None:
-        out.append(_plain(_wheels(smoothed), SPEED_SCALE, 1.0))
+        out.append(_known(smoothed, speed_scale(data), SPEED_SCALE_SIGMA, 1.0))
+    if data.headings is not None:
+        out.append(_known(smoothed, HEADING_YAW, HEADING_RAD, 0.5))
+    if data.baselines is not None:
+        out.append(_known(smoothed, SECOND_ARM, ARM_M, ARM_KNOWN_M))
     if data.orientation and not data.yaw_bias:
         out.append(_plain(_HEADING, HEADING_RAD, 1.0))
+    if data.wheels is not None:
+        return tuple(out)
     gyroscope, accelerometer = _inertial_scales(smoothed)
     if _turned_rad(smoothed) > MIN_TURN_RAD:
         out.append(_plain(gyroscope, SENSOR_SCALE, 1.0))
@@ -167,27 +177,6 @@ def _gnss_clock(smoothed: SmoothedTrajectory) -> InputParameter:
         return replace(data, positions=replace(data.positions, position_map=shifted))
 
     return _scalar("gnss.time_offset", "s", "gnss", moved)
-
-
-def _wheels(smoothed: SmoothedTrajectory) -> InputParameter:
-    """Measured over true velocities, less one.
-
-    Estimated velocities are scaled, not the measured ones: these are noise times noise.
-    """
-    twist = smoothed.data.motion.twist
-    assert twist is not None
-    begin, end = smoothed.span_ns
-    inside = np.clip(twist.stamps_ns, begin, end)
-    velocity, _ = smoothed.velocities_at(inside)
-
-    def moved(data: SmootherInput, d: Array) -> SmootherInput:
-        assert data.motion.twist is not None
-        scaled: TwistSamples = replace(
-            data.motion.twist, velocity=data.motion.twist.velocity - d[0] * velocity
-        )
-        return replace(data, motion=replace(data.motion, twist=scaled))
-
-    return _scalar("twist.scale", "", "velocity", moved)
 
 
 def _inertial_scales(smoothed: SmoothedTrajectory) -> tuple[InputParameter, InputParameter]:

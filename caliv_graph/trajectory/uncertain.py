@@ -22,9 +22,16 @@ from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
     IMU_ROTATION,
     LEVER_ARM,
+    SECOND_ARM,
+    SLOPE,
+    SPEED_SCALE,
+    WHEELS_ROTATION,
     UncertainParameter,
+    mount_rotation,
+    speed_scale,
 )
 from caliv_graph.trajectory.solve import ERROR_TOLERANCE, Estimate, solve
 
@@ -36,10 +43,15 @@ STEP_SIGMAS, ROUGH_STEP_SIGMAS = 0.01, 0.1
 """Step of a parameter, in sigmas of what is then known of it, at which it has converged; while
 outliers are still in the graph."""
 
-WIDE_SIGMAS = {LEVER_ARM.name: 0.05, IMU_ROTATION.name: np.radians(1.0)}
-"""From these prior sigmas on (m, rad) an error would make sound fixes look like outliers: three
-times the noise of a good fix, and what 1 degree is at 3 m. The parameter is then estimated before
-fixes are rejected."""
+WIDE_SIGMAS = {
+    LEVER_ARM.name: 0.05,
+    IMU_ROTATION.name: np.radians(1.0),
+    WHEELS_ROTATION.name: np.radians(1.0),
+    SPEED_SCALE.name: 0.01,
+}
+"""From these prior sigmas on (m, rad, part) an error would make sound fixes look like outliers:
+three times the noise of a good fix, what 1 degree is at 3 m, and 2 cm/s at 2 m/s. The parameter is
+then estimated before fixes are rejected."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +81,29 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     if arm is not None and data.positions is not None:
         out.append(UncertainParameter(LEVER_ARM, np.full(3, arm), np.zeros(3)))
     if data.rotation_sigmas is not None:
-        out.append(UncertainParameter(IMU_ROTATION, data.rotation_sigmas, np.zeros(3)))
+        out.append(UncertainParameter(mount_rotation(data), data.rotation_sigmas, np.zeros(3)))
+    wheels = data.config.wheels
+    if data.wheels is not None:
+        slope = np.full(2, np.radians(wheels.slope_sigma_deg))
+        out.append(UncertainParameter(SLOPE, slope, np.zeros(2)))
+    scale = wheels.scale_sigma(with_imu=data.wheels is None)
+    if scale is not None and data.motion.twist is not None:
+        out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))
+    heading = data.config.heading
+    if data.headings is not None:
+        sigma = np.full(1, np.radians(heading.sigma_deg))
+        out.append(UncertainParameter(HEADING_YAW, sigma, np.zeros(1)))
+    if data.baselines is not None:
+        arms = np.full(3, heading.lever_arm_sigma)
+        out.append(UncertainParameter(SECOND_ARM, arms, np.zeros(3)))
     return tuple(out)
 
 
 def are_wide(parameters: Sequence[UncertainParameter]) -> bool:
     """Whether a parameter has to be estimated before outliers are looked for."""
     return any(
-        p.sigmas is not None and p.sigmas.max() > WIDE_SIGMAS[p.parameter.name] for p in parameters
+        p.sigmas is not None and p.sigmas.max() > WIDE_SIGMAS.get(p.parameter.name, np.inf)
+        for p in parameters
     )
 
 
@@ -149,7 +176,6 @@ def moved(
 def _with_variable(linear: gtsam.GaussianFactorGraph, columns: Array) -> gtsam.GaussianFactorGraph:
     """A linear graph in which the parameters are a variable, of the dimension of `columns`."""
     out, start = gtsam.GaussianFactorGraph(), 0
-    make: Any = gtsam.JacobianFactor
     for number in range(linear.size()):
         factor: Any = linear.at(number)
         own = columns[start : start + factor.rows()]
@@ -157,14 +183,38 @@ def _with_variable(linear: gtsam.GaussianFactorGraph, columns: Array) -> gtsam.G
         if not own.any():
             out.push_back(factor)
             continue
-        A, terms, first = factor.getA(), [], 0
-        for key in factor.keys():  # noqa: SIM118 - a factor is no dict
+        A, keys, first = factor.getA(), list(factor.keys()), 0
+        blocks = []
+        for key in keys:
             size = _DIMS[chr(gtsam.symbolChr(key))]
-            terms += [key, A[:, first : first + size]]
+            blocks.append(A[:, first : first + size])
             first += size
-        unit = gtsam.noiseModel.Unit.Create(len(own))
-        out.add(make(*terms, key_parameters(), own, factor.getb(), unit))
+        out.push_back(_linear_factor([*keys, key_parameters()], [*blocks, own], factor.getb()))
     return out
+
+
+def _linear_factor(keys: Sequence[int], blocks: Sequence[Array], b: Array) -> Any:
+    """`|sum A_k d_k - b|^2` of any number of keys: the constructor takes three from Python."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    if len(keys) <= MOST_KEYS:
+        terms = [part for pair in zip(keys, blocks, strict=True) for part in pair]
+        make: Any = gtsam.JacobianFactor
+        return make(*terms, b, unit)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        if jacobians is not None:
+            for k, block in enumerate(blocks):
+                jacobians[k] = block
+        return -b
+
+    zero = gtsam.Values()
+    for key, block in zip(keys, blocks, strict=True):
+        zero.insert(key, np.zeros(block.shape[1]))
+    return gtsam.CustomFactor(unit, list(keys), error).linearize(zero)
+
+
+MOST_KEYS = 3
+"""Of a `gtsam.JacobianFactor` that is made from Python."""
 
 
 _DIMS = {"i": 6, "v": 3, "b": 6, "y": 1}

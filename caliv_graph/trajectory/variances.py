@@ -31,17 +31,30 @@ from caliv_graph.trajectory.correlated import (
     linearised,
 )
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
+from caliv_graph.trajectory.parameters import (
+    HEADING_YAW,
+    LEVER_ARM,
+    SECOND_ARM,
+    mount_rotation,
+    speed_scale,
+)
 from caliv_graph.trajectory.smoothed import States, first_nodes
 
-COMPONENTS: Mapping[str, tuple[str, slice]] = {
-    "gnss_horizontal": ("gnss", slice(0, 2)),
-    "gnss_vertical": ("gnss", slice(2, 3)),
+COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {
+    "gnss_horizontal": ("gnss", (0, 1)),
+    "gnss_vertical": ("gnss", (2,)),
     # GTSAM whitens from above: the rotation by itself, then position and velocity given it.
-    "gyroscope": ("imu", slice(0, 3)),
-    "accelerometer": ("imu", slice(3, 9)),
-    "orientation": ("orientation", slice(0, 3)),
-    "velocity": ("velocity", slice(0, 3)),
+    "gyroscope": ("imu", (0, 1, 2)),
+    "accelerometer": ("imu", (3, 4, 5, 6, 7, 8)),
+    "orientation": ("orientation", (0, 1, 2)),
+    "velocity": ("velocity", (0, 1, 2)),
+    "heading": ("heading", (0,)),
+    "baseline": ("baseline", (0, 1, 2)),
+    # Without an IMU: what odometry measures, and how its acceleration and its yaw rate change.
+    "yaw_rate": ("imu", (2,)),
+    "speed": ("velocity", (0,)),
+    "braking": ("imu", (3, 4, 5, 6, 7, 8, 9, 10, 11)),
+    "steering": ("imu", (2, 14)),
 }
 """Name of a noise level -> kind of its factors, and rows of their residual."""
 
@@ -78,7 +91,19 @@ def free_components(data: SmootherInput) -> list[str]:
         "accelerometer": noise.accelerometer_density_m_s2_sqrthz,
         "orientation": noise.orientation_deg,
         "velocity": noise.velocity_m_s,
+        "heading": noise.heading_deg,
+        "baseline": noise.gnss_horizontal_m,
     }
+    if data.wheels is not None:
+        for name in ("gyroscope", "accelerometer", *(["velocity"] if data.wheels.planar else [])):
+            del configured[name]
+        if data.wheels.planar:
+            configured["speed"] = noise.velocity_m_s
+        if data.wheels.yaw_rate:
+            configured["yaw_rate"] = noise.yaw_rate_rad_s
+        else:
+            configured["steering"] = None
+        configured["braking"] = None
     return [name for name, value in configured.items() if value is None]
 
 
@@ -101,7 +126,12 @@ def estimated_scales(
     graph = build_graph(data, nodes, part, dropped, "none")
     values = to_values(part, data)
     # Free, whatever sigma they have: a lever arm that was typed wrong is no noise.
-    typed = [IMU_ROTATION] if data.positions is None else [LEVER_ARM, IMU_ROTATION]
+    rotation = mount_rotation(data)
+    typed = [rotation] if data.positions is None else [LEVER_ARM, rotation]
+    if data.motion.twist is not None and data.config.wheels.scale_sigma(data.wheels is None):
+        typed.append(speed_scale(data))
+    typed += [HEADING_YAW] if data.headings is not None else []
+    typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)
     likelihood = NoiseLikelihood(
         graph.factors.linearize(values),
@@ -168,7 +198,7 @@ class NoiseLikelihood:
             for c, name in enumerate(free):
                 of_kind, rows = COMPONENTS[name]
                 if of_kind == kind:
-                    label[at + rows.start : at + rows.stop] = c
+                    label[at + np.array(rows)] = c
             at += m
         self.names = [name for c, name in enumerate(free) if (label == c).any()]
         index = [c for c, name in enumerate(free) if name in self.names]

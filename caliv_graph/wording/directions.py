@@ -26,7 +26,13 @@ STATIONARY_TWISTS = 5
 """Undetermined motions of all LiDARs together from which the vehicle did not move: driving straight
 ahead leaves four undetermined, and five past walls without ground, the yaw being determined."""
 
-PARAMETER_KEYS = {"lever_arm": "gnss.lever_arm", "imu_rotation": "imu.T_vehicle_imu"}
+PARAMETER_KEYS = {
+    "lever_arm": "gnss.lever_arm",
+    "imu_rotation": "imu.T_vehicle_imu",
+    "wheels_rotation": "wheels.T_vehicle_wheels",
+    "heading_yaw": "heading.yaw_deg",
+    "speed_scale": "scale of the speeds in topics.twist",
+}
 """What was measured by hand on the vehicle -> its key in the config."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import gtsam
@@ -16,7 +17,13 @@ from caliv_graph.targets.ground.guesses import Misfit
 from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.axes import Axes
 from caliv_graph.trajectory.heading import HeadingDisagreement
-from caliv_graph.trajectory.physics import Gravity, MotionPhysics, Ratio, known_rotation
+from caliv_graph.trajectory.physics import (
+    Gravity,
+    Misheading,
+    MotionPhysics,
+    Ratio,
+    known_rotation,
+)
 from caliv_graph.trajectory.tilt import VehicleTilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
 
@@ -54,10 +61,13 @@ SPEED_UNITS = {3.6: "km/h", 2.23694: "miles per hour", 1.94384: "knots"}
 def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]:
     """What the raw sensors of a drive say against each other and against `T_vehicle_imu`."""
     axes = found.axes
+    heading = () if found.heading is None else tuple(_antennas(found.name, found.heading, config))
+    if found.gravity is None:
+        return (*_rates(found), *heading)
     if found.gravity.tilt_rad > MAX_GRAVITY_TILT_RAD:
         # Nothing else can be judged about wrong axes, but units can.
         return (_gravity(found, config), *_rates(found))
-    out = list(_rates(found))
+    out = [*_rates(found), *heading]
     if axes is not None:
         out += _axes(found.name, axes, config)
     return tuple(out)
@@ -90,7 +100,8 @@ def _rpy(values: Sequence[float], digits: int = 0) -> str:
 
 
 def _gravity(found: MotionPhysics, config: Config) -> Finding:
-    gravity: Gravity = found.gravity
+    gravity = found.gravity
+    assert gravity is not None
     given = config.imu.T_vehicle_imu
     value: tuple[float, ...] = ()
     sentence = gravity_problem(gravity.up_imu, given.pose().rotation().matrix())
@@ -128,6 +139,9 @@ def _rates(found: MotionPhysics) -> Iterator[Finding]:
         for ratio in by_orientation:
             if abs(ratio.value - 1.0) > GROSS_RATIO:
                 yield from _ratio(found.name, ratio, "topics.imu", {})
+    if found.yaw_rate is not None:
+        turn = replace(found.yaw_rate, against="turn")
+        yield from _ratio(found.name, turn, "topics.twist", GYRO_UNITS)
     if found.speed is not None:
         yield from _ratio(found.name, found.speed, "topics.twist", SPEED_UNITS)
 
@@ -141,6 +155,10 @@ _RATIOS = {
         "the gyroscope turns {value} times as fast as the orientation of the same messages",
         "One of the two is wrong: choose another topics.imu, or set its orientation_covariance[0] "
         "to -1",
+    ),
+    "turn": (
+        "the yaw rate of the velocities is {value} times that of the course over ground",
+        "Check the yaw rate in topics.twist",
     ),
     "gnss": (
         "the velocities are {value} times those of the GNSS",
@@ -162,7 +180,7 @@ def _ratio(name: str, ratio: Ratio, key: str, units: dict[float, str]) -> Iterat
         remedy = (
             f"This is {unit}: convert them"
             if "sign" not in unit
-            else ("They have the opposite sign: check the axes of the IMU")
+            else f"They have the opposite sign: check the axes of {key}"
         )
     gross: Literal["contradiction", "warning"] = "contradiction" if off > GROSS_RATIO else "warning"
     value = f"{ratio.value:.3g} +- {ratio.sigma:.1g}"
@@ -174,6 +192,39 @@ def _ratio(name: str, ratio: Ratio, key: str, units: dict[float, str]) -> Iterat
         "fatal" if unit else gross,
         f"{name}: {what.format(value=value)}. {remedy}",
     )
+
+
+def _antennas(name: str, found: Misheading, config: Config) -> Iterator[Finding]:
+    """The heading of two antennas against the course."""
+    steady = found.spread_rad < MIN_YAW_RAD
+    if steady and abs(found.off_rad) < MIN_YAW_RAD:
+        return
+    now = config.heading
+    key = "heading.yaw_deg"
+    value: tuple[float, ...] = (_turn(now.yaw_deg + math.degrees(found.off_rad)),)
+    what = f"is off the course by {math.degrees(found.off_rad):.0f} degrees"
+    # A driver that counts the other way has all angles mirrored: they do not keep to the course.
+    if not steady:
+        what = f"does not follow the course, by {math.degrees(found.spread_rad):.0f} degrees"
+        key, value = "heading.axes", ()
+    remedy = "Choose another topics.heading, or leave it out"
+    if found.other_spread_rad < min(found.spread_rad, MIN_YAW_RAD):
+        other = now.yaw_deg + math.degrees(found.other_off_rad)
+        axes = "ned" if now.axes == "enu" else "enu"
+        remedy = f"It counts the other way: set heading.axes: {axes}"
+        if abs(found.other_off_rad) > MIN_YAW_RAD:
+            remedy += f", and heading.yaw_deg to about {_turn(other):.0f}"
+    elif steady:
+        remedy = f"Set heading.yaw_deg to about {value[0]:.0f}"
+    off = max(abs(found.off_rad), found.spread_rad)
+    sigma = MIN_YAW_RAD / CONTRADICTION_SIGMAS
+    sentence = f"{name}: the heading of topics.heading {what}. {remedy}"
+    yield Finding(key, value, math.degrees(sigma), off / sigma, "fatal", sentence)
+
+
+def _turn(degrees: float) -> float:
+    """An angle within half a turn."""
+    return math.remainder(degrees, 360.0) + 0.0
 
 
 def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:

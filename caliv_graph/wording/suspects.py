@@ -90,10 +90,16 @@ _REMEDIES = {
     "gnss.lever_arm": "Measure the antenna in the vehicle frame again, or set gnss.lever_arm: null",
     "gnss.time_offset": "Check the clock of the GNSS receiver against that of the IMU",
     "imu.T_vehicle_imu": "Check imu.T_vehicle_imu, or set its rpy_deg: null",
+    "heading.yaw_deg": "Check heading.yaw_deg, where the baseline of the antennas points",
+    "heading.lever_arm": "Measure the second antenna in the vehicle frame again",
+    "wheels.T_vehicle_wheels": "Check wheels.T_vehicle_wheels and its rotation_sigma_deg",
     "imu.yaw_bias": "Check the heading of the IMU's orientation, or set imu.yaw_bias",
     "imu.gyroscope.scale": "Check the unit and the axes of the IMU's messages",
     "imu.accelerometer.scale": "Check the unit and the axes of the IMU's messages",
-    "twist.scale": "Check the unit and the scale of the velocities in topics.twist",
+    "twist.scale": (
+        "Check the unit and the scale of the velocities in topics.twist, or set "
+        "wheels.speed_scale_sigma"
+    ),
     "ground.vehicle_height": "Measure the height of the vehicle frame above the ground again",
     "poses.frame": "Check that topics.pose has the poses of the vehicle frame",
     "poses.drift": "The given poses drift by this range over the drive: use better ones",

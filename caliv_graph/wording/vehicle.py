@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from caliv_graph.products import VehicleParameter
+from caliv_graph.products import TURNS, VehicleParameter
 from caliv_graph.wording.directions import PARAMETER_KEYS
 
 
 def vehicle_text(name: str, found: VehicleParameter) -> str:
     """One line: value, sigma, what the drive determines, and which axes of S2V it limits."""
-    turn = name == "imu_rotation"
+    if name == "speed_scale":
+        scales, sigmas = _numbers(found.value, 4), _numbers(found.sigma, 5)
+        return f"{PARAMETER_KEYS[name]}: ({scales}), sigma ({sigmas}), one per drive"
+    if name == "heading_yaw":
+        turns, sigmas = (_numbers(np.degrees(v), 3) for v in (found.value, found.sigma))
+        return f"{PARAMETER_KEYS[name]}: ({turns}), sigma ({sigmas}) degrees, one per drive"
+    turn = name in TURNS
     unit, digits = ("degrees", 2) if turn else ("m", 3)
     value, sigma = (
         (np.degrees(found.value), np.degrees(found.sigma))

@@ -28,10 +28,12 @@ from caliv_graph.readers.discover import (
 from caliv_graph.workflows.caliv_config import find_original
 from caliv_graph.workflows.draft_text import (
     GNSS_TEMPLATE,
+    HEADING_TEMPLATE,
     IMU_TEMPLATE,
     SEARCHED_TARGET_TEMPLATE,
     TEMPLATE,
     TODO_POSE,
+    WHEELS_TEMPLATE,
     align,
     comment,
     from_source,
@@ -216,11 +218,16 @@ def _mounts_of_bag(bag: Bag, frames: Frames, motion: MotionTopics) -> tuple[str,
             arm=yaml_list(guess.numbers()[0]) if known else "null",
         )
         unknown += [] if known else ["gnss.lever_arm"]
+    if "heading" in motion.chosen:
+        sections += HEADING_TEMPLATE
+        unknown += ["heading.yaw_deg"]
+    if "twist" in motion.chosen and "imu" not in motion.chosen:
+        sections += WHEELS_TEMPLATE
     return sections, unknown
 
 
 def _topics_text(bag: Bag, motion: MotionTopics) -> str:
-    lines = ["topics:\t# of the vehicle's motion: imu, gnss and twist; or pose"]
+    lines = ["topics:\t# of the vehicle's motion: imu, gnss, twist and heading, or pose"]
     if not motion.chosen:
         lines = [
             "topics: {}\t# the bag has no motion data by its types: the LiDARs tell their motion",

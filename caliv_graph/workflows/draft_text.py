@@ -145,6 +145,23 @@ imu:
 
 """
 
+HEADING_TEMPLATE = """\
+heading:\t# of two antennas
+  yaw_deg: 0.0\t# TODO: degrees, from the vehicle's x to where it points: 0 ahead, 90 left
+  sigma_deg: 1.0\t# degrees, how far off that may be, 1 sigma
+  axes: enu\t# enu: counted from east to the left; ned: from north to the right (nmea_navsat_driver)
+
+"""
+
+WHEELS_TEMPLATE = """\
+wheels:\t# there is no IMU: the wheels tell the motion between the fixes
+  T_vehicle_wheels:\t# middle of the axle that does not steer, x where the vehicle goes straight
+    xyz: [0.0, 0.0, 0.0]\t# metres; zeros: the vehicle frame is there
+    rpy_deg: [0.0, 0.0, 0.0]\t# degrees
+  speed_scale_sigma: 0.02\t# 1 sigma of the scale of the speeds, which is estimated
+
+"""
+
 GROUND_TEMPLATE = """\
 ground:\t# the ground under the wheels: roll, pitch and z of the LiDARs
   vehicle_height: {height}\t# metres, {origin}

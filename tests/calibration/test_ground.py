@@ -28,6 +28,7 @@ from caliv_graph.calibration.ground import (
 )
 from caliv_graph.calibration.ground_factors import (
     ground_plane_factor,
+    held,
     parallel_factor,
     plane_normal,
     standing_factor,
@@ -236,6 +237,32 @@ def plane_squares_of(
             if kind == "ground_plane"
         ]
     )
+
+
+def test_ground_that_is_held_is_that_of_the_extrinsic_and_stays() -> None:
+    values, anchor = random_values(3, 1.0)
+    T = values.atPose3(X).compose(values.atPose3(E))
+    seen = seen_from(T, values.atVector(G), anchor)
+    R = values.atPose3(E).rotation()
+    guess = R.compose(gtsam.Rot3.Expmap(np.array([0.02, -0.03, 0.01]))).matrix()
+    by_extrinsic = 0.02 * np.random.default_rng(1).normal(size=(3, 3))
+    swept = replace(seen, R_vehicle_lidar=guess, by_extrinsic=by_extrinsic)
+
+    free = ground_plane_factor((X, E), G, anchor, swept)
+    fixed = ground_plane_factor((X, E), G, anchor, held(swept, R.matrix()))
+    # Tilts of below 1 mrad: their axes turn by as little, which is below a microradian.
+    np.testing.assert_allclose(
+        fixed.unwhitenedError(values), free.unwhitenedError(values), atol=2e-6
+    )
+    # The LiDAR stays in the map, the vehicle frame turns: only the free one depends on it.
+    turn = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.01, 0.0, 0.0])), np.zeros(3))
+    moved = gtsam.Values(values)
+    moved.update(X, values.atPose3(X).compose(turn.inverse()))
+    moved.update(E, turn.compose(values.atPose3(E)))
+    np.testing.assert_allclose(
+        fixed.unwhitenedError(moved), fixed.unwhitenedError(values), atol=1e-12
+    )
+    assert np.abs(free.unwhitenedError(moved) - free.unwhitenedError(values)).max() > 1e-5
 
 
 @pytest.mark.parametrize("offset_m", [1.0, 30.0, 2000.0])

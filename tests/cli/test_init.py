@@ -244,6 +244,30 @@ def test_every_key_of_a_config_of_a_bag_is_commented(tmp_path: Path) -> None:
     assert names == ["data", "path: drive", "imu", "front", "rear", "solve", "robust"]
 
 
+def test_a_vehicle_with_wheels_and_two_antennas_instead_of_an_imu(tmp_path: Path) -> None:
+    drifting = odometry(START, (0, 0, 0)) | {"header": header(START, "odom")}
+    turn = {"_type": "geometry_msgs/msg/QuaternionStamped", "header": header(START, "gnss")}
+    messages = [
+        ("/points", START, cloud(START, [[1, 2, 3]], frame_id="lidar")),
+        ("/fix", START, fix(START)),
+        ("/odom", START, drifting),
+        ("/heading", START, turn),
+    ]
+    out = tmp_path / "config.yaml"
+    result = init(write_bag(tmp_path / "drive", messages), "--out", out)
+
+    assert "fill in before you calibrate: gnss.lever_arm, heading.yaw_deg" in result.stderr
+    config = load_config(out)
+    topics = {key: topic for key, topic in config.topics.model_dump().items() if topic}
+    assert topics == {"gnss": "/fix", "twist": "/odom", "heading": "/heading"}
+    assert config.wheels.speed_scale_sigma == 0.02
+    lines = out.read_text().splitlines()
+    bare = [line.strip().rstrip(":") for line in lines if line and "#" not in line]
+    assert bare == ["data", "path: drive", "lidar", "solve", "robust"]
+    # Every topic of it can be read.
+    assert open_recording(config).motion().gnss is not None
+
+
 def test_extrinsics_from_a_urdf(tmp_path: Path) -> None:
     urdf = tmp_path / "car.urdf"
     urdf.write_text(

@@ -19,6 +19,7 @@ from tests.readers.bags import (
     Message,
     cloud,
     fix,
+    header,
     imu,
     livox,
     odometry,
@@ -119,6 +120,35 @@ def test_raw_sensors_are_preferred_to_poses(tmp_path: Path) -> None:
     assert topics.others["imu"] == ("/imu/data_raw", "/livox/imu")
     assert topics.others["pose"] == ("/odom",)
     assert topics.others["twist"] == ("/odom",)
+
+
+def test_without_an_imu_gnss_and_wheels_are_preferred_to_poses_that_drift(tmp_path: Path) -> None:
+    drifting = odometry(START, (0, 0, 0)) | {"header": header(START, "odom")}
+    wheels = [("/fix", fix(START)), ("/gnss/velocity", twist(START, (1, 0, 0)))]
+    bag = bag_of(tmp_path / "wheels", *wheels, ("/odom", drifting))
+    topics = choose_motion_topics(bag)
+    assert topics.chosen == {"gnss": "/fix", "twist": "/odom"}
+    assert topics.others["pose"] == ("/odom",)
+
+    located = odometry(START, (0, 0, 0)) | {"header": header(START, "map")}
+    bag = bag_of(tmp_path / "located", *wheels, ("/odom", drifting), ("/state", located))
+    assert choose_motion_topics(bag).chosen == {"pose": "/state"}
+
+
+def test_headings_are_known_by_type_and_name(tmp_path: Path) -> None:
+    turn = {"_type": "geometry_msgs/msg/QuaternionStamped", "header": header(START, "gnss")}
+    sensors = [("/imu", imu(START)), ("/fix", fix(START))]
+    bag = bag_of(tmp_path / "a", *sensors, ("/heading", turn), ("/attitude", turn))
+    assert choose_motion_topics(bag).chosen == {
+        "imu": "/imu",
+        "gnss": "/fix",
+        "heading": "/heading",
+    }
+
+    bag = bag_of(tmp_path / "b", *sensors, ("/a/navheading", imu(START)))
+    topics = choose_motion_topics(bag)
+    assert topics.chosen == {"imu": "/imu", "gnss": "/fix", "heading": "/a/navheading"}
+    assert topics.others["imu"] == ()
 
 
 def test_poses_where_imu_or_gnss_is_missing(tmp_path: Path) -> None:

@@ -216,6 +216,28 @@ def test_a_receiver_that_never_had_a_fix() -> None:
     assert "2 without a fix" in collector.notes()[0]
 
 
+def test_yaw_rates_are_those_that_a_driver_knows() -> None:
+    def turning(stamp: int, rate: float, variance: float) -> Any:
+        cov = np.zeros(36)
+        cov[35] = variance
+        message = odometry(stamp, (0, 0, 0), velocity=(1, 0, 0), twist_cov=cov)
+        message["twist"]["twist"]["angular"] = xyz((0, 0, rate))
+        return message
+
+    found = fed(
+        TwistCollector(),
+        turning(START, 0.2, 0.01),
+        turning(START + 1, -0.1, 0.0),
+        turning(START + 2, 0.3, 1e9),
+        turning(START + 3, math.nan, 0.0),
+    ).finish()
+    np.testing.assert_array_equal(found.yaw_rate, [0.2, -0.1, math.nan, math.nan])
+    np.testing.assert_array_equal(found.yaw_rate_var, [0.01, math.nan, math.nan, math.nan])
+    none = fed(TwistCollector(), turning(START, 0.0, 0.01), turning(START + 1, 0.0, 0.01)).finish()
+    assert none.yaw_rate is None
+    assert none.yaw_rate_var is None
+
+
 def test_velocities_of_all_types() -> None:
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag([0.1, 0.2, 0.3])

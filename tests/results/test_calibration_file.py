@@ -505,7 +505,11 @@ def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> N
         np.array([1.2, 0.3, 0.85]), np.array([0.01, 0.02, 2.0]), (True, True, False), ("x", "y")
     )
     turn = VehicleParameter(np.radians([90.0, 0.0, 2.0]), np.radians([0.1, 0.1, 0.2]), (False,) * 3)
-    calibration = replace(make_calibration(), vehicle={"lever_arm": arm, "imu_rotation": turn})
+    scales = VehicleParameter(np.array([1.02, 1.019]), np.array([1e-3, 2e-3]), (True, False))
+    yaw = VehicleParameter(np.radians([91.0]), np.radians([0.2]), (True,))
+    measured = {"lever_arm": arm, "imu_rotation": turn, "wheels_rotation": turn}
+    measured |= {"speed_scale": scales, "heading_yaw": yaw}
+    calibration = replace(make_calibration(), vehicle=measured)
 
     write_calibration(calibration, tmp_path / "calibration.yaml")
 
@@ -514,12 +518,22 @@ def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> N
     assert document["lever_arm"]["determined"] == [True, True, False]
     assert document["imu_rotation"]["value_deg"] == pytest.approx([90.0, 0.0, 2.0])
     assert document["imu_rotation"]["sigma_deg"] == pytest.approx([0.1, 0.1, 0.2])
+    assert document["speed_scale"]["value"] == [1.02, 1.019]
+    assert document["heading_yaw"]["value_deg"] == pytest.approx([91.0])
     found = read_calibration(tmp_path / "calibration.yaml").vehicle
     for name, expected in calibration.vehicle.items():
         np.testing.assert_allclose(found[name].value, expected.value, atol=1e-12)
         np.testing.assert_allclose(found[name].sigma, expected.sigma, atol=1e-12)
         assert found[name].determined == expected.determined
         assert found[name].limits == expected.limits
+
+
+def test_scales_of_some_drives_and_sigmas_of_others_are_refused(tmp_path: Path) -> None:
+    scales = VehicleParameter(np.array([1.02, 1.019]), np.array([1e-3]), (True, False))
+    path = tmp_path / "calibration.yaml"
+    write_calibration(replace(make_calibration(), vehicle={"speed_scale": scales}), path)
+    with pytest.raises(ConfigError, match="one entry per drive"):
+        read_calibration(path)
 
 
 def test_suspects_are_read_back_and_may_be_those_of_another_writer(tmp_path: Path) -> None:

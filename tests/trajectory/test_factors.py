@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from caliv_graph.trajectory.factors import (
+    baseline_factor,
     biased_orientation_factor,
+    heading_factor,
+    level_factor,
     marginal_factor,
     orientation_factor,
     position_factor,
@@ -121,3 +124,41 @@ def test_a_marginal_factor_is_its_gaussian() -> None:
         moved.insert(key, pose.retract(step))
 
     assert factor.error(moved) == pytest.approx(0.5 * d.ravel() @ information @ d.ravel())
+
+
+def test_a_scaled_velocity_has_the_right_jacobians() -> None:
+    at = values()
+    factor = velocity_factor(POSE, VELOCITY, np.ones(3), np.array([0.1, 0.2, 0.3]), UNIT, 1.03)
+    check_jacobians(factor, at)
+    plain = velocity_factor(POSE, VELOCITY, np.zeros(3), np.zeros(3), UNIT)
+    scaled = velocity_factor(POSE, VELOCITY, np.zeros(3), np.zeros(3), UNIT, 1.03)
+    np.testing.assert_allclose(scaled.unwhitenedError(at), 1.03 * plain.unwhitenedError(at))
+
+
+def test_level_ground_is_below_the_frame() -> None:
+    at = values()
+    up = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
+    check_jacobians(level_factor(POSE, up, gtsam.noiseModel.Unit.Create(2)), at)
+    at.update(POSE, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, -0.02, 2.0), np.zeros(3)))
+    factor = level_factor(POSE, np.array([0.0, 0.0, 1.0]), gtsam.noiseModel.Unit.Create(2))
+    # Nose up by 20 mrad is pitch -0.02; left side up by 10 mrad is roll 0.01.
+    np.testing.assert_allclose(factor.unwhitenedError(at), [0.02, 0.01], atol=1e-5)
+
+
+def test_a_heading_is_the_azimuth_of_a_direction() -> None:
+    at = values()
+    noise = gtsam.noiseModel.Unit.Create(1)
+    check_jacobians(heading_factor(POSE, np.array([0.2, 0.9, 0.3]), 1.0, noise), at)
+    at.update(POSE, gtsam.Pose3(gtsam.Rot3.Rz(3.0), np.zeros(3)))
+    # 3.0 + pi / 2 is beyond half a turn.
+    left = heading_factor(POSE, np.array([0.0, 1.0, 0.0]), 3.0 + np.pi / 2 - 0.2, noise)
+    np.testing.assert_allclose(left.unwhitenedError(at), [0.2], atol=1e-12)
+
+
+def test_a_baseline_is_a_turned_vector() -> None:
+    at = values()
+    factor = baseline_factor(POSE, np.array([0.2, 1.9, 0.3]), np.array([1.0, 2.0, 3.0]), UNIT)
+    check_jacobians(factor, at)
+    at.update(POSE, gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.ones(3)))
+    factor = baseline_factor(POSE, np.array([2.0, 0.0, 0.5]), np.array([0.0, 1.9, 0.5]), UNIT)
+    np.testing.assert_allclose(factor.unwhitenedError(at), [0.0, 0.1, 0.0], atol=1e-12)

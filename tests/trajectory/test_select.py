@@ -115,5 +115,5 @@ def test_scans_outside_the_given_poses_are_lost_and_told() -> None:
 
 
 def test_a_recording_without_any_motion_says_what_is_missing() -> None:
-    with pytest.raises(TrajectoryError, match=r"^empty: no IMU: set topics\.imu"):
+    with pytest.raises(TrajectoryError, match=r"^empty: no IMU and no velocities: set topics\.imu"):
         smooth_trajectories([Drive(MotionData("empty"), (START_NS,))], config_for(Sensors()))

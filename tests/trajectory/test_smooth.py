@@ -290,7 +290,7 @@ def test_without_gnss_the_motion_is_known_from_the_start_on() -> None:
     ("missing", "message"),
     [
         (("gnss", "twist"), "neither GNSS fixes nor velocities"),
-        (("imu",), "no IMU: set topics.imu"),
+        (("imu", "twist"), "no IMU and no velocities: set topics.imu"),
     ],
     ids=["imu-alone", "no-imu"],
 )

@@ -17,7 +17,7 @@ from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
 from caliv_graph.trajectory.effects import STEP_NS, error_effects, smoothed_in_time
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.variances import COMPONENTS, NoiseLikelihood
+from caliv_graph.trajectory.variances import NoiseLikelihood, free_components
 from tests.trajectory.motions import Course, Sensors, arc_drive, config_for, record, stamps
 from tests.trajectory.test_chain import random_chain
 
@@ -139,7 +139,7 @@ def test_the_slope_of_the_likelihood_is_right() -> None:
         nodes,
         states.R_map_imu[:30],
         (CorrelatedError("gnss", (0.02, 0.02, 0.01), 5.0),),
-        list(COMPONENTS),
+        free_components(trajectory.data),
     )
     scales = np.array([1.2, 0.8, 1.1, 0.9, 1.3, 0.7])
     _, slope = likelihood.at(scales)

@@ -268,6 +268,15 @@ def test_a_measured_figure_comes_with_what_it_limits() -> None:
         "imu.T_vehicle_imu: (90.00, 0.00, 2.00) degrees, sigma (0.100, 0.100, 0.100) degrees; the "
         "drive adds nothing"
     )
+    scales = VehicleParameter(np.array([1.021, 1.019]), np.array([3e-4, 2e-4]), (True, True))
+    assert vehicle_text("speed_scale", scales) == (
+        "scale of the speeds in topics.twist: (1.0210, 1.0190), sigma (0.00030, 0.00020), one per "
+        "drive"
+    )
+    yaw = VehicleParameter(np.radians([91.2]), np.radians([0.05]), (True,))
+    assert vehicle_text("heading_yaw", yaw) == (
+        "heading.yaw_deg: (91.200), sigma (0.050) degrees, one per drive"
+    )
 
 
 # ------------------------------------------------------------------ walls instead of a target

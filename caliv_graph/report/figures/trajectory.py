@@ -89,13 +89,17 @@ def path_figure(
 
 
 def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figure:
-    """IMU biases and GNSS residuals over time."""
+    """Biases of the IMU, or motion of the axle without one, and GNSS residuals over time."""
     nodes = trajectory.nodes_ns
     begin = int(nodes[0])
     some = evenly(len(nodes), MOST_SAMPLES // 6)
     seconds = to_seconds(nodes[some] - begin)
     fixes, r = gnss_residuals(trajectory)
+    wheels = trajectory.data.wheels
     titles = ["accelerometer bias (mm/s²)", "gyroscope bias (mrad/s)"]
+    if wheels is not None:
+        rates = "bias of the yaw rate (mrad/s)" if wheels.yaw_rate else "minus the rates (mrad/s)"
+        titles = ["minus the acceleration (mm/s²)", rates]
     if len(fixes):
         titles.append("GNSS residual (mm)")
     figure = Plot(titles, stacked=True, spacing=0.09)
@@ -125,7 +129,7 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
                 y=small(value),
                 mode="lines",
                 line={"color": colour, "dash": dashes[axis]},
-                name=f"{axes[axis]} of the IMU",
+                name=f"{axes[axis]} of the {'IMU' if wheels is None else 'axle'}",
                 legendgroup=f"bias {axis}",
                 showlegend=panel == 1,
                 panel=panel,
@@ -147,7 +151,8 @@ def motion_figure(drive: int, trajectory: SmoothedTrajectory, name: str) -> Figu
     dropped = len(trajectory.gnss_rejected)
     return Figure(
         f"motion_{drive}",
-        f"Recording '{name}': IMU biases (bands: 1 sigma)"
+        f"Recording '{name}': {'IMU biases' if wheels is None else 'motion of the axle'} "
+        "(bands: 1 sigma)"
         + (" and residuals of the GNSS fixes used" if len(fixes) else "")
         + (f"; {dropped} fixes were dropped" if dropped else "")
         + ". No GNSS was recorded." * (not len(fixes)),

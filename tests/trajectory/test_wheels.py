@@ -1,0 +1,167 @@
+"""Wheels and fixes without an IMU, against drives that are known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array, MotionData, TwistSamples
+from caliv_graph.trajectory.inputs import check_input
+from caliv_graph.trajectory.physics import motion_physics
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.wheels import WheelModel, level_sigmas, node_spans_s, wheel_noise
+from caliv_graph.wording.physics import motion_findings
+from tests.trajectory.motions import (
+    START_NS,
+    Course,
+    Sensors,
+    config_for,
+    eight_drive,
+    errors,
+    record,
+    seconds,
+    stamps,
+)
+
+DRIVE = Course(eight_drive(14.0))
+ANTENNA = replace(Sensors(), lever_arm=(0.3, 0.5, 1.8))
+SCALE = 1.03
+
+
+def wheels(seed: int, yaw_rate: bool = True) -> MotionData:
+    """Fixes and odometry at 50 Hz: forward speed, and a yaw rate with a bias."""
+    motion = record(DRIVE, ANTENNA, seed)
+    rng = np.random.default_rng([seed, 9])
+    at = stamps(DRIVE.duration_s, 50.0)
+    truth = DRIVE.at(seconds(at))
+    speed = np.linalg.norm(truth.velocity_map, axis=1)
+    velocity = np.zeros((len(at), 3))
+    velocity[:, 0] = SCALE * speed + 0.03 * rng.standard_normal(len(at))
+    rate = truth.rates[:, 2] + 0.004 + 0.005 * rng.standard_normal(len(at))
+    twist = TwistSamples(at, velocity, yaw_rate=rate if yaw_rate else None)
+    return replace(motion, imu=None, twist=twist)
+
+
+def settings(**more: object) -> Config:
+    return config_for(ANTENNA, wheels={"tilt_sigma_deg": 0.1, "slip_sigma_deg": 0.1, **more})
+
+
+@cache
+def smoothed(yaw_rate: bool) -> tuple[MotionData, SmoothedTrajectory]:
+    motion = wheels(1, yaw_rate=yaw_rate)
+    return motion, smooth_trajectory(motion, settings(), stamps(DRIVE.duration_s, 5.0, 0.05))
+
+
+def whitened(motion: MotionData, found: SmoothedTrajectory) -> tuple[Array, Array, Array]:
+    R, t = stack(found.trajectory.T_map_vehicle)
+    turn, shift = errors(DRIVE, motion, found.trajectory.stamps_ns, R, t)
+    e = np.hstack([turn, np.einsum("nji,nj->ni", R, shift)])
+    assert found.trajectory.cov is not None
+    nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.trajectory.cov), e)
+    return nees, turn, shift
+
+
+@pytest.mark.parametrize(("yaw_rate", "worst_rad"), [(True, 4e-3), (False, 10e-3)])
+def test_wheels_and_fixes_tell_the_motion(yaw_rate: bool, worst_rad: float) -> None:
+    motion, found = smoothed(yaw_rate)
+    nees, turn, shift = whitened(motion, found)
+    assert np.sqrt((turn**2).mean(axis=0)).max() < worst_rad
+    assert np.sqrt((shift[:, :2] ** 2).mean(axis=0)).max() < 12e-3
+    # Flat ground and no slip: less than what the sigmas allow.
+    assert nees.mean() < 9.0
+    assert found.gravity_m_s2 == 0.0
+
+
+def test_the_scale_of_the_wheels_is_found() -> None:
+    _, found = smoothed(True)
+    sigmas = found.sigmas_of("twist.scale")
+    assert sigmas is not None
+    assert sigmas[0] < 2e-3
+    assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
+
+
+def test_with_an_imu_the_scale_is_found_if_it_is_asked_for() -> None:
+    motion, inertial = wheels(3), record(DRIVE, ANTENNA, 3)
+    motion = replace(motion, imu=inertial.imu)
+    wanted = stamps(DRIVE.duration_s, 2.0)
+    found = smooth_trajectory(motion, settings(speed_scale_sigma=0.02), wanted)
+    sigmas = found.sigmas_of("twist.scale")
+    assert sigmas is not None
+    assert sigmas[0] < 2e-3
+    assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
+    exact = smooth_trajectory(motion, settings(), wanted)
+    assert exact.data.speed_scale == 1.0
+    assert exact.sigmas_of("twist.scale") is None
+
+
+def test_without_fixes_nothing_pulls_the_scale() -> None:
+    motion = replace(wheels(2), gnss=None)
+    found = smooth_trajectory(motion, settings(), stamps(DRIVE.duration_s, 2.0))
+    sigmas = found.sigmas_of("twist.scale")
+    assert sigmas is not None
+    assert abs(found.data.speed_scale - 1.0) < 2e-3
+    assert sigmas[0] == pytest.approx(0.02, rel=0.05)
+
+
+def test_poses_within_a_sweep_follow_the_turn() -> None:
+    motion, found = smoothed(True)
+    at = START_NS + 10_000_000_000 + np.arange(0, 100_000_000, 5_000_000)
+    R, t = found.poses_at(at)
+    turn, shift = errors(DRIVE, motion, at, R, t)
+    # Over 0.1 s the vehicle goes 0.2 m and turns by 22 mrad.
+    assert np.abs(turn - turn[0]).max() < 0.5e-3
+    assert np.abs(shift - shift[0]).max() < 1e-3
+
+
+def test_roll_and_pitch_are_a_stationary_process() -> None:
+    # White rates and a pull to level, as in the graph, against cov = s^2 exp(-|dt| / T).
+    model = WheelModel(True, True, slip_rad=1e-3, tilt_rad=4e-3, correlation_s=1.0)
+    nodes = START_NS + np.arange(0, 12_000_000_000, 50_000_000)
+    config = settings()
+    twist = wheels(1).twist
+    assert twist is not None
+    density = wheel_noise(twist, config).gyro_density[0, 0]
+    density *= (model.tilt_rad / np.radians(config.wheels.tilt_sigma_deg)) ** 2
+    steps = np.diff(nodes) * 1e-9
+    difference = np.diff(np.eye(len(nodes)), axis=0)
+    information = difference.T @ np.diag(1.0 / (density * steps)) @ difference
+    information += np.diag(level_sigmas(nodes, model) ** -2)
+    cov = np.linalg.inv(information)
+    middle = len(nodes) // 2
+    assert cov[middle, middle] == pytest.approx(model.tilt_rad**2, rel=0.02)
+    assert cov[middle, middle + 20] == pytest.approx(model.tilt_rad**2 * np.exp(-1.0), rel=0.03)
+    assert node_spans_s(nodes).sum() == pytest.approx(steps.sum())
+
+
+def test_what_wheels_cannot_tell_is_said() -> None:
+    speeds = replace(wheels(1, yaw_rate=False), gnss=None)
+    with pytest.raises(TrajectoryError, match=r"speeds alone .* set topics.gnss"):
+        check_input(speeds, settings())
+    unread = config_for(ANTENNA, topics={"imu": "/imu"})
+    with pytest.raises(TrajectoryError, match=r"no IMU: topics.imu '/imu' .* or leave it out"):
+        check_input(wheels(1), unread)
+
+
+@pytest.mark.parametrize(
+    ("speed", "turn", "said"),
+    [(3.6, 1.0, "km/h"), (1.0, -1.0, "opposite sign: check the axes of topics.twist")],
+)
+def test_units_and_signs_of_wheels_are_checked(speed: float, turn: float, said: str) -> None:
+    motion = wheels(1)
+    twist = motion.twist
+    assert twist is not None
+    assert twist.yaw_rate is not None
+    wrong = replace(twist, velocity=speed * twist.velocity, yaw_rate=turn * twist.yaw_rate)
+    found = motion_physics(replace(motion, twist=wrong), settings())
+    assert found is not None
+    assert [said in finding.sentence for finding in motion_findings(found, settings())] == [True]
+    sound = motion_physics(motion, settings())
+    assert sound is not None
+    assert motion_findings(sound, settings()) == ()

@@ -47,7 +47,6 @@ from caliv_graph.registration.register import JointRegistration, register_jointl
 from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 
 def estimate(
@@ -112,7 +111,7 @@ def _estimate(
     grounds, structure = surroundings
     limit = config.registration.max_iterations
     guesses = {name: problem.guesses[name] for name in problem.lidars}
-    guessed = _held_grounds(grounds, guesses, trajectories)
+    guessed = _held_grounds(grounds, guesses)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         noise = estimated_noise(rough.state, rough.registrations, trajectories)
@@ -129,7 +128,7 @@ def _estimate(
     begun = time.perf_counter()
     lines = linearise_clouds(problem, rough.state.values)
     extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
-    grounds = _held_grounds(grounds, extrinsics, trajectories)
+    grounds = _held_grounds(grounds, extrinsics)
     states = [
         JointRegistration(
             _deskewed(o, extrinsics, trajectories),
@@ -186,24 +185,15 @@ def _estimate(
 
 
 def _held_grounds(
-    grounds: Sequence[GroundObservation],
-    extrinsics: Mapping[str, gtsam.Pose3],
-    trajectories: Sequence[VehicleTrajectory],
+    grounds: Sequence[GroundObservation], extrinsics: Mapping[str, gtsam.Pose3]
 ) -> tuple[GroundObservation, ...]:
-    """The ground put together with the extrinsics of the clouds, on drives without an IMU.
+    """The ground, its motion compensated with the extrinsics of the clouds.
 
-    There roll of the LiDARs is known to milliradians. The ground's dependence on it would weigh as
-    much, and pull towards the extrinsics with which clouds were put together.
+    Left free, it says roll and pitch of the LiDARs to milliradians, which clouds contradict that
+    were put together with a guess: S2V would be pulled towards that guess.
     """
-    of_wheels = {
-        d
-        for d, t in enumerate(trajectories)
-        if isinstance(t, SmoothedTrajectory) and t.data.wheels is not None
-    }
     return tuple(
-        held(o, extrinsics[o.lidar].rotation().matrix())
-        if o.drive in of_wheels and o.lidar in extrinsics
-        else o
+        held(o, extrinsics[o.lidar].rotation().matrix()) if o.lidar in extrinsics else o
         for o in grounds
     )
 

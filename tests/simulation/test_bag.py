@@ -348,6 +348,7 @@ def test_config_is_ready_to_run_on_the_bag(folder: Path) -> None:
         "imu": "/imu/data",
         "gnss": "/gnss/fix",
         "twist": "/vehicle/twist",
+        "heading": None,
         "pose": None,
     }
     assert config.imu.T_vehicle_imu.model_dump() == SCENARIO.imu.mounting.model_dump()

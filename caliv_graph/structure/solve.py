@@ -86,7 +86,7 @@ class Estimate:
     geometry: Geometry
     converged: bool
 
-    def system(self) -> System:
+    def linearised(self) -> System:
         """The linearised system there. It takes most of the memory: nobody keeps two."""
         problem, sightings = self.problem, self.sightings
         group = groups_of(sightings, self.strips)
@@ -110,19 +110,10 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Solved:
-    """The outcome: estimate, strips, and the system at the estimate."""
+class Solved(Estimate):
+    """The outcome: an estimate, and the system there."""
 
-    problem: Problem
-    state: State
-    strips: Strips
-    sightings: Sightings
-    weights: Array
-    nuisances: Nuisances
-    layout: Layout
-    geometry: Geometry
     system: System
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -204,7 +195,7 @@ def _with_jitter(found: Estimate) -> tuple[Estimate, int, System] | None:
     state = replace(found.state, errors=errors)
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
-    system = jittering.system()
+    system = jittering.linearised()
     H, b = with_guesses(problem, state, system)
     sigma_s = jitter_sigma_s(H, b, layout)
     if sigma_s == 0.0:
@@ -222,12 +213,12 @@ def _on_all_poses(found: Estimate, problem: Problem, poses: IntArray) -> Solved:
     Its information is without what dents of the ground tell. The steps use them: derivatives that
     are not those of the residuals do not lead to the estimate.
     """
-    b = on_all_coordinates(found.system().b, problem.prior, poses)
+    b = on_all_coordinates(found.linearised().b, problem.prior, poses)
     state = on_all_poses(problem.prior, poses, found.state)
     layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
     geometry = geometry_at(problem, state, found.sightings, layout, dents=False)
     found = replace(found, problem=problem, state=state, layout=layout, geometry=geometry)
-    return Solved(**vars(found), system=replace(found.system(), b=b))
+    return Solved(**vars(found), system=replace(found.linearised(), b=b))
 
 
 def linearised(
@@ -306,7 +297,7 @@ def _settled(found: Estimate, steps: int, first: System | None = None) -> Estima
 def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
     """The estimate after a step, and the size of the step in sigmas of the extrinsics."""
     problem, layout, sightings = found.problem, found.layout, found.sightings
-    system = system or found.system()
+    system = system or found.linearised()
     factor, b = _factor(found, system)
     d = system.surfaces.follow(solved(factor, b))
     state = stepped(found.state, layout, d)

@@ -78,6 +78,17 @@ def page(**changes: object) -> str:
 
 SCRIPT = Path(__file__).with_name("use_inspection_page.js").read_text(encoding="utf-8")
 
+BLANK = """
+let looked = 0;
+function blank() {
+  return looked++ < 60 && ["space", "map"].some(function (id) {
+    const c = document.getElementById(id);
+    return !c.getContext("2d").getImageData(0, 0, c.width, c.height).data.some(Boolean);
+  });
+}
+"""
+"""Whether a view has not been drawn yet, up to half a minute."""
+
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
@@ -90,9 +101,12 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     ends = [T.transformFrom(np.array(corner)) for corner in (turned.region.min, turned.region.max)]
     extent = json.dumps(np.array([np.min(ends, axis=0), np.max(ends, axis=0)]).tolist())
     script = SCRIPT.replace("POSES", poses).replace("BOX", extent)
-    # After the first pictures, which are drawn when the browser has a moment.
-    wait = f"setTimeout(function () {{ {script} }}, 500);"
-    html = page().replace("</body>", f"<script>{wait}</script></body>")
+    # After the first pictures: at a time of the browser's own that a busy machine stretches.
+    wait = (
+        "setTimeout(function go() { if (blank()) { setTimeout(go, 500); return; } "
+        f"{script} }}, 500);"
+    )
+    html = page().replace("</body>", f"<script>{BLANK}{wait}</script></body>")
     result = shown(html, tmp_path_factory.mktemp("page"))
     found = re.search(r'<pre id="told">(.*?)</pre>', result.dom, re.DOTALL)
     assert found is not None, result.console

@@ -29,13 +29,12 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.pipeline import calibrate
 from caliv_graph.readers import open_recording
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2v
 
 SCENARIO = Path(__file__).resolve().parents[1] / "configs" / "scenarios" / "yard.yaml"
 DRIVES: dict[str, dict[str, Any]] = {
@@ -82,20 +81,19 @@ def result(row: str, seed: int, out: Path) -> str:
     truth = {name: model.mounting.pose() for name, model in scenario.lidars.items()}
     found = evaluate(calibration, truth)
     pair = found["pairs"][0]
-    errors = " ".join(f"{1e3 * v:6.2f}" for v in (*pair["translation_m"], *pair["rotation_rad"]))
+    shown = " ".join(f"{1e3 * v:6.2f}" for v in (*pair["translation_m"], *pair["rotation_rad"]))
     open_axes = [a for a, good in pair_determined(calibration, *truth).items() if not good]
-    lines = [f"{calibration.status:12} S2S {pair['nees']:5.1f} ({errors})"]
+    lines = [f"{calibration.status:12} S2S {pair['nees']:5.1f} ({shown})"]
     lines[0] += f", open: {' '.join(open_axes)}" if open_axes else ""
     for name, lidar in calibration.lidars.items():
         item = found["lidars"][name]["s2v"]
-        axes = right_to_vehicle_axes(lidar.T_vehicle_lidar)
-        sigma = np.sqrt(np.diag(axes @ lidar.cov @ axes.T))
-        off = np.concatenate([item["rotation_rad"], item["translation_m"]]) / sigma
-        shown = [
+        errors = np.concatenate([item["rotation_rad"], item["translation_m"]])
+        off = errors / sigmas_s2v(calibration, name)
+        axes = [
             f"{axis} {value:5.2f}" if lidar.determined[axis] else f"{axis} open"
             for axis, value in zip(AXES, off, strict=True)
         ]
-        lines.append(f"{'':14}S2V {name:6} {', '.join(shown)}")
+        lines.append(f"{'':14}S2V {name:6} {', '.join(axes)}")
     return "\n".join(lines)
 
 

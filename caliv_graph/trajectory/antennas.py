@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pymap3d
 
+from caliv_graph.config.heading import HeadingAxes
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GnssFixes, HeadingSamples, IntArray, MotionData
-from caliv_graph.trajectory.gnss import Positions
+from caliv_graph.trajectory.gnss import Positions, places_in_map
 from caliv_graph.trajectory.imu import DeadReckoning, interpolate
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.noise import gnss_covariances
@@ -77,11 +77,14 @@ class NodeDirections:
     direction_imu: Array
 
 
+def azimuth_of(yaw_rad: Array, axes: HeadingAxes) -> Array:
+    """(n,) angles from the map's x (east) to the left, of angles as their source counts them."""
+    return yaw_rad if axes == "enu" else 0.5 * math.pi - yaw_rad
+
+
 def headings_of(samples: HeadingSamples, config: Config) -> Headings:
     """Angles of messages in the map."""
-    azimuth, var = samples.yaw_rad, samples.var
-    if config.heading.axes == "ned":
-        azimuth = 0.5 * math.pi - azimuth
+    azimuth, var = azimuth_of(samples.yaw_rad, config.heading.axes), samples.var
     sigma_deg = config.noise.heading_deg
     if sigma_deg is not None:
         every = np.full(len(azimuth), math.radians(sigma_deg) ** 2)
@@ -108,15 +111,8 @@ def baselines_of(second: GnssFixes, first: Positions, config: Config, name: str)
         )
     after = np.clip(np.searchsorted(first.stamps_ns, second.stamps_ns), 1, len(first.stamps_ns) - 1)
     before = after - 1
-    gap = np.maximum(
-        np.abs(second.stamps_ns - first.stamps_ns[before]),
-        np.abs(first.stamps_ns[after] - second.stamps_ns),
-    )
-    near = np.minimum(
-        np.abs(second.stamps_ns - first.stamps_ns[before]),
-        np.abs(first.stamps_ns[after] - second.stamps_ns),
-    )
-    kept = (gap <= MAX_APART_NS) | (near == 0)
+    apart = np.abs(np.stack([first.stamps_ns[before], first.stamps_ns[after]]) - second.stamps_ns)
+    kept = (apart.max(axis=0) <= MAX_APART_NS) | (apart.min(axis=0) == 0)
     if not kept.any():
         raise TrajectoryError(
             f"{name}: no fix of topics.heading is within {MAX_APART_NS * 1e-9:g} s of fixes of "
@@ -124,13 +120,12 @@ def baselines_of(second: GnssFixes, first: Positions, config: Config, name: str)
         )
     cov, source = gnss_covariances(second, config)
     stamps = np.asarray(second.stamps_ns, np.int64)[kept]
-    enu = pymap3d.geodetic2enu(
+    place = places_in_map(
         second.latitude_deg[kept],
         second.longitude_deg[kept],
         second.altitude_m[kept],
-        *first.origin_deg_m,
+        first.origin_deg_m,
     )
-    place = np.stack([np.asarray(axis, np.float64) for axis in enu], axis=1)
     vector = place - interpolate(stamps, first.stamps_ns, first.position_map)
     return Baselines(stamps, vector, cov[kept] + first.cov_map[after][kept], source)
 

@@ -54,10 +54,20 @@ def positions_in_map(
     latitude, longitude = gnss.latitude_deg[usable], gnss.longitude_deg[usable]
     altitude = gnss.altitude_m[usable]
     origin = (float(latitude[0]), float(longitude[0]), float(altitude[0]))
-    enu = pymap3d.geodetic2enu(latitude, longitude, altitude, *origin)
     stamps = np.asarray(gnss.stamps_ns, dtype=np.int64)[usable]
-    position_map = np.stack([np.asarray(axis, dtype=np.float64) for axis in enu], axis=1)
+    position_map = places_in_map(latitude, longitude, altitude, origin)
     return Positions(stamps, position_map, cov[usable], origin, source), warnings
+
+
+def places_in_map(
+    latitude_deg: Array,
+    longitude_deg: Array,
+    altitude_m: Array,
+    origin_deg_m: tuple[float, float, float],
+) -> Array:
+    """(n, 3) metres east, north and up of `Positions.origin_deg_m`, of fixes (n,)."""
+    enu = pymap3d.geodetic2enu(latitude_deg, longitude_deg, altitude_m, *origin_deg_m)
+    return np.stack([np.asarray(axis, dtype=np.float64) for axis in enu], axis=1)
 
 
 def normal_gravity(latitude_deg: float, altitude_m: float) -> float:

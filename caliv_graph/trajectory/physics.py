@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caliv_graph.config.heading import HeadingAxes
 from caliv_graph.config.model import Config
 from caliv_graph.products import (
     Array,
@@ -21,6 +22,7 @@ from caliv_graph.products import (
     TwistSamples,
 )
 from caliv_graph.trajectory.alignment import level
+from caliv_graph.trajectory.antennas import azimuth_of
 from caliv_graph.trajectory.axes import SIGMAS, Axes, accelerometer_axes
 from caliv_graph.trajectory.gnss import Positions, positions_in_map
 from caliv_graph.trajectory.imu import Inertial, clean_inertial, interpolate, log_so3
@@ -196,9 +198,10 @@ def _heading_by_course(motion: MotionData, moving: Windows, config: Config) -> M
     course = np.arctan2(ahead * v[:, 1], ahead * v[:, 0]) + config.heading.yaw_rad
     near = nearest_node(samples.stamps_ns, moving.stamps_ns)
     out: list[float] = []
-    for axes in (config.heading.axes, "ned" if config.heading.axes == "enu" else "enu"):
-        yaw = samples.yaw_rad[near]
-        off = (yaw if axes == "enu" else 0.5 * math.pi - yaw) - course
+    axes = config.heading.axes
+    other: HeadingAxes = "ned" if axes == "enu" else "enu"
+    for counted in (axes, other):
+        off = azimuth_of(samples.yaw_rad[near], counted) - course
         mean = float(np.angle(np.exp(1j * off).sum()))
         around = np.angle(np.exp(1j * (off - mean)))
         middle = float(np.median(around))

@@ -251,10 +251,9 @@ def _in_span(recording: Recording, trajectory: VehicleTrajectory | None, name: s
     return stamps[(stamps >= begin) & (stamps <= end)]
 
 
-def _evenly(stamps_ns: IntArray, count: int) -> IntArray:
-    if len(stamps_ns) <= count:
-        return stamps_ns
-    return stamps_ns[np.linspace(0, len(stamps_ns) - 1, count).round().astype(np.int64)]
+def _evenly(count: int, most: int) -> IntArray:
+    """Indices of at most so many of `count`, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
 def _view_stamp(recording: Recording, trajectory: VehicleTrajectory | None) -> int | None:
@@ -265,7 +264,8 @@ def _view_stamp(recording: Recording, trajectory: VehicleTrajectory | None) -> i
         return None
     begin, end = max(int(s[0]) for s in spans), min(int(s[-1]) for s in spans)
     common = spans[0][(spans[0] >= begin) & (spans[0] <= end)]
-    stamps = _evenly(common if len(common) else spans[0], 200)
+    stamps = common if len(common) else spans[0]
+    stamps = stamps[_evenly(len(stamps), 200)]
     if trajectory is None:
         return int(stamps[0])
     twists = twists_at(trajectory, stamps.tolist())
@@ -284,7 +284,8 @@ def _chosen(
     once = [int(stamps[np.abs(stamps - view_ns).argmin()])]
     if trajectory is None:
         return once, []
-    return once, _evenly(scans_to_read(stamps.tolist(), trajectory), ALONG_SCANS).tolist()
+    readable = scans_to_read(stamps.tolist(), trajectory)
+    return once, readable[_evenly(len(readable), ALONG_SCANS)].tolist()
 
 
 def _pieces(
@@ -342,7 +343,7 @@ def _fixes(recording: Recording, config: Config, trajectory: VehicleTrajectory |
     except CalivError:
         return NO_POINTS  # the inspection says what is wrong with them
     at = positions.position_map
-    return at[np.linspace(0, len(at) - 1, min(len(at), FIXES)).round().astype(np.int64)]
+    return at[_evenly(len(at), FIXES)]
 
 
 def _boxes(

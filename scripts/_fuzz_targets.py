@@ -30,14 +30,8 @@ from caliv_graph.readers.bag import Bag, DamagedMessageError
 from caliv_graph.readers.caliv_folder import CalivFolder
 from caliv_graph.readers.discover import choose_lidar_topics, choose_motion_topics
 from caliv_graph.readers.frames import FrameTree, read_urdf
-from caliv_graph.readers.motion import (
-    GnssCollector,
-    ImuCollector,
-    PoseCollector,
-    TfCollector,
-    TwistCollector,
-    check_imu,
-)
+from caliv_graph.readers.imu import ImuCollector, check_imu
+from caliv_graph.readers.motion import GnssCollector, TwistCollector
 from caliv_graph.readers.pcd import read_pcd
 from caliv_graph.readers.pointcloud2 import (
     DecodedCloud,
@@ -45,6 +39,7 @@ from caliv_graph.readers.pointcloud2 import (
     decode_livox,
     decode_pointcloud2,
 )
+from caliv_graph.readers.poses import PoseCollector, TfCollector
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.results.calibration_file import calibration_document, read_calibration_file
 from caliv_graph.results.truth_file import read_truth

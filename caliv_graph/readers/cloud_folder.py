@@ -28,7 +28,7 @@ from caliv_graph.readers.ahead import worked_ahead
 from caliv_graph.readers.bag import Topic
 from caliv_graph.readers.bin_clouds import bin_sweep_times, plain_fields, read_bin
 from caliv_graph.readers.clock import Clock, read_clock
-from caliv_graph.readers.motion import ImuCheck
+from caliv_graph.readers.imu import ImuCheck
 from caliv_graph.readers.pcd import read_pcd
 from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.products import Array, HeadingSamples
-from caliv_graph.readers.motion import NORM_TOLERANCE, RowCollector
+from caliv_graph.readers.collectors import NORM_TOLERANCE, RowCollector
 
 QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 IMU = "sensor_msgs/msg/Imu"

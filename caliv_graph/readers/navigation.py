@@ -24,18 +24,20 @@ import pymap3d
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, GnssFixes
+from caliv_graph.readers.collectors import (
+    MOST_M,
+    Collector,
+    RowCollector,
+    below,
+)
 from caliv_graph.readers.motion import (
     INSPVAX_TYPES,
-    MOST_M,
     NAVPVT,
     NAVSATFIX,
     ON_EARTH,
     POSITION_TYPES,
     PVT_GEODETIC,
-    Collector,
     GnssCollector,
-    RowCollector,
-    below,
 )
 
 _GOOD = {3, 6, 7, "INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE"}

@@ -25,7 +25,7 @@ from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Array, GivenPoses, IntArray
-from caliv_graph.readers.motion import poses_of
+from caliv_graph.readers.poses import poses_of
 
 _MOST_BYTES = 1_000_000_000
 """ego_pose.json of all of nuScenes has half of it."""

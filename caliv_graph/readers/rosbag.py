@@ -25,20 +25,16 @@ from caliv_graph.products import LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
 from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
+from caliv_graph.readers.collectors import Collector
 from caliv_graph.readers.definitions import WITHOUT_HEADER
 from caliv_graph.readers.frames import TF_TYPES, clean_frame
 from caliv_graph.readers.heading import HeadingCollector
+from caliv_graph.readers.imu import ImuCheck, ImuCollector, check_imu
 from caliv_graph.readers.motion import (
     MOTION_TYPES,
     ON_REQUEST,
-    Collector,
     GnssCollector,
-    ImuCheck,
-    ImuCollector,
-    PoseCollector,
-    TfCollector,
     TwistCollector,
-    check_imu,
 )
 from caliv_graph.readers.navigation import COLLECTORS, own_stamp_ns
 from caliv_graph.readers.pointcloud2 import (
@@ -48,6 +44,7 @@ from caliv_graph.readers.pointcloud2 import (
     packets_hint,
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
+from caliv_graph.readers.poses import PoseCollector, TfCollector
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
     Sample,

@@ -15,7 +15,7 @@ from caliv_graph.errors import RecordingError
 from caliv_graph.products import Finding, Recording, TargetObservation
 from caliv_graph.readers.clock import Clock
 from caliv_graph.readers.cloud_folder import CloudFolder
-from caliv_graph.readers.motion import ImuCheck
+from caliv_graph.readers.imu import ImuCheck
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.report.inspection import (
     DriveSummary,

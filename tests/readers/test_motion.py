@@ -8,15 +8,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.readers.motion import (
-    GnssCollector,
-    ImuCollector,
-    PoseCollector,
-    TfCollector,
-    TwistCollector,
-    check_imu,
-    right_perturbations,
-)
+from caliv_graph.readers.imu import ImuCollector, check_imu
+from caliv_graph.readers.motion import GnssCollector, TwistCollector
+from caliv_graph.readers.poses import PoseCollector, TfCollector, right_perturbations
 from tests.readers.bags import (
     SECOND,
     START,

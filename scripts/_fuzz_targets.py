@@ -19,8 +19,10 @@ from rosbags.typesys.store import Typestore
 
 from caliv_graph.batch.manifest import load_manifest
 from caliv_graph.cli import streams
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import dump_config, load_config, parse_config
-from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
+from caliv_graph.config.model import TopicsConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.export.consumers import export
 from caliv_graph.export.edit import read_base

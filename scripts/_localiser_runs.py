@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.common.files import atomic_write
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import (
     retract_vehicle_axes,

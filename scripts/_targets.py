@@ -16,7 +16,8 @@ import numpy as np
 from caliv_graph.common.exits import DEFECT, USAGE, exit_code
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Calibration

@@ -32,7 +32,8 @@ from caliv_graph import __version__
 from caliv_graph._open3d import import_open3d
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.geometry.se3 import rpy

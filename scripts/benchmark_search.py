@@ -32,7 +32,8 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.choose import choose_static, displaced
 from caliv_graph.common.exits import USAGE, exit_code
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
 from caliv_graph.scenario.model import InitialGuessModel, Scenario, load_scenario

@@ -38,7 +38,8 @@ sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script fr
 
 from caliv_graph.common.exits import USAGE, exit_code
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, Calibration, GivenPoses, Recording

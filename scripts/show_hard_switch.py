@@ -30,7 +30,7 @@ from scipy.special import ndtr
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
-from caliv_graph.config.model import PoseSigmaConfig
+from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.terms import fuse, guess_of, own_term
 from caliv_graph.geometry.se3 import skew, vehicle_axes_difference

@@ -35,7 +35,7 @@ import numpy as np
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run from anywhere
 
-from caliv_graph.config.model import PoseSigmaConfig
+from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import (

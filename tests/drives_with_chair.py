@@ -11,15 +11,15 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import (
     Config,
     GroundConfig,
-    LidarConfig,
-    PoseConfig,
     RegistrationConfig,
     StructureConfig,
 )
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData
 from caliv_graph.readers import open_recording

@@ -11,7 +11,8 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array
 from caliv_graph.results.run import CalibrationRun

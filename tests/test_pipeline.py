@@ -14,16 +14,16 @@ import pytest
 import yaml
 
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.load import load_config
 from caliv_graph.config.model import (
     GroundConfig,
-    PoseConfig,
-    PoseSigmaConfig,
     RegistrationConfig,
     RobustConfig,
     RobustKernel,
     SolveConfig,
 )
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import calibrate

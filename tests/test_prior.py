@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference

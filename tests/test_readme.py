@@ -21,8 +21,9 @@ from pydantic.fields import FieldInfo
 from caliv_graph.batch.manifest import load_manifest
 from caliv_graph.cli.main import app
 from caliv_graph.common import exits
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import Config, GroundConfig, LidarConfig
+from caliv_graph.config.model import Config, GroundConfig
 from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.truth_file import read_truth
 from caliv_graph.results.vehicle import VehiclePart

@@ -15,7 +15,12 @@ import pytest
 from caliv_graph import pipeline
 from caliv_graph.calibration.assemble import DRIVES
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import GroundConfig, SolveConfig, StructureConfig, TargetRegion
+from caliv_graph.config.model import (
+    GroundConfig,
+    SolveConfig,
+    StructureConfig,
+    TargetRegion,
+)
 from caliv_graph.errors import TargetError
 from caliv_graph.fusion.compare import compare
 from caliv_graph.fusion.merge import merge

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from caliv_graph.common.files import each_once
 from caliv_graph.common.progress import SilentProgress, StageRecord
-from caliv_graph.config.model import Config, PoseConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import Calibration, Recording
 from caliv_graph.readers import open_recording

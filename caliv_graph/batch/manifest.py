@@ -12,7 +12,12 @@ from typing import Any
 from pydantic import Field, field_validator, model_validator
 
 from caliv_graph.config.load import parse_config, read_yaml, validated
-from caliv_graph.config.model import Config, Requirement, SolveMode, check_limit_keys
+from caliv_graph.config.model import (
+    Config,
+    Requirement,
+    SolveMode,
+    check_limit_keys,
+)
 from caliv_graph.config.sections import FilePath, Positive, Section, as_written
 from caliv_graph.errors import ConfigError
 

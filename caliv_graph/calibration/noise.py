@@ -28,7 +28,7 @@ from caliv_graph.calibration.pose_effects import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.robust import own_blocks
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import key_pose_error, key_vehicle
 from caliv_graph.products import Array, BoolArray, IntArray, PoseNoise
 

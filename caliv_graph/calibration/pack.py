@@ -13,7 +13,7 @@ from caliv_graph.calibration.problem import moved_map
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, cloud_residuals, guessed_graph, measured_poses
 from caliv_graph.calibration.vehicle_parameters import KEYS, NAMES, estimated_parameters
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise, Registration, Solution

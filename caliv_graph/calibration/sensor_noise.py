@@ -18,7 +18,7 @@ from caliv_graph.calibration.noise import LOG_SPREAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation, NoiseLevel, Registration
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
 from caliv_graph.trajectory.correlated import CorrelatedError

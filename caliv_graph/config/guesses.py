@@ -5,13 +5,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import (
-    Config,
-    FoundLidarConfig,
-    LidarConfig,
-    PoseConfig,
-    PoseSigmaConfig,
-)
+from caliv_graph.config.lidars import FoundLidarConfig, LidarConfig, PoseSigmaConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.products import Guess
 
 DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()

@@ -5,189 +5,33 @@ Units are in the `Field` descriptions. An unknown key is an error that names the
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from caliv_graph.config.heading import HeadingConfig
+from caliv_graph.config.lidars import LidarConfig, checked_names
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
-from caliv_graph.config.mounting import PoseConfig as PoseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.config.sections import (
     FilePath,
     Finite,
     Name,
     NonNegative,
     Positive,
-    PositiveTriple,
     Section,
     Triple,
 )
 from caliv_graph.config.wheels import WheelsConfig
-from caliv_graph.errors import ConfigError
-
-_LEAST_SIGMA = 1e-6
-"""Of a guess, metres or degrees: GTSAM treats much smaller ones as constraints."""
-
-if TYPE_CHECKING:
-    import gtsam
-
-    from caliv_graph.products import Array
 
 SolveMode = Literal["auto", "staged", "joint"]
 RobustKernel = Literal["huber", "tls", "trimmed", "none"]
 Requirement = Literal["s2s", "s2v_rotation", "s2v"]
-StampSetting = Literal["start", "end", "auto"]
 PoseAxes = Literal["flu", "frd", "ned"]
 
-Lidar = TypeVar("Lidar")
-
 LIMIT_KEY = re.compile(r"^(s2s|s2v)_(?:(roll|pitch|yaw)_deg|(x|y|z)_m)$")
-
-
-_MOST_CHARACTERS = 100
-"""Of a LiDAR's name, a column of tables."""
-
-
-def name_problem(name: str) -> str:
-    """The problem of a name for a LiDAR; empty: none.
-
-    Names go to tables, terminals and files of other programs, where line ends and escape sequences
-    do damage.
-    """
-    if name.strip() == name != "" and name.isprintable() and len(name) <= _MOST_CHARACTERS:
-        return ""
-    return (
-        f"{name[:40]!r} cannot be the name of a LiDAR: give it 1 to {_MOST_CHARACTERS} printable "
-        "characters, without blanks around them"
-    )
-
-
-def checked_names(lidars: dict[str, Lidar]) -> dict[str, Lidar]:
-    """The LiDARs of a file by name; raises ValueError with the first `name_problem`."""
-    for problem in filter(None, map(name_problem, lidars)):
-        raise ValueError(problem)
-    return lidars
-
-
-class PoseSigmaConfig(Section):
-    """How far off the initial guess may be, 1 sigma, per vehicle axis."""
-
-    xyz: Positive | PositiveTriple = Field(0.058, description="metres; 0.058 is a uniform +-0.1 m")
-    rpy_deg: Positive | PositiveTriple = Field(
-        1.73, description="degrees; 1.73 is a uniform +-3 degrees"
-    )
-
-    @field_validator("xyz", "rpy_deg")
-    @classmethod
-    def _not_a_certainty(cls, sigma: Any) -> Any:
-        if min(sigma if isinstance(sigma, tuple) else (sigma,)) < _LEAST_SIGMA:
-            raise ValueError(
-                f"must be at least {_LEAST_SIGMA:g}. To trust the guess, set 'fixed: true'"
-            )
-        return sigma
-
-    def xyz_m(self) -> tuple[float, float, float]:
-        """Sigma of x, y, z in metres."""
-        return self.xyz if isinstance(self.xyz, tuple) else (self.xyz,) * 3
-
-    def rpy_rad(self) -> tuple[float, float, float]:
-        """Sigma of the rotation about the vehicle's x, y, z axes in radians."""
-        deg = self.rpy_deg if isinstance(self.rpy_deg, tuple) else (self.rpy_deg,) * 3
-        return (math.radians(deg[0]), math.radians(deg[1]), math.radians(deg[2]))
-
-    def sigmas(self) -> Array:
-        """(6,) rotation before translation, rad and m, vehicle axes."""
-        import numpy as np
-
-        return np.array([*self.rpy_rad(), *self.xyz_m()])
-
-
-def _bin_field(text: str) -> str:
-    name, _, kind = text.partition(" ")
-    if not name or kind not in BIN_TYPES:
-        raise ValueError(
-            f"'{text[:40]}' is not a name and one of {', '.join(BIN_TYPES)}, such as 'x f4'"
-        )
-    return text
-
-
-BIN_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8")
-"""Types of a field in .bin files: letter and bytes, as numpy names them, little-endian."""
-
-BinField = Annotated[str, AfterValidator(_bin_field)]
-
-
-class LidarConfig(Section):
-    """One LiDAR, by the user's name for it."""
-
-    topic: Name = Field(
-        description="topic of its clouds; in a CaLiV folder sensor_1, sensor_2, ..."
-    )
-    bin_fields: Annotated[tuple[BinField, ...], Field(min_length=3)] | None = Field(
-        None,
-        description="fields of a point in .bin files, each a name and a type, such as x f4; "
-        "absent: x, y, z, intensity and perhaps a ring, all f4",
-    )
-    initial: PoseConfig | None = Field(
-        None,
-        description="initial guess of T_vehicle_lidar; absent or null: found from the drive",
-    )
-    sigma: PoseSigmaConfig = PoseSigmaConfig()
-    fixed: bool = Field(False, description="trust the initial guess: it is not estimated")
-    min_range: NonNegative = Field(
-        1.0, description="metres; nearer returns are dropped (the vehicle's own body)"
-    )
-    max_range: Positive = Field(200.0, description="metres; farther returns are dropped")
-    stamp: StampSetting = Field(
-        "auto",
-        description="what the header's stamp marks, start or end of the sweep; auto: by the data",
-    )
-
-    @model_validator(mode="after")
-    def _ranges_in_order(self) -> LidarConfig:
-        if self.min_range >= self.max_range:
-            raise ValueError(
-                f"min_range ({self.min_range} m) must be below max_range ({self.max_range} m)"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _trusts_something(self) -> LidarConfig:
-        if self.fixed and self.initial is None:
-            raise ValueError("fixed: true trusts the initial guess, and initial is not given")
-        return self
-
-    @property
-    def given(self) -> PoseConfig:
-        """The initial guess as it was entered.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        if self.initial is None:
-            raise ConfigError(
-                f"the LiDAR with topic {self.topic} has no initial guess. Enter its 'initial', or "
-                "what 'caliv-graph calibrate' finds"
-            )
-        return self.initial
-
-    def guess(self) -> gtsam.Pose3:
-        """`T_vehicle_lidar`, the initial guess.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        return self.given.pose()
-
-
-class FoundLidarConfig(LidarConfig):
-    """A LiDAR whose `initial` was not given and has been found in the drive.
-
-    `sigma` is then how far off it may be, and `initial` no evidence beside the drive.
-    """
 
 
 class DataConfig(Section):
@@ -257,92 +101,6 @@ class StructureConfig(Section):
     """Walls, fronts, containers and other flat structure that stands still."""
 
     use: bool = Field(True, description="used where it is")
-
-
-class NoiseConfig(Section):
-    """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
-
-    lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
-    lidar_range_bias_m: Positive | None = Field(
-        None,
-        description="metres, how much all ranges of a LiDAR on one target are off, 1 sigma; "
-        "absent: integrated over, with the few millimetres of data sheets as the prior",
-    )
-    pose_position_m: Positive | None = Field(
-        None,
-        description="metres, white error of each given pose; absent: its message, or fitted",
-    )
-    pose_rotation_deg: Positive | None = Field(
-        None,
-        description="degrees, white error of each given pose; absent: its message, or fitted",
-    )
-    pose_drift_position_m: Positive | None = Field(
-        None, description="metres, slowly varying error of the given poses over the drive"
-    )
-    pose_drift_rotation_deg: Positive | None = Field(
-        None, description="degrees, slowly varying error of the given poses over the drive"
-    )
-    pose_drift_time_s: Positive = Field(
-        4.0, description="seconds, correlation time of the slowly varying error of given poses"
-    )
-    accelerometer_density_m_s2_sqrthz: Positive | None = None
-    gyroscope_density_rad_s_sqrthz: Positive | None = None
-    accelerometer_bias_walk_m_s3_sqrthz: Positive | None = None
-    gyroscope_bias_walk_rad_s2_sqrthz: Positive | None = None
-    accelerometer_bias_m_s2: Positive = Field(
-        0.1, description="m/s^2, constant bias of the accelerometer, per axis"
-    )
-    gyroscope_bias_rad_s: Positive = Field(
-        0.01, description="rad/s, constant bias of the gyroscope, per axis"
-    )
-    gnss_horizontal_m: Positive | None = None
-    gnss_vertical_m: Positive | None = None
-    gnss_correlated_horizontal_m: NonNegative | None = Field(
-        None,
-        description="metres, first-order Gauss-Markov error of the fixes, east and north alike; "
-        "absent: estimated; 0: none",
-    )
-    gnss_correlated_vertical_m: NonNegative | None = Field(
-        None, description="metres, the same, up; absent while the other is given: none"
-    )
-    gnss_correlation_s: Positive | None = Field(
-        None, description="seconds, its correlation time; absent: estimated"
-    )
-    orientation_correlated_deg: NonNegative | None = Field(
-        None,
-        description="degrees, first-order Gauss-Markov error of the IMU's orientation, per map "
-        "axis; absent: estimated; 0: none",
-    )
-    orientation_correlation_s: Positive | None = Field(
-        None, description="seconds, its correlation time; absent: estimated"
-    )
-    heave_m: Positive | None = Field(
-        None,
-        description="metres, lift of the body on its springs at each stamp; absent: estimated",
-    )
-    sway_deg: Positive = Field(
-        0.057,
-        description="degrees, tilt of the body at each stamp from its mean over the drive, per "
-        "axis; used with ground.parallel_sigma_deg",
-    )
-    ground_normal_deg: Positive | None = Field(
-        None,
-        description="degrees, tilt of the ground around a LiDAR from the plane of the drive, from "
-        "scan to scan; absent: estimated",
-    )
-    ground_distance_m: Positive | None = Field(
-        None,
-        description="metres, height of the ground below a LiDAR over that plane, from scan to "
-        "scan; absent: estimated",
-    )
-    velocity_m_s: Positive | None = None
-    yaw_rate_rad_s: Positive | None = Field(
-        None, description="rad/s, yaw rate of the odometry, used where there is no IMU"
-    )
-    heading_deg: Positive | None = Field(
-        None, description="degrees, each heading of topics.heading; absent: its message, or 0.3"
-    )
-    orientation_deg: Positive | None = None
 
 
 class SolveConfig(Section):

@@ -16,7 +16,7 @@ import numpy as np
 from caliv_graph.calibration.ground import TOGETHER_NS
 from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.planning.assumptions import Assumptions, Ground, Source
 from caliv_graph.planning.motion import NODE_NS, PlannedMotion, plan_motion

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.planning.assumptions import Source

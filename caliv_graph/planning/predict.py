@@ -16,7 +16,8 @@ import numpy as np
 
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
-from caliv_graph.config.model import ExtractionConfig, PoseSigmaConfig
+from caliv_graph.config.lidars import PoseSigmaConfig
+from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError, ConfigError, TargetError
 from caliv_graph.planning.assumptions import Assumptions

@@ -18,8 +18,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import read_yaml
-from caliv_graph.config.model import LidarConfig
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import GivenPoses, LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead

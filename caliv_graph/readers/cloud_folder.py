@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from caliv_graph.common.inputs import read_input
-from caliv_graph.config.model import LidarConfig, PoseAxes
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import GivenPoses, LidarScan, MotionData

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import read_yaml
-from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
+from caliv_graph.config.model import TopicsConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Recording
 from caliv_graph.readers.caliv_folder import POSES_FILE, CalivFolder

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.config.model import LidarConfig, PoseAxes, TopicsConfig
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import PoseAxes, TopicsConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData

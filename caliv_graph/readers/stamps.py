@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from caliv_graph.config.model import StampSetting
+from caliv_graph.config.lidars import StampSetting
 from caliv_graph.products import Array
 
 Told = Literal["config", "times", "records", "nothing", ""]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.config.model import StampSetting
+from caliv_graph.config.lidars import StampSetting
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic

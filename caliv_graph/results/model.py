@@ -22,7 +22,7 @@ from pydantic import (
 )
 from scipy.linalg import block_diag
 
-from caliv_graph.config.model import checked_names
+from caliv_graph.config.lidars import checked_names
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import (

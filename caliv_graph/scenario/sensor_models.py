@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.sections import Finite, NonNegative, Positive, Section
 from caliv_graph.scenario.drive_models import Pair
 

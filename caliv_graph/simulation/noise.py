@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray

@@ -9,7 +9,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray, LidarScan, MotionData
 from caliv_graph.scenario.drives import Drive, VehicleStates, cloud_stamps, make_drive

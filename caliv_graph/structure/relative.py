@@ -14,7 +14,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.guesses import configured_guess
-from caliv_graph.config.model import Config, FoundLidarConfig
+from caliv_graph.config.lidars import FoundLidarConfig
+from caliv_graph.config.model import Config
 from caliv_graph.products import Array
 from caliv_graph.structure.problem import Problem
 from caliv_graph.trajectory.odometry import OdometryPoses

@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_guess
-from caliv_graph.config.model import Config, FoundLidarConfig
+from caliv_graph.config.lidars import FoundLidarConfig
+from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours

@@ -15,8 +15,10 @@ import numpy as np
 import yaml
 
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.lidars import FoundLidarConfig
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import Config, FoundLidarConfig, PoseConfig, TargetRegion
+from caliv_graph.config.model import Config, TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import CalivError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.pipeline import Look

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from caliv_graph.calibration.suspect_values import FREE_ARM_M
-from caliv_graph.config.model import Config, PoseConfig, PoseSigmaConfig
+from caliv_graph.config.lidars import PoseSigmaConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.sections import Section
 from caliv_graph.products import Calibration, Suspect
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.choose import choose_static, displaced
-from caliv_graph.config.model import Config, LidarConfig, PoseConfig, SolveConfig, TargetRegion
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, SolveConfig, TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, IntArray, TargetCloud, TargetObservation, Trajectory
 from caliv_graph.scenario.drive_models import FigureEightDrive

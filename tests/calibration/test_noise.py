@@ -22,7 +22,7 @@ from caliv_graph.calibration.noise import (
     fit_pose_noise,
     fit_scale,
 )
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import PoseNoise
 from tests.calibration.problems import PERIOD_NS, Case, make_case, noisy, with_poses
 

@@ -12,7 +12,9 @@ import pytest
 from caliv_graph.calibration.linear import retract
 from caliv_graph.calibration.problem import Problem, pose_problem
 from caliv_graph.config.guesses import TRUSTED_SIGMAS
-from caliv_graph.config.model import Config, LidarConfig, PoseConfig, PoseSigmaConfig
+from caliv_graph.config.lidars import LidarConfig, PoseSigmaConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import key_extrinsic, key_sensor, key_target, key_vehicle
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference

@@ -11,7 +11,7 @@ import pytest
 from caliv_graph.calibration.evidence import Evidence
 from caliv_graph.calibration.sensor_noise import LEVELS, SLOW, estimated, with_floors
 from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time

@@ -14,7 +14,9 @@ from caliv_graph.calibration.robust import MIN_WEIGHT
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
-from caliv_graph.config.model import Config, LidarConfig, PoseConfig, RobustConfig, SolveConfig
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, RobustConfig, SolveConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Registration, Solution
 from tests.calibration.problems import SIGMAS, Case, make_case, noisy

@@ -23,7 +23,10 @@ from caliv_graph.calibration.graph import (
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.noise import fit_pose_noise, sound_clouds, squares_without_own_pose
 from caliv_graph.calibration.problem import Problem, pose_problem
-from caliv_graph.config.model import Config, LidarConfig, NoiseConfig, PoseConfig
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import (
     Array,
     GivenPoses,

@@ -10,8 +10,9 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.load import dump_config, load_config, parse_config
-from caliv_graph.config.model import Config, PoseSigmaConfig
+from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.errors import ConfigError
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.planning.assumptions import Assumptions, Ground

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import ExtractionConfig, PoseConfig
+from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import ExtractionConfig, PoseConfig
+from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.planning.sightings import (
     INDEPENDENT_PART,
     POSITION_FLOOR_M,

@@ -10,7 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from caliv_graph.cli.main import app
-from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import TopicsConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.readers.rosbag import RosbagRecording
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.scenario.model import BagModel, Scenario

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import LidarConfig, PoseConfig, TopicsConfig
+from caliv_graph.config.model import TopicsConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.pointcloud2 import DecodedCloud

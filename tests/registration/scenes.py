@@ -10,13 +10,10 @@ from functools import cache
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import (
-    Config,
-    LidarConfig,
-    NoiseConfig,
-    PoseConfig,
-    RegistrationConfig,
-)
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, RegistrationConfig
+from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, TargetCloud, TargetObservation
 from caliv_graph.scenario.model import CropModel

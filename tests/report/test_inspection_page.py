@@ -15,7 +15,8 @@ import pytest
 import yaml
 
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import PoseConfig, TargetRegion
+from caliv_graph.config.model import TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.report.inspection import (
     DriveSummary,
     Inspection,

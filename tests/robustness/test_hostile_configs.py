@@ -11,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from caliv_graph.config.lidars import name_problem
 from caliv_graph.config.load import dump_config, load_config, parse_config
-from caliv_graph.config.model import Config, name_problem
+from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from tests.robustness.hostile_drives import command
 

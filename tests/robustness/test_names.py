@@ -16,8 +16,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from caliv_graph.config.lidars import name_problem
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import name_problem
 from caliv_graph.results.calibration_file import write_calibration
 from tests.robustness.hostile_drives import SCENARIO, command, write_config
 from tests.samples import make_calibration

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import AXES
 from scripts import benchmark_released as benchmark
 from scripts.benchmark_released import Outcome, Runs, Timing, Verdict

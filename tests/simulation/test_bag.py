@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array
 from caliv_graph.scenario.drive_models import ArcDrive

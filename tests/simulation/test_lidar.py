@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.products import Array
 from caliv_graph.scenario.model import CropModel
 from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel

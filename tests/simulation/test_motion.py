@@ -8,7 +8,7 @@ import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, GnssFixes, ImuSamples, TwistSamples
 from caliv_graph.scenario.drive_models import (

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.products import Array, LidarScan, Recording
 from caliv_graph.scenario.drive_models import ArcDrive, FigureEightDrive, SCurveDrive
 from caliv_graph.scenario.model import CropModel, SuspensionModel

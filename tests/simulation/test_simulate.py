@@ -12,7 +12,7 @@ import yaml
 
 from caliv_graph.common.progress import SilentProgress, StageRecord
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import PoseConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError, OutputError
 from caliv_graph.products import Array
 from caliv_graph.readers.caliv_folder import CalivFolder

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import Config, LidarConfig, PoseConfig
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, LidarScan, Trajectory

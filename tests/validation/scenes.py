@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from caliv_graph.config.model import Config, GroundConfig, LidarConfig, PoseConfig, TargetRegion
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, GroundConfig, TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.sections import Triple
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import (

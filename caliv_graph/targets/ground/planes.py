@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.targets.ground.fit import fit_ground, height_above

@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.guesses import with_guess
-from caliv_graph.config.model import Config, FoundLidarConfig
+from caliv_graph.config.lidars import FoundLidarConfig
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.targets.search.find import FoundTarget

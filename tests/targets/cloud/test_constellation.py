@@ -12,8 +12,10 @@ import pytest
 
 from caliv_graph.common.exits import DONE, exit_code
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.lidars import LidarConfig, PoseSigmaConfig
 from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.config.model import Config, LidarConfig, PoseConfig, PoseSigmaConfig, TargetRegion
+from caliv_graph.config.model import Config, TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan, TargetObservation
 from caliv_graph.readers import open_recording

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.model import Config, ExtractionConfig, LidarConfig, PoseConfig, TargetRegion
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import TargetError
 from caliv_graph.products import (
     Array,

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import NoiseConfig
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.simulation import load_scenario, simulate_drive

@@ -14,14 +14,9 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.guesses import with_found_guess
-from caliv_graph.config.model import (
-    Config,
-    ExtractionConfig,
-    GroundConfig,
-    LidarConfig,
-    PoseConfig,
-    PoseSigmaConfig,
-)
+from caliv_graph.config.lidars import LidarConfig, PoseSigmaConfig
+from caliv_graph.config.model import Config, ExtractionConfig, GroundConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TargetError
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, MotionData, Trajectory

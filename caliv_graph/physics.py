@@ -146,7 +146,7 @@ _CANDIDATES = {
 def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibration:
     """The calibration, a suspect that a finding contradicts first, if the graph has no culprit.
 
-    A finding and the graph's score of the same input rest on the same data (`calibration/README.md`,
+    A finding and the score of the same input rest on the same data (`calibration/README.md`,
     section 11): they do not add up. The more significant one counts: the score is linear, and sees
     nothing where the effect of an error is far from it. Where a score is beyond 5 sigma, a finding
     may be what its culprit causes, and changes nothing.

@@ -20,6 +20,7 @@ from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.calibration.sensor_noise import heave_of
 from caliv_graph.calibration.stance import StanceRows, stance_rows
+from caliv_graph.calibration.vehicle_parameters import KEYS, parameter_priors
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Solution
@@ -128,6 +129,7 @@ class _Quadratic:
     graph: LinearisedGraph
     motion: _Motion
     blocks: list[_Block]
+    shared: Mapping[str, _Shared]
 
     def scores(self, information: Array, gradient: Array) -> Scores:
         """All variables eliminated; `information`, `gradient` of them with all evidence."""
@@ -161,10 +163,56 @@ class _Quadratic:
         B[own, own] += self.motion.own
         c[own] += self.motion.own_gradient
         candidates = [b.candidate for b in self.blocks]
+        N, off = np.zeros_like(cross), np.zeros(len(gradient))
+        keep = np.ones(len(gradient), dtype=bool)
+        for candidate, size, end in zip(candidates, sizes, ends, strict=True):
+            variable = self.shared.get(candidate.name)
+            if variable is not None:
+                own = slice(variable.start, variable.start + size)
+                N[own, end - size : end], off[own], keep[own] = variable.by, variable.off, False
+        # z = K z' + N d - off, z' being the variables without those that are candidates.
+        B += N.T @ information @ N + N.T @ cross + cross.T @ N
+        gradient = gradient + information @ off
+        c += N.T @ gradient + cross.T @ off
+        cross += information @ N
         try:
-            return assembled(candidates, B, c, cross, information, gradient)
+            return assembled(
+                candidates, B, c, cross[keep], information[np.ix_(keep, keep)], gradient[keep]
+            )
         except scipy.linalg.LinAlgError:
             raise SolveError("the graph at the estimate is singular") from None
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """A variable of the graph that is a candidate, too: `by d - off` from the estimate.
+
+    Structure depends on it through the poses that were eliminated; its prior and the motion data
+    are the candidate's. `start`: its first coordinate.
+    """
+
+    start: int
+    by: Array
+    off: Array
+
+
+def _shared(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> dict[str, _Shared]:
+    """The parameters of the vehicle that the graph estimates, by the name of their candidate."""
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    out = {}
+    for name, prior in parameter_priors(smoothed).items():
+        start = solution.linearised.starts.get(KEYS[name])
+        if start is None:
+            continue
+        if isinstance(prior.mean, gtsam.Rot3):
+            R = solution.values.atRot3(KEYS[name])
+            to_right = R.matrix().T
+            moved = gtsam.Rot3.Logmap(R.compose(prior.mean.inverse()))
+            out[name] = _Shared(start, to_right, to_right @ moved)
+        else:
+            moved = solution.values.atVector(KEYS[name]) - prior.mean
+            out[name] = _Shared(start, np.eye(3), moved)
+    return out
 
 
 def suspect_scores(
@@ -209,7 +257,8 @@ def suspect_scores(
         gradient -= added @ stance.residual
     if not blocks:
         return Scores((), np.zeros((0, 0)), np.zeros(0))
-    scores = _Quadratic(graph, motion, blocks).scores(information, gradient)
+    shared = _shared(solution, trajectories)
+    scores = _Quadratic(graph, motion, blocks, shared).scores(information, gradient)
     return replace(scores, misfit=worst_misfit(trajectories))
 
 

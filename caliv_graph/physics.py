@@ -19,6 +19,7 @@ from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
 from caliv_graph.wording.physics import (
     copies_sentence,
     guess_findings,
@@ -131,6 +132,48 @@ def contradicted(
         return calibration
     sentences = (*before, *calibration.contradictions, *after)
     return replace(calibration, status="inconsistent", contradictions=sentences)
+
+
+_CANDIDATES = {
+    "topics.gnss": "gnss.time_offset",
+    "topics.imu": "imu.gyroscope.scale",
+    "topics.twist": "twist.scale",
+    "topics.pose": "poses.frame",
+}
+"""Key of the config that a finding blames -> the suspect of the graph, where they differ."""
+
+
+def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibration:
+    """The calibration, a suspect that a finding contradicts first, if the graph has no culprit.
+
+    A finding and the score of the same input rest on the same data (`calibration/README.md`,
+    section 11): they do not add up. The more significant one counts: the score is linear, and sees
+    nothing where the effect of an error is far from it. Where a score is beyond 5 sigma, a finding
+    may be what its culprit causes, and changes nothing.
+    """
+    suspects = calibration.suspects
+    if not suspects or suspects[0].sigmas > CONTRADICTION_SIGMAS:
+        return calibration
+    found: dict[str, float] = {}
+    for each in findings:
+        if each.severity == "contradiction":
+            name = _candidate(each.input)
+            found[name] = max(found.get(name, 0.0), each.sigmas)
+    raised = [
+        replace(s, sigmas=max(s.sigmas, found[s.input])) if s.input in found else s
+        for s in suspects
+    ]
+    raised.sort(key=lambda s: -s.sigmas if s.input in found else 0.0)
+    if raised[0].input in found:
+        raised[0] = replace(raised[0], sigmas_left=raised[0].sigmas)
+    return replace(calibration, suspects=tuple(raised))
+
+
+def _candidate(key: str) -> str:
+    """The suspect that a key of the config belongs to."""
+    if key.startswith("lidars."):
+        return key.removesuffix(".xyz").removesuffix(".rpy_deg")
+    return _CANDIDATES.get(key, key)
 
 
 def contradictions_of(findings: Sequence[Finding]) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from caliv_graph.physics import (
     contradictions_of,
     heading_findings,
     raise_fatal,
+    ranked_with,
     raw_findings,
     smoothed_findings,
     warnings_of,
@@ -416,7 +417,9 @@ def _calibrate(
             displaced=bool(prepared.contradictions),
         )
         calibration = contradicted(
-            calibration, prepared.contradictions, contradictions_of(prepared.findings)
+            ranked_with(calibration, prepared.findings),
+            prepared.contradictions,
+            contradictions_of(prepared.findings),
         )
         calibration, conflicts = with_prior(calibration, prior, config)
 

@@ -364,6 +364,30 @@ class Strip:
 
 
 @dataclass(frozen=True)
+class Stance:
+    """How the vehicle stands on the ground that the LiDARs of a drive see.
+
+    With the coordinates d of a `StructureTerm`, errors of what is assumed of it are `value +
+    rows d` with covariance `cov`: of the height above the ground (m) where the config has one, and,
+    unless the term has a tilt, x and y of the ground's mean normal in the vehicle frame (rad).
+    Nothing that is assumed is in them.
+
+    Attributes:
+        value: (s,) s is 1 to 3.
+        rows: (s, n).
+        cov: (s, s).
+        height_sigma_m: of the assumed height, which is in the term; None: unknown.
+        tilt_in_term: whether an assumed tilt is in the term.
+    """
+
+    value: Array
+    rows: Array
+    cov: Array
+    height_sigma_m: float | None
+    tilt_in_term: bool
+
+
+@dataclass(frozen=True)
 class StructureTerm:
     """What the structure of one drive says; its planes and all other poses are eliminated.
 
@@ -388,6 +412,7 @@ class StructureTerm:
         warnings: for the user, a line each.
         odometry_of: the LiDAR by whose odometry the poses are known, and of whose mounting ground
             and direction of travel alone tell the rotation; empty: there are motion data.
+        stance: how the vehicle stands on the ground; None: no ground below it was seen.
     """
 
     drive: int
@@ -403,6 +428,7 @@ class StructureTerm:
     ground: frozenset[str] = frozenset()
     warnings: tuple[str, ...] = ()
     odometry_of: str = ""
+    stance: Stance | None = None
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,15 @@ Needs the environment that scripts/demo makes:
 
     .venv/bin/python scripts/benchmark_consistency.py --seeds 50
     .venv/bin/python scripts/benchmark_consistency.py --faults --seeds 3
+    .venv/bin/python scripts/benchmark_consistency.py --seeds 8 --scenarios noisy distorted
     .venv/bin/python scripts/benchmark_consistency.py --summary
 
 Clean drives: seed n uses the scenarios in turn. Every run draws all errors that a stated sigma
-covers. No run may be `inconsistent`. Faults, all on figure_eight: wrong stamps of one LiDAR,
-displaced clouds of one LiDAR, swapped topics. Each must be `inconsistent` or, if no target is
-found, an error. A run is a line in out/consistency/runs.jsonl, written when it ends. A second start
-runs the missing ones. Runs of another version of the program do not count unless --any-version is
-given.
+covers. No run may be `inconsistent`; the most suspect input of each scenario is printed. Faults,
+all on figure_eight: wrong stamps of one LiDAR, displaced clouds of one LiDAR, swapped topics. Each
+must be `inconsistent` or, if no target is found, an error. A run is a line in
+out/consistency/runs.jsonl, written when it ends. A second start runs the missing ones. Runs of
+another version of the program do not count unless --any-version is given.
 """
 
 from __future__ import annotations
@@ -138,6 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=12, help="1 to N (default: 12)")
     parser.add_argument("--faults", action="store_true", help="drives with faults, N of each")
+    parser.add_argument("--scenarios", nargs="+", default=SCENARIOS, help="of clean drives")
     parser.add_argument("--summary", action="store_true", help="only print what is there")
     parser.add_argument("--any-version", action="store_true", help="count runs of older text too")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/consistency)")
@@ -149,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         done = {
             Task(r["scenario"], r["fault"], r["seed"]) for r in lines_of(path, asked.any_version)
         }
-        for task in tasks(asked.seeds, faults=asked.faults):
+        for task in tasks(asked.seeds, asked.scenarios, faults=asked.faults):
             if task not in done:
                 line = perform(task, asked.beams)
                 add_line(path, line)
@@ -160,11 +162,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failures else 0
 
 
-def tasks(seeds: int, *, faults: bool) -> list[Task]:
+def tasks(seeds: int, scenarios: Sequence[str], *, faults: bool) -> list[Task]:
     """All runs that are requested."""
     if faults:
         return [Task("figure_eight", f, seed) for seed in range(1, seeds + 1) for f in FAULTS]
-    return [Task(SCENARIOS[(n - 1) % len(SCENARIOS)], "", n) for n in range(1, seeds + 1)]
+    return [Task(scenarios[(n - 1) % len(scenarios)], "", n) for n in range(1, seeds + 1)]
 
 
 def perform(task: Task, beams: Path) -> dict[str, Any]:
@@ -187,6 +189,7 @@ def perform(task: Task, beams: Path) -> dict[str, Any]:
         **line,
         "status": run.calibration.status,
         "said": list(run.calibration.contradictions),
+        "suspects": [(s.input, s.sigmas) for s in run.calibration.suspects[:3]],
         "registration_scale": run.solution.registration_scale,
     }
 
@@ -201,6 +204,16 @@ def summary(lines: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
     clean = [line for line in lines if not line["fault"]]
     alarms = [line for line in clean if line["status"] not in ("ok", "partial")]
     out = [f"clean drives: {len(clean)}, of which {len(alarms)} are called wrong"]
+    for scenario in dict.fromkeys(line["scenario"] for line in clean):
+        suspects = [
+            (sigmas, name)
+            for line in clean
+            if line["scenario"] == scenario
+            for name, sigmas in line.get("suspects", ())
+        ]
+        if suspects:
+            sigmas, name = max(suspects)
+            out.append(f"  {scenario}: most suspect {name}, {sigmas:.1f} sigma")
     for line in alarms:
         out += [f"  {line['scenario']} seed {line['seed']}: {said}" for said in line["said"]]
     missed = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import pytest
@@ -11,10 +12,11 @@ from caliv_graph.physics import (
     contradicted,
     contradictions_of,
     raise_fatal,
+    ranked_with,
     warnings_of,
     with_cause,
 )
-from caliv_graph.products import Finding
+from caliv_graph.products import Finding, Suspect
 from tests.samples import make_calibration
 
 
@@ -58,3 +60,20 @@ def test_contradictions_make_a_calibration_inconsistent_and_warnings_do_not() ->
     assert found.status == "inconsistent"
     assert found.contradictions == (*calibration.contradictions, "it is off by 6 sigma")
     assert warnings_of([finding(6.0), finding(4.0, "warning")]) == ("it is off by 4 sigma",)
+
+
+def suspect(name: str, sigmas: float) -> Suspect:
+    return Suspect(name, (0.1,), (0.05,), (0.1,), ("m",), 0.5, sigmas, 0.3)
+
+
+def test_an_input_that_a_finding_contradicts_leads_where_no_score_does() -> None:
+    height, guess = suspect("ground.vehicle_height", 2.0), suspect("lidars.rear.initial", 2.5)
+    doubtful = replace(make_calibration("front", "rear"), suspects=(guess, height))
+    found = ranked_with(doubtful, [finding(6.0), finding(5.5)]).suspects
+    # The same data: 6 sigma, not 2 and 6 together.
+    assert found == (replace(height, sigmas=6.0, sigmas_left=6.0), guess)
+    blamed = Finding("lidars.rear.initial.xyz", (2.0,), 0.1, 7.0, "contradiction", "")
+    assert [s.sigmas for s in ranked_with(doubtful, [blamed]).suspects] == [7.0, 2.0]
+    assert ranked_with(doubtful, [finding(4.0, "warning")]).suspects == (guess, height)
+    culprit = replace(doubtful, suspects=(suspect("gnss.lever_arm", 20.0), height))
+    assert ranked_with(culprit, [finding(6.0)]) is culprit

@@ -75,14 +75,18 @@ def check(
     trusted = [
         name for name, lidar in calibration.lidars.items() if lidar.guess and lidar.guess.fixed
     ]
-    untested: tuple[str, ...] = ()
+    between: tuple[ScoreTest, ...] = ()
+    suspects: tuple[Suspect, ...] = ()
+    # Where a test is impossible the result stands, and the user must know that it was not tested.
+    untested: list[str] = []
     try:
         between = score_tests(solution, trajectories, trusted)
+    except SolveError as e:
+        untested.append(f"parts of the drive were not tested against each other: {e}")
+    try:
         suspects = ranked_suspects(solution, trajectories, motions, config, displaced)
     except (SolveError, TrajectoryError) as e:
-        # The result stands, and the user must know that it was not tested.
-        between, suspects = (), ()
-        untested = (f"parts of the drive were not tested against each other: {e}",)
+        untested.append(f"the inputs were not tested against each other: {e}")
     found = consistency.contradictions(
         consistency.CheckInputs(
             lidars=calibration.lidars,

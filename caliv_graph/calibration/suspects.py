@@ -15,14 +15,14 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
-from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.calibration.sensor_noise import heave_of
-from caliv_graph.conventions import key_ground
+from caliv_graph.calibration.stance import StanceRows, stance_rows
+from caliv_graph.calibration.vehicle_parameters import KEYS, parameter_priors
 from caliv_graph.errors import SolveError
-from caliv_graph.geometry.se3 import skew, vehicle_axes_difference
+from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Solution
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -35,11 +35,6 @@ from caliv_graph.uncertainty.suspects import (
     Scores,
     assembled,
 )
-
-STANCE_RAD = math.radians(0.2)
-"""1 sigma of the angle between a vehicle's horizontal plane and the ground it stands on: a frame is
-drawn for the nominal load. Five of them, one degree, are 49 mm of sag over a wheelbase of 2.8 m:
-the whole travel that a load takes out of the springs."""
 
 DRIFT_WAVES = 2
 """Half waves over the drive, of one and two: what is faster is noise to the fit of the noise."""
@@ -134,6 +129,7 @@ class _Quadratic:
     graph: LinearisedGraph
     motion: _Motion
     blocks: list[_Block]
+    shared: Mapping[str, _Shared]
 
     def scores(self, information: Array, gradient: Array) -> Scores:
         """All variables eliminated; `information`, `gradient` of them with all evidence."""
@@ -167,10 +163,56 @@ class _Quadratic:
         B[own, own] += self.motion.own
         c[own] += self.motion.own_gradient
         candidates = [b.candidate for b in self.blocks]
+        N, off = np.zeros_like(cross), np.zeros(len(gradient))
+        keep = np.ones(len(gradient), dtype=bool)
+        for candidate, size, end in zip(candidates, sizes, ends, strict=True):
+            variable = self.shared.get(candidate.name)
+            if variable is not None:
+                own = slice(variable.start, variable.start + size)
+                N[own, end - size : end], off[own], keep[own] = variable.by, variable.off, False
+        # z = K z' + N d - off, z' being the variables without those that are candidates.
+        B += N.T @ information @ N + N.T @ cross + cross.T @ N
+        gradient = gradient + information @ off
+        c += N.T @ gradient + cross.T @ off
+        cross += information @ N
         try:
-            return assembled(candidates, B, c, cross, information, gradient)
+            return assembled(
+                candidates, B, c, cross[keep], information[np.ix_(keep, keep)], gradient[keep]
+            )
         except scipy.linalg.LinAlgError:
             raise SolveError("the graph at the estimate is singular") from None
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """A variable of the graph that is a candidate, too: `by d - off` from the estimate.
+
+    Structure depends on it through the poses that were eliminated; its prior and the motion data
+    are the candidate's. `start`: its first coordinate.
+    """
+
+    start: int
+    by: Array
+    off: Array
+
+
+def _shared(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> dict[str, _Shared]:
+    """The parameters of the vehicle that the graph estimates, by the name of their candidate."""
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    out = {}
+    for name, prior in parameter_priors(smoothed).items():
+        start = solution.linearised.starts.get(KEYS[name])
+        if start is None:
+            continue
+        if isinstance(prior.mean, gtsam.Rot3):
+            R = solution.values.atRot3(KEYS[name])
+            to_right = R.matrix().T
+            moved = gtsam.Rot3.Logmap(R.compose(prior.mean.inverse()))
+            out[name] = _Shared(start, to_right, to_right @ moved)
+        else:
+            moved = solution.values.atVector(KEYS[name]) - prior.mean
+            out[name] = _Shared(start, np.eye(3), moved)
+    return out
 
 
 def suspect_scores(
@@ -181,19 +223,19 @@ def suspect_scores(
     """The inputs of a calibration as left-out parameters, all variables eliminated.
 
     The guesses are evidence here, in every mode: one wrong input shows as all estimates being off
-    their guesses alike. So is the vehicle's stance on the ground (`STANCE_RAD`), where the ground
-    is seen. `trajectories` are one per drive; `guesses` of the LiDARs of the solution.
+    their guesses alike. So is how the vehicle stands on the ground (`stance_rows`), where the
+    ground is seen. `trajectories` are one per drive; `guesses` of the LiDARs of the solution.
 
     Raises:
         SolveError: the graph is singular.
     """
     graph = solution.linearised
-    motion = _motion(solution, trajectories)
+    motion, stances = _motion(solution, trajectories), stance_rows(solution)
     blocks = [
         *motion.blocks,
         *_of_clouds(CloudParts(solution, trajectories)),
         *_of_guesses(solution, guesses),
-        *_of_height(solution),
+        *_of_height(stances),
         *_of_drift(solution, trajectories),
         *_of_given_frame(solution, trajectories),
     ]
@@ -209,12 +251,14 @@ def suspect_scores(
             rows, residual, weight, _ = block.prior
             information += rows.T @ weight @ rows
             gradient -= rows.T @ (weight @ residual)
-    for rows, residual in _stance(solution):
-        information += rows.T @ rows / STANCE_RAD**2
-        gradient -= rows.T @ residual / STANCE_RAD**2
+    for stance in stances:
+        added = stance.rows.T @ (stance.weight - stance.in_graph)
+        information += added @ stance.rows
+        gradient -= added @ stance.residual
     if not blocks:
         return Scores((), np.zeros((0, 0)), np.zeros(0))
-    scores = _Quadratic(graph, motion, blocks).scores(information, gradient)
+    shared = _shared(solution, trajectories)
+    scores = _Quadratic(graph, motion, blocks, shared).scores(information, gradient)
     return replace(scores, misfit=worst_misfit(trajectories))
 
 
@@ -256,31 +300,19 @@ def _of_guesses(solution: Solution, guesses: Mapping[str, Guess]) -> list[_Block
     return out
 
 
-def _of_height(solution: Solution) -> list[_Block]:
+def _of_height(stances: Sequence[StanceRows]) -> list[_Block]:
     """The vehicle's height above ground, one for all drives, where the config states it."""
-    graph = solution.linearised
-    rows, residuals, weights = [], [], []
-    for index, kind in enumerate(solution.factor_kinds):
-        if kind == "ground_height":
-            factor = solution.graph.at(index)
-            key = factor.keys()[0]
-            if key not in graph.starts:
-                continue
-            row = np.zeros(len(graph.gradient))
-            row[graph.starts[key]] = 1.0
-            rows.append(row)
-            residuals.append(float(solution.values.atVector(key)[0]))
-            weights.append(_information(factor, solution.values))
-    if not rows:
+    heights = [stance for stance in stances if stance.by_height.any()]
+    if not heights:
         return []
-    prior = (np.array(rows), np.array(residuals), np.diag(weights), np.ones((len(rows), 1)))
+    prior = (
+        np.vstack([stance.rows for stance in heights]),
+        np.concatenate([stance.residual for stance in heights]),
+        scipy.linalg.block_diag(*(stance.weight for stance in heights)),
+        np.concatenate([stance.by_height for stance in heights])[:, None],
+    )
     candidate = Candidate("ground.vehicle_height", np.zeros(1), np.array([HEIGHT_SCALE_M]))
     return [_Block(candidate, prior=prior)]
-
-
-def _information(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> float:
-    """Of a factor of one variable of one dimension."""
-    return float(np.asarray(factor.linearize(values).information())[0, 0])
 
 
 def _drives(solution: Solution) -> tuple[IntArray, IntArray]:
@@ -340,33 +372,3 @@ def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory
     columns = np.asarray(np.kron(of[:, None], np.eye(6)), np.float64)
     candidate = Candidate("poses.frame", np.zeros(6), GUESS_SCALE)
     return [_Block(candidate, poses=columns)]
-
-
-def _stance(solution: Solution) -> list[tuple[Array, Array]]:
-    """Per drive the mean tilt of the vehicle against the ground, (2,) rad, and its rows (2, M).
-
-    x and y of the plane's normal in the vehicle frame. None where the config has the tilt already.
-    """
-    graph = solution.linearised
-    if "ground_tilt" in solution.factor_kinds:
-        return []
-    drives, _ = _drives(solution)
-    poses = list(solution.T_map_vehicle.values())
-    out = []
-    for drive in sorted(set(drives.tolist())):
-        key = key_ground(drive)
-        if key not in graph.starts:
-            continue
-        plane = solution.values.atVector(key)
-        normal, by_plane = plane_normal(plane), normal_jacobian(plane)
-        mine = np.flatnonzero(drives == drive).tolist()
-        rows, tilt = np.zeros((2, len(graph.gradient))), np.zeros(2)
-        for i in mine:
-            R_vehicle_map = poses[i].rotation().matrix().T
-            seen = R_vehicle_map @ normal
-            tilt += seen[:2] / len(mine)
-            rows[:, 6 * i : 6 * i + 3] = skew(seen)[:2] / len(mine)
-            start = graph.starts[key]
-            rows[:, start : start + 3] += (R_vehicle_map @ by_plane)[:2] / len(mine)
-        out.append((rows, tilt))
-    return out

@@ -54,6 +54,19 @@ class Surfaces:
             halves.append(half)
         return self._followed(solved(factor, rest), halves)
 
+    def reduced(self, rows: Array) -> tuple[Array, Array]:
+        """Rows (r, D) on what remains, (r, R), the eliminated coordinates following it.
+
+        Also the covariance (r, r) of the rows by these coordinates, the rest being known.
+        """
+        out = rows[:, : self.rest].copy()
+        cov = np.zeros((len(rows), len(rows)))
+        for block in self.blocks:
+            half = _lower(block.L, rows[:, block.own].T)
+            out[:, block.others] -= half.T @ block.coupling
+            cov += half.T @ half
+        return out, cov
+
     def follow(self, d: Array) -> Array:
         """The whole step (D,) from that (R,) of the coordinates that remain."""
         halves = [_lower(block.L, self.right[block.own - self.rest]) for block in self.blocks]

@@ -32,7 +32,7 @@ from caliv_graph.structure.problem import (
     with_guesses,
 )
 from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.standing import stands_of
+from caliv_graph.structure.standing import Stands, stands_of
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import (
     Geometry,
@@ -101,12 +101,21 @@ class Estimate:
             self.weights,
             self.layout.size,
         )
-        state = self.state
-        stands = stands_of(state.t_map_vehicle, self.strips.centres_map, self.strips.normals_map)
-        stands = stands.only(np.isin(stands.pose, problem.pose_of_scan))
         return system_of(
-            rows, state, self.layout, problem.prior, self.nuisances, problem.standing, stands
+            rows,
+            self.state,
+            self.layout,
+            problem.prior,
+            self.nuisances,
+            problem.standing,
+            self.stands(),
         )
+
+    def stands(self) -> Stands:
+        """The level strip below each pose with a scan, where there is one."""
+        t_map_vehicle = self.state.t_map_vehicle
+        stands = stands_of(t_map_vehicle, self.strips.centres_map, self.strips.normals_map)
+        return stands.only(np.isin(stands.pose, self.problem.pose_of_scan))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -150,3 +150,29 @@ def standing_rows(
     where_all = np.concatenate(rows), np.concatenate(columns)
     J_all = scipy.sparse.csr_array((np.concatenate(blocks), where_all), shape=(count, size))
     return J_all, np.concatenate(residuals)
+
+
+def tilt_rows(
+    standing: Standing,
+    stands: Stands,
+    R_map_vehicle: Array,
+    normals_map: Array,
+    plane: int,
+    size: int,
+) -> tuple[Array, Array, float]:
+    """Mean of the ground's normal in the vehicle frame: x and y (2,), its rows (2, `size`), sigma.
+
+    The sigma (rad) is that of sway and of the unevenness below the wheels. At least one stand;
+    arguments as of `standing_rows`.
+    """
+    tilted = replace(standing, height_m=None, tilt_sigma_rad=1.0)
+    nowhere = np.zeros_like(normals_map)
+    t = np.zeros((len(R_map_vehicle), 3))
+    J, r = standing_rows(
+        tilted, stands, R_map_vehicle, t, nowhere, normals_map, np.zeros(3), size, plane, size + 3
+    )
+    one = np.hypot(standing.sway_rad, UNEVEN_RAD)
+    count = len(stands.pose)
+    mean = np.tile(one / count * np.eye(2), count)
+    own = UNEVEN_RAD**2 / len(np.unique(stands.strip)) + standing.sway_rad**2 / count
+    return mean @ r, np.asarray((J.T @ mean.T).T[:, :size]), float(np.sqrt(own))

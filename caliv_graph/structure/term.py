@@ -26,6 +26,7 @@ from caliv_graph.structure.relative import (
     start_about,
 )
 from caliv_graph.structure.solve import Solved, solve_structure
+from caliv_graph.structure.stance import STANDING, MeanTilt, mean_tilt, stance_of
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.structure.thickness import (
@@ -185,8 +186,17 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         H[own] -= prior.parameter_information
         moved = prior.parameter_offset + found.state.moved[parameters]
         b[parameters] += prior.parameter_information @ moved
-    information, gradient = _marginal(H, b, keep)
-    motion, motion_gradient = _marginal(system.H_prior, system.b_prior, of_motion)
+    # How the vehicle stands is kept at first: others test what is assumed of it.
+    stand = np.arange(layout.standing, layout.standing + STANDING)
+    tilt = mean_tilt(found)
+    of_tilt = np.zeros((0, len(H))) if tilt is None else tilt.rows
+    both, both_gradient, rows, cov = _marginal(H, b, np.concatenate([keep, stand]), of_tilt)
+    if tilt is not None:
+        tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
+    now_m = float(found.state.errors[layout.standing])
+    stance = stance_of(found.problem.standing, now_m, both, both_gradient, tilt)
+    information, gradient, *_ = _marginal(both, both_gradient, np.arange(len(keep)))
+    motion, motion_gradient, *_ = _marginal(system.H_prior, system.b_prior, of_motion)
     own_part = slice(0, len(of_motion))
     information[own_part, own_part] -= motion
     gradient[own_part] -= motion_gradient
@@ -205,6 +215,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         strips=strips_of(found),
         offset_m=float(np.median(found.nuisances.sighting)),
         ground=lidars_with_ground(found),
+        stance=stance,
     )
 
 
@@ -227,6 +238,7 @@ def term_of_odometry(
     state = found.state
     return replace(
         term,
+        stance=None,
         stamps_ns=found.problem.prior.stamps_ns[kept],
         T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
         information=information,
@@ -245,17 +257,34 @@ def lidars_with_ground(found: Solved) -> frozenset[str]:
     return frozenset(n for n, c in zip(names, count, strict=True) if c >= GROUND_SIGHTINGS)
 
 
-def _marginal(H: Array, b: Array, keep: IntArray) -> tuple[Array, Array]:
-    """The quadratic with all coordinates but `keep` eliminated."""
+def _marginal(
+    H: Array, b: Array, keep: IntArray, rows: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """The quadratic with all coordinates but `keep` (k,) eliminated, and rows (r, D) on `keep`.
+
+    Information (k, k) and gradient (k,); the rows (r, k + 1), the rest following `keep`, what they
+    are at its zero last; and their covariance (r, r) by the rest, `keep` being known.
+    """
     rest = np.ones(len(H), dtype=bool)
     rest[keep] = False
     inside = H[np.ix_(keep, keep)]
+    rows = np.zeros((0, len(H))) if rows is None else rows
+    on_keep, on_rest = rows[:, keep], rows[:, rest]
     if not rest.any():
-        return inside.copy(), b[keep].copy()
+        on_zero = np.column_stack([on_keep, np.zeros(len(rows))])
+        return inside.copy(), b[keep].copy(), on_zero, np.zeros((len(rows), len(rows)))
     cross = H[np.ix_(rest, keep)]
-    both = solved(factor_of(H[np.ix_(rest, rest)]), np.column_stack([cross, b[rest]]))
-    information = inside - cross.T @ both[:, :-1]
-    return 0.5 * (information + information.T), b[keep] - cross.T @ both[:, -1]
+    right = np.column_stack([cross, b[rest], on_rest.T])
+    both = solved(factor_of(H[np.ix_(rest, rest)]), right)
+    split = len(keep) + 1
+    information = inside - cross.T @ both[:, : split - 1]
+    follow = on_rest @ both[:, :split]
+    return (
+        0.5 * (information + information.T),
+        b[keep] - cross.T @ both[:, split - 1],
+        np.column_stack([on_keep - follow[:, :-1], follow[:, -1]]),
+        on_rest @ both[:, split:],
+    )
 
 
 def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:

@@ -75,18 +75,12 @@ def check(
     trusted = [
         name for name, lidar in calibration.lidars.items() if lidar.guess and lidar.guess.fixed
     ]
-    between: tuple[ScoreTest, ...] = ()
+    between, untested = _between_parts(solution, trajectories, trusted)
     suspects: tuple[Suspect, ...] = ()
-    # Where a test is impossible the result stands, and the user must know that it was not tested.
-    untested: list[str] = []
-    try:
-        between = score_tests(solution, trajectories, trusted)
-    except SolveError as e:
-        untested.append(f"parts of the drive were not tested against each other: {e}")
     try:
         suspects = ranked_suspects(solution, trajectories, motions, config, displaced)
     except (SolveError, TrajectoryError) as e:
-        untested.append(f"the inputs were not tested against each other: {e}")
+        untested = (*untested, f"the inputs were not tested against each other: {e}")
     found = consistency.contradictions(
         consistency.CheckInputs(
             lidars=calibration.lidars,
@@ -119,6 +113,16 @@ def check(
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
     return calibration, (*disagreements, *untested)
+
+
+def _between_parts(
+    solution: Solution, trajectories: Sequence[VehicleTrajectory], trusted: Sequence[str]
+) -> tuple[tuple[ScoreTest, ...], tuple[str, ...]]:
+    """The score tests; or a warning: the result stands, and the user must know what is untested."""
+    try:
+        return score_tests(solution, trajectories, trusted), ()
+    except SolveError as e:
+        return (), (f"parts of the drive were not tested against each other: {e}",)
 
 
 def unexplained(

@@ -55,6 +55,11 @@ USUAL_SIGMAS = {
 """A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
 
+HELD_M = 1e-3
+"""1 sigma of a coordinate that is held: it lifts the map, and a map that is metres away makes tilts
+look like shifts of the poses."""
+
+
 @dataclass(frozen=True)
 class MotionTerm:
     """What the motion data of a drive say of its m poses and of k parameters.
@@ -80,11 +85,14 @@ class ParameterPrior:
     """The prior of a parameter of the vehicle: its mean, and (3, 3) of its perturbation.
 
     `sigmas` (3,) are those of the lever arm's x, y, z, or of the rotation about the vehicle's axes.
+    `held` (3,) are coordinates that nothing tells and that change nothing else: `cov` has
+    `HELD_M` of them.
     """
 
     mean: ParameterValue
     cov: Array
     sigmas: Array
+    held: tuple[bool, bool, bool] = (False, False, False)
 
 
 def motion_term(
@@ -106,6 +114,8 @@ def motion_gaussian(
     """
     names = [name for name in KEYS if name in _uncertain(trajectory)]
     joint = _in_tangents(trajectory, trajectory.joint(stamps_ns, names))
+    if _height_unknown(trajectory):
+        joint = _without_height(joint)
     information, gradient = with_heave(
         joint.information, joint.gradient, len(joint.T_map_vehicle), heave_m
     )
@@ -129,6 +139,12 @@ def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Pa
             else:
                 mean = value - offset
             out.setdefault(name, ParameterPrior(mean, cov, sigmas))
+    with_arm = [t for t in trajectories if LEVER_ARM.name in _uncertain(t)]
+    if with_arm and all(map(_height_unknown, with_arm)):
+        arm = out[LEVER_ARM.name]
+        cov = arm.cov.copy()
+        cov[2, 2] = HELD_M**2
+        out[LEVER_ARM.name] = replace(arm, cov=cov, held=(False, False, True))
     return {name: out[name] for name in KEYS if name in out}
 
 
@@ -155,7 +171,7 @@ def estimated_parameters(
         # What the drive knows is what the result knows beyond the prior.
         by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
         limit = UNDETERMINED_RATIO * np.minimum(prior.sigmas, USUAL_SIGMAS[name])
-        determined = by_drive > limit**-2.0
+        determined = (by_drive > limit**-2.0) & ~np.array(prior.held)
         # Of what nobody knows the linearised graph knows too much: the noise of the poses' tilt
         # looks like one that would tell the height of the antenna (`README.md`, section 17).
         unknown = ~determined & (prior.sigmas > USUAL_SIGMAS[name]) & (name == LEVER_ARM.name)
@@ -224,6 +240,39 @@ def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> Joi
     information[POSE * m :] = turn.T @ information[POSE * m :]
     gradient[POSE * m :] = turn.T @ gradient[POSE * m :]
     return JointInformation(information, gradient, joint.T_map_vehicle, joint.parameters)
+
+
+def _height_unknown(trajectory: SmoothedTrajectory) -> bool:
+    """Whether the motion data leave the height of the antenna to its prior."""
+    known = trajectory.sigmas_of(LEVER_ARM.name)
+    prior = _uncertain(trajectory).get(LEVER_ARM.name)
+    return (
+        known is not None
+        and prior is not None
+        and bool(prior[0][2] > USUAL_SIGMAS[LEVER_ARM.name][2])
+        and bool(known[2] > UNDETERMINED_RATIO * prior[0][2])
+    )
+
+
+def _without_height(joint: JointInformation) -> JointInformation:
+    """The same; the height of the antenna lifts the whole map, and nothing tells it.
+
+    On level ground it shows in the tilts alone, linearised where their noise is: times an error of
+    metres it looks like errors of the fixes. Poses that LiDARs know to a millimetre would then say
+    where the antenna is, 20 m away.
+    """
+    m = len(joint.T_map_vehicle)
+    z = POSE * m + 3 * joint.parameters.index(LEVER_ARM.name) + 2
+    # The fixes stay: a vehicle whose antenna is higher is lower.
+    follow = np.eye(len(joint.gradient))
+    follow[z, z] = 0.0
+    for i, T in enumerate(joint.T_map_vehicle):
+        follow[POSE * i + 3 : POSE * i + 6, z] = T.rotation().matrix()[2]
+    return replace(
+        joint,
+        information=follow.T @ joint.information @ follow,
+        gradient=follow.T @ joint.gradient,
+    )
 
 
 def _constant(joint: JointInformation) -> float:

@@ -11,7 +11,13 @@ import pytest
 
 from caliv_graph.calibration.graph import initial_values, motion_graph
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, pose_problem
-from caliv_graph.calibration.vehicle_parameters import ParameterPrior, estimated_parameters
+from caliv_graph.calibration.vehicle_parameters import (
+    HELD_M,
+    ParameterPrior,
+    estimated_parameters,
+    motion_term,
+    parameter_priors,
+)
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm
 from caliv_graph.products import Array, TargetCloud, TargetObservation
@@ -97,6 +103,35 @@ def test_several_drives_share_one_prior() -> None:
     expected = informations[0] + informations[1] - prior
     np.testing.assert_allclose(informations[2], expected, rtol=1e-6, atol=1e-3)
     assert motion_graph(both).kinds.count("vehicle_parameter") == 2
+
+
+def test_an_antenna_of_unknown_height_lifts_the_map_and_nothing_tells_its_height() -> None:
+    sensors = replace(SENSORS, lever_arm=(1.2, 0.3, 0.85))
+    config = config_for(sensors, gnss={"lever_arm": None})
+    level = record(Course(eight_drive(16.0)), sensors, 1)
+    trajectory = smooth_trajectory(level, config, WANTED)
+    term = motion_term(trajectory, WANTED.tolist(), HEAVE_SIGMA_M)
+    assert term is not None
+
+    z = 6 * len(WANTED) + 2
+    lift = np.zeros(len(term.gradient))
+    lift[z] = 1.0
+    for i, (R, _) in enumerate(zip(*trajectory.poses_at(WANTED), strict=True)):
+        lift[6 * i + 3 : 6 * i + 6] = -R.T[:, 2]
+
+    scale = np.sqrt(np.diag(term.information))
+    assert np.abs(term.information @ lift / scale).max() < 1e-6
+    assert abs(term.gradient @ lift) < 1e-6
+    # It is held, and reported with what is known of it.
+    held = parameter_priors([trajectory])["gnss.lever_arm"]
+    assert (held.held, held.sigmas.tolist()) == ((False, False, True), [2.0, 2.0, 2.0])
+    assert np.sqrt(np.diag(held.cov)) == pytest.approx([2.0, 2.0, HELD_M])
+    # What tells x and y of it is as it was.
+    along = trajectory.sigmas_of("gnss.lever_arm")
+    assert along is not None
+    prior = np.concatenate([np.zeros(z - 2), np.full(3, 0.5), np.full(3, 1.0 / np.radians(0.1))])
+    cov = np.linalg.inv(term.information + np.diag(prior**2))
+    assert np.sqrt(np.diag(cov)[z - 2 : z]) == pytest.approx(along[:2], rel=0.05)
 
 
 def test_exact_figures_are_no_variables() -> None:

@@ -1,10 +1,13 @@
-"""The order of the tests where several processes share them."""
+"""Tests that several processes share: their order, and one core for each process."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+
+from caliv_graph.common.cores import on_one_core
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -39,6 +42,20 @@ LONGEST = (
 )
 """Files that take more than 10 s, the longest first: what begins last should be short, or one
 process works alone at the end."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """One thread in each process of pytest-xdist: two would wait for the other processes' cores."""
+    if hasattr(config, "workerinput"):
+        stack = ExitStack()
+        stack.enter_context(on_one_core())
+        config.add_cleanup(stack.close)
+
+
+@pytest.fixture
+def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of threads: as many as the process may use, in a process of pytest-xdist too."""
+    monkeypatch.setattr("caliv_graph.common.cores._one_core", False)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

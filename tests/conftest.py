@@ -1,10 +1,13 @@
-"""The order of the tests where several processes share them."""
+"""Tests that several processes share: their order, and one core for each process."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+
+from caliv_graph.common.cores import cores, on_one_core
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -12,33 +15,61 @@ LONGEST = (
     "tests/test_pipeline.py",
     "tests/cli/test_batch.py",
     "tests/targets/search/test_find.py",
-    "tests/test_raw_sensors.py",
-    "tests/calibration/test_several_drives.py",
-    "tests/trajectory/test_smooth.py",
-    "tests/robustness/test_outputs.py",
     "tests/robustness/test_spoiled_drives.py",
-    "tests/calibration/test_score_tests.py",
-    "tests/test_prior.py",
+    "tests/test_raw_sensors.py",
+    "tests/robustness/test_outputs.py",
     "tests/targets/cloud/test_constellation.py",
-    "tests/report/test_html.py",
+    "tests/trajectory/test_smooth.py",
+    "tests/calibration/test_score_tests.py",
+    "tests/workflows/test_survey.py",
+    "tests/test_prior.py",
     "tests/registration/test_register.py",
+    "tests/calibration/test_several_drives.py",
     "tests/test_memory.py",
     "tests/scripts/test_demo.py",
-    "tests/test_moved_target.py",
-    "tests/trajectory/test_heading.py",
-    "tests/trajectory/test_uncertain.py",
+    "tests/report/test_html.py",
+    "tests/cli/test_plan.py",
     "tests/validation/test_validate.py",
     "tests/scripts/test_fuzz.py",
+    "tests/simulation/test_recording.py",
+    "tests/cli/test_main.py",
+    "tests/test_moved_target.py",
+    "tests/trajectory/test_heading.py",
     "tests/targets/cloud/test_extract.py",
     "tests/scripts/test_check_reproducible.py",
+    "tests/mounting/test_place.py",
     "tests/scripts/test_paper.py",
-    "tests/cli/test_main.py",
+    "tests/cli/test_validate.py",
+    "tests/test_structure.py",
+    "tests/robustness/test_names.py",
     "tests/scripts/test_thinned.py",
-    "tests/calibration/test_motion_suspects.py",
-    "tests/workflows/test_survey.py",
+    "tests/scripts/test_benchmark_constants.py",
+    "tests/trajectory/test_uncertain.py",
 )
-"""Files that take more than 10 s, the longest first: what begins last should be short, or one
+"""Files that take more than 8 s, the longest first: what begins last should be short, or one
 process works alone at the end."""
+
+
+MOST_PROCESSES = 4
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than cores: some tests wait for other processes, for a clock or the disk."""
+    return min(cores() + 1, MOST_PROCESSES)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """One thread in each process of pytest-xdist: two would wait for the other processes' cores."""
+    if hasattr(config, "workerinput"):
+        stack = ExitStack()
+        stack.enter_context(on_one_core())
+        config.add_cleanup(stack.close)
+
+
+@pytest.fixture
+def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of threads: as many as the process may use, in a process of pytest-xdist too."""
+    monkeypatch.setattr("caliv_graph.common.cores._one_core", False)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

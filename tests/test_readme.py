@@ -64,10 +64,10 @@ def commands() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo's drive with half of its clouds."""
+    """The demo's drive with a quarter of its clouds."""
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
     lidars = {
-        name: lidar.model_copy(update={"rate_hz": 2.5}) for name, lidar in scenario.lidars.items()
+        name: lidar.model_copy(update={"rate_hz": 1.25}) for name, lidar in scenario.lidars.items()
     }
     folder = tmp_path_factory.mktemp("readme") / "drive"
     simulate_caliv(scenario.model_copy(update={"lidars": lidars}), folder, seed=1)

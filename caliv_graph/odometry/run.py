@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.common.progress import Progress
@@ -202,6 +201,9 @@ def _smooth(stamps_ns: IntArray, R: Array, t: Array) -> tuple[IntArray, Array, A
     does to velocities. Cubic smoothing splines by generalised cross-validation, per axis and per
     component of the quaternion, tell such noise from motion.
     """
+    # Here: most drives do without odometry, and it takes 0.1 s to import.
+    from scipy.interpolate import make_smoothing_spline
+
     begin = int(stamps_ns[0])
     seconds = (stamps_ns - begin) / NANOSECONDS_PER_SECOND
     count = math.ceil((int(stamps_ns[-1]) - begin) / KNOT_NS)

@@ -268,9 +268,9 @@ def _tridiagonal(
 
 
 def banded_of(diagonal: Array, above: Array) -> Array:
-    """Lower banded storage of a symmetric block-tridiagonal matrix, as scipy wants it."""
+    """Lower banded storage of a symmetric block-tridiagonal matrix, in LAPACK's order of memory."""
     n, r, _ = diagonal.shape
-    out = np.zeros((2 * r, n * r))
+    out = np.zeros((2 * r, n * r), order="F")
     for column in range(r):
         for row in range(column, r):
             out[row - column, column::r] = diagonal[:, row, column]

@@ -101,7 +101,7 @@ def _factorised(chain: Chain) -> tuple[Array, Array, Array]:
     border = (chain.border / size[:, :, None]).reshape(n * w, len(chain.corner))
     try:
         factor = scipy.linalg.cholesky_banded(
-            banded_of(diagonal, coupling), lower=True, check_finite=False
+            banded_of(diagonal, coupling), overwrite_ab=True, lower=True, check_finite=False
         )
     except np.linalg.LinAlgError:
         raise TrajectoryError(UNDETERMINED) from None

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -221,10 +222,16 @@ class NoiseLikelihood:
         found = solved(total.chain, total.gradient)
         cost = total.square + float(total.gradient @ found.step) + found.log_determinant
         slope = np.zeros(len(scales))
+        moments = _second_moments(found)
         for c, (part, weight) in enumerate(zip(self.parts, weights, strict=True)):
             cost += 2.0 * part.rows * math.log(scales[c])
-            slope[c] = 2.0 * part.rows - 2.0 * weight * _expected(part, found)
+            slope[c] = 2.0 * part.rows - 2.0 * weight * _expected(part, found.step, moments)
         return cost, slope
+
+    @cached_property
+    def as_stated(self) -> tuple[float, Array]:
+        """`at` the stated noise, where every fit begins."""
+        return self.at(np.ones(len(self.names)))
 
 
 def _sum(parts: Sequence[_Part], weights: Sequence[float]) -> _Part:
@@ -243,18 +250,26 @@ def _sum(parts: Sequence[_Part], weights: Sequence[float]) -> _Part:
     )
 
 
-def _expected(part: _Part, found: ChainSolution) -> float:
-    """Expected squared residual of the rows of a part, the trajectory's uncertainty included."""
-    chain, d = part.chain, found.step
-    n, w = chain.diagonal.shape[:2]
-    x, common = d[: n * w].reshape(n, w), d[n * w :]
-    second = found.cov + x[:, :, None] * x[:, None]
-    across = found.cov_next + x[:-1, :, None] * x[1:, None]
-    total = part.square + 2.0 * part.gradient @ d
-    total += np.sum(chain.diagonal * second) + 2.0 * np.sum(chain.coupling * across)
-    if len(common):
-        total += 2.0 * np.sum(chain.border * (found.cov_border + x[:, :, None] * common))
-        total += np.sum(chain.corner * (found.cov_corner + np.outer(common, common)))
+def _second_moments(found: ChainSolution) -> Chain:
+    """Expected products of the coordinates, the trajectory's uncertainty included."""
+    n, w = found.cov.shape[:2]
+    x, common = found.step[: n * w].reshape(n, w), found.step[n * w :]
+    return Chain(
+        found.cov + x[:, :, None] * x[:, None],
+        found.cov_next + x[:-1, :, None] * x[1:, None],
+        found.cov_border + x[:, :, None] * common,
+        found.cov_corner + np.outer(common, common),
+    )
+
+
+def _expected(part: _Part, step: Array, moments: Chain) -> float:
+    """Expected squared residual of the rows of a part."""
+    chain = part.chain
+    total = part.square + 2.0 * part.gradient @ step
+    total += np.vdot(chain.diagonal, moments.diagonal)
+    total += 2.0 * np.vdot(chain.coupling, moments.coupling)
+    total += 2.0 * np.vdot(chain.border, moments.border)
+    total += np.vdot(chain.corner, moments.corner)
     return float(total)
 
 
@@ -274,11 +289,11 @@ def fit(likelihood: NoiseLikelihood, free: Set[str]) -> tuple[dict[str, float], 
     """
     at = [i for i, name in enumerate(likelihood.names) if name in free]
     logarithms = np.zeros(len(likelihood.names))
-    begin = likelihood.at(np.exp(logarithms))[0]
+    begin = likelihood.as_stated[0]
 
     def cost(x: Array) -> tuple[float, Array]:
         logarithms[at] = x
-        value, slope = likelihood.at(np.exp(logarithms))
+        value, slope = likelihood.at(np.exp(logarithms)) if x.any() else likelihood.as_stated
         # Less the value at the start: the optimiser's tolerance is relative.
         return (
             value - begin + float(x @ x) / LOG_SPREAD**2,

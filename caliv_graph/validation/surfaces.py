@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import label
 
 from caliv_graph.products import Array, BoolArray, IntArray
 
@@ -257,12 +256,19 @@ def _connected(place: Array, at: Array) -> BoolArray:
     cell = np.clip(cell - low, 0, 400)
     filled = np.zeros(cell.max(axis=0, initial=0) + 2, dtype=bool)
     filled[cell[:, 0], cell[:, 1]] = True
-    pieces, _ = label(filled, np.ones((3, 3)))
+    pieces = _pieces(filled)
     home = np.clip(np.floor(at / PIECE_M).astype(np.int64) - low, 0, np.array(filled.shape) - 1)
     own = pieces[home[0], home[1]]
     if own == 0:
         return np.zeros(len(place), dtype=bool)
     return np.asarray(pieces[cell[:, 0], cell[:, 1]] == own)
+
+
+def _pieces(filled: BoolArray) -> IntArray:
+    """Numbers from 1 of the connected pieces of a grid, corners included; 0 where it is empty."""
+    from scipy.ndimage import label  # here: a report does not need it; 0.1 s to import
+
+    return np.asarray(label(filled, np.ones((3, 3)))[0])
 
 
 def _columns(
@@ -277,7 +283,7 @@ def _columns(
     size = cell.max(axis=0) + 2
     count = np.zeros(size, dtype=np.int64)
     np.add.at(count, (cell[:, 0], cell[:, 1]), 1)
-    pieces, _ = label(count >= CELL_POINTS, np.ones((3, 3)))
+    pieces = _pieces(count >= CELL_POINTS)
     of = pieces[cell[:, 0], cell[:, 1]]
     poles: list[Pole] = []
     things: list[Thing] = []

@@ -44,7 +44,7 @@ TWO_CHAIRS = {
 def lidar(x_m: float, yaw_deg: float, y_m: float = 0.0) -> LidarModel:
     return LidarModel(
         mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
-        rate_hz=4.0,
+        rate_hz=2.0,
         channels=90,
         horizontal_resolution_deg=0.3,
     )

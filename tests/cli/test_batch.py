@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import yaml
 
+from caliv_graph.batch import cluster
 from caliv_graph.results.calibration_file import read_calibration
 from tests.batch.tiny import tiny_drive
 from tests.cli.commands import ROOT, called
@@ -200,7 +201,7 @@ def test_what_is_done_is_not_done_again_and_what_has_changed_is(
     before = records(out)
     manifest = fleet / "good.yaml"
 
-    again = batch(manifest, "--out", out, "--json")
+    again = called("batch", manifest, "--out", out, "--json")
 
     assert (again.returncode, again.stderr) == (0, "")
     document = json.loads(again.stdout)
@@ -311,11 +312,13 @@ def test_on_an_existing_scheduler(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]], scheduler: str
 ) -> None:
     out = fleet / "elsewhere"
+    manifest = write_manifest(fleet / "one.yaml", {"name": "tue", "config": "tue/config.yaml"})
 
-    result = batch(fleet / "good.yaml", "--out", out, "--scheduler", scheduler)
+    result = batch(manifest, "--out", out, "--scheduler", scheduler)
 
     assert (result.returncode, result.stderr) == (0, "")
-    assert contents(out) == contents(finished[0])
+    here = contents(finished[0])
+    assert contents(out) == {name: here[name] for name in here if name.startswith("tue/")}
     assert read_calibration(out / "tue/calibration.yaml").status == "partial"
 
 
@@ -327,25 +330,13 @@ def test_on_an_existing_scheduler(
     ],
 )
 def test_a_scheduler_that_is_not_there(
-    fleet: Path, tmp_path: Path, address: str, said: str
+    fleet: Path, tmp_path: Path, address: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    code = (
-        "from caliv_graph.batch import cluster\n"
-        "assert cluster.CONNECT_S == 10.0\n"
-        "cluster.CONNECT_S = 1.0\n"
-        "from caliv_graph.cli.main import main\n"
-        "main()\n"
-    )
-    command = ["batch", fleet / "good.yaml", "--out", out, "--scheduler", address, "--json"]
+    assert cluster.CONNECT_S == 10.0
+    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
 
-    result = subprocess.run(
-        [sys.executable, "-c", code, *map(str, command)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = called("batch", fleet / "good.yaml", "--out", out, "--scheduler", address, "--json")
 
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith(f"error: --scheduler {address}: {said}")
@@ -353,22 +344,13 @@ def test_a_scheduler_that_is_not_there(
     assert not out.exists()
 
 
-def test_without_dask_it_says_how_to_get_it(fleet: Path, tmp_path: Path) -> None:
-    code = (
-        "import sys\n"
-        "sys.modules['distributed'] = sys.modules['dask'] = None\n"
-        "from caliv_graph.cli.main import main\n"
-        "main()\n"
-    )
-    command = ["batch", str(fleet / "good.yaml"), "--out", str(tmp_path / "out")]
+def test_without_dask_it_says_how_to_get_it(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("dask", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
 
-    result = subprocess.run(
-        [sys.executable, "-c", code, *command],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = called("batch", fleet / "good.yaml", "--out", tmp_path / "out")
 
     assert result.returncode == 2
     assert result.stderr == (

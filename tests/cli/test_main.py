@@ -24,7 +24,10 @@ HEAVY = {
 """What no help needs: each takes a twentieth of a second and more. (So does pydantic, but typer has
 a use for it.)"""
 
-LATE = {"open3d", "plotly", "jinja2", "rosbags", "pandas", "matplotlib", "scipy.stats"}
+LATE = {
+    *("open3d", "plotly", "jinja2", "rosbags", "pandas", "matplotlib"),
+    *("scipy.stats", "scipy.ndimage", "scipy.interpolate"),
+}
 """What a calibration from a folder needs late, for its report, or not at all."""
 
 SUCCEEDS = """

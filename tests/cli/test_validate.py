@@ -59,11 +59,16 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_right_calibration(drive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+@pytest.fixture(scope="module")
+def right(drive: Path) -> tuple[Result, Path]:
+    """What was said of the right calibration, and the folder that was written."""
+    out = drive / "out"
     arguments = (drive / "right.yaml", drive / "config.yaml", "--out", out, "--no-repeat")
-    result = validate(*arguments, "--json")
+    return validate(*arguments, "--json"), out
 
+
+def test_a_right_calibration(drive: Path, right: tuple[Result, Path]) -> None:
+    result, out = right
     assert (result.exit_code, result.stderr) == (0, "")
     document = json.loads(result.stdout)
     assert document == json.loads((out / "validation.json").read_text())
@@ -77,16 +82,15 @@ def test_a_right_calibration(drive: Path, tmp_path: Path) -> None:
     assert [s["name"] for s in document["surfaces"]] == ["wall 1", "wall 2", "pole 1"]
     assert [o["name"] for o in document["objects"]] == ["object 1"]
     # Once more, there is something in the way.
+    arguments = (drive / "right.yaml", drive / "config.yaml", "--out", out, "--no-repeat")
     again = validate(*arguments)
     assert again.exit_code == 1
     assert "exists already. Give --force" in str(again.exception)
     assert validate(*arguments, "--force").exit_code == 0
 
 
-def test_the_page_is_whole_and_needs_no_network(drive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    validate(drive / "right.yaml", drive / "config.yaml", "--out", out, "--no-repeat", "--json")
-    page = (out / "validation.html").read_text()
+def test_the_page_is_whole_and_needs_no_network(right: tuple[Result, Path]) -> None:
+    page = (right[1] / "validation.html").read_text()
 
     # What plotly itself holds of addresses is never fetched: the page forbids it.
     assert "default-src 'none'" in page

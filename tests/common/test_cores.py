@@ -8,6 +8,8 @@ import pytest
 
 from caliv_graph.common.cores import cores, on_one_core, parts, share_out
 
+pytestmark = pytest.mark.usefixtures("all_cores")
+
 
 def test_on_one_core_all_is_done_here_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2})

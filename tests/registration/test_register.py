@@ -563,6 +563,7 @@ def test_a_cloud_that_is_dropped_does_not_shape_the_target() -> None:
     assert np.trace(first.blocks[3]) < 1e-4 * np.trace(first.blocks[4])
 
 
+@pytest.mark.usefixtures("all_cores")
 def test_cores_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     # 13 clouds: not a multiple of what is summed up together.
     scene = chair_scene(np.linspace(20.0, 110.0, 13).tolist(), [8.0] * 13, SIGMA_M, 1)

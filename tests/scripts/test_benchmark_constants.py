@@ -129,7 +129,9 @@ def test_a_failure_is_counted_and_compared_with_nothing() -> None:
 
 def test_a_constant_changes_a_drive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     scenario = load_scenario(drives.SCENARIOS / "demo_arc.yaml")
-    recording = KeptDrive(scenario, 1)
+    # Few clouds are enough for a change: `SMALL` takes 12 of each LiDAR.
+    lidars = {n: li.model_copy(update={"rate_hz": 1.25}) for n, li in scenario.lidars.items()}
+    recording = KeptDrive(scenario.model_copy(update={"lidars": lidars}), 1)
     monkeypatch.setattr(drives, "_recording", lambda *_: recording)
 
     own = drives.performed("given", 1, tmp_path, SMALL, early=False)

@@ -35,11 +35,11 @@ def test_the_main_job_is_done_and_explained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    # The arc with half of its clouds.
+    # The arc with a quarter of its clouds.
     scenario = tmp_path / "demo_arc.yaml"
     text = (ROOT / "configs/scenarios/demo_arc.yaml").read_text(encoding="utf-8")
     assert text.count("rate_hz: 5.0") == 2
-    scenario.write_text(text.replace("rate_hz: 5.0", "rate_hz: 2.5"), encoding="utf-8")
+    scenario.write_text(text.replace("rate_hz: 5.0", "rate_hz: 1.25"), encoding="utf-8")
     monkeypatch.setattr(_demo, "SCENARIO", scenario)
 
     assert run(monkeypatch, "--out", out) == 0

@@ -9,6 +9,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.products import TargetCloud, TargetObservation
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.workflows.repeatability import alternate, split, split_halves
+from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 from tests.workflows.test_survey import QUICK, scenario_of
 
@@ -60,7 +61,7 @@ def test_scans_in_turns() -> None:
 def test_halves_of_a_drive_agree() -> None:
     recording = KeptDrive(scenario_of("arc"), 2)
     config = parse_config(config_of(recording, has_bag=True), "arc", Path())
-    config = config.model_copy(update={"registration": QUICK})
+    config = without_structure(config.model_copy(update={"registration": QUICK}))
     found = split_halves(recording, config, SilentProgress(), 0.01)
 
     assert not found.by_passes

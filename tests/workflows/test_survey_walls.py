@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from functools import cache
 from pathlib import Path
 
 from rich.console import Console
@@ -11,7 +10,7 @@ from rich.console import Console
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, GroundConfig
-from caliv_graph.pipeline import Prepared, calibrate, prepare, structure_evidence
+from caliv_graph.pipeline import calibrate, prepare, structure_evidence
 from caliv_graph.report.predicted import survey_document, survey_table
 from caliv_graph.scenario.drive_models import StraightDrive
 from caliv_graph.scenario.model import Scenario
@@ -60,20 +59,15 @@ CASES = {
 }
 
 
-@cache
-def prepared(name: str) -> tuple[KeptDrive, Config, Prepared]:
+def driven(name: str) -> tuple[KeptDrive, Config]:
     recording = KeptDrive(scenario_of(*CASES[name]), 1)
     config = parse_config(config_of(recording, has_bag=True), name, Path())
-    config = config.model_copy(update={"target": False, "ground": GroundConfig(use=True)})
-    return (
-        recording,
-        config,
-        prepare([recording], config, {0: recording.motion()}, SilentProgress()),
-    )
+    return recording, config.model_copy(update={"target": False, "ground": GroundConfig(use=True)})
 
 
 def surveyed(name: str) -> Survey:
-    _, _, found = prepared(name)
+    recording, config = driven(name)
+    found = prepare([recording], config, {0: recording.motion()}, SilentProgress())
     return survey_observations(
         found.observations,
         found.trajectories,
@@ -86,7 +80,7 @@ def surveyed(name: str) -> Survey:
 
 def test_parallel_walls_leave_open_what_lies_along_them() -> None:
     """Straight ahead between two fronts, in the result of `calibrate`."""
-    recording, config, _ = prepared("parallel")
+    recording, config = driven("parallel")
 
     run = calibrate([recording], config, SilentProgress())
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.sparse import coo_array, csr_array, diags_array, vstack
+from scipy.sparse import coo_array, csr_array, vstack
 from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, BoolArray, IntArray
@@ -48,6 +48,15 @@ SUPPORT_M = 1.5
 """Ground was seen at a place if one of its cells is within this distance."""
 
 _PER_AXIS = 2 * int(HALF_SIZE_M / NODE_M) + 1
+_NODES = _PER_AXIS**2
+
+_BAND = 2 * _PER_AXIS
+"""Nodes are coupled to two rows of the grid at most."""
+
+_CORNERS = np.array([0, 1, _PER_AXIS, _PER_AXIS + 1])
+"""Nodes about a place, less the first of them."""
+
+_PAIRS = np.triu_indices(len(_CORNERS))
 
 
 @dataclass(frozen=True)
@@ -89,17 +98,19 @@ def fit_surface(points: Array) -> GroundSurface | None:
         return None
     # The tilt is removed first: the stiffness concerns deviations from the plane.
     above_plane = height_above(plane, lowest) / plane[2]
-    interpolate = _bilinear(lowest[:, :2])
-    stiffness = STIFFNESS * _BENDING + GAUGE_PRIOR * diags_array(np.ones(_PER_AXIS**2))
-    nodes = np.zeros(_PER_AXIS**2)
+    corners, factors = _bilinear(lowest[:, :2])
+    entries, products = _normal_entries(corners, factors)
+    nodes = np.zeros(_NODES)
     for tolerance in TOLERANCES_M:
-        residual = above_plane - interpolate @ nodes
+        residual = above_plane - (factors * nodes[corners]).sum(axis=0)
         weight = np.where(
             residual > tolerance, 0.0, np.minimum(1.0, tolerance / np.abs(residual - 1e-12))
         )
-        normal = interpolate.T @ diags_array(weight) @ interpolate + stiffness
-        nodes = _solve_banded(normal, interpolate.T @ (weight * above_plane))
-    ground = np.abs(above_plane - interpolate @ nodes) < TOLERANCES_M[-1]
+        normal = _summed(entries, products * weight, _STIFFNESS.size).reshape(_STIFFNESS.shape)
+        normal += _STIFFNESS
+        right = _summed(corners, factors * (weight * above_plane), _NODES)
+        nodes = solveh_banded(normal.T, right, overwrite_ab=True, check_finite=False)
+    ground = np.abs(above_plane - (factors * nodes[corners]).sum(axis=0)) < TOLERANCES_M[-1]
     at = np.linspace(-HALF_SIZE_M, HALF_SIZE_M, _PER_AXIS)
     x, y = np.meshgrid(at, at, indexing="ij")
     tilted = (
@@ -130,26 +141,29 @@ def _node_and_part(xy: Array) -> tuple[IntArray, Array]:
     return np.asarray(low[:, 0] * _PER_AXIS + low[:, 1]), np.asarray(at - low)
 
 
-def _bilinear(xy: Array) -> csr_array:
-    """(k, nodes) matrix that interpolates the nodes at places (k, 2)."""
+def _bilinear(xy: Array) -> tuple[IntArray, Array]:
+    """Per place (k, 2) the nodes about it (4, k), and the factors (4, k) that interpolate them."""
     node, part = _node_and_part(xy)
-    row = np.arange(len(xy))
-    rows, columns, values = [], [], []
-    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        rows.append(row)
-        columns.append(node + i * _PER_AXIS + j)
-        values.append(
-            (part[:, 0] if i else 1.0 - part[:, 0]) * (part[:, 1] if j else 1.0 - part[:, 1])
-        )
-    shape = (len(xy), _PER_AXIS**2)
-    return coo_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
-    ).tocsr()
+    x, y = part.T
+    factors = np.stack([(1.0 - x) * (1.0 - y), (1.0 - x) * y, x * (1.0 - y), x * y])
+    return node + _CORNERS[:, None], factors
+
+
+def _normal_entries(corners: IntArray, factors: Array) -> tuple[IntArray, Array]:
+    """What places add to the normal matrix: entries (10, k) of its bands, products (10, k)."""
+    row, column = (corners[pair] for pair in _PAIRS)
+    first, second = (factors[pair] for pair in _PAIRS)
+    return column * (_BAND + 1) + _BAND + row - column, first * second
+
+
+def _summed(index: IntArray, values: Array, size: int) -> Array:
+    """(size,) sums of the values with the same index, both of the same shape."""
+    return np.asarray(np.bincount(index.ravel(), values.ravel(), size))
 
 
 def _bending() -> csr_array:
     """(nodes, nodes) sum of squares of the second differences along x, y, and of the twist."""
-    index = np.arange(_PER_AXIS**2).reshape(_PER_AXIS, _PER_AXIS)
+    index = np.arange(_NODES).reshape(_PER_AXIS, _PER_AXIS)
     stencils = [
         ((index[:-2], index[1:-1], index[2:]), (1.0, -2.0, 1.0)),
         ((index[:, :-2], index[:, 1:-1], index[:, 2:]), (1.0, -2.0, 1.0)),
@@ -164,20 +178,23 @@ def _bending() -> csr_array:
         rows = np.tile(np.arange(count), len(nodes))
         columns = np.concatenate([n.ravel() for n in nodes])
         values = np.repeat(factors, count)
-        blocks.append(coo_array((values, (rows, columns)), shape=(count, _PER_AXIS**2)))
+        blocks.append(coo_array((values, (rows, columns)), shape=(count, _NODES)))
     stacked = vstack(blocks).tocsr()
     return csr_array(stacked.T @ stacked)
 
 
-_BENDING = _bending()
+def _stiffness() -> Array:
+    """(nodes, band + 1) upper bands of what holds the nodes together.
 
-
-def _solve_banded(matrix: csr_array, right: Array) -> Array:
-    """Solves a positive definite system whose nodes are coupled to two rows of the grid at most."""
-    band = 2 * _PER_AXIS
-    entries = coo_array(matrix)
+    Transposed they are those of `solveh_banded`, in LAPACK's order of memory: no copy is made.
+    """
+    entries = (STIFFNESS * _bending()).tocoo()
     upper = entries.col >= entries.row
     row, column = entries.row[upper], entries.col[upper]
-    banded = np.zeros((band + 1, _PER_AXIS**2))
-    banded[band + row - column, column] = entries.data[upper]
-    return np.asarray(solveh_banded(banded, right, check_finite=False))
+    banded = np.zeros((_NODES, _BAND + 1))
+    banded[column, _BAND + row - column] = entries.data[upper]
+    banded[:, _BAND] += GAUGE_PRIOR
+    return banded
+
+
+_STIFFNESS = _stiffness()

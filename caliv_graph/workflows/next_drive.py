@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import PurePath
 
 import numpy as np
@@ -17,11 +17,12 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError, RecordingError, TrajectoryError
 from caliv_graph.pipeline import Look, look
 from caliv_graph.planning.assumptions import Assumptions
+from caliv_graph.planning.predict import predict_drives
 from caliv_graph.planning.recorded_lidar import SeenBeams, lidar_model
 from caliv_graph.planning.recorded_motion import RecordedMotion, lifted, recorded_motion
 from caliv_graph.planning.recorded_route import RecordedRoute
 from caliv_graph.planning.recorded_target import nearest_object, silhouettes
-from caliv_graph.planning.suggest import DEFAULT_RADIUS_M, DEFAULT_SPEED_M_S
+from caliv_graph.planning.suggest import DEFAULT_RADIUS_M, DEFAULT_SPEED_M_S, Planned
 from caliv_graph.products import IntArray, Recording
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.scenario.drives import Route, make_drive
@@ -64,7 +65,7 @@ class RecordedDrive:
             arc as the vehicle can drive it.
         route: the drive.
         assumptions: how the config calibrates it.
-        vehicle: the scenario for suggestions: with a chair if no target was found.
+        vehicle: the same on level ground, with a chair if no target was found: for suggestions.
         sees_target: whether there is a target to predict with.
         notes: for the user, a line each.
     """
@@ -75,6 +76,13 @@ class RecordedDrive:
     vehicle: Scenario
     sees_target: bool
     notes: tuple[str, ...]
+
+    def with_mountings(self, others: Mapping[str, LidarModel]) -> dict[str, LidarModel]:
+        """Its LiDARs, mounted as others of the same names."""
+        return {
+            name: model.model_copy(update={"mounting": others[name].mounting})
+            for name, model in self.scenario.lidars.items()
+        }
 
     def driving(self, other: Scenario) -> tuple[Scenario, Route]:
         """The drive and the world of another scenario with this vehicle."""
@@ -118,10 +126,10 @@ def recorded_drive(recording: Recording, config: Config, progress: Progress) -> 
     objects, said_targets = _targets(seen, seen.trajectory, config, route)
     lidars = _lidars(recording, seen, config, route, progress)
     scenario = _scenario(recording, config, motion, route, lidars, objects)
-    vehicle = scenario
-    if not objects:
-        stead = WorldModel(objects={"chair": ChairModel(xy_m=(0.0, 0.0))}, targets=("chair",))
-        vehicle = scenario.model_copy(update={"world": stead})
+    elsewhere = objects or {"chair": ChairModel(xy_m=(0.0, 0.0))}
+    vehicle = scenario.model_copy(
+        update={"world": WorldModel(objects=elsewhere, targets=tuple(elsewhere))}
+    )
     return RecordedDrive(
         scenario,
         route,
@@ -290,12 +298,32 @@ def _ground_height(route: RecordedRoute, objects: Mapping[str, ObjectModel]) -> 
     return round(float(places[away.min(axis=1).argmin(), 2]), 3)
 
 
-def with_options(assumptions: Assumptions, options: Mapping[str, object]) -> Assumptions:
-    """Assumptions with what the user asked for on the command line; None: as they are."""
-    given = {key: value for key, value in options.items() if value is not None}
-    return replace(assumptions, **given)  # type: ignore[arg-type]
+def next_drive(
+    drives: Sequence[RecordedDrive], planned: Sequence[Scenario], assumptions: Assumptions
+) -> Planned:
+    """Predicts recorded drives of one vehicle, together with planned ones if there are any.
 
+    Args:
+        drives: of the vehicle, at least one; the first one's sensors are the vehicle's.
+        planned: drives and worlds; the vehicle in them is replaced.
+        assumptions: how all are calibrated.
 
-def suggestion_basis(drives: Sequence[RecordedDrive]) -> Scenario:
-    """The vehicle of the first drive that shows a target, else of the first."""
-    return next((d.vehicle for d in drives if d.sees_target), drives[0].vehicle)
+    Raises:
+        CalivError: as for `planning.predict`.
+    """
+    first = drives[0]
+    lidars = first.scenario.lidars
+    seeing = [d for d in drives if d.sees_target]
+    # One vehicle: what a LiDAR shows of its beams and what is found of its place may differ a bit.
+    routes: list[tuple[Scenario, Route]] = [
+        (d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}), d.route)
+        for d in seeing
+    ]
+    routes += [first.driving(scenario) for scenario in planned]
+    return Planned(
+        predict_drives(routes, assumptions) if routes else None,
+        (seeing or drives)[0].vehicle,
+        assumptions,
+        lidars,
+        tuple(dict.fromkeys(note for d in drives for note in d.notes)),
+    )

@@ -29,6 +29,8 @@ from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.inputs import STANDARD_GRAVITY_M_S2, SmootherInput
 from caliv_graph.trajectory.measurements import usable_orientations
 from caliv_graph.trajectory.noise import (
+    MIN_POSE_POSITION_M,
+    MIN_POSE_ROTATION_RAD,
     TYPICAL_CORRELATION_S,
     given_pose_covariances,
     orientation_covariances,
@@ -42,8 +44,13 @@ from caliv_graph.wording.recorded import INSTEAD, heading_sentence, slow_error_s
 OUTAGE_PERIODS = 3.5
 """Periods of the GNSS without a fix that count as an outage."""
 
-THIRD_DIFFERENCE = math.sqrt(20.0)
-"""1 sigma of x3 - 3 x2 + 3 x1 - x0 over that of each x, if they are white."""
+ORDER = 5
+"""Of the differences in which the white error of given poses is looked at. With (turn rate times
+period)^ORDER of the motion left, it is 10 micrometres at 2 m/s, 0.2 rad/s and 2 Hz; of third
+differences 3 mm."""
+
+DIFFERENCE = math.sqrt(math.comb(2 * ORDER, ORDER))
+"""1 sigma of a difference of this order over that of the values, if they are white."""
 
 MAD_TO_SIGMA = 1.4826
 """1 sigma over the median of the absolute values, of a Gaussian."""
@@ -220,8 +227,8 @@ def _velocity(data: SmootherInput, begin_ns: int) -> VelocityModel:
 def pose_noise_model(trajectory: GivenTrajectory, config: Config) -> PoseNoiseModel:
     """Errors of given poses: those of the config, else of their messages, else of the poses.
 
-    The white error is seen in third differences of the poses, in which a vehicle's motion is next
-    to nothing. The slow one is not: without a figure in the config it has the values that a
+    The white error is seen in differences of the poses of a high order, in which a vehicle's motion
+    is next to nothing. The slow one is not: without a figure in the config it has the values that a
     calibration begins with, as a random walk that grows as fast.
     """
     given = first_pose_noise(config.noise)
@@ -236,9 +243,9 @@ def pose_noise_model(trajectory: GivenTrajectory, config: Config) -> PoseNoiseMo
         R, t = stack(T.T_map_vehicle)
         turns = log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:])
         if config.noise.pose_rotation_deg is None:
-            white_rotation = _white(np.diff(turns, 2, axis=0))
+            white_rotation = max(MIN_POSE_ROTATION_RAD, _white(np.diff(turns, ORDER - 1, axis=0)))
         if config.noise.pose_position_m is None:
-            white_position = _white(np.diff(t, 3, axis=0))
+            white_position = max(MIN_POSE_POSITION_M, _white(np.diff(t, ORDER, axis=0)))
     # A Gauss-Markov error of sigma s and time T begins as a walk of s sqrt(2 / T).
     grows = math.sqrt(2.0 / given.drift_time_s)
     return PoseNoiseModel(
@@ -250,8 +257,8 @@ def pose_noise_model(trajectory: GivenTrajectory, config: Config) -> PoseNoiseMo
 
 
 def _white(differences: Array) -> float:
-    """1 sigma of a white error, from third differences (n, 3)."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(differences))) / THIRD_DIFFERENCE
+    """1 sigma of a white error, from differences (n, 3) of order `ORDER`."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(differences))) / DIFFERENCE
 
 
 def _sigma(cov: Array) -> float:

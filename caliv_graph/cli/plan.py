@@ -88,7 +88,7 @@ def plan(
 
     Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
 
-    Example: caliv-graph plan config.yaml --out next.yaml
+    Example: caliv-graph plan config.yaml --data drive/
     """
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.config.load import load_config

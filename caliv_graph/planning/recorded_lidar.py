@@ -81,7 +81,8 @@ class SeenBeams:
         edges = azimuth_edges(every)
         azimuths = (-180.0, 180.0)
         if edges is not None:
-            azimuths = (math.degrees(edges[0] - edges[1]), math.degrees(edges[0] + edges[1]))
+            middle, half = math.remainder(edges[0], 2.0 * math.pi), edges[1]
+            azimuths = (math.degrees(middle - half), math.degrees(middle + half))
         reach_m = float(np.linalg.norm(every, axis=1).max())
         channels = _channels(elevations(every))
         if channels is not None:

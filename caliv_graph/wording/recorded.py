@@ -6,6 +6,13 @@ import math
 
 _SENSORS = {"gnss": "the fixes", "orientation": "the IMU's orientation"}
 
+_SHAPES = {
+    "thin_chair": "thin chair",
+    "boxes": "stack of boxes",
+    "cones": "group of cones",
+    "stroller": "pram",
+}
+
 INSTEAD = (
     "'caliv-graph observability' tells what this drive determines. For a next drive give plan a "
     "scenario with the vehicle's sensors, such as one of configs/scenarios"
@@ -37,10 +44,18 @@ def no_target_sentence(why: str) -> str:
     )
 
 
+def walls_sentence() -> str:
+    """The config uses structure, the prediction does not."""
+    return (
+        "walls of the recorded drive are not predicted: its sigmas are those of target and ground "
+        "alone. 'caliv-graph observability' counts the walls too"
+    )
+
+
 def target_sentence(name: str, shape: str, width_m: tuple[float, float], height_m: float) -> str:
     """What a target is taken for; its widths from the narrowest to the widest side."""
     return (
-        f"'{name}' is planned as a {shape.replace('_', ' ')}, the nearest of the known shapes: "
+        f"'{name}' is planned as a {_SHAPES.get(shape, shape)}, the nearest of the known shapes: "
         f"it looks {width_m[0]:.2f} to {width_m[1]:.2f} m wide and {height_m:.2f} m high"
     )
 

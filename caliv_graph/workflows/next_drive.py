@@ -43,6 +43,7 @@ from caliv_graph.wording.recorded import (
     no_target_sentence,
     target_sentence,
     unknown_height_sentence,
+    walls_sentence,
 )
 
 SCANS = 12
@@ -125,6 +126,7 @@ def recorded_drive(recording: Recording, config: Config, progress: Progress) -> 
     route = RecordedRoute(seen.trajectory, begin_ns, end_ns, height_m)
     objects, said_targets = _targets(seen, seen.trajectory, config, route)
     lidars = _lidars(recording, seen, config, route, progress)
+    said_walls = (walls_sentence(),) if objects and config.structure.use else ()
     scenario = _scenario(recording, config, motion, route, lidars, objects)
     elsewhere = objects or {"chair": ChairModel(xy_m=(0.0, 0.0))}
     vehicle = scenario.model_copy(
@@ -136,7 +138,7 @@ def recorded_drive(recording: Recording, config: Config, progress: Progress) -> 
         _assumptions(config),
         vehicle,
         bool(objects),
-        (*seen.notes, *motion.notes, *said_height, *said_targets),
+        (*seen.notes, *motion.notes, *said_height, *said_targets, *said_walls),
     )
 
 

@@ -65,6 +65,15 @@ def test_uneven_channels_to_one_side() -> None:
     assert found.column_deg == pytest.approx(0.4, rel=0.01)
 
 
+def test_the_field_of_view_of_a_lidar_that_looks_back() -> None:
+    found = turning(np.arange(-15.0, 0.0, 2.0), (130.0, 250.0), 0.4)
+
+    low, high = found.horizontal_fov_deg
+    assert (low % 360.0, high % 360.0) == pytest.approx((130.0, 250.0), abs=0.5)
+    # About a middle between -180 and 180.
+    assert abs(low + high) <= 360.0
+
+
 def test_two_returns_of_a_beam_are_no_columns() -> None:
     azimuth = np.radians(np.arange(-60.0, 60.0, 0.2))
     once = cloud(np.radians(np.arange(-15.0, 0.0, 1.0))[:, None], azimuth, 1)

@@ -22,7 +22,10 @@ import yaml
 from caliv_graph.cli import main
 from caliv_graph.export.text import quaternion_xyzw
 from caliv_graph.pipeline import Look
+from caliv_graph.planning import Assumptions
+from caliv_graph.planning.suggest import Planned
 from caliv_graph.results.calibration_file import write_calibration
+from caliv_graph.scenario.model import Scenario, load_scenario
 from tests.cli.commands import ROOT
 from tests.cli.test_init import write_sensors
 from tests.fusion.drives import TRUTH, drive, information
@@ -83,7 +86,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "sensors_calibration.yaml").write_text(yaml.safe_dump(vehicle))
     (folder / "fleet.yaml").write_text("jobs: [{name: monday, config: config.yaml}]")
     shutil.copytree(ROOT / "configs", folder / "configs")
-    shutil.copy(ROOT / "configs/scenarios/paper_arc.yaml", folder / "scenario.yaml")
+    for name in ("scenario.yaml", "next.yaml"):
+        shutil.copy(ROOT / "configs/scenarios/paper_arc.yaml", folder / name)
     return folder
 
 
@@ -98,8 +102,20 @@ def quiet(*_: Any, **__: Any) -> Any:
     """A result that says nothing, of a survey, a validation, a batch or a simulation."""
     verdict = types.SimpleNamespace(contradicts=False, sentences=())
     lists: dict[str, Any] = dict.fromkeys(("warnings", "unmet", "rows"), ())
+    lists |= {"assumptions": Assumptions()}
     lists |= {"scans": {}, "duration_s": 1.0, "folder": "drive", "exit": 0}
     return types.SimpleNamespace(**lists, verdict=verdict, has_structure=True)
+
+
+def planned(*_: Any) -> Planned:
+    """What is known of a vehicle whose drive shows no target."""
+    return Planned(None, load_scenario(ROOT / "configs/scenarios/paper_arc.yaml"), Assumptions())
+
+
+def suggested(scenario: Scenario, *_: Any) -> Any:
+    """The drive itself as the best one."""
+    nothing = types.SimpleNamespace(space_m=(1.0, 1.0), sigma_s2v={}, sigma_s2s={})
+    return types.SimpleNamespace(scenario=scenario, met=False, manoeuvre="arc", prediction=nothing)
 
 
 REPLACED = {
@@ -107,7 +123,9 @@ REPLACED = {
     "caliv_graph.pipeline.look": lambda *_: Look(None, (), ()),
     "caliv_graph.workflows.survey.survey": quiet,
     "caliv_graph.report.predicted.survey_table": lambda *_: "",
-    "caliv_graph.planning.suggest.suggest": lambda *_: None,
+    "caliv_graph.planning.suggest.suggest": suggested,
+    "caliv_graph.workflows.next_drive.recorded_drive": quiet,
+    "caliv_graph.workflows.next_drive.next_drive": planned,
     "caliv_graph.simulation.write_drive": quiet,
     "caliv_graph.validation.validate": quiet,
     "caliv_graph.workflows.repeatability.split_halves": lambda *_: None,

@@ -18,7 +18,7 @@ def observability(
 
     Prints the expected sigma per LiDAR and axis, the undetermined and weak directions with the
     manoeuvre that determines each, and the scans that see the target. Takes less time than
-    'calibrate' and needs the same data.
+    'calibrate' and needs the same data. 'plan' with the same config suggests the next drive.
 
     Exit code 3: something that 'require' or 'limits' in the config asks for will not be reached, or
     a LiDAR saw neither target nor structure.

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from caliv_graph.cli import streams
-from caliv_graph.cli.options import AsJson, Force
+from caliv_graph.cli.options import AsJson, Drives, Force
 from caliv_graph.common.exits import UNMET
+
+if TYPE_CHECKING:
+    from caliv_graph.common.progress import SilentProgress
+    from caliv_graph.planning.assumptions import Assumptions, Ground, Source
+    from caliv_graph.planning.suggest import Planned
 
 
 def plan(
-    scenarios: Annotated[
+    drives: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SCENARIO.yaml",
-            help="The drive: vehicle, LiDARs, target, walls. Several: drives of one vehicle, "
-            "solved together.",
+            metavar="SCENARIO.yaml|CONFIG.yaml",
+            help="The drive: a scenario with vehicle, LiDARs, target, walls, or the config of a "
+            "recorded drive, from which all this is taken. Several: drives of one vehicle, solved "
+            "together; beside a config, the vehicle of a scenario is replaced by the recorded one.",
         ),
     ],
+    data: Drives = None,
     sigma: Annotated[
         list[str] | None,
         typer.Option(
@@ -31,13 +40,14 @@ def plan(
         ),
     ] = None,
     ground: Annotated[
-        Literal["none", "plane", "height"],
+        Literal["none", "plane", "height"] | None,
         typer.Option(
             "--ground",
             help="How the ground is used: not at all, as a plane, or as a plane at a known height "
             "below the vehicle.",
+            show_default="height, or as the config says",
         ),
-    ] = "height",
+    ] = None,
     poses: Annotated[
         bool,
         typer.Option(
@@ -69,44 +79,119 @@ def plan(
     ramp unless the ground has a known height) and target placements without walls, and names the
     one that keeps all limits in the least space.
 
+    With the config of a recorded drive, vehicle, sensors, noise and target are read off the
+    recording, and its own sigmas are predicted, without its walls. The suggestion is a drive of
+    that vehicle. --out writes it as a scenario; with the config and this scenario the command tells
+    what both drives give together. Limits are those of the config unless --sigma names others.
+
     Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target or a wall.
 
     Example: caliv-graph plan scenario.yaml --sigma s2v_yaw_deg=0.05 --sigma s2v_x_m=0.01
+
+    Example: caliv-graph plan config.yaml --data drive/
     """
     from caliv_graph.common.files import atomic_write, check_output_file
+    from caliv_graph.config.load import load_config
     from caliv_graph.errors import OutputError
     from caliv_graph.planning.assumptions import Assumptions
-    from caliv_graph.planning.predict import predict
     from caliv_graph.planning.suggest import is_met, parse_goals, shortfall, suggest
     from caliv_graph.report.predicted import plan_document, plan_table
-    from caliv_graph.scenario.model import dump_scenario, load_scenario
+    from caliv_graph.scenario.model import dump_scenario, is_recording_config
 
     goals = parse_goals(sigma or ())
     if out is not None:
         check_output_file(out, force)
-    first, *others = [load_scenario(path) for path in scenarios]
-    assumptions = Assumptions(
-        ground=ground,
-        source="poses" if poses else None,
-        time_offset=time_offset,
-        structure=structure,
-    )
-    prediction = predict(first, others, assumptions)
-    met = is_met(shortfall(prediction, goals), goals)
-    suggestion = suggest(first, goals, assumptions)
+    configs = [path for path in drives if is_recording_config(path)]
+    scenarios = [path for path in drives if path not in configs]
+    if configs:
+        goals = goals or load_config(configs[0]).limits
+        _check_options(configs, poses)
+        with streams.progress_on_stdout(as_json) as progress:
+            planned = _of_recording(
+                configs[0], scenarios, data or (), (ground, time_offset, structure), progress
+            )
+    else:
+        source: Source | None = "poses" if poses else None
+        assumptions = Assumptions(
+            ground=ground or "height", source=source, time_offset=time_offset, structure=structure
+        )
+        planned = _of_scenarios(scenarios, data or (), assumptions)
+    prediction = planned.prediction
+    met = prediction is not None and is_met(shortfall(prediction, goals), goals)
+    suggestion = suggest(planned.vehicle, goals, planned.assumptions)
     if out is not None:
         if suggestion is None:
             why = "no LiDAR sees the target in any of the manoeuvres tried"
-            if not first.world.targets:
+            if not planned.vehicle.world.targets:
                 why = "the scenario has no target to place: name one in world.targets"
             raise OutputError(f"{out}: not written: {why}")
         atomic_write(out, dump_scenario(suggestion.scenario), force)
     if as_json:
-        streams.show_json(plan_document(prediction, goals, met, suggestion))
+        streams.show_json(plan_document(planned, goals, met, suggestion))
     else:
-        streams.show(plan_table(prediction, goals, met, suggestion))
+        streams.show(plan_table(planned, goals, met, suggestion))
         if out is not None:
             streams.say(f"Written to {out}")
-    streams.warn(prediction.warnings)
-    if (goals and not met) or prediction.covariance.unseeing:
+    streams.warn([*planned.notes, *(prediction.warnings if prediction is not None else ())])
+    if (goals and not met) or (prediction is not None and prediction.covariance.unseeing):
         raise typer.Exit(UNMET)
+
+
+def _check_options(configs: Sequence[Path], poses: bool) -> None:
+    """Refuses options that a recorded drive has no use for."""
+    from caliv_graph.errors import ConfigError
+
+    if len(configs) > 1:
+        raise ConfigError(
+            f"{configs[1]}: is a second config of a recorded drive. Give one config, and --data "
+            "for each drive of the vehicle"
+        )
+    if poses:
+        raise ConfigError(f"--poses: the recording of {configs[0]} tells what it has. Omit it")
+
+
+def _of_scenarios(paths: Sequence[Path], data: Sequence[Path], assumptions: Assumptions) -> Planned:
+    """Drives that scenarios describe."""
+    from caliv_graph.errors import ConfigError
+    from caliv_graph.planning.predict import predict
+    from caliv_graph.planning.suggest import Planned
+    from caliv_graph.scenario.model import load_scenario
+
+    if data:
+        raise ConfigError(
+            f"--data {data[0]}: is a recorded drive, which needs a config. Give it instead of "
+            f"{paths[0]}, or beside it"
+        )
+    first, *others = [load_scenario(path) for path in paths]
+    return Planned(predict(first, others, assumptions), first, assumptions)
+
+
+def _of_recording(
+    path: Path,
+    scenarios: Sequence[Path],
+    data: Sequence[Path],
+    options: tuple[Ground | None, bool, bool],
+    progress: SilentProgress,
+) -> Planned:
+    """The recorded drives of a config, with scenarios beside them.
+
+    `options` are the ground (None: as the config says), time offsets, structure.
+    """
+    from caliv_graph.batch.job import check_guesses, open_recordings
+    from caliv_graph.config.load import load_config
+    from caliv_graph.scenario.model import load_scenario
+    from caliv_graph.workflows.next_drive import next_drive, recorded_drive
+
+    settings = load_config(path)
+    check_guesses(settings, path)
+    planned = [load_scenario(scenario) for scenario in scenarios]
+    drives = [recorded_drive(r, settings, progress) for r in open_recordings(settings, data)]
+    ground, time_offset, structure = options
+    assumptions = drives[0].assumptions
+    assumptions = replace(
+        assumptions,
+        ground=ground or assumptions.ground,
+        time_offset=time_offset or assumptions.time_offset,
+        structure=structure and assumptions.structure,
+    )
+    return next_drive(drives, planned, assumptions)

@@ -30,7 +30,7 @@ from caliv_graph.planning.sightings import (
     sees_ground,
 )
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.drives import Drive
+from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.targets.cloud.views import view_weights
 from caliv_graph.targets.ground.measure import MAX_APART_NS
@@ -102,7 +102,7 @@ class Columns:
 
 def drive_information(
     scenario: Scenario,
-    drive: Drive,
+    drive: Route,
     sightings: Sequence[Sighting],
     lidars: Sequence[str],
     assumptions: Assumptions,
@@ -242,7 +242,7 @@ def add_ground(
     H: Array,
     motion: PlannedMotion,
     scenario: Scenario,
-    drive: Drive,
+    drive: Route,
     stamps_ns: IntArray,
     columns: Columns,
     assumptions: Assumptions,
@@ -314,7 +314,7 @@ def _add_contact(
     H[at] += np.swapaxes(J, 1, 2) @ J / HEAVE_SIGMA_M**2
 
 
-def _level(motion: PlannedMotion, scenario: Scenario, drive: Drive) -> Array:
+def _level(motion: PlannedMotion, scenario: Scenario, drive: Route) -> Array:
     """(n,) whether the vehicle stands on the plane, not on a ramp."""
     upright = motion.R_map_vehicle[:, 2, 2] > math.cos(TILT_RAD[0])
     low = motion.position_map[:, 2] - scenario.world.ground.height_m < RAMP_HEIGHT_M

@@ -19,7 +19,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.planning.assumptions import Source
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.drives import Drive, sample_stamps
+from caliv_graph.scenario.drives import Route, sample_stamps
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.trajectory.chain import POSE, STATE
 from caliv_graph.trajectory.noise import DEFAULT_FORCE_WALK_M_S3, DEFAULT_GYRO_WALK_RAD_S2
@@ -78,7 +78,7 @@ def nearest(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
 
 
 def plan_motion(
-    drive: Drive,
+    drive: Route,
     scenario: Scenario,
     stamps_ns: IntArray,
     source: Source,
@@ -109,7 +109,7 @@ def plan_motion(
     return PlannedMotion(nodes, R, states.position_map, twist, to_vehicle, diagonal, coupling)
 
 
-def _nodes(drive: Drive, stamps_ns: IntArray, source: Source, spacing_ns: int) -> IntArray:
+def _nodes(drive: Route, stamps_ns: IntArray, source: Source, spacing_ns: int) -> IntArray:
     end = round(drive.duration_s * NANOSECONDS_PER_SECOND)
     grid = np.arange(0, end + 1, spacing_ns, dtype=np.int64)
     # Given poses exist only at the stamps; more nodes would add information.
@@ -146,7 +146,7 @@ def _given_poses(nodes: IntArray, R: Array, scenario: Scenario) -> tuple[Array, 
 
 
 def _inertial(
-    drive: Drive, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
+    drive: Route, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
 ) -> tuple[Array, Array]:
     """Diagonal and coupling of the IMU's information between neighbouring nodes."""
     n = len(nodes)
@@ -174,7 +174,7 @@ def _inertial(
 
 
 def _propagated(
-    drive: Drive, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
+    drive: Route, nodes: IntArray, scenario: Scenario, R_vehicle_imu: Array, arm: Array
 ) -> tuple[Array, Array]:
     """Error-state propagation of the IMU between neighbouring nodes, with white noise.
 
@@ -220,7 +220,7 @@ def _propagated(
     return carried, cov
 
 
-def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenario) -> None:
+def _add_aiding(diagonal: Array, drive: Route, nodes: IntArray, scenario: Scenario) -> None:
     """Adds GNSS, orientation and velocity, each sample at its nearest node."""
     states = drive.states(nodes)
     T_vehicle_imu = scenario.imu.mounting.pose()
@@ -270,14 +270,14 @@ def _add_aiding(diagonal: Array, drive: Drive, nodes: IntArray, scenario: Scenar
 
 
 def _count(
-    nodes: IntArray, drive: Drive, what: str, rate_hz: float, phase_s: float
+    nodes: IntArray, drive: Route, what: str, rate_hz: float, phase_s: float
 ) -> npt.NDArray[np.int64]:
     """(n,) number of samples nearest to each node."""
     stamps = sample_stamps(what, rate_hz, phase_s, drive.duration_s)
     return np.asarray(np.bincount(nearest(nodes, stamps), minlength=len(nodes)))
 
 
-def _good_fixes(drive: Drive, scenario: Scenario) -> IntArray:
+def _good_fixes(drive: Route, scenario: Scenario) -> IntArray:
     """Stamps of the fixes without those in a jump, which the smoother drops."""
     gnss = scenario.gnss
     stamps = sample_stamps("gnss", gnss.rate_hz, gnss.phase_s, drive.duration_s)

@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
+from caliv_graph.geometry.se3 import unstack
 from caliv_graph.planning.faces import Faces, Places, face_places, ground_places
 from caliv_graph.planning.sightings import scan_stamps, solid_angle, within
 from caliv_graph.products import Array, BoolArray, IntArray, Trajectory
 from caliv_graph.scenario.beams import channel_elevations_deg
-from caliv_graph.scenario.drives import Drive
+from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import CropModel, Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.structure.patches import DrivePatches
@@ -28,7 +29,7 @@ PATH_NS = 50_000_000
 
 
 def planned_patches(
-    scenario: Scenario, drive: Drive, faces: Faces, ground: bool
+    scenario: Scenario, drive: Route, faces: Faces, ground: bool
 ) -> tuple[DrivePatches, IntArray]:
     """The patches of the scans that `calibrate` would read, and the face of each; -1: ground.
 
@@ -87,11 +88,12 @@ def planned_patches(
     return patches, np.concatenate(faces_seen)
 
 
-def _path(scenario: Scenario, drive: Drive) -> GivenTrajectory:
+def _path(scenario: Scenario, drive: Route) -> GivenTrajectory:
     end = round(1e9 * drive.duration_s)
     stamps = np.unique(np.append(np.arange(0, end, PATH_NS, dtype=np.int64), end))
-    poses = drive.poses(stamps, scenario.world.ground.height_m)
-    return GivenTrajectory(Trajectory(stamps, tuple(poses)))
+    states = drive.states(stamps, scenario.world.ground.height_m)
+    poses = unstack(states.R_map_vehicle, states.position_map)
+    return GivenTrajectory(Trajectory(stamps, poses))
 
 
 def _seen(

@@ -30,7 +30,7 @@ from caliv_graph.planning.structure import (
     plan_structure,
 )
 from caliv_graph.products import Array, Direction
-from caliv_graph.scenario.drives import Drive, make_drive
+from caliv_graph.scenario.drives import Route, make_drive
 from caliv_graph.scenario.model import UNIFORM_TO_SIGMA, Scenario
 from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.targets.cloud.views import view_weights
@@ -117,7 +117,7 @@ def predict(
 
 
 def predict_drives(
-    planned: Sequence[tuple[Scenario, Drive]], assumptions: Assumptions
+    planned: Sequence[tuple[Scenario, Route]], assumptions: Assumptions
 ) -> Prediction:
     """Like `predict`, for drives that a scenario cannot describe.
 
@@ -175,7 +175,7 @@ def predict_drives(
 
 def _information(
     scenario: Scenario,
-    drive: Drive,
+    drive: Route,
     sightings: Sequence[Sighting],
     structure: PlannedStructure | None,
     lidars: Sequence[str],
@@ -195,7 +195,7 @@ def _information(
     return np.zeros((per_lidar * n, per_lidar * n))
 
 
-def _sightings(scenario: Scenario, drive: Drive, assumptions: Assumptions) -> tuple[Sighting, ...]:
+def _sightings(scenario: Scenario, drive: Route, assumptions: Assumptions) -> tuple[Sighting, ...]:
     """Clouds in which each LiDAR sees each placement, and which of them are used."""
     extraction = assumptions.extraction
     out = []
@@ -211,7 +211,7 @@ def _sightings(scenario: Scenario, drive: Drive, assumptions: Assumptions) -> tu
 
 
 def _nobody(
-    planned: Sequence[tuple[Scenario, Drive]],
+    planned: Sequence[tuple[Scenario, Route]],
     seen: Sequence[Sequence[Sighting]],
     extraction: ExtractionConfig,
 ) -> CalivError:
@@ -231,7 +231,7 @@ def _nobody(
 
 
 def _warnings(
-    planned: Sequence[tuple[Scenario, Drive]],
+    planned: Sequence[tuple[Scenario, Route]],
     seen: Sequence[Sequence[Sighting]],
     lidars: Sequence[str],
     time_offset: bool,
@@ -288,13 +288,13 @@ def _unshared(seen: Sequence[Sequence[Sighting]], lidars: Sequence[str]) -> Iter
                 )
 
 
-def space(planned: Sequence[tuple[Scenario, Drive]]) -> tuple[float, float]:
+def space(planned: Sequence[tuple[Scenario, Route]]) -> tuple[float, float]:
     """Sides of the rectangles around path and targets, the largest of each, metres."""
     sides = []
     for scenario, drive in planned:
         stamps = np.linspace(0, drive.duration_s * 1e9, 200).astype(np.int64)
         places = [
-            drive.motion(stamps).xy_map,
+            drive.states(stamps).position_map[:, :2],
             *(p.centre_map[None, :2] for p in placements(scenario)),
         ]
         sides.append(np.ptp(np.concatenate(places), axis=0))

@@ -15,7 +15,7 @@ from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
-from caliv_graph.scenario.drives import Drive, cloud_stamps
+from caliv_graph.scenario.drives import Route, cloud_stamps
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.shapes import object_mesh
@@ -202,7 +202,7 @@ def scan_stamps(scenario: Scenario, lidar: str, duration_s: float) -> IntArray:
 
 
 def sight(
-    drive: Drive,
+    drive: Route,
     scenario: Scenario,
     lidar: str,
     placement: Placement,

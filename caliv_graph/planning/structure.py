@@ -28,7 +28,7 @@ from caliv_graph.planning.motion import PlannedMotion, plan_motion
 from caliv_graph.planning.patches import planned_patches
 from caliv_graph.planning.sightings import Sighting, placements, sees_ground
 from caliv_graph.products import Array, IntArray
-from caliv_graph.scenario.drives import Drive
+from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem
@@ -89,7 +89,7 @@ class PlannedStructure:
 
 
 def plan_structure(
-    scenario: Scenario, drive: Drive, sightings: Sequence[Sighting], assumptions: Assumptions
+    scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
 ) -> PlannedStructure | None:
     """The structure of a drive; None if it passes no walls, or if none is to be used."""
     faces = faces_of(scenario)
@@ -160,7 +160,7 @@ def _pose_prior(motion: PlannedMotion, nodes: IntArray, heave_m: float) -> PoseP
 
 def information_with_structure(
     scenario: Scenario,
-    drive: Drive,
+    drive: Route,
     sightings: Sequence[Sighting],
     structure: PlannedStructure,
     assumptions: Assumptions,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from caliv_graph.planning.predict import Prediction, predict, sigma_of, space
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
 from caliv_graph.scenario.drives import Drive, make_drive
 from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.world_models import RampModel
 
 DEFAULT_RADIUS_M = 9.16
@@ -70,6 +71,25 @@ class Suggestion:
     prediction: Prediction
     met: bool
     worst: float
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The drives that are asked about, and what a suggestion starts from.
+
+    Attributes:
+        prediction: of all of them together; None: recorded ones that show no target, alone.
+        vehicle: vehicle, sensors, and the target to place (the first).
+        assumptions: how drives will be recorded and calibrated.
+        lidars: as a recording showed them, by name; empty: a scenario states them.
+        notes: for the user, a line each.
+    """
+
+    prediction: Prediction | None
+    vehicle: Scenario
+    assumptions: Assumptions
+    lidars: Mapping[str, LidarModel] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def parse_goals(items: Sequence[str]) -> dict[str, float]:

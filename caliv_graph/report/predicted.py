@@ -24,11 +24,12 @@ from caliv_graph.report.walls import (
     wall_parts,
 )
 from caliv_graph.results.calibration_file import calibration_document
+from caliv_graph.scenario.beams import channel_elevations_deg
 
 if TYPE_CHECKING:
     from caliv_graph.planning.predict import Prediction
     from caliv_graph.planning.sightings import Sighting
-    from caliv_graph.planning.suggest import Suggestion
+    from caliv_graph.planning.suggest import Planned, Suggestion
     from caliv_graph.uncertainty.predicted import PredictedCovariance
     from caliv_graph.workflows.survey import Survey
 
@@ -70,16 +71,27 @@ def survey_document(survey: Survey) -> dict[str, Any]:
 
 
 def plan_table(
-    prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
+    planned: Planned, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> RenderableType:
     """The result of `plan` as tables; `goals` has per limit the largest sigma allowed.
 
     The suggestion is the drive that keeps all limits in the least space, or comes nearest; None:
     none was found.
     """
+    parts = [] if planned.prediction is None else _prediction_parts(planned.prediction)
+    parts += _vehicle_parts(planned)
+    if goals and planned.prediction is not None:
+        kept = "keeps" if met else "does not keep"
+        limits = ", ".join(f"{key} {value:g}" for key, value in goals.items())
+        parts += ["", Text(f"The drive {kept} the limits: {limits}.")]
+    parts += _suggestion_parts(planned.prediction, goals, met, suggestion)
+    return Group(*parts)
+
+
+def _prediction_parts(prediction: Prediction) -> list[RenderableType]:
     predicted = prediction.covariance
     x, y = prediction.space_m
-    parts: list[RenderableType] = [
+    return [
         Text.assemble(
             ("Predicted accuracy", "bold"),
             f": {', '.join(prediction.names)}, {prediction.duration_s:.0f} s, {x:.0f} x {y:.0f} m",
@@ -89,24 +101,39 @@ def plan_table(
         *wall_parts(prediction),
         *_direction_parts(predicted),
     ]
-    if goals:
-        kept = "keeps" if met else "does not keep"
-        limits = ", ".join(f"{key} {value:g}" for key, value in goals.items())
-        parts += ["", Text(f"The drive {kept} the limits: {limits}.")]
-    parts += _suggestion_parts(prediction, goals, met, suggestion)
-    return Group(*parts)
+
+
+def _vehicle_parts(planned: Planned) -> list[RenderableType]:
+    """What a recording showed of its LiDARs."""
+    if not planned.lidars:
+        return []
+    table = new_table("LiDAR", "azimuth\ndeg", "elevation\ndeg", "channels", "column\ndeg", "Hz")
+    for name, model in planned.lidars.items():
+        elevations = channel_elevations_deg(model)
+        table.add_row(
+            Text(name),
+            "{:.0f} to {:.0f}".format(*model.horizontal_fov_deg),
+            f"{elevations[0]:.1f} to {elevations[-1]:.1f}",
+            str(len(elevations)),
+            f"{model.horizontal_resolution_deg:.2f}",
+            f"{model.rate_hz:.1f}",
+        )
+    return titled("LiDARs by their clouds: beams that returned", table)
 
 
 def plan_document(
-    prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
+    planned: Planned, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> dict[str, Any]:
     """The result as plain values: metres, degrees, seconds."""
+    prediction = planned.prediction
+    recorded = {name: m.model_dump(mode="json") for name, m in planned.lidars.items()}
     return {
-        **_prediction_document(prediction),
+        **({} if prediction is None else _prediction_document(prediction)),
+        **({"recorded_lidars": recorded} if recorded else {}),
         "asked": dict(goals),
         "met": met,
         "suggestion": None if suggestion is None else _suggestion_document(suggestion),
-        "warnings": list(prediction.warnings),
+        "warnings": [*planned.notes, *(() if prediction is None else prediction.warnings)],
     }
 
 
@@ -202,12 +229,16 @@ def _times(sighting: Sighting) -> list[tuple[float, float]]:
 
 
 def _suggestion_parts(
-    prediction: Prediction, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
+    prediction: Prediction | None,
+    goals: Mapping[str, float],
+    met: bool,
+    suggestion: Suggestion | None,
 ) -> list[RenderableType]:
     if suggestion is None:
         return []
     x, y = suggestion.prediction.space_m
-    smaller = x * y < 0.95 * prediction.space_m[0] * prediction.space_m[1]
+    used = math.inf if prediction is None else prediction.space_m[0] * prediction.space_m[1]
+    smaller = x * y < 0.95 * used
     if met and not (suggestion.met and smaller):
         return []
     keeps = "keeps all limits" if goals else "determines all axes"

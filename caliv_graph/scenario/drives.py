@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, Protocol, assert_never
 
 import gtsam
 import numpy as np
@@ -171,6 +171,21 @@ class VehicleStates:
     velocity_map: Array
     acceleration_map: Array
     angular_velocity: Array
+
+
+class Route(Protocol):
+    """What a prediction needs to know of a drive, planned or recorded."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time of its end, since its start."""
+
+    @property
+    def terrain(self) -> Terrain | None:
+        """The ground; None: flat, or as the states show it."""
+
+    def states(self, stamps_ns: IntArray, z_map: npt.ArrayLike = 0.0) -> VehicleStates:
+        """See `Drive.states`."""
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,19 @@ def parse_scenario(raw: Any, source: str) -> Scenario:
     return validated(Scenario, raw, source, expected)
 
 
+def is_recording_config(path: Path) -> bool:
+    """Whether a YAML file is a config of a recorded drive, not a scenario.
+
+    Raises:
+        ConfigError: the file is missing or not YAML.
+    """
+    return _is_recording_config(read_yaml(path))
+
+
+def _is_recording_config(raw: Any) -> bool:
+    return isinstance(raw, Mapping) and "lidars" in raw and not {"drive", "world"} & raw.keys()
+
+
 def load_scenario(path: Path) -> Scenario:
     """Reads and validates a scenario file.
 
@@ -142,11 +155,11 @@ def load_scenario(path: Path) -> Scenario:
         ConfigError: the file is missing, not YAML, or not valid.
     """
     raw = read_yaml(path)
-    if isinstance(raw, Mapping) and "lidars" in raw and not {"drive", "world"} & raw.keys():
+    if _is_recording_config(raw):
         raise ConfigError(
             f"{path}: is a config of a recorded drive: it has neither 'drive' nor 'world', which a "
-            f"scenario has. 'caliv-graph observability {path}' tells what the recorded drive "
-            "determines. For a drive to come give a scenario, such as one of configs/scenarios"
+            f"scenario has. 'caliv-graph plan {path} --out scenario.yaml' makes one with its "
+            "vehicle, and configs/scenarios has others"
         )
     return parse_scenario(raw, str(path))
 

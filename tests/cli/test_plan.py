@@ -13,6 +13,8 @@ from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app, run
 from caliv_graph.scenario.model import load_scenario
+from caliv_graph.simulation.simulate import write_drive as write_simulated
+from tests.workflows.test_survey import scenario_of
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 ARC = SCENARIOS / "paper_arc.yaml"
@@ -169,6 +171,65 @@ def test_a_lidar_that_sees_nothing_is_exit_3(tmp_path: Path) -> None:
     assert result.exit_code == 3
     assert "lidar 'blind' never sees a target" in result.stderr
     assert json.loads(result.stdout)["lidars"]["blind"]["sees_target"] is False
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated arc as a bag, with a config that is ready to run."""
+    folder = tmp_path_factory.mktemp("drives") / "arc"
+    write_simulated(scenario_of("arc"), folder, 1, output="bag", threads=1)
+    return folder / "config.yaml"
+
+
+def test_a_recorded_drive_and_the_next_one(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "next.yaml"
+
+    found = document(recorded, "--out", out)
+
+    assert found["drives"] == ["drive as recorded"]
+    assert found["lidars"]["front"]["determined"]["yaw"] is False
+    assert found["lidars"]["front"]["determined"]["z"] is True
+    lost = found["observability"]["undetermined"]
+    assert [d["text"].rpartition(",")[0] for d in lost] == [
+        "rotation of all LiDARs about the turn centre: x and yaw together"
+    ]
+    assert found["recorded_lidars"]["rear"]["rate_hz"] == 2.0
+    assert found["suggestion"]["drive"]["kind"] == "s_curve"
+    assert any("is planned as a chair" in line for line in found["warnings"])
+    assert any("walls of the recorded drive are not" in line for line in found["warnings"])
+    both = plan(recorded, out, "--sigma", "s2v_yaw_deg=0.05")
+    assert both.exit_code == 0
+    assert "drive as recorded, suggestion" in both.stdout
+    assert "LiDARs by their clouds" in both.stdout
+    assert "The drive keeps the limits" in both.stdout
+
+
+def test_limits_and_ground_are_those_of_the_config(recorded: Path, tmp_path: Path) -> None:
+    raw = yaml.safe_load(recorded.read_text())
+    raw |= {"limits": {"s2v_yaw_deg": 0.05}, "ground": {"use": False}}
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(raw))
+
+    result = plan(config, "--data", recorded.parent / "drive")
+
+    assert result.exit_code == 3
+    assert "The drive does not keep the limits: s2v_yaw_deg 0.05." in result.stdout
+    assert "height of all LiDARs together" in result.stdout
+
+
+def test_what_does_not_go_with_a_recorded_drive(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, said in (
+        ([recorded, recorded.parent / "config.yaml"], "is a second config of a recorded drive"),
+        ([recorded, "--poses"], "--poses: the recording of"),
+        ([ARC, "--data", recorded.parent], "needs a config"),
+    ):
+        assert run(["plan", *map(str, arguments)]) == 2
+        shown = capsys.readouterr()
+        assert shown.out == ""
+        assert len(shown.err.splitlines()) == 1
+        assert said in shown.err
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from caliv_graph.planning import Assumptions, Prediction, predict
 from caliv_graph.planning.assumptions import Ground
 from caliv_graph.planning.faces import faces_of
 from caliv_graph.planning.patches import planned_patches
+from caliv_graph.planning.suggest import Planned
 from caliv_graph.products import Array
 from caliv_graph.report.predicted import plan_document, plan_table
 from caliv_graph.scenario.drive_models import (
@@ -228,9 +229,10 @@ def test_the_document_and_the_words_name_what_is_shared() -> None:
         (seen,) = prediction.walls
         assert seen is not None
 
-        document = plan_document(prediction, {}, False, None)
+        asked = Planned(prediction, DRIVES[name], Assumptions())
+        document = plan_document(asked, {}, False, None)
         words = io.StringIO()
-        Console(width=300, file=words).print(plan_table(prediction, {}, False, None))
+        Console(width=300, file=words).print(plan_table(asked, {}, False, None))
 
         (shared,) = document["shared_walls"]
         assert shared["lidars"] == ["front", "rear"]

@@ -187,7 +187,7 @@ def _stride(draw: _Draw, lidars: Mapping[str, Any]) -> int:
     The LiDAR with the fewest channels keeps 16 or 32 of them, or all: it must see ground and walls.
     """
     fewest = min(lidar["channels"] for lidar in lidars.values())
-    return max(fewest // int(draw.one_of([16, 32])), 1)
+    return int(max(fewest // draw.one_of([16, 32]), 1))
 
 
 def _world(draw: _Draw, seed: int) -> dict[str, Any]:

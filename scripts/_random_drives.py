@@ -103,12 +103,13 @@ def random_drive(seed: int) -> RandomDrive:
     model = make_drive(TypeAdapter(DriveModel).validate_python(drive))
     stamps_ns = np.arange(0.0, model.duration_s, 0.1) * NANOSECONDS_PER_SECOND
     draw.path_xy = model.states(stamps_ns.astype(np.int64)).position_map[:, :2]
+    lidars = _lidars(draw)
     raw = {
         "name": f"random_{seed}",
         "drive": drive,
-        "lidars": _lidars(draw),
+        "lidars": lidars,
         "world": _world(draw, seed),
-        "crop": {"margin_m": 1.0, "elsewhere_stride": draw.one_of([3, 5])},
+        "crop": {"margin_m": 1.0, "elsewhere_stride": _stride(draw, lidars)},
         **_motion_sensors(draw),
         "bag": {"covariances": draw.one_of(["stated", "unknown"], [0.8, 0.2])},
         "suspension": {
@@ -178,6 +179,15 @@ def _lidar(draw: _Draw, yaw_deg: float, top_m: float) -> dict[str, Any]:
             "direction": draw.one_of(["clockwise", "counter_clockwise"]),
         }
     return lidar
+
+
+def _stride(draw: _Draw, lidars: Mapping[str, Any]) -> int:
+    """Of which channels and columns beams are cast where no target is.
+
+    The LiDAR with the fewest channels keeps 16 or 32 of them, or all: it must see ground and walls.
+    """
+    fewest = min(lidar["channels"] for lidar in lidars.values())
+    return int(max(fewest // draw.one_of([16, 32]), 1))
 
 
 def _world(draw: _Draw, seed: int) -> dict[str, Any]:

@@ -50,6 +50,8 @@ def test_an_arc_as_json(arc: Path) -> None:
 def test_in_words_and_with_exit_3_where_the_config_wants_more(arc: Path, tmp_path: Path) -> None:
     raw = yaml.safe_load((arc / "config.yaml").read_text())
     raw |= {"require": ["s2s", "s2v_rotation"], "data": {"path": str(arc / "drive")}}
+    # The words are the subject.
+    raw |= {"structure": {"use": False}, "registration": {"components": 200, "max_points": 160}}
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(raw))
 

@@ -18,6 +18,7 @@ from tests.workflows.test_survey import scenario_of
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 ARC = SCENARIOS / "paper_arc.yaml"
+EIGHT = SCENARIOS / "figure_eight.yaml"
 
 
 def plan(*arguments: object) -> Result:
@@ -95,7 +96,7 @@ def test_sigmas_asked_for_and_not_kept_are_exit_3() -> None:
     assert result.exit_code == 3
     assert "The drive does not keep the limits: s2v_yaw_deg 0.05, s2s_x_m 0.01." in result.stdout
     assert "Smallest drive that keeps all limits" in result.stdout
-    kept = plan(SCENARIOS / "figure_eight.yaml", "--sigma", "s2v_yaw_deg=0.05")
+    kept = plan(EIGHT, "--no-structure", "--sigma", "s2v_yaw_deg=0.05")
     assert kept.exit_code == 0
     assert "The drive keeps the limits" in kept.stdout
 
@@ -104,7 +105,7 @@ def test_what_is_made_of_the_ground() -> None:
     texts = {
         ground: [
             d["text"]
-            for d in document(SCENARIOS / "figure_eight.yaml", "--ground", ground)["observability"][
+            for d in document(EIGHT, "--no-structure", "--ground", ground)["observability"][
                 "undetermined"
             ]
         ]
@@ -131,10 +132,10 @@ def test_two_drives_together(tmp_path: Path) -> None:
 
 
 def test_time_offsets_on_request() -> None:
-    found = document(SCENARIOS / "figure_eight.yaml", "--time-offset")
+    found = document(EIGHT, "--no-structure", "--time-offset")
 
     assert found["lidars"]["front"]["time_offset"]["sigma"] < 0.001
-    assert "time_offset" not in document(ARC)["lidars"]["front"]
+    assert "time_offset" not in document(ARC, "--no-structure")["lidars"]["front"]
 
 
 def test_a_standing_vehicle() -> None:

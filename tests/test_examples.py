@@ -114,18 +114,21 @@ def planned(*_: Any) -> Planned:
 
 def suggested(scenario: Scenario, *_: Any) -> Any:
     """The drive itself as the best one."""
-    nothing = types.SimpleNamespace(space_m=(1.0, 1.0), sigma_s2v={}, sigma_s2s={})
-    return types.SimpleNamespace(scenario=scenario, met=False, manoeuvre="arc", prediction=nothing)
+    nothing = types.SimpleNamespace(sigma_s2v={}, sigma_s2s={})
+    return types.SimpleNamespace(
+        scenario=scenario, met=False, manoeuvre="arc", prediction=nothing, space_m=(1.0, 1.0)
+    )
 
 
 REPLACED = {
+    # First, for it takes the real `look` when it is imported.
+    "caliv_graph.workflows.next_drive.recorded_drive": quiet,
+    "caliv_graph.workflows.next_drive.next_drive": planned,
     "caliv_graph.pipeline.calibrate": calibrated,
     "caliv_graph.pipeline.look": lambda *_: Look(None, (), ()),
     "caliv_graph.workflows.survey.survey": quiet,
     "caliv_graph.report.predicted.survey_table": lambda *_: "",
     "caliv_graph.planning.suggest.suggest": suggested,
-    "caliv_graph.workflows.next_drive.recorded_drive": quiet,
-    "caliv_graph.workflows.next_drive.next_drive": planned,
     "caliv_graph.simulation.write_drive": quiet,
     "caliv_graph.validation.validate": quiet,
     "caliv_graph.workflows.repeatability.split_halves": lambda *_: None,

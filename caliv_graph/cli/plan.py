@@ -81,8 +81,9 @@ def plan(
 
     With the config of a recorded drive, vehicle, sensors, noise and target are read off the
     recording, and its own sigmas are predicted, without its walls. The suggestion is a drive of
-    that vehicle. --out writes it as a scenario; with the config and this scenario the command tells
-    what both drives give together. Limits are those of the config unless --sigma names others.
+    that vehicle to be solved together with the recorded one, unless that alone suffices. --out
+    writes it as a scenario; with the config and this scenario the command tells what both drives
+    give together. Limits are those of the config unless --sigma names others.
 
     Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target or a wall.
 
@@ -118,7 +119,8 @@ def plan(
         planned = _of_scenarios(scenarios, data or (), assumptions)
     prediction = planned.prediction
     met = prediction is not None and is_met(shortfall(prediction, goals), goals)
-    suggestion = suggest(planned.vehicle, goals, planned.assumptions)
+    beside = () if met else planned.recorded
+    suggestion = suggest(planned.vehicle, goals, planned.assumptions, beside)
     if out is not None:
         if suggestion is None:
             why = "no LiDAR sees the target in any of the manoeuvres tried"

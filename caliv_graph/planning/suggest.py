@@ -18,11 +18,12 @@ from caliv_graph.config.model import LIMIT_KEY
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.planning.assumptions import Assumptions
-from caliv_graph.planning.predict import Prediction, predict, sigma_of, space
+from caliv_graph.planning.predict import Prediction, predict_drives, sigma_of, space
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
-from caliv_graph.scenario.drives import Drive, make_drive
+from caliv_graph.scenario.drives import Drive, Route, make_drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.scenario.world_models import RampModel
 
 DEFAULT_RADIUS_M = 9.16
@@ -53,6 +54,10 @@ RAMP_FLANK_M = 4.0
 """A ramp such as a dropped kerb or two boards on bricks: 7.8 degrees at most."""
 
 
+Drives = Sequence[tuple[Scenario, Route]]
+"""Drives of one vehicle, as for `predict_drives`."""
+
+
 @dataclass(frozen=True)
 class Suggestion:
     """A drive that meets the limits, or the one nearest to them.
@@ -60,10 +65,11 @@ class Suggestion:
     Attributes:
         manoeuvre: the manoeuvre in words.
         scenario: the same as a scenario, ready to be simulated or planned.
-        prediction: its prediction.
+        prediction: its prediction, together with the drives that there are already.
         met: whether it meets the limits.
         worst: largest ratio of a predicted sigma to its limit, at most 1 if all limits are met.
             Without limits, the number of undetermined directions.
+        space_m: sides of the rectangle around its path and target.
     """
 
     manoeuvre: str
@@ -71,6 +77,7 @@ class Suggestion:
     prediction: Prediction
     met: bool
     worst: float
+    space_m: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,7 @@ class Planned:
         prediction: of all of them together; None: recorded ones that show no target, alone.
         vehicle: vehicle, sensors, and the target to place (the first).
         assumptions: how drives will be recorded and calibrated.
+        recorded: drives of the vehicle that there are already, each with a target.
         lidars: as a recording showed them, by name; empty: a scenario states them.
         notes: for the user, a line each.
     """
@@ -88,6 +96,7 @@ class Planned:
     prediction: Prediction | None
     vehicle: Scenario
     assumptions: Assumptions
+    recorded: Drives = ()
     lidars: Mapping[str, LidarModel] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -150,7 +159,10 @@ def is_met(worst: float, goals: Mapping[str, float]) -> bool:
 
 
 def suggest(
-    scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
+    scenario: Scenario,
+    goals: Mapping[str, float],
+    assumptions: Assumptions,
+    beside: Drives = (),
 ) -> Suggestion | None:
     """The manoeuvre that meets the goals in the smallest space, or the one nearest to them.
 
@@ -158,6 +170,7 @@ def suggest(
         scenario: vehicle, sensors, and the target to place (the first).
         goals: as for `shortfall`.
         assumptions: how drives will be recorded and calibrated.
+        beside: drives of the vehicle that there are already; it is solved together with them.
 
     Returns:
         None if no LiDAR sees the target in any of them, or if there is none to place.
@@ -165,30 +178,37 @@ def suggest(
     if not scenario.world.targets:
         return None
     best: Suggestion | None = None
-    tried = sorted(candidates(scenario, with_ramp=assumptions.ground != "height"), key=_cost)
-    for manoeuvre, candidate in tried:
-        quick = _tried(manoeuvre, candidate, goals, replace(assumptions, stride=STRIDE))
+    with_ramp = assumptions.ground != "height"
+    quickly = replace(assumptions, stride=STRIDE)
+    for tried in sorted(candidates(scenario, with_ramp, both_turns=bool(beside)), key=_cost):
+        quick = _tried(tried, goals, quickly, beside)
         if quick is None:
             continue
         if quick.met or (goals and quick.worst <= 1.0 + QUICK_TOLERANCE):
-            found = _tried(manoeuvre, candidate, goals, assumptions)
+            found = _tried(tried, goals, assumptions, beside)
             if found is not None and found.met:
                 return found
         if best is None or quick.worst < best.worst:
             best = quick
-    return best and _tried(best.manoeuvre, best.scenario, goals, assumptions)
+    return best and _tried((best.manoeuvre, best.scenario), goals, assumptions, beside)
 
 
 def _tried(
-    manoeuvre: str, scenario: Scenario, goals: Mapping[str, float], assumptions: Assumptions
+    candidate: tuple[str, Scenario],
+    goals: Mapping[str, float],
+    assumptions: Assumptions,
+    beside: Drives,
 ) -> Suggestion | None:
     """A candidate with its prediction; None if no LiDAR sees the target."""
+    manoeuvre, scenario = candidate
+    drive = make_drive(scenario.drive, make_terrain(scenario.world.ground))
     try:
-        prediction = predict(scenario, assumptions=assumptions)
+        prediction = predict_drives([*beside, (scenario, drive)], assumptions)
     except CalivError:
         return None
     worst = shortfall(prediction, goals)
-    return Suggestion(manoeuvre, scenario, prediction, is_met(worst, goals), worst)
+    met = is_met(worst, goals)
+    return Suggestion(manoeuvre, scenario, prediction, met, worst, space([(scenario, drive)]))
 
 
 def _cost(candidate: tuple[str, Scenario]) -> tuple[float, float]:
@@ -199,19 +219,22 @@ def _cost(candidate: tuple[str, Scenario]) -> tuple[float, float]:
     return (round(x * y, 1), drive.duration_s)
 
 
-def candidates(scenario: Scenario, with_ramp: bool = False) -> Iterator[tuple[str, Scenario]]:
+def candidates(
+    scenario: Scenario, with_ramp: bool = False, both_turns: bool = False
+) -> Iterator[tuple[str, Scenario]]:
     """The manoeuvres and target placements to try, in words and as scenarios.
 
     Args:
         scenario: vehicle, sensors, and the target to place (the first).
         with_ramp: also over a ramp, which makes the height observable without the ground.
+        both_turns: arcs to either side: two of them change the curvature.
 
     Raises:
         ConfigError: the scenario has no target.
     """
     if not scenario.world.targets:
         raise ConfigError(f"scenario '{scenario.name}': world.targets names no target to place")
-    for words, model in _manoeuvres(scenario):
+    for words, model in _manoeuvres(scenario, both_turns):
         drive = make_drive(model)
         ramps: list[tuple[str, tuple[RampModel, ...]]] = [("", ())]
         if with_ramp and not isinstance(model, ArcDrive):
@@ -226,7 +249,7 @@ def _place(xy_m: tuple[float, float]) -> str:
     return f"({xy_m[0]:.1f}, {xy_m[1]:.1f}) m from the start, x ahead and y left"
 
 
-def _manoeuvres(scenario: Scenario) -> Iterator[tuple[str, DriveModel]]:
+def _manoeuvres(scenario: Scenario, both_turns: bool) -> Iterator[tuple[str, DriveModel]]:
     given = scenario.drive
     radius_m = float(getattr(given, "radius_m", DEFAULT_RADIUS_M))
     speed = float(getattr(given, "speed_m_s", DEFAULT_SPEED_M_S))
@@ -244,10 +267,13 @@ def _manoeuvres(scenario: Scenario) -> Iterator[tuple[str, DriveModel]]:
     rest_s = still.standstill_s + still.ramp_s
     arc_s = rest_s + ARC_RAD * radius_m / speed
     s_s = rest_s + 2.0 * S_RAD * radius_m / speed
-    yield (
-        f"arc of radius {radius_m:.1f} m by {math.degrees(ARC_RAD):.0f} degrees, {arc_s:.0f} s",
-        ArcDrive(duration_s=round(arc_s, 1), **kept),
-    )
+    for turn in ("right", "left") if both_turns else (kept["turn"],):
+        side = f" to the {turn}" if both_turns else ""
+        yield (
+            f"arc{side} of radius {radius_m:.1f} m by {math.degrees(ARC_RAD):.0f} degrees, "
+            f"{arc_s:.0f} s",
+            ArcDrive(duration_s=round(arc_s, 1), **{**kept, "turn": turn}),
+        )
     yield (
         f"S-curve of radius {radius_m:.1f} m, {math.degrees(S_RAD):.0f} degrees each way, "
         f"{s_s:.0f} s",

@@ -84,7 +84,7 @@ def plan_table(
         kept = "keeps" if met else "does not keep"
         limits = ", ".join(f"{key} {value:g}" for key, value in goals.items())
         parts += ["", Text(f"The drive {kept} the limits: {limits}.")]
-    parts += _suggestion_parts(planned.prediction, goals, met, suggestion)
+    parts += _suggestion_parts(planned, goals, met, suggestion)
     return Group(*parts)
 
 
@@ -229,23 +229,21 @@ def _times(sighting: Sighting) -> list[tuple[float, float]]:
 
 
 def _suggestion_parts(
-    prediction: Prediction | None,
-    goals: Mapping[str, float],
-    met: bool,
-    suggestion: Suggestion | None,
+    planned: Planned, goals: Mapping[str, float], met: bool, suggestion: Suggestion | None
 ) -> list[RenderableType]:
     if suggestion is None:
         return []
-    x, y = suggestion.prediction.space_m
+    x, y = suggestion.space_m
+    prediction = planned.prediction
     used = math.inf if prediction is None else prediction.space_m[0] * prediction.space_m[1]
-    smaller = x * y < 0.95 * used
-    if met and not (suggestion.met and smaller):
+    if met and not (suggestion.met and x * y < 0.95 * used):
         return []
     keeps = "keeps all limits" if goals else "determines all axes"
+    beside = ", together with the recorded one," if planned.recorded and not met else ""
     heading = (
-        f"Smallest drive that {keeps}:"
+        f"Smallest drive that{beside} {keeps}:"
         if suggestion.met
-        else f"None of the manoeuvres tried {keeps}. The nearest:"
+        else f"None of the manoeuvres tried{beside} {keeps}. The nearest:"
     )
     lines: list[RenderableType] = [
         "",

@@ -14,7 +14,8 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_guess
 from caliv_graph.config.lidars import FoundLidarConfig
 from caliv_graph.config.model import Config
-from caliv_graph.errors import ConfigError
+from caliv_graph.errors import ConfigError, TrajectoryError
+from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.select import smooth_trajectories
@@ -51,6 +52,7 @@ from caliv_graph.validation.refine import align, sharper
 from caliv_graph.validation.surfaces import Structure, Thing, Wall
 from caliv_graph.validation.verdict import is_shared, judge, with_held_out
 from caliv_graph.wording.guesses import before_words
+from caliv_graph.wording.odometry import unvalidated_sentence
 
 Stages = Mapping[str, tuple[Placed, Sequence[gtsam.Pose3] | None]]
 
@@ -81,6 +83,8 @@ def validate(
         before = before_words(names, [n for n in names if _is_found(config, n)])
         extrinsics = _extrinsics(names, calibration, config)
         motions = {0: recording.motion() if motion is None else motion}
+        if needs_odometry(motions[0], config):
+            raise TrajectoryError(unvalidated_sentence(recording.name))
         with progress.stage("smoothing the trajectory", None):
             (rough,) = smooth_trajectories([recording], config, [[]], motions)
         regions, no_target = target_regions(recording, rough, config, progress)

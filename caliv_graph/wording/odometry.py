@@ -26,3 +26,12 @@ def odometry_sentence(lidar: str, statement: VehicleStatement, config: Config) -
         f"{tilt:.2f} degrees), {yaw}; {z}, x and y are open: an IMU with GNSS or velocities, or "
         f"poses, would tell them{target}"
     )
+
+
+def unvalidated_sentence(name: str) -> str:
+    """Why a drive without motion data validates nothing, and what does."""
+    return (
+        f"{name}: no motion data: validation puts the clouds of all LiDARs into one map by poses "
+        "that no LiDAR made. Name IMU, GNSS, velocities or poses in topics (or data.poses) if they "
+        "were recorded, or give --data a drive of this vehicle that has them"
+    )

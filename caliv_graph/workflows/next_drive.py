@@ -317,15 +317,16 @@ def next_drive(
     lidars = first.scenario.lidars
     seeing = [d for d in drives if d.sees_target]
     # One vehicle: what a LiDAR shows of its beams and what is found of its place may differ a bit.
-    routes: list[tuple[Scenario, Route]] = [
+    recorded: list[tuple[Scenario, Route]] = [
         (d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}), d.route)
         for d in seeing
     ]
-    routes += [first.driving(scenario) for scenario in planned]
+    every = [*recorded, *(first.driving(scenario) for scenario in planned)]
     return Planned(
-        predict_drives(routes, assumptions) if routes else None,
+        predict_drives(every, assumptions) if every else None,
         (seeing or drives)[0].vehicle,
         assumptions,
+        recorded,
         lidars,
         tuple(dict.fromkeys(note for d in drives for note in d.notes)),
     )

@@ -195,7 +195,9 @@ def test_a_recorded_drive_and_the_next_one(recorded: Path, tmp_path: Path) -> No
         "rotation of all LiDARs about the turn centre: x and yaw together"
     ]
     assert found["recorded_lidars"]["rear"]["rate_hz"] == 2.0
-    assert found["suggestion"]["drive"]["kind"] == "s_curve"
+    # To the right and to the left: two arcs suffice together.
+    assert found["suggestion"]["drive"]["kind"] == "arc"
+    assert found["suggestion"]["drive"]["turn"] == "left"
     assert any("is planned as a chair" in line for line in found["warnings"])
     assert any("walls of the recorded drive are not" in line for line in found["warnings"])
     both = plan(recorded, out, "--sigma", "s2v_yaw_deg=0.05")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from caliv_graph.errors import ConfigError, TrajectoryError
 from caliv_graph.planning.predict import Prediction, predict, predict_drives
 from caliv_graph.planning.suggest import suggest
 from caliv_graph.products import MotionData
+from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.workflows.next_drive import RecordedDrive, next_drive, recorded_drive
 from caliv_graph.workflows.survey import survey
@@ -84,18 +86,26 @@ def test_as_recorded_is_what_the_scenario_and_a_survey_predict() -> None:
 
 def test_what_is_suggested_determines_the_rest_together_with_the_drive() -> None:
     _, _, drive = arc()
+    recorded = next_drive([drive], [], drive.assumptions).recorded
 
-    suggestion = suggest(drive.vehicle, {}, drive.assumptions)
+    suggestion = suggest(drive.vehicle, {}, drive.assumptions, recorded)
     assert suggestion is not None
     both = next_drive([drive], [suggestion.scenario], drive.assumptions).prediction
 
+    # Two arcs to different sides change the curvature, and neither does alone.
+    assert isinstance(suggestion.scenario.drive, ArcDrive)
+    assert suggestion.scenario.drive.turn == "left"
+    assert len(predict(suggestion.scenario, assumptions=drive.assumptions).undetermined) == 1
     assert both is not None
     assert both.undetermined == ()
     assert both.names[1] == "suggestion"
     assert both.names[0].endswith(" as recorded")
-    # Two drives tell more than each of them.
     for name, sigma in both.sigma_s2v.items():
-        assert (sigma < 1.001 * suggestion.prediction.sigma_s2v[name]).all()
+        assert sigma == pytest.approx(suggestion.prediction.sigma_s2v[name], rel=1e-6)
+    # Without the recorded drive more space is needed.
+    alone_too = suggest(drive.vehicle, {}, drive.assumptions)
+    assert alone_too is not None
+    assert math.prod(alone_too.space_m) > math.prod(suggestion.space_m)
 
 
 def test_a_scenario_beside_a_recorded_drive_has_its_vehicle() -> None:

@@ -59,7 +59,7 @@ from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
-from caliv_graph.wording.mounting import placement_sentence
+from caliv_graph.wording.mounting import placement_sentence, region_sentence
 from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
 from caliv_graph.wording.suspects import motion_sentence
@@ -214,6 +214,9 @@ def _searched(
         found = _targets(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         caused = _with_cause(error, rough, motions, config, (findings, raw))
+        if caused is error and isinstance(error, TargetError) and config.target:
+            elsewhere = region_sentence(placements)
+            caused = TargetError(error.what, elsewhere) if elsewhere else error
         if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
             raise caused from error
         return rough, findings, (config, (), (), caused), placements

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -21,6 +23,23 @@ def placement_sentence(found: Placement) -> str:
         return text
     listed = "; ".join(map(_pose, found.others[:MOST_OTHERS]))
     return f"{text}. Other mountings fit nearly as well: {listed}"
+
+
+def region_sentence(placements: Sequence[Placement]) -> str:
+    """Why a LiDAR may see nothing in a region of the map; or nothing.
+
+    A drive that does not determine a mounting leaves what the LiDAR sees metres off in the map: on
+    an arc, turned about its centre.
+    """
+    names = [f"'{found.lidar}'" for found in placements if found.others]
+    if not names:
+        return ""
+    return (
+        f"No initial guess was given, and several mountings of {', '.join(names)} fit this drive, "
+        "which put what it sees at places of the map that are metres apart: the target may be "
+        "there and seem to be outside the region. Enter an initial guess (lidars.<name>.initial), "
+        "or leave out 'target', so that the target is searched for"
+    )
 
 
 def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:

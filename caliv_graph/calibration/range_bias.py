@@ -2,9 +2,10 @@
 
 The ranges of real LiDARs are off by some millimetres, by material, incidence and unit: the same for
 all points of one LiDAR on one target, or slowly changing over it, and so no noise that averages
-out. An offset moves all clouds of a LiDAR on a target along their mean beams; a smooth error moves
-and tilts those of one side. Both are nuisances with normal priors, whose sizes are integrated over
-(`caliv_graph/calibration/README.md`, "Bias of the ranges").
+out. An offset moves all clouds of a LiDAR on a target along their mean beams; what grows with the
+incidence moves and turns each as its faces stand to its beams; a smooth error moves and tilts those
+of one side. All are nuisances with normal priors (`caliv_graph/calibration/README.md`, "Bias of the
+ranges").
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ import scipy.linalg
 
 from caliv_graph.calibration.linear import cloud_rows
 from caliv_graph.calibration.reduced import Reduced
-from caliv_graph.geometry.se3 import skew
+from caliv_graph.geometry.se3 import cross, skew
 from caliv_graph.products import Array
+from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import LEAST_SIGMA_M
 from caliv_graph.registration.register import JointRegistration
+from caliv_graph.structure.solve import INCIDENCE_BIAS_M
 
 TYPICAL_OFFSET_M = 3e-3
 """Median of the prior of the offsets' sigma. Data sheets state an accuracy of 10 to 30 mm at most
@@ -44,6 +47,10 @@ VIEW_RAD = math.radians(20.0)
 """Angle between views, about the target, at which their smooth errors are alike by e^-1/2: what
 depends on incidence changes by a third from 30 to 50 degrees."""
 
+HARDLY_SHOWN = 1e-3
+"""Ridge, relative to what a cloud's faces show of its motion in all directions: a cloud of one face
+does not seem to slide along it or to turn in it."""
+
 RANK_PART = 1e-4
 """Eigenvectors of the correlation of views with less than this part of the largest eigenvalue are
 left out: numerical."""
@@ -60,11 +67,13 @@ class BiasSizes:
         offset_m: of each LiDAR on each target, metres.
         smooth: of the smooth errors, over the roughness.
         least_m: the offsets' is at least this, by the data, metres (`SURE`).
+        incidence_m: of the growth with 1 / cos(incidence), of each LiDAR on each target, metres.
     """
 
     offset_m: float
     smooth: float
     least_m: float = 0.0
+    incidence_m: float = 0.0
 
 
 UNKNOWN = BiasSizes(float(OFFSETS_M[0]), 0.0)
@@ -77,15 +86,18 @@ class RangeBiases:
 
     Attributes:
         offsets: (6 J, B) by a metre of the offset of each LiDAR and placement.
+        incidence: (6 J, B) by a metre per 1 / cos(incidence) - 1, of the same.
         smooth: (6 J, C) by smooth errors of the size of the roughness, as independent ones.
     """
 
     offsets: Array
+    incidence: Array
     smooth: Array
 
     def directions(self, sizes: BiasSizes) -> Array:
-        """(6 J, B + C) by biases of sigma 1."""
-        return np.hstack([sizes.offset_m * self.offsets, sizes.smooth * self.smooth])
+        """(6 J, 2 B + C) by biases of sigma 1."""
+        of_lidars = [sizes.offset_m * self.offsets, sizes.incidence_m * self.incidence]
+        return np.hstack([*of_lidars, sizes.smooth * self.smooth])
 
 
 def range_biases(
@@ -94,13 +106,12 @@ def range_biases(
     """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each."""
     both = [_of_placement(state, R, t) for state, (R, t) in zip(states, poses, strict=True)]
     return RangeBiases(
-        np.asarray(scipy.linalg.block_diag(*(offsets for offsets, _ in both))),
-        np.asarray(scipy.linalg.block_diag(*(smooth for _, smooth in both))),
+        *(np.asarray(scipy.linalg.block_diag(*kind)) for kind in zip(*both, strict=True))
     )
 
 
-def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, Array]:
-    """`RangeBiases.offsets` and `.smooth` of a placement."""
+def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, Array, Array]:
+    """`RangeBiases.offsets`, `.incidence` and `.smooth` of a placement."""
     clouds = state.clouds
     sizes = clouds.sizes[:, None]
     beams = clouds.sum_per_cloud(clouds.rotated(R, clouds.beams)) / sizes
@@ -128,8 +139,39 @@ def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, 
         out = np.zeros((clouds.count, 6, 4 * root.shape[1]))
         out[own] = np.einsum("jac,jk->jack", moves, root).reshape(len(own), 6, -1)
         smooth.append(out)
-    flat = 6 * clouds.count
-    return offsets.reshape(flat, -1), np.concatenate(smooth, axis=2).reshape(flat, -1)
+    kinds = (offsets, _by_incidence(clouds, R, points, middles), np.concatenate(smooth, axis=2))
+    of_offsets, of_incidence, of_smooth = (of.reshape(6 * clouds.count, -1) for of in kinds)
+    return of_offsets, of_incidence, of_smooth
+
+
+def _by_incidence(clouds: CloudStack, R: Array, points: Array, middles: Array) -> Array:
+    """(J, 6, L) how a cloud seems to move by a metre per 1 / cos(incidence) - 1 of its LiDAR.
+
+    A range that is too long by that puts its point `1 - cos(incidence)` behind the surface. The
+    motion that explains this best, over all points whose normals are reliable. `points` (N, 3) and
+    their mean per cloud, `middles` (J, 3), are in the target frame.
+    """
+    normals, own = clouds.rotated(R, clouds.normals), clouds.cloud
+    facing = -np.einsum("na,na->n", normals, clouds.rotated(R, clouds.beams))
+    behind = -(1.0 - np.clip(facing, 0.0, 1.0))
+    apart = points - middles[own]
+    radii = np.sqrt(clouds.sum_per_cloud((apart**2).sum(axis=1)) / clouds.sizes)
+    radii = np.maximum(radii, LEAST_SIGMA_M)[:, None]
+    # Turns in units of the displacement that they are at the radius.
+    J = np.hstack([cross(apart, normals) / radii[own], normals])
+    weighted = clouds.flatness[:, None] * J
+    shown = clouds.sum_per_cloud((weighted[:, :, None] * J[:, None]).reshape(-1, 36))
+    shown = shown.reshape(-1, 6, 6)
+    ridge = HARDLY_SHOWN * np.trace(shown, axis1=1, axis2=2) + 1e-9
+    shown += ridge[:, None, None] * np.eye(6)
+    sums = clouds.sum_per_cloud(weighted * behind[:, None])
+    motion = np.linalg.solve(shown, sums[..., None])[..., 0]
+    turn = motion[:, :3] / radii
+    out = np.zeros((clouds.count, 6, clouds.lidars))
+    each = np.arange(clouds.count)
+    out[each, :3, clouds.lidar] = turn
+    out[each, 3:, clouds.lidar] = motion[:, 3:] + cross(middles, turn)
+    return out
 
 
 def _root_of_views(views: Array) -> Array:
@@ -151,7 +193,7 @@ def without_bias(H: Array, gradient: Array, directions: Array) -> tuple[Array, A
 def fit_bias_sizes(
     reduced: Reduced, biases: RangeBiases, prior: Array, offset_m: float | None = None
 ) -> BiasSizes:
-    """The sigmas of the biases: root mean squares of their posterior.
+    """The sigmas of the biases: root mean squares of their posterior; that of the incidence is set.
 
     By the restricted likelihood: extrinsics, poses, targets and shape are integrated out, so that a
     bias that a mounting can make up for says nothing.
@@ -163,14 +205,17 @@ def fit_bias_sizes(
         offset_m: 1 sigma of the offsets, if the user knows it.
     """
     offsets_m = OFFSETS_M if offset_m is None else np.array([offset_m])
-    information, pull = _information(reduced, np.hstack([biases.offsets, biases.smooth]), prior)
+    # Who knows that all ranges are right to a millimetre knows it of those at a slant, too.
+    incidence_m = INCIDENCE_BIAS_M if offset_m is None else min(INCIDENCE_BIAS_M, offset_m)
+    unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
+    information, pull = _information(reduced, unit, prior)
     smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)
     count = biases.offsets.shape[1]
     cost = np.zeros((len(offsets_m), len(smooths)))
     for i, each_m in enumerate(offsets_m):
         for k, smooth in enumerate(smooths):
             sigma = np.full(len(pull), smooth)
-            sigma[:count] = each_m
+            sigma[:count], sigma[count : 2 * count] = each_m, incidence_m
             cost[i, k] = _cost(sigma[:, None] * information * sigma, sigma * pull)
     cost += 0.5 * (np.log(offsets_m / TYPICAL_OFFSET_M) / LOG_SPREAD)[:, None] ** 2
     if biases.smooth.shape[1]:
@@ -183,6 +228,7 @@ def fit_bias_sizes(
         offset_m=float(np.sqrt(of_offsets @ offsets_m**2)),
         smooth=float(np.sqrt(weights.sum(axis=0) @ smooths**2)),
         least_m=float(offsets_m[least]) if offset_m is None else 0.0,
+        incidence_m=incidence_m,
     )
 
 

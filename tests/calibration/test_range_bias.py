@@ -23,6 +23,7 @@ from caliv_graph.calibration.range_bias import (
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.products import Array, PoseNoise, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
+from caliv_graph.structure.solve import INCIDENCE_BIAS_M
 from tests.calibration.problems import Case, make_case
 from tests.registration.scenes import (
     config_of,
@@ -132,10 +133,72 @@ def test_an_offset_moves_the_clouds_of_one_lidar_and_placement_along_their_beams
         assert beam == pytest.approx(-t[j] / np.linalg.norm(t[j]), abs=0.01)
 
 
-def displacements(smooth: Array, y: Array) -> Array:
+def tilted_plate(tilt_deg: float) -> tuple[JointRegistration, tuple[Array, Array], Array]:
+    """A plate that 'front' sees square, and 'rear' under `tilt_deg` of incidence; its normal."""
+    rng = np.random.default_rng(3)
+    corner = np.array([0.0, -0.2, -0.2])
+    plate = rectangle_points(rng, 900, corner, np.array([0, 0.4, 0]), np.array([0, 0, 0.4]))
+    poses = [looking_at_target(azimuth, 8.0, 0.0) for azimuth in (0.0, tilt_deg)]
+    clouds = tuple(
+        TargetCloud(name, 0, j, seen_from(T, plate, 0.0, rng), f"{j}.pcd")
+        for j, (name, T) in enumerate(zip(("front", "rear"), poses, strict=True))
+    )
+    observation = TargetObservation(0, "plate", np.zeros(3), clouds)
+    return JointRegistration(observation, config_of()), matrices(poses), np.array([1.0, 0.0, 0.0])
+
+
+def test_incidence_moves_a_face_behind_itself_by_one_less_its_cosine() -> None:
+    state, (R, t), normal = tilted_plate(50.0)
+    incidence = range_biases([state], [(R, t)]).incidence.reshape(2, 6, 2)
+    # Square to the beams, whose incidence is at most 2 degrees at its edges: nothing.
+    assert np.abs(incidence[0]).max() < 2e-3
+    assert not incidence[1, :, 0].any()
+    points = state.clouds.moved(R, t)[state.clouds.cloud == 1]
+    moved = displacements(incidence[1, :, 1:], points)[..., 0]
+    # A range too long by 1 / cos - 1 is 1 - cos behind the plane.
+    expected = -(1.0 - math.cos(math.radians(50.0))) * normal
+    np.testing.assert_allclose(moved.mean(axis=0), expected, atol=0.01)
+    # Along the plate nothing is seen.
+    assert np.abs(moved @ np.array([0.0, 1.0, 0.0])).max() < 0.02
+
+
+def test_incidence_moves_a_cloud_as_ranges_that_are_too_long_do() -> None:
+    # Two plates at right angles, seen under 25 and 65 degrees: against points with such ranges.
+    rng = np.random.default_rng(4)
+    faces = [
+        rectangle_points(rng, 700, np.array([0.0, -0.4, -0.2]), across, np.array([0, 0, 0.4]))
+        for across in (np.array([0.0, 0.4, 0.0]), np.array([-0.4, 0.0, 0.0]))
+    ]
+    T = looking_at_target(-25.0, 8.0)
+    clouds, factor = [], 0.05
+    for number, size in enumerate((0.0, factor)):
+        long_points = []
+        for face, normal in zip(faces, ([1.0, 0.0, 0.0], [0.0, -1.0, 0.0]), strict=True):
+            beams = face - T.translation()
+            beams /= np.linalg.norm(beams, axis=1)[:, None]
+            long = size * (1.0 / np.abs(beams @ np.array(normal)) - 1.0)
+            long_points.append(face + long[:, None] * beams)
+        seen = seen_from(T, np.vstack(long_points), 0.0, rng)
+        clouds.append(TargetCloud("front", 0, number, seen, f"{number}.pcd"))
+    observation = TargetObservation(0, "corner", np.zeros(3), tuple(clouds))
+    state = JointRegistration(observation, config_of())
+    poses = matrices([T, T])
+    motion = factor * range_biases([state], [poses]).incidence.reshape(2, 6, 1)[0]
+    points = np.split(state.clouds.moved(*poses), state.clouds.starts[1:])
+    # Both faces move by as much, to the same side.
+    after = points[0] + displacements(motion, points[0])[..., 0]
+    on_first = np.abs(points[0][:, 0]) < 1e-3
+    for own, axis in ((on_first, 0), (~on_first, 1)):
+        expected = np.median(points[1][own, axis] - points[0][own, axis])
+        assert np.median(after[own, axis] - points[0][own, axis]) == pytest.approx(
+            expected, rel=0.1
+        )
+
+
+def displacements(motions: Array, y: Array) -> Array:
     """(N, 3, C) how the points (N, 3) of a cloud move by its left perturbations (6, C)."""
-    turned = np.cross(smooth[None, :3], y[:, :, None], axisa=1, axisb=1, axisc=1)
-    return np.asarray(smooth[None, 3:] + turned)
+    turned = np.cross(motions[None, :3], y[:, :, None], axisa=1, axisb=1, axisc=1)
+    return np.asarray(motions[None, 3:] + turned)
 
 
 def smooth_errors(apart_deg: float, *names: str) -> tuple[Array, list[Array], Array]:
@@ -224,11 +287,16 @@ def biased(bias_m: float, seed: int, *, placements: int = 6) -> tuple[Reduced, A
     return reduced, directions, drawn
 
 
+def only_offsets(directions: Array, smooth: Array | None = None) -> RangeBiases:
+    """Offsets (6 J, B) of clouds whose faces are square to their beams."""
+    nothing = np.zeros((len(directions), 0))
+    return RangeBiases(directions, np.zeros_like(directions), nothing if smooth is None else smooth)
+
+
 def fitted(bias_m: float, seed: int) -> tuple[BiasSizes, Array]:
     reduced, directions, drawn = biased(bias_m, seed)
     prior = reduced.in_tangents(make_case().problem.guess_information())
-    biases = RangeBiases(directions, np.zeros((len(directions), 0)))
-    return fit_bias_sizes(reduced, biases, prior), drawn
+    return fit_bias_sizes(reduced, only_offsets(directions), prior), drawn
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -262,14 +330,17 @@ def test_offsets_that_the_place_of_a_target_makes_up_for_say_nothing() -> None:
         linearise_clouds(case.problem, case.truth),
     )
     prior = reduced.in_tangents(case.problem.guess_information())
-    found = fit_bias_sizes(reduced, RangeBiases(common, np.zeros((24, 0))), prior)
+    found = fit_bias_sizes(reduced, only_offsets(common), prior)
     # The root mean square of a log-normal distribution, but for its tail beyond 30 mm.
     assert found.offset_m == pytest.approx(TYPICAL_OFFSET_M * np.exp(LOG_SPREAD**2), rel=0.2)
     assert found.least_m < 0.5e-3
     # Who knows his LiDARs is believed.
-    known = fit_bias_sizes(reduced, RangeBiases(common, np.zeros((24, 0))), prior, 0.001)
+    known = fit_bias_sizes(reduced, only_offsets(common), prior, 0.001)
     assert known.offset_m == pytest.approx(0.001)
     assert known.least_m == 0.0
+    # So he is of ranges at a slant.
+    assert found.incidence_m == INCIDENCE_BIAS_M
+    assert known.incidence_m == pytest.approx(0.001)
 
 
 def test_turned_faces_are_told_from_offsets() -> None:
@@ -285,6 +356,6 @@ def test_turned_faces_are_told_from_offsets() -> None:
     system = replace(reduced.system, b=reduced.system.b + rows.T @ H @ smooth @ drawn)
     moved = replace(moved, system=system)
     prior = reduced.in_tangents(make_case().problem.guess_information())
-    found = fit_bias_sizes(moved, RangeBiases(offsets, smooth), prior)
+    found = fit_bias_sizes(moved, only_offsets(offsets, smooth), prior)
     assert 2.0 < found.smooth < 4.5
     assert found.offset_m < TYPICAL_OFFSET_M

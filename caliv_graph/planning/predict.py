@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -116,6 +116,60 @@ def predict(
     return predict_drives(planned, assumptions)
 
 
+@dataclass(frozen=True)
+class SeenDrive:
+    """One drive of a prediction, and what its LiDARs see.
+
+    Attributes:
+        scenario: vehicle, sensors and world.
+        drive: the drive.
+        assumptions: how it will be recorded and calibrated.
+        sightings: clouds in which each LiDAR sees each target.
+        structure: the structure that it passes, if any is used.
+    """
+
+    scenario: Scenario
+    drive: Route
+    assumptions: Assumptions
+    sightings: tuple[Sighting, ...]
+    structure: PlannedStructure | None
+    _known: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, scenario: Scenario, drive: Route, assumptions: Assumptions) -> SeenDrive:
+        """Finds out what the LiDARs see.
+
+        Raises:
+            ConfigError: the drive ends before the first sample of a sensor.
+        """
+        sightings = _sightings(scenario, drive, assumptions)
+        structure = plan_structure(scenario, drive, sightings, assumptions)
+        return cls(scenario, drive, assumptions, sightings, structure)
+
+    def information(self, lidars: tuple[str, ...]) -> Array:
+        """As `drive_information`, with structure if there is any; zero if the drive tells nothing.
+
+        It is computed once: a suggestion solves a recorded drive together with many others.
+        """
+        if lidars not in self._known:
+            self._known[lidars] = self._computed(lidars)
+        return self._known[lidars]
+
+    def _computed(self, lidars: tuple[str, ...]) -> Array:
+        scenario, drive, of = self.scenario, self.drive, self.assumptions
+        if self.structure is not None:
+            H = information_with_structure(scenario, drive, self.sightings, self.structure, of)
+            names = list(scenario.lidars)
+            index = [names.index(name) for name in lidars]
+            own = [6 * i + axis for i in index for axis in range(6)]
+            own += [6 * len(names) + i for i in index if of.time_offset]
+            return np.asarray(H[np.ix_(own, own)])
+        if any(len(s.used) for s in self.sightings):
+            return drive_information(scenario, drive, self.sightings, lidars, of)
+        size = (7 if of.time_offset else 6) * len(lidars)
+        return np.zeros((size, size))
+
+
 def predict_drives(
     planned: Sequence[tuple[Scenario, Route]], assumptions: Assumptions
 ) -> Prediction:
@@ -128,12 +182,18 @@ def predict_drives(
     Raises:
         ConfigError, TargetError, TrajectoryError: as for `predict`.
     """
-    first = planned[0][0]
-    seen = [_sightings(scenario, drive, assumptions) for scenario, drive in planned]
-    structures = [
-        plan_structure(scenario, drive, sightings, assumptions)
-        for (scenario, drive), sightings in zip(planned, seen, strict=True)
-    ]
+    return predict_seen([SeenDrive.of(*pair, assumptions) for pair in planned], assumptions)
+
+
+def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Prediction:
+    """Like `predict_drives`, for drives whose sightings are known.
+
+    Raises:
+        ConfigError, TargetError, TrajectoryError: as for `predict`.
+    """
+    planned = [(of.scenario, of.drive) for of in drives]
+    seen, structures = [of.sightings for of in drives], [of.structure for of in drives]
+    first = drives[0].scenario
     by_structure = frozenset().union(*(s.lidars for s in structures if s is not None))
     lidars = tuple(
         name
@@ -143,10 +203,7 @@ def predict_drives(
     if not lidars:
         raise _nobody(planned, seen, assumptions.extraction)
     n = len(lidars)
-    size = (7 if assumptions.time_offset else 6) * n
-    information = np.zeros((size, size))
-    for (scenario, drive), sightings, structure in zip(planned, seen, structures, strict=True):
-        information += _information(scenario, drive, sightings, structure, lidars, assumptions)
+    information = np.sum([of.information(lidars) for of in drives], axis=0)
     sigmas = _guess_sigmas(first)
     D, offsets_s = _without_offsets(information, lidars, np.diag(np.tile(sigmas, n) ** -2.0))
     covariance = predict_covariance(
@@ -171,28 +228,6 @@ def predict_drives(
             *undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
-
-
-def _information(
-    scenario: Scenario,
-    drive: Route,
-    sightings: Sequence[Sighting],
-    structure: PlannedStructure | None,
-    lidars: Sequence[str],
-    assumptions: Assumptions,
-) -> Array:
-    """As `drive_information`, with structure if there is any; zero if the drive tells nothing."""
-    n, per_lidar = len(lidars), 7 if assumptions.time_offset else 6
-    if structure is not None:
-        H = information_with_structure(scenario, drive, sightings, structure, assumptions)
-        names = list(scenario.lidars)
-        index = [names.index(name) for name in lidars]
-        own = [6 * i + axis for i in index for axis in range(6)]
-        own += [6 * len(names) + i for i in index if assumptions.time_offset]
-        return np.asarray(H[np.ix_(own, own)])
-    if any(len(s.used) for s in sightings):
-        return drive_information(scenario, drive, sightings, lidars, assumptions)
-    return np.zeros((per_lidar * n, per_lidar * n))
 
 
 def _sightings(scenario: Scenario, drive: Route, assumptions: Assumptions) -> tuple[Sighting, ...]:

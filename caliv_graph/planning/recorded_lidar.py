@@ -81,7 +81,8 @@ class SeenBeams:
         edges = azimuth_edges(every)
         azimuths = (-180.0, 180.0)
         if edges is not None:
-            middle, half = math.remainder(edges[0], 2.0 * math.pi), edges[1]
+            middle = math.remainder(edges[0], 2.0 * math.pi)
+            half = max(edges[1], LEAST_COLUMN_RAD)
             azimuths = (math.degrees(middle - half), math.degrees(middle + half))
         reach_m = float(np.linalg.norm(every, axis=1).max())
         channels = _channels(elevations(every))
@@ -121,6 +122,7 @@ def _without_channels(clouds: Sequence[Array], every: Array) -> tuple[Array, flo
     """Elevations and distance of columns, degrees, with the density of a LiDAR without channels."""
     spacing = 1.0 / math.sqrt(FieldOfView.of([c for c in clouds if len(c)]).density)
     low, high = np.quantile(elevations(every), [0.001, 0.999])
+    high = max(high, low + spacing)
     count = max(2, round((high - low) / spacing) + 1)
     return np.degrees(np.linspace(low, high, count)), math.degrees(spacing)
 

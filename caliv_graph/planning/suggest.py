@@ -18,7 +18,7 @@ from caliv_graph.config.model import LIMIT_KEY
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.planning.assumptions import Assumptions
-from caliv_graph.planning.predict import Prediction, predict_drives, sigma_of, space
+from caliv_graph.planning.predict import Prediction, SeenDrive, predict_seen, sigma_of, space
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
 from caliv_graph.scenario.drives import Drive, Route, make_drive
 from caliv_graph.scenario.model import Scenario
@@ -180,30 +180,33 @@ def suggest(
     best: Suggestion | None = None
     with_ramp = assumptions.ground != "height"
     quickly = replace(assumptions, stride=STRIDE)
+    known_quickly = [SeenDrive.of(*drive, quickly) for drive in beside]
+    known = [SeenDrive.of(*drive, assumptions) for drive in beside]
     for tried in sorted(candidates(scenario, with_ramp, both_turns=bool(beside)), key=_cost):
-        quick = _tried(tried, goals, quickly, beside)
+        quick = _tried(tried, goals, quickly, known_quickly)
         if quick is None:
             continue
         if quick.met or (goals and quick.worst <= 1.0 + QUICK_TOLERANCE):
-            found = _tried(tried, goals, assumptions, beside)
+            found = _tried(tried, goals, assumptions, known)
             if found is not None and found.met:
                 return found
         if best is None or quick.worst < best.worst:
             best = quick
-    return best and _tried((best.manoeuvre, best.scenario), goals, assumptions, beside)
+    return best and _tried((best.manoeuvre, best.scenario), goals, assumptions, known)
 
 
 def _tried(
     candidate: tuple[str, Scenario],
     goals: Mapping[str, float],
     assumptions: Assumptions,
-    beside: Drives,
+    beside: Sequence[SeenDrive],
 ) -> Suggestion | None:
     """A candidate with its prediction; None if no LiDAR sees the target."""
     manoeuvre, scenario = candidate
     drive = make_drive(scenario.drive, make_terrain(scenario.world.ground))
     try:
-        prediction = predict_drives([*beside, (scenario, drive)], assumptions)
+        own = SeenDrive.of(scenario, drive, assumptions)
+        prediction = predict_seen([*beside, own], assumptions)
     except CalivError:
         return None
     worst = shortfall(prediction, goals)

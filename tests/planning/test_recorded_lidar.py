@@ -103,6 +103,20 @@ def test_a_lidar_without_channels_has_the_density_of_its_points() -> None:
     assert found.elevations_deg[[0, -1]] == pytest.approx([-20.0, 10.0], abs=0.2)
 
 
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_lidar_of_one_plane_is_one(upright: bool) -> None:
+    angle = np.radians(np.arange(-40.0, 0.0, 0.2))
+    still = np.zeros(1)
+    clouds = [cloud(angle, still, s) if upright else cloud(still, angle, s) for s in range(4)]
+
+    found = SeenBeams.of(clouds, "drive")
+    stamps = 100_000_000 * np.arange(5, dtype=np.int64)
+    model = lidar_model(found, LidarConfig(topic="a"), PoseConfig(xyz=(0, 0, 2)), 0.02, stamps)
+
+    level, steep = (np.ptp(fov) for fov in (model.horizontal_fov_deg, model.vertical_fov_deg))
+    assert (level < 2.0, steep < 2.0) == (upright, not upright)
+
+
 def test_a_topic_of_next_to_no_points_is_refused() -> None:
     with pytest.raises(RecordingError, match="drive: LiDAR 'a': 2 clouds have 6 points beyond 2 m"):
         SeenBeams.of([np.full((3, 3), 4.0), np.full((3, 3), 5.0)], "drive: LiDAR 'a'")

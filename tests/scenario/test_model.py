@@ -230,12 +230,7 @@ def test_other_drives_and_objects_can_be_described() -> None:
 def test_the_config_of_a_recorded_drive_leads_to_plan(tmp_path: Path) -> None:
     path = write_config(tmp_path / "config.yaml")
 
-<<<<<<< HEAD
-    made = r"'caliv-graph plan .*config\.yaml --out scenario\.yaml' makes"
-    with pytest.raises(ConfigError, match=made):
-=======
     with pytest.raises(
         ConfigError, match=r"'caliv-graph plan .*config\.yaml --out scenario\.yaml' makes"
     ):
->>>>>>> plan
         load_scenario(path)

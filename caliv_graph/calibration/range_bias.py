@@ -24,7 +24,6 @@ from caliv_graph.products import Array
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import LEAST_SIGMA_M
 from caliv_graph.registration.register import JointRegistration
-from caliv_graph.structure.solve import INCIDENCE_BIAS_M
 
 TYPICAL_OFFSET_M = 3e-3
 """Median of the prior of the offsets' sigma. Data sheets state an accuracy of 10 to 30 mm at most
@@ -39,6 +38,10 @@ LOG_SPREAD = math.log(2.5)
 
 OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
 """Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
+
+INCIDENCES_M = np.geomspace(1e-4, 1e-2, 9)
+"""Sigmas of the growth with 1 / cos(incidence), likewise. Data sheets do not state it, so that all
+sizes are as likely: from nothing to what makes as much as the largest offset at 75 degrees."""
 
 SMOOTHS = np.geomspace(0.02, 5.0, 12)
 """The same of the smooth errors, over the roughness."""
@@ -193,7 +196,7 @@ def without_bias(H: Array, gradient: Array, directions: Array) -> tuple[Array, A
 def fit_bias_sizes(
     reduced: Reduced, biases: RangeBiases, prior: Array, offset_m: float | None = None
 ) -> BiasSizes:
-    """The sigmas of the biases: root mean squares of their posterior; that of the incidence is set.
+    """The sigmas of the biases: root mean squares of their posterior.
 
     By the restricted likelihood: extrinsics, poses, targets and shape are integrated out, so that a
     bias that a mounting can make up for says nothing.
@@ -206,30 +209,36 @@ def fit_bias_sizes(
     """
     offsets_m = OFFSETS_M if offset_m is None else np.array([offset_m])
     # Who knows that all ranges are right to a millimetre knows it of those at a slant, too.
-    incidence_m = INCIDENCE_BIAS_M if offset_m is None else min(INCIDENCE_BIAS_M, offset_m)
+    most_m = INCIDENCES_M[-1] if offset_m is None else offset_m
+    incidences_m = np.minimum(INCIDENCES_M, most_m)
     unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
     information, pull = _information(reduced, unit, prior)
     smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)
     count = biases.offsets.shape[1]
-    cost = np.zeros((len(offsets_m), len(smooths)))
-    for i, each_m in enumerate(offsets_m):
-        for k, smooth in enumerate(smooths):
-            sigma = np.full(len(pull), smooth)
-            sigma[:count], sigma[count : 2 * count] = each_m, incidence_m
-            cost[i, k] = _cost(sigma[:, None] * information * sigma, sigma * pull)
-    cost += 0.5 * (np.log(offsets_m / TYPICAL_OFFSET_M) / LOG_SPREAD)[:, None] ** 2
+    grid = (offsets_m, incidences_m, smooths)
+    cost = np.zeros([len(axis) for axis in grid])
+    for at in np.ndindex(*cost.shape):
+        sigma = np.full(len(pull), smooths[at[2]])
+        sigma[:count], sigma[count : 2 * count] = offsets_m[at[0]], incidences_m[at[1]]
+        cost[at] = _cost(sigma[:, None] * information * sigma, sigma * pull)
+    cost += _unlikely(offsets_m, TYPICAL_OFFSET_M)[:, None, None]
     if biases.smooth.shape[1]:
-        cost += 0.5 * (np.log(smooths / TYPICAL_SMOOTH) / LOG_SPREAD) ** 2
+        cost += _unlikely(smooths, TYPICAL_SMOOTH)
     weights = np.exp(cost.min() - cost)
     weights /= weights.sum()
-    of_offsets = weights.sum(axis=1)
+    of_offsets = weights.sum(axis=(1, 2))
     least = int(np.searchsorted(np.cumsum(of_offsets), 1.0 - SURE))
     return BiasSizes(
         offset_m=float(np.sqrt(of_offsets @ offsets_m**2)),
-        smooth=float(np.sqrt(weights.sum(axis=0) @ smooths**2)),
+        smooth=float(np.sqrt(weights.sum(axis=(0, 1)) @ smooths**2)),
         least_m=float(offsets_m[least]) if offset_m is None else 0.0,
-        incidence_m=incidence_m,
+        incidence_m=float(np.sqrt(weights.sum(axis=(0, 2)) @ incidences_m**2)),
     )
+
+
+def _unlikely(sizes: Array, typical: float) -> Array:
+    """Minus the logarithm of the prior of sizes (n,), up to a constant."""
+    return np.asarray(0.5 * (np.log(sizes / typical) / LOG_SPREAD) ** 2)
 
 
 def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Array, Array]:

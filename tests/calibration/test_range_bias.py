@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from caliv_graph.calibration.graph import pose_graph
 from caliv_graph.calibration.linear import cloud_rows, linearise_clouds
 from caliv_graph.calibration.range_bias import (
+    INCIDENCES_M,
     LOG_SPREAD,
     TYPICAL_OFFSET_M,
     BiasSizes,
@@ -23,7 +24,6 @@ from caliv_graph.calibration.range_bias import (
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.products import Array, PoseNoise, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
-from caliv_graph.structure.solve import INCIDENCE_BIAS_M
 from tests.calibration.problems import Case, make_case
 from tests.registration.scenes import (
     config_of,
@@ -339,8 +339,20 @@ def test_offsets_that_the_place_of_a_target_makes_up_for_say_nothing() -> None:
     assert known.offset_m == pytest.approx(0.001)
     assert known.least_m == 0.0
     # So he is of ranges at a slant.
-    assert found.incidence_m == INCIDENCE_BIAS_M
-    assert known.incidence_m == pytest.approx(0.001)
+    assert found.incidence_m == pytest.approx(np.sqrt(np.mean(INCIDENCES_M**2)))
+    assert known.incidence_m <= 0.001
+
+
+@pytest.mark.parametrize(("drawn_m", "low_m", "high_m"), [(0.0, 0.0, 1e-3), (6e-3, 3e-3, 10e-3)])
+def test_the_incidence_counts_as_far_as_it_shows(
+    drawn_m: float, low_m: float, high_m: float
+) -> None:
+    # No offsets are known of; what moves the clouds is the incidence, or nothing.
+    reduced, directions, _ = biased(drawn_m, 0)
+    nothing = np.zeros((len(directions), 0))
+    biases = RangeBiases(np.zeros_like(directions), directions, nothing)
+    prior = reduced.in_tangents(make_case().problem.guess_information())
+    assert low_m < fit_bias_sizes(reduced, biases, prior).incidence_m < high_m
 
 
 def test_turned_faces_are_told_from_offsets() -> None:

@@ -58,7 +58,7 @@ from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
 from caliv_graph.wording.mounting import placement_sentence, region_sentence
 from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
@@ -163,8 +163,9 @@ def prepare(
         )
     with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
+        scales = noise_scales(rough) or None
         del rough  # a graph of its own, which nobody asks any more
-        trajectories = smooth_trajectories(recordings, config, stamps, motions)
+        trajectories = smooth_trajectories(recordings, config, stamps, motions, scales)
     warnings = [w for r in recordings for w in r.warnings()]
     warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]

@@ -111,11 +111,13 @@ def smooth_trajectories(
     config: Config,
     wanted: Sequence[Sequence[int] | IntArray] | None = None,
     motions: Mapping[int, MotionData] | None = None,
+    scales: Sequence[Mapping[str, float] | None] | None = None,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
     """The trajectory of each drive: given poses if `topics.pose` is set or there is no IMU.
 
     `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
-    `motions` are motion data by the recording's index, if they have been read already.
+    `motions` are motion data by the recording's index, if they have been read already. `scales` are
+    the noise levels of an earlier smoothing (`noise_scales`); None: estimated.
 
     Raises:
         TrajectoryError: the data of a drive do not determine its motion.
@@ -128,8 +130,19 @@ def smooth_trajectories(
         if takes_given_poses(motion, config):
             out.append(_given(motion, stamps))
         else:
-            out.append(smooth_trajectory(motion, config, stamps))
+            known = None if scales is None else scales[index]
+            out.append(smooth_trajectory(motion, config, stamps, scales=known))
     return tuple(out)
+
+
+def noise_scales(
+    trajectories: Sequence[VehicleTrajectory],
+) -> tuple[Mapping[str, float] | None, ...]:
+    """Per drive the scales on the stated sigmas, to smooth it again; None for given poses.
+
+    They are told best where nodes are even: later ones crowd where scans see a target.
+    """
+    return tuple(t.data.scales if isinstance(t, SmoothedTrajectory) else None for t in trajectories)
 
 
 def takes_given_poses(motion: MotionData, config: Config) -> bool:

@@ -7,7 +7,7 @@ origin, and without an orientation source its heading is the x axis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import gtsam
@@ -53,6 +53,7 @@ def smooth_trajectory(
     config: Config,
     stamps_ns: Sequence[int] | IntArray,
     correlated: Sequence[CorrelatedError] = (),
+    scales: Mapping[str, float] | None = None,
 ) -> SmoothedTrajectory:
     """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
 
@@ -60,12 +61,14 @@ def smooth_trajectory(
 
     Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
     IMU are in `lost_ns` of the result. `correlated` are errors of sensors that the config does not
-    give.
+    give. `scales` on the stated sigmas are those of an earlier smoothing of the drive
+    (`SmootherInput.scales`); None: estimated.
 
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
     """
     data, warnings = check_input(motion, config)
+    data = scaled(data, scales or {})
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
     data, states, parameters = _begun(data, nodes)
@@ -73,9 +76,13 @@ def smooth_trajectory(
     robust = solve_without_outliers(data, nodes, states)
     warnings += [*lines, *robust.warnings]
     found = robust.estimate.states
-    scales = estimated_scales(robust.data, nodes, found, robust.dropped, errors)
-    if scales:
-        robust = solve_without_outliers(scaled(robust.data, scales), nodes, found)
+    wrong = (
+        estimated_scales(robust.data, nodes, found, robust.dropped, errors)
+        if scales is None
+        else {}
+    )
+    if wrong:
+        robust = solve_without_outliers(scaled(robust.data, wrong), nodes, found)
         warnings += robust.warnings
     data, estimate, positions = robust.data, robust.estimate, robust.data.positions
     settled = Settled(data, estimate)

@@ -18,7 +18,7 @@ from caliv_graph.errors import ConfigError, TrajectoryError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
-from caliv_graph.trajectory.select import smooth_trajectories
+from caliv_graph.trajectory.select import noise_scales, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
@@ -91,7 +91,8 @@ def validate(
         chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
         nodes = _nodes(chosen, extrinsics[AFTER], rough.span_ns)
         with progress.stage("smoothing the trajectory at the scans", None):
-            (trajectory,) = smooth_trajectories([recording], config, [nodes], motions)
+            scales = noise_scales([rough])
+            (trajectory,) = smooth_trajectories([recording], config, [nodes], motions, scales)
         # The calibration comes first: it decides which points are target and ground.
         clouds = read_clouds(
             recording, trajectory, chosen, extrinsics, regions, not config.ground.use, progress

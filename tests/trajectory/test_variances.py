@@ -15,6 +15,7 @@ from caliv_graph.trajectory.chain import STATE
 from caliv_graph.trajectory.chain_solution import inverse_columns, solved
 from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
 from caliv_graph.trajectory.effects import STEP_NS, error_effects, smoothed_in_time
+from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.variances import NoiseLikelihood, free_components
@@ -111,6 +112,23 @@ def test_stated_sigmas_that_the_data_contradict_are_scaled() -> None:
         assert found[name] == pytest.approx(factor, rel=0.3), name
     assert "by the residuals" in trajectory.noise_sources["gnss"]
     assert "vertical times" in trajectory.noise_sources["gnss"]
+
+
+def test_a_drive_that_is_smoothed_again_keeps_its_noise_levels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    motion = recorded(gnss_vertical=2.0)
+    first = smoothed(motion)
+    monkeypatch.setattr("caliv_graph.trajectory.smooth.estimated_scales", None)
+    again = smooth_trajectory(
+        motion, config_for(Sensors()), WANTED, scales=noise_scales([first])[0]
+    )
+    assert again.data.scales == first.data.scales
+    assert again.noise_sources == first.noise_sources
+    for one, other in zip(
+        again.trajectory.T_map_vehicle, first.trajectory.T_map_vehicle, strict=True
+    ):
+        assert one.equals(other, 2e-5)  # a hundredth of its sigma
 
 
 def test_sigmas_of_the_config_are_kept() -> None:

@@ -163,7 +163,7 @@ def prepare(
         )
     with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
-        scales = noise_scales(rough) or None
+        scales = noise_scales(rough)
         del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(recordings, config, stamps, motions, scales)
     warnings = [w for r in recordings for w in r.warnings()]

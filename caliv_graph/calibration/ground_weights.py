@@ -25,15 +25,13 @@ from caliv_graph.calibration.ground_factors import (
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_ground
 from caliv_graph.products import Array, GroundObservation, IntArray
+from caliv_graph.targets.ground.planes import MEDIAN_OF_NORMAL
 
 APART_NS = 10_000_000
 """Scans are grouped by their time from their pose, in steps of this."""
 
 SPREADS = (4.0, 8.0)
 """Spreads of its group up to which an observation has full weight, and beyond which it has none."""
-
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of the absolute value of a standard normal variable: makes of medians a spread."""
 
 FEWEST_ALIKE = 5
 """Fewer observations give no spread; all keep full weight."""

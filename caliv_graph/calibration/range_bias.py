@@ -209,8 +209,7 @@ def fit_bias_sizes(
     """
     offsets_m = OFFSETS_M if offset_m is None else np.array([offset_m])
     # Who knows that all ranges are right to a millimetre knows it of those at a slant, too.
-    most_m = INCIDENCES_M[-1] if offset_m is None else offset_m
-    incidences_m = np.minimum(INCIDENCES_M, most_m)
+    incidences_m = INCIDENCES_M if offset_m is None else np.minimum(INCIDENCES_M, offset_m)
     unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
     information, pull = _information(reduced, unit, prior)
     smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)

@@ -13,10 +13,11 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
+from caliv_graph.calibration.structure import rows_of_lidars
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.conventions import key_ground
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, skew
-from caliv_graph.products import Array, Solution, Stance, StructureTerm
+from caliv_graph.products import Array, IntArray, Solution, Stance, StructureTerm
 from caliv_graph.trajectory.tilt import BODY_SIGMA_RAD
 
 
@@ -44,16 +45,17 @@ def stance_rows(solution: Solution) -> list[StanceRows]:
     terms = {term.drive: term for term in solution.structure if term.stance is not None}
     out = [_of_term(solution, term) for term in terms.values()]
     out += _heights_in_graph(solution)
-    drives, tilted = _drives(solution), "ground_tilt" in solution.factor_kinds
+    (drives, _), tilted = drives_and_stamps(solution), "ground_tilt" in solution.factor_kinds
     for drive in sorted(set(drives.tolist())):
         if key_ground(drive) in solution.linearised.starts and drive not in terms and not tilted:
             out.append(_tilt_in_graph(solution, drive, np.flatnonzero(drives == drive).tolist()))
     return out
 
 
-def _drives(solution: Solution) -> Array:
-    """(n,) drive of every pose, in the order of the graph."""
-    return np.array([drive for drive, _ in solution.T_map_vehicle], dtype=np.int64)
+def drives_and_stamps(solution: Solution) -> tuple[IntArray, IntArray]:
+    """(n,) drive and stamp of every pose, in the order of the graph."""
+    places = np.array(list(solution.T_map_vehicle), dtype=np.int64).reshape(-1, 2)
+    return places[:, 0], places[:, 1]
 
 
 def _of_term(solution: Solution, term: StructureTerm) -> StanceRows:
@@ -111,16 +113,15 @@ def _coordinates(solution: Solution, term: StructureTerm) -> tuple[Array, Array]
             else:
                 moved[row : row + 3] = values.atVector(KEYS[name]) - value
         row += 3
-    row += len(term.time_offsets_s)  # a clock that is late by an offset lifts and tilts nothing
+    # Time offsets are left out: a clock that is late lifts and tilts nothing.
     first = len(graph.gradient) - 6 * len(solution.lidars)
-    for name, T in term.T_vehicle_lidar.items():
+    for name, own in rows_of_lidars(term).items():
         if name in solution.lidars:
             now = solution.T_vehicle_lidar[name]
             i = solution.lidars.index(name)
             to_right = right_to_vehicle_axes(now).T
-            rows[row : row + 6, first:] = to_right @ graph.to_vehicle_axes[6 * i : 6 * i + 6]
-            moved[row : row + 6] = T.localCoordinates(now)
-        row += 6
+            rows[own, first:] = to_right @ graph.to_vehicle_axes[6 * i : 6 * i + 6]
+            moved[own] = term.T_vehicle_lidar[name].localCoordinates(now)
     return rows, moved
 
 

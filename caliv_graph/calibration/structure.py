@@ -44,7 +44,7 @@ def lidars_with_structure(terms: Sequence[StructureTerm]) -> frozenset[str]:
     return frozenset(
         name
         for term in terms
-        for name, own in _rows_of_lidars(term).items()
+        for name, own in rows_of_lidars(term).items()
         if np.diag(term.information)[own].any()
     )
 
@@ -56,7 +56,7 @@ def nearest_extrinsics(
     return {**rough, **{name: T for term in terms for name, T in term.T_vehicle_lidar.items()}}
 
 
-def _rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
+def rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
     """Where the coordinates of each LiDAR's extrinsic are in a term."""
     first = len(term.gradient) - 6 * len(term.T_vehicle_lidar)
     return {
@@ -87,7 +87,7 @@ def _factor(
             held[row] = -offset_s
         row += 1
     # T_a = E S_a, hence d(T_a) = Ad(S_a^-1) d(E) + d(S_a).
-    for name, rows in _rows_of_lidars(term).items():
+    for name, rows in rows_of_lidars(term).items():
         if name not in problem.lidars:
             continue
         _, *others = problem.extrinsic_keys_of(name)

@@ -19,11 +19,11 @@ from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.motion_suspects import motion_parts, worst_misfit
 from caliv_graph.calibration.score_tests import CloudParts
 from caliv_graph.calibration.sensor_noise import heave_of
-from caliv_graph.calibration.stance import StanceRows, stance_rows
+from caliv_graph.calibration.stance import StanceRows, drives_and_stamps, stance_rows
 from caliv_graph.calibration.vehicle_parameters import KEYS, parameter_priors
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array, Guess, IntArray, LinearisedGraph, Solution
+from caliv_graph.products import Array, Guess, LinearisedGraph, Solution
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty.consistency import CLOCK_BIAS_S, REGISTRATION_BIAS
@@ -83,7 +83,7 @@ class _Motion:
 
 def _motion(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> _Motion:
     """The vehicle's poses: the graph's own of the given ones, the smoothers' of the others."""
-    graph, (drives, stamps) = solution.linearised, _drives(solution)
+    graph, (drives, stamps) = solution.linearised, drives_and_stamps(solution)
     smoothed = {
         d: t
         for d, t in enumerate(trajectories)
@@ -315,19 +315,13 @@ def _of_height(stances: Sequence[StanceRows]) -> list[_Block]:
     return [_Block(candidate, prior=prior)]
 
 
-def _drives(solution: Solution) -> tuple[IntArray, IntArray]:
-    """(n,) drive and stamp of every pose, in the order of the graph."""
-    places = np.array(list(solution.T_map_vehicle), dtype=np.int64).reshape(-1, 2)
-    return places[:, 0], places[:, 1]
-
-
 def _of_drift(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> list[_Block]:
     """Slow errors of the vehicle's positions, map axes, and of the yaw of given poses.
 
     Cosines of one and two half waves over each drive. A pose that is too far east by b pulls the
     graph's pose to where it is less b.
     """
-    drives, stamps = _drives(solution)
+    drives, stamps = drives_and_stamps(solution)
     out = []
     for drive, trajectory in enumerate(trajectories):
         mine = np.flatnonzero(drives == drive)
@@ -364,7 +358,7 @@ def _of_several(drive: int, trajectories: Sequence[VehicleTrajectory]) -> str:
 
 def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> list[_Block]:
     """Given poses that are those of another frame than the vehicle's: one transform for all."""
-    drives, _ = _drives(solution)
+    drives, _ = drives_and_stamps(solution)
     given = [d for d, t in enumerate(trajectories) if not isinstance(t, SmoothedTrajectory)]
     of = np.isin(drives, given)
     if not of.any():

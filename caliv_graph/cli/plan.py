@@ -15,6 +15,7 @@ from caliv_graph.common.exits import UNMET
 
 if TYPE_CHECKING:
     from caliv_graph.common.progress import SilentProgress
+    from caliv_graph.config.model import Config
     from caliv_graph.planning.assumptions import Assumptions, Ground, Source
     from caliv_graph.planning.suggest import Planned
 
@@ -91,6 +92,7 @@ def plan(
 
     Example: caliv-graph plan config.yaml --data drive/
     """
+    from caliv_graph.batch.job import check_guesses
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.config.load import load_config
     from caliv_graph.errors import OutputError
@@ -105,11 +107,13 @@ def plan(
     configs = [path for path in drives if is_recording_config(path)]
     scenarios = [path for path in drives if path not in configs]
     if configs:
-        goals = goals or load_config(configs[0]).limits
         _check_options(configs, poses)
+        config = load_config(configs[0])
+        goals = goals or config.limits
+        check_guesses(config, configs[0])
         with streams.progress_on_stdout(as_json) as progress:
             planned = _of_recording(
-                configs[0], scenarios, data or (), (ground, time_offset, structure), progress
+                config, scenarios, data or (), (ground, time_offset, structure), progress
             )
     else:
         source: Source | None = "poses" if poses else None
@@ -169,7 +173,7 @@ def _of_scenarios(paths: Sequence[Path], data: Sequence[Path], assumptions: Assu
 
 
 def _of_recording(
-    path: Path,
+    config: Config,
     scenarios: Sequence[Path],
     data: Sequence[Path],
     options: tuple[Ground | None, bool, bool],
@@ -179,15 +183,12 @@ def _of_recording(
 
     `options` are the ground (None: as the config says), time offsets, structure.
     """
-    from caliv_graph.batch.job import check_guesses, open_recordings
-    from caliv_graph.config.load import load_config
+    from caliv_graph.batch.job import open_recordings
     from caliv_graph.scenario.model import load_scenario
     from caliv_graph.workflows.next_drive import next_drive, recorded_drive
 
-    settings = load_config(path)
-    check_guesses(settings, path)
     planned = [load_scenario(scenario) for scenario in scenarios]
-    drives = [recorded_drive(r, settings, progress) for r in open_recordings(settings, data)]
+    drives = [recorded_drive(r, config, progress) for r in open_recordings(config, data)]
     ground, time_offset, structure = options
     assumptions = drives[0].assumptions
     assumptions = replace(

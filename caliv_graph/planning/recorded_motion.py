@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -24,6 +23,7 @@ from caliv_graph.scenario.sensor_models import (
     PoseNoiseModel,
     VelocityModel,
 )
+from caliv_graph.targets.ground.planes import MEDIAN_OF_NORMAL
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.inputs import STANDARD_GRAVITY_M_S2, SmootherInput
@@ -52,9 +52,6 @@ differences 3 mm."""
 DIFFERENCE = math.sqrt(math.comb(2 * ORDER, ORDER))
 """1 sigma of a difference of this order over that of the values, if they are white."""
 
-MAD_TO_SIGMA = 1.4826
-"""1 sigma over the median of the absolute values, of a Gaussian."""
-
 LEAST_POSES = 20
 """Given poses from which their white error is estimated."""
 
@@ -78,16 +75,6 @@ class RecordedMotion:
     poses: PoseNoiseModel
     gravity_m_s2: float
     notes: tuple[str, ...] = ()
-
-    def models(self) -> Mapping[str, object]:
-        """The fields of a scenario."""
-        return {
-            "imu": self.imu,
-            "gnss": self.gnss,
-            "velocity": self.velocity,
-            "poses": self.poses,
-            "gravity_m_s2": self.gravity_m_s2,
-        }
 
 
 def recorded_motion(
@@ -258,7 +245,7 @@ def pose_noise_model(trajectory: GivenTrajectory, config: Config) -> PoseNoiseMo
 
 def _white(differences: Array) -> float:
     """1 sigma of a white error, from differences (n, 3) of order `ORDER`."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(differences))) / DIFFERENCE
+    return float(np.median(np.abs(differences))) / (MEDIAN_OF_NORMAL * DIFFERENCE)
 
 
 def _sigma(cov: Array) -> float:

@@ -20,7 +20,7 @@ from caliv_graph.errors import CalivError, ConfigError
 from caliv_graph.planning.assumptions import Assumptions
 from caliv_graph.planning.predict import Prediction, SeenDrive, predict_seen, sigma_of, space
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, FigureEightDrive, SCurveDrive
-from caliv_graph.scenario.drives import Drive, Route, make_drive
+from caliv_graph.scenario.drives import Drive, make_drive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.terrain import make_terrain
@@ -52,10 +52,6 @@ QUICK_TOLERANCE = 0.1
 RAMP_HEIGHT_M = 0.25
 RAMP_FLANK_M = 4.0
 """A ramp such as a dropped kerb or two boards on bricks: 7.8 degrees at most."""
-
-
-Drives = Sequence[tuple[Scenario, Route]]
-"""Drives of one vehicle, as for `predict_drives`."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class Planned:
     prediction: Prediction | None
     vehicle: Scenario
     assumptions: Assumptions
-    recorded: Drives = ()
+    recorded: Sequence[SeenDrive] = ()
     lidars: Mapping[str, LidarModel] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -162,7 +158,7 @@ def suggest(
     scenario: Scenario,
     goals: Mapping[str, float],
     assumptions: Assumptions,
-    beside: Drives = (),
+    beside: Sequence[SeenDrive] = (),
 ) -> Suggestion | None:
     """The manoeuvre that meets the goals in the smallest space, or the one nearest to them.
 
@@ -180,19 +176,18 @@ def suggest(
     best: Suggestion | None = None
     with_ramp = assumptions.ground != "height"
     quickly = replace(assumptions, stride=STRIDE)
-    known_quickly = [SeenDrive.of(*drive, quickly) for drive in beside]
-    known = [SeenDrive.of(*drive, assumptions) for drive in beside]
+    beside_quickly = [SeenDrive.of(of.scenario, of.drive, quickly) for of in beside]
     for tried in sorted(candidates(scenario, with_ramp, both_turns=bool(beside)), key=_cost):
-        quick = _tried(tried, goals, quickly, known_quickly)
+        quick = _tried(tried, goals, quickly, beside_quickly)
         if quick is None:
             continue
         if quick.met or (goals and quick.worst <= 1.0 + QUICK_TOLERANCE):
-            found = _tried(tried, goals, assumptions, known)
+            found = _tried(tried, goals, assumptions, beside)
             if found is not None and found.met:
                 return found
         if best is None or quick.worst < best.worst:
             best = quick
-    return best and _tried((best.manoeuvre, best.scenario), goals, assumptions, known)
+    return best and _tried((best.manoeuvre, best.scenario), goals, assumptions, beside)
 
 
 def _tried(

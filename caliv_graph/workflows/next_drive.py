@@ -17,7 +17,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError, RecordingError, TrajectoryError
 from caliv_graph.pipeline import Look, look
 from caliv_graph.planning.assumptions import Assumptions
-from caliv_graph.planning.predict import predict_drives
+from caliv_graph.planning.predict import SeenDrive, predict_seen
 from caliv_graph.planning.recorded_lidar import SeenBeams, lidar_model
 from caliv_graph.planning.recorded_motion import RecordedMotion, lifted, recorded_motion
 from caliv_graph.planning.recorded_route import RecordedRoute
@@ -317,13 +317,16 @@ def next_drive(
     lidars = first.scenario.lidars
     seeing = [d for d in drives if d.sees_target]
     # One vehicle: what a LiDAR shows of its beams and what is found of its place may differ a bit.
-    recorded: list[tuple[Scenario, Route]] = [
-        (d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}), d.route)
+    recorded = [
+        SeenDrive.of(
+            d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}), d.route, assumptions
+        )
         for d in seeing
     ]
-    every = [*recorded, *(first.driving(scenario) for scenario in planned)]
+    to_come = [SeenDrive.of(*first.driving(scenario), assumptions) for scenario in planned]
+    every = [*recorded, *to_come]
     return Planned(
-        predict_drives(every, assumptions) if every else None,
+        predict_seen(every, assumptions) if every else None,
         (seeing or drives)[0].vehicle,
         assumptions,
         recorded,

@@ -8,15 +8,11 @@ from __future__ import annotations
 
 import difflib
 import textwrap
-from array import array
-from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import PoseAxes, TopicsConfig
@@ -24,20 +20,12 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead
-from caliv_graph.readers.bag import Bag, DamagedMessageError, Header, Topic
-from caliv_graph.readers.clock import Clock, clock_warnings, effective_stamps, read_clock
-from caliv_graph.readers.collectors import Collector
-from caliv_graph.readers.definitions import WITHOUT_HEADER
-from caliv_graph.readers.frames import TF_TYPES, clean_frame
-from caliv_graph.readers.heading import HeadingCollector
+from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic
+from caliv_graph.readers.bag_clouds import wanted_clouds
+from caliv_graph.readers.bag_index import BagIndex, read_index
+from caliv_graph.readers.clock import Clock
 from caliv_graph.readers.imu import ImuCheck, ImuCollector, check_imu
-from caliv_graph.readers.motion import (
-    MOTION_TYPES,
-    ON_REQUEST,
-    GnssCollector,
-    TwistCollector,
-)
-from caliv_graph.readers.navigation import COLLECTORS, own_stamp_ns
+from caliv_graph.readers.motion import MOTION_TYPES, ON_REQUEST, GnssCollector
 from caliv_graph.readers.pointcloud2 import (
     CLOUD_TYPES,
     DecodedCloud,
@@ -45,16 +33,8 @@ from caliv_graph.readers.pointcloud2 import (
     packets_hint,
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
-from caliv_graph.readers.poses import PoseCollector, TfCollector
 from caliv_graph.readers.stamps import StampMark
-from caliv_graph.readers.sweeps import (
-    Sample,
-    TimesSeen,
-    decode_cloud,
-    is_sampled,
-    mark_of,
-    times_warnings,
-)
+from caliv_graph.readers.sweeps import TimesSeen, decode_cloud, times_warnings
 
 _KINDS = {
     "imu": "IMU",
@@ -64,39 +44,9 @@ _KINDS = {
     "pose": "pose of the vehicle",
 }
 
-_COLLECTORS: Mapping[str, type[Collector]] = {
-    "imu": ImuCollector,
-    "gnss": GnssCollector,
-    "twist": TwistCollector,
-    "heading": HeadingCollector,
-    "pose": PoseCollector,
-}
-
-_STATIC_TOPIC = "/tf_static"
-
-_JOIN_NS = NANOSECONDS_PER_SECOND // 2
-"""Wanted clouds recorded within this time of each other are read in one go: reading on costs less
-than starting again."""
-
 _LONG_GAP_S = {"imu": 0.1, "gnss": 2.0, "twist": 1.0, "heading": 2.0, "pose": 1.0}
 """Seconds without a message from which there is a warning. Integration over a gap of an IMU soon
 drifts."""
-
-
-@dataclass(frozen=True)
-class _Index:
-    """The result of the first pass over the bag; `scans` has per LiDAR the record time by stamp.
-
-    `collectors` are by kind and topic; `damaged` counts messages that do not decode, by topic;
-    `marks` are what the stamps of each LiDAR mark.
-    """
-
-    clocks: Mapping[str, Clock]
-    frame_ids: Mapping[str, str]
-    scans: Mapping[str, Mapping[int, int]]
-    collectors: Mapping[tuple[str, str], Collector]
-    damaged: Mapping[str, int]
-    marks: Mapping[str, StampMark]
 
 
 class RosbagRecording:
@@ -222,37 +172,25 @@ class RosbagRecording:
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in the order of their stamps, a few decoded ahead (`Recording`).
 
-        A damaged cloud is left out and counted in `warnings`. Clouds recorded out of order are kept
-        until their turn. Parts of the bag without a wanted cloud are not read.
+        A damaged cloud is left out and counted in `warnings`.
 
         Raises:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.
         """
         topic = self._topics[lidar].name
-        queue = _Queue(
-            {
-                stamp_ns: record_ns
-                for stamp_ns, record_ns in self._index.scans[lidar].items()
-                if wanted is None or stamp_ns in wanted
-            }
-        )
-        found = ((lidar, stamp_ns, raw) for stamp_ns, raw in self._found(topic, queue))
+        records_ns = {
+            stamp_ns: record_ns
+            for stamp_ns, record_ns in self._index.scans[lidar].items()
+            if wanted is None or stamp_ns in wanted
+        }
+        clouds = wanted_clouds(self._bag, topic, records_ns)
+        found = ((lidar, stamp_ns, raw) for stamp_ns, raw in clouds)
         for decoded in worked_ahead(self._decoded, found):
             scan = self._scan(lidar, *decoded)
             del decoded  # not kept alive while the next one is read
             if scan is not None:
                 yield scan
             del scan
-
-    def _found(self, topic: str, queue: _Queue) -> Iterator[tuple[int, bytes]]:
-        """Stamps and clouds of a queue, still serialised, in the order of the stamps."""
-        for start_ns, stop_ns in _windows(queue.records_ns.values()):
-            for _, record_ns, raw in self._bag.messages([topic], start_ns, stop_ns):
-                try:
-                    stamp_ns = self._bag.header(raw).stamp_ns or record_ns
-                except DamagedMessageError:
-                    continue  # counted by the first pass
-                yield from queue.take(stamp_ns, record_ns, raw)
 
     def motion(self) -> MotionData:
         """The motion data of the topics that the config names.
@@ -293,90 +231,10 @@ class RosbagRecording:
         return topic
 
     @cached_property
-    def _index(self) -> _Index:
-        collectors = {
-            (kind, topic): _collector(kind, self._bag.topics[topic].type)
-            for kind, topic in self._motion_topics
-        }
-        taking: dict[str, list[Collector]] = {}
-        for (_, topic), collector in collectors.items():
-            taking.setdefault(topic, []).append(collector)
-        lidar_topics = {topic.name for topic in self._topics.values()}
-        topics = dict.fromkeys([*lidar_topics, *taking])
-        samples: dict[str, list[Sample]] = {topic: [] for topic in lidar_topics}
-        trees = [c for c in collectors.values() if isinstance(c, TfCollector)]
-        header_ns = {topic: array("q") for topic in topics}
-        records_ns = {topic: array("q") for topic in topics}
-        frame_ids: dict[str, str] = {}
-        damaged: Counter[str] = Counter()
-        also = {_STATIC_TOPIC} & set(self._bag.topics) if trees else set()
-        for topic, record_ns, raw in self._bag.messages({*topics, *also}):
-            try:
-                message = self._bag.decode(topic, raw) if topic in taking or topic in also else None
-                header = self._header(topic, record_ns, raw, message)
-            except DamagedMessageError:
-                damaged[topic] += 1
-                continue
-            if topic in also:
-                for tree in trees:
-                    tree.add_static(message)
-                if topic not in topics:
-                    continue
-            frame_ids.setdefault(topic, clean_frame(header.frame_id))
-            if topic in samples and is_sampled(len(header_ns[topic])):
-                samples[topic].append(Sample(header.stamp_ns or record_ns, bytes(raw)))
-            header_ns[topic].append(header.stamp_ns)
-            records_ns[topic].append(record_ns)
-            for collector in taking.get(topic, ()):
-                collector.add(header.stamp_ns or record_ns, message)
-        stamps = {
-            topic: (np.array(header_ns[topic], np.int64), np.array(records_ns[topic], np.int64))
-            for topic in topics
-        }
-        clocks = {topic: read_clock(*both) for topic, both in stamps.items()}
-        index = _Index(
-            clocks=clocks,
-            frame_ids=frame_ids,
-            scans={name: _by_stamp(*stamps[topic.name]) for name, topic in self._topics.items()},
-            collectors=collectors,
-            damaged=damaged,
-            marks={
-                name: mark_of(
-                    self._bag,
-                    topic,
-                    self._lidars[name].stamp,
-                    samples[topic.name],
-                    stamps[topic.name],
-                    clocks[topic.name].period_s,
-                )
-                for name, topic in self._topics.items()
-            },
-        )
-        self._warnings += [
-            f"{self._bag.name}: {topic} should have {self._bag.topics[topic].messages} messages, "
-            f"but {len(stamps[topic][0]) + damaged[topic]} were found: the bag seems to be damaged"
-            for topic in topics
-            if len(stamps[topic][0]) + damaged[topic] != self._bag.topics[topic].messages
-        ]
-        # A message of /tf has no stamp of its own, and its senders keep no common order.
-        own = {t: c for t, c in clocks.items() if self._bag.topics[t].type not in TF_TYPES}
-        self._warnings += clock_warnings(self._bag.name, own)
-        self._warnings += [
-            f"{self._bag.name}: {count} messages of {topic} are damaged and not used"
-            for topic, count in damaged.items()
-        ]
+    def _index(self) -> BagIndex:
+        index = read_index(self._bag, self._lidars, self._topics, self._motion_topics)
+        self._warnings += index.warnings
         return index
-
-    def _header(self, topic: str, record_ns: int, raw: bytes, message: Any) -> Header:
-        if self._bag.topics[topic].type in WITHOUT_HEADER:
-            return Header(own_stamp_ns(message, record_ns), "")
-        if self._bag.topics[topic].type not in TF_TYPES:
-            return self._bag.header(raw)
-        if not message.transforms:
-            return Header(0, "")
-        first = message.transforms[0].header
-        stamp_ns = first.stamp.sec * NANOSECONDS_PER_SECOND + first.stamp.nanosec
-        return Header(stamp_ns, first.frame_id)
 
     def _read_motion(self) -> MotionData:
         index = self._index
@@ -475,49 +333,6 @@ class RosbagRecording:
                 where = f"{self._bag.name}: LiDAR '{lidar}'"
                 lines += times_warnings(where, times, self._index.marks[lidar], period_s)
         return lines
-
-
-class _Queue:
-    """The wanted clouds, and those of them that were read before their turn."""
-
-    def __init__(self, records_ns: Mapping[int, int]) -> None:
-        """Takes the record time by stamp, in the order of the stamps."""
-        self.records_ns = records_ns
-        self._order = iter(records_ns)
-        self._next = next(self._order, None)
-        self._early: dict[int, bytes] = {}
-
-    def take(self, stamp_ns: int, record_ns: int, raw: bytes) -> Iterator[tuple[int, bytes]]:
-        """Takes a message; yields the stamps and clouds whose turn has come."""
-        # Of two messages with one stamp, only one is in the index.
-        if self.records_ns.get(stamp_ns) != record_ns:
-            return
-        self._early[stamp_ns] = raw
-        while self._next is not None and self._next in self._early:
-            turn, self._next = self._next, next(self._order, None)
-            yield turn, self._early.pop(turn)
-
-
-def _collector(kind: str, type_name: str) -> Collector:
-    if type_name in TF_TYPES:
-        return TfCollector()
-    return COLLECTORS.get((kind, type_name), _COLLECTORS[kind])()
-
-
-def _by_stamp(header_ns: Any, record_ns: Any) -> dict[int, int]:
-    """Record time by stamp, in the order of the stamps; of equal stamps the first recorded."""
-    stamps, first = np.unique(effective_stamps(header_ns, record_ns), return_index=True)
-    return dict(zip(stamps.tolist(), record_ns[first].tolist(), strict=True))
-
-
-def _windows(records_ns: Iterable[int]) -> list[tuple[int, int]]:
-    """Spans of record time, start and stop, around all of these times and little else."""
-    times = np.unique(np.fromiter(records_ns, np.int64))
-    if not len(times):
-        return []
-    breaks = np.flatnonzero(np.diff(times) > _JOIN_NS)
-    starts, stops = times[np.r_[0, breaks + 1]], times[np.r_[breaks, len(times) - 1]]
-    return [(int(a), int(b) + 1) for a, b in zip(starts, stops, strict=True)]
 
 
 def _seconds(stamp_ns: int) -> str:

@@ -9,15 +9,15 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gtsam
 import numpy as np
 
-from caliv_graph import pipeline
 from caliv_graph.common.progress import PlainProgress, SilentProgress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError
-from caliv_graph.pipeline import calibrate
+from caliv_graph.pipeline import Prepared, calibrate, prepare
 from caliv_graph.products import GivenPoses, Recording
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation import SimulatedRecording
@@ -182,26 +182,22 @@ def performed(
     }
 
 
-_PREPARED: dict[tuple[str, int], pipeline.Prepared] = {}
+_PREPARED: dict[tuple[str, int], Prepared] = {}
 """Trajectory, target and ground of the last drive and seed, with the constants as they are."""
 
 
 @contextmanager
 def _prepared_once(run: tuple[str, int]) -> Iterator[None]:
     """Lets the pipeline take its early stages from before; what estimates does not change them."""
-    prepare = pipeline.prepare
 
-    def prepared(*given: Any) -> pipeline.Prepared:
+    def prepared(*given: Any) -> Prepared:
         if run not in _PREPARED:
             _PREPARED.clear()
             _PREPARED[run] = prepare(*given)
         return _PREPARED[run]
 
-    pipeline.prepare = prepared  # type: ignore[assignment]
-    try:
+    with mock.patch("caliv_graph.pipeline.run.prepare", prepared):
         yield
-    finally:
-        pipeline.prepare = prepare
 
 
 def _given(recording: ThinnedRecording, seed: int) -> GivenPoses:

@@ -12,7 +12,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph import pipeline
 from caliv_graph.calibration.assemble import DRIVES
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import (
@@ -63,8 +62,8 @@ def walls(monkeypatch: pytest.MonkeyPatch) -> Structure:
 
 
 def structure(monkeypatch: pytest.MonkeyPatch, terms: Structure) -> Structure:
-    monkeypatch.setattr(pipeline, "read_patches", patches_of)
-    monkeypatch.setattr(pipeline, "structure_terms", terms)
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.read_patches", patches_of)
+    monkeypatch.setattr("caliv_graph.pipeline.run.structure_terms", terms)
     return terms
 
 
@@ -169,7 +168,7 @@ def test_where_none_is_found_a_warning_says_so(
     def fail(*_: object) -> None:
         raise TargetError("drive: no object stands still", "Give a region")
 
-    monkeypatch.setattr(pipeline, "find_target", fail)
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.find_target", fail)
     drive = arc().asked(target=None)
 
     run = run_on(drive)
@@ -178,7 +177,7 @@ def test_where_none_is_found_a_warning_says_so(
     assert run.calibration.status == "ok"
 
     # Structure that tells nothing: the error names both.
-    monkeypatch.setattr(pipeline, "structure_terms", lambda *_: ())
+    monkeypatch.setattr("caliv_graph.pipeline.run.structure_terms", lambda *_: ())
     with pytest.raises(
         TargetError, match=r"no object stands still.*neither a target nor structure"
     ):

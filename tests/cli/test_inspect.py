@@ -112,8 +112,8 @@ def test_with_a_config_who_sees_the_target_when(
         cloud = TargetCloud("front", 0, 100_000_000, np.full((60, 3), 4.0), "1.pcd")
         return (TargetObservation(0, "target", np.zeros(3), (cloud,), ("2 scans were cut",)),)
 
-    monkeypatch.setattr("caliv_graph.pipeline.find_target", lambda *_: [])
-    monkeypatch.setattr("caliv_graph.pipeline.extract_targets", extract)
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.find_target", lambda *_: [])
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.extract_targets", extract)
     drive = write_drive(tmp_path / "drive")
     config = write_config(tmp_path / "config.yaml")
 
@@ -210,8 +210,8 @@ def test_a_bag_with_a_config_tells_times_of_sightings(
         )
         return (TargetObservation(0, "target", np.zeros(3), clouds),)
 
-    monkeypatch.setattr("caliv_graph.pipeline.find_target", lambda *_: [])
-    monkeypatch.setattr("caliv_graph.pipeline.extract_targets", extract)
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.find_target", lambda *_: [])
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.extract_targets", extract)
     bag = write_bag(tmp_path / "drive", bag_messages())
     lidars = {"front": {"topic": "/lidar/front/points", "initial": {"xyz": [0, 0, 0]}}}
     config = write_config(
@@ -243,8 +243,8 @@ def test_sightings_are_told_though_a_calibration_uses_some_of_the_clouds(
         seen_ns = {"front": tuple(stamps[k] for k in (8, 10, 12, 14, 22, 24, 26))}
         return (TargetObservation(0, "target", np.zeros(3), clouds, seen_ns=seen_ns),)
 
-    monkeypatch.setattr("caliv_graph.pipeline.find_target", lambda *_: [])
-    monkeypatch.setattr("caliv_graph.pipeline.extract_targets", extract)
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.find_target", lambda *_: [])
+    monkeypatch.setattr("caliv_graph.pipeline.preparation.extract_targets", extract)
     bag = write_bag(tmp_path / "drive", bag_messages(30))
     lidars = {"front": {"topic": "/lidar/front/points", "initial": {"xyz": [0, 0, 0]}}}
     config = write_config(

@@ -1,46 +1,32 @@
-"""From recordings to a calibration: one statement per stage, as in the paper's figure."""
+"""From recordings to clouds along a smoothed trajectory, ready to be solved."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from caliv_graph.calibration.assemble import assemble
-from caliv_graph.calibration.check import check
 from caliv_graph.calibration.choose import choose_static, displaced
-from caliv_graph.calibration.estimate import estimate_with_noise
-from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure_evidence import (
-    StructureEvidence,
     kept_stamps,
 )
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
-from caliv_graph.config.guesses import with_found_of
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, TargetError, TrajectoryError
-from caliv_graph.fusion.merge import starting_from, with_earlier
-from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.mounting.place import Placement, place_lidars
 from caliv_graph.odometry.run import with_odometry
 from caliv_graph.physics import (
     check_clouds,
-    contradicted,
-    contradictions_of,
     heading_findings,
     raise_fatal,
-    ranked_with,
     raw_findings,
     smoothed_findings,
     warnings_of,
     with_cause,
 )
 from caliv_graph.products import (
-    Calibration,
     Finding,
     GroundObservation,
     MotionData,
@@ -48,11 +34,8 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.readers.common_stamps import with_common_stamps
-from caliv_graph.readers.sampled import SampledRecording
-from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import read_patches
-from caliv_graph.structure.term import structure_terms
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
@@ -61,7 +44,7 @@ from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
 from caliv_graph.wording.mounting import placement_sentence, region_sentence
 from caliv_graph.wording.odometry import odometry_sentence
-from caliv_graph.wording.structure import no_target_sentence, nothing_sentence
+from caliv_graph.wording.structure import no_target_sentence
 from caliv_graph.wording.suspects import motion_sentence
 
 
@@ -212,7 +195,7 @@ def _searched(
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         config, placements = place_lidars(recordings, rough, config, progress)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
-        found = _targets(recordings, rough, config, progress)
+        found = targets_of(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         caused = _with_cause(error, rough, motions, config, (findings, raw))
         if caused is error and isinstance(error, TargetError) and config.target:
@@ -258,7 +241,7 @@ def _with_cause(
     return with_cause(error, causes)
 
 
-def _targets(
+def targets_of(
     recordings: Sequence[Recording],
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
@@ -278,62 +261,6 @@ def _targets(
         recordings, trajectories, config, progress, choose_static, searched
     )
     return config, misplaced, observations
-
-
-@dataclass(frozen=True)
-class Look:
-    """What a recorded drive shows with a config, as far as it can be seen.
-
-    Attributes:
-        observations: the targets' clouds; None if the search stopped.
-        findings: values of the config that the raw data contradict, the heading included.
-        problems: what stopped the search, a sentence each.
-        notes: where LiDARs without an initial guess were found, a sentence each.
-        trajectory: of the vehicle; None if it could not be smoothed.
-        config: with the mountings that were found; None if none was looked for.
-    """
-
-    observations: tuple[TargetObservation, ...] | None
-    findings: tuple[Finding, ...]
-    problems: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    trajectory: VehicleTrajectory | None = None
-    config: Config | None = None
-
-
-def look(recording: Recording, config: Config, progress: Progress) -> Look:
-    """The checks of `prepare`, and the search for the target, of one drive; raises no CalivError.
-
-    Clouds that are read for the first time here may be damaged: that is a problem like the others.
-    """
-    findings: tuple[Finding, ...] = ()
-    problems: list[str] = []
-    notes: tuple[str, ...] = ()
-    trajectory: VehicleTrajectory | None = None
-    observations: tuple[TargetObservation, ...] | None = None
-    try:
-        check_clouds([recording], config)
-    except CalivError as error:
-        problems.append(str(error))
-    try:
-        motions, config, notes = completed_motions(
-            [recording], config, {0: recording.motion()}, progress
-        )
-        findings = raw = raw_findings(motions, config)
-        if any(found.severity == "fatal" for found in findings):
-            return Look(None, findings, tuple(problems), notes)
-        trajectories = smooth_trajectories([recording], config, [[]], motions)
-        (trajectory,) = trajectories
-        config, placements = place_lidars([recording], trajectories, config, progress)
-        notes += tuple(map(placement_sentence, placements))
-        findings += smoothed_findings([recording], trajectories, motions, config, progress)
-        findings += heading_findings(trajectories, motions, config, raw)
-        near, misplaced, observations = _targets([recording], trajectories, config, progress)
-        problems += (*misplaced, *displaced(observations, trajectories, near))
-    except CalivError as error:
-        problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
-        observations = None
-    return Look(observations, findings, tuple(problems), notes, trajectory, config)
 
 
 def _doubts_about_motion(
@@ -358,102 +285,3 @@ def _stamps_seen(
     seen = {(cloud.drive, cloud.stamp_ns) for o in observations for cloud in o.clouds}
     seen |= {(of.drive, stamp) for of in patches for stamp in of.stamps_ns.tolist()}
     return [sorted(stamp for d, stamp in seen if d == drive) for drive in range(drives)]
-
-
-def calibrate(
-    recordings: Sequence[Recording],
-    config: Config,
-    progress: Progress,
-    prior: Calibration | None = None,
-) -> CalibrationRun:
-    """Calibrates all LiDARs of one vehicle from one or several drives.
-
-    Args:
-        recordings: opened drives (`readers.open_recording`).
-        config: the configuration.
-        progress: reports every stage.
-        prior: an earlier calibration of the vehicle. Its extrinsics are the initial guesses of the
-            solve, and the data of its drives are added to the result. The solve itself does not
-            use these data: it shall find a mount that has moved since.
-
-    Raises:
-        CalivError: something is wrong with the input; the message says what to do.
-    """
-    # Matrices are small, and threads that share a sum add it up in another order: the same result
-    # on any number of cores.
-    with threadpool_limits(limits=1):
-        return _calibrate(recordings, config, progress, prior)
-
-
-def _calibrate(
-    recordings: Sequence[Recording], config: Config, progress: Progress, prior: Calibration | None
-) -> CalibrationRun:
-    """One statement per stage; see `calibrate`."""
-    # The report shows the scans as they are read; nothing is read for it.
-    recordings = sampled = [SampledRecording(recording) for recording in recordings]
-    motions, used, notes = motions_of(recordings, config, progress)
-    digests = [drive_digest(motion) for motion in motions.values()]
-    guessed = used if prior is None else starting_from(used, prior, digests)
-
-    prepared = prepare(recordings, guessed, motions, progress)
-    try:
-        solution, trajectories = estimate_with_noise(
-            prepared.observations,
-            prepared.trajectories,
-            prepared.config,
-            progress,
-            prepared.grounds,
-            structure_evidence(prepared),
-        )
-    except TargetError as error:
-        raise without_anything(prepared, error) from error
-    with progress.stage("checking the result", None):
-        calibration = assemble(
-            solution, with_found_of(config, prepared.config), recordings, digests, trajectories
-        )
-        calibration, doubts = check(
-            calibration,
-            solution,
-            recordings,
-            prepared.trajectories,
-            motions,
-            prepared.config,
-            displaced=bool(prepared.contradictions),
-        )
-        calibration = contradicted(
-            ranked_with(calibration, prepared.findings),
-            prepared.contradictions,
-            contradictions_of(prepared.findings),
-        )
-        calibration, conflicts = with_prior(calibration, prior, config)
-
-    warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts)
-    record = RunRecord(
-        drives=tuple(Path(recording.name).absolute().name for recording in recordings),
-        trajectories=trajectories,
-        grounds=prepared.grounds,
-        scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
-    )
-    return CalibrationRun(calibration, solution, prepared.observations, warnings, record)
-
-
-def structure_evidence(prepared: Prepared) -> StructureEvidence:
-    """The structure of prepared drives, for the solve."""
-    return StructureEvidence(prepared.patches, structure_terms)
-
-
-def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
-    """The error of drives of which structure tells nothing; with why there is no target."""
-    if prepared.no_target is None:
-        return error
-    return TargetError(nothing_sentence(str(prepared.no_target), error.what))
-
-
-def with_prior(
-    calibration: Calibration, prior: Calibration | None, config: Config
-) -> tuple[Calibration, tuple[str, ...]]:
-    """Adds the data of an earlier calibration's drives; and a warning for each conflict."""
-    if prior is None:
-        return calibration, ()
-    fused, conflicts = with_earlier(calibration, prior)
-    return unmet_requirements(fused, config), conflicts

@@ -1,0 +1,135 @@
+"""From recordings to a calibration: one statement per stage, as in the paper's figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from caliv_graph.calibration.assemble import assemble
+from caliv_graph.calibration.check import check
+from caliv_graph.calibration.estimate import estimate_with_noise
+from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.structure_evidence import (
+    StructureEvidence,
+)
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.guesses import with_found_of
+from caliv_graph.config.model import Config
+from caliv_graph.errors import TargetError
+from caliv_graph.fusion.merge import starting_from, with_earlier
+from caliv_graph.fusion.terms import drive_digest
+from caliv_graph.physics import (
+    contradicted,
+    contradictions_of,
+    ranked_with,
+)
+from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
+from caliv_graph.products import (
+    Calibration,
+    Recording,
+)
+from caliv_graph.readers.sampled import SampledRecording
+from caliv_graph.results.run import CalibrationRun, RunRecord
+from caliv_graph.structure.term import structure_terms
+from caliv_graph.wording.structure import nothing_sentence
+
+
+def calibrate(
+    recordings: Sequence[Recording],
+    config: Config,
+    progress: Progress,
+    prior: Calibration | None = None,
+) -> CalibrationRun:
+    """Calibrates all LiDARs of one vehicle from one or several drives.
+
+    Args:
+        recordings: opened drives (`readers.open_recording`).
+        config: the configuration.
+        progress: reports every stage.
+        prior: an earlier calibration of the vehicle. Its extrinsics are the initial guesses of the
+            solve, and the data of its drives are added to the result. The solve itself does not
+            use these data: it shall find a mount that has moved since.
+
+    Raises:
+        CalivError: something is wrong with the input; the message says what to do.
+    """
+    # Matrices are small, and threads that share a sum add it up in another order: the same result
+    # on any number of cores.
+    with threadpool_limits(limits=1):
+        return _calibrate(recordings, config, progress, prior)
+
+
+def _calibrate(
+    recordings: Sequence[Recording], config: Config, progress: Progress, prior: Calibration | None
+) -> CalibrationRun:
+    """One statement per stage; see `calibrate`."""
+    # The report shows the scans as they are read; nothing is read for it.
+    recordings = sampled = [SampledRecording(recording) for recording in recordings]
+    motions, used, notes = motions_of(recordings, config, progress)
+    digests = [drive_digest(motion) for motion in motions.values()]
+    guessed = used if prior is None else starting_from(used, prior, digests)
+
+    prepared = prepare(recordings, guessed, motions, progress)
+    try:
+        solution, trajectories = estimate_with_noise(
+            prepared.observations,
+            prepared.trajectories,
+            prepared.config,
+            progress,
+            prepared.grounds,
+            structure_evidence(prepared),
+        )
+    except TargetError as error:
+        raise without_anything(prepared, error) from error
+    with progress.stage("checking the result", None):
+        calibration = assemble(
+            solution, with_found_of(config, prepared.config), recordings, digests, trajectories
+        )
+        calibration, doubts = check(
+            calibration,
+            solution,
+            recordings,
+            prepared.trajectories,
+            motions,
+            prepared.config,
+            displaced=bool(prepared.contradictions),
+        )
+        calibration = contradicted(
+            ranked_with(calibration, prepared.findings),
+            prepared.contradictions,
+            contradictions_of(prepared.findings),
+        )
+        calibration, conflicts = with_prior(calibration, prior, config)
+
+    warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts)
+    record = RunRecord(
+        drives=tuple(Path(recording.name).absolute().name for recording in recordings),
+        trajectories=trajectories,
+        grounds=prepared.grounds,
+        scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
+    )
+    return CalibrationRun(calibration, solution, prepared.observations, warnings, record)
+
+
+def structure_evidence(prepared: Prepared) -> StructureEvidence:
+    """The structure of prepared drives, for the solve."""
+    return StructureEvidence(prepared.patches, structure_terms)
+
+
+def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
+    """The error of drives of which structure tells nothing; with why there is no target."""
+    if prepared.no_target is None:
+        return error
+    return TargetError(nothing_sentence(str(prepared.no_target), error.what))
+
+
+def with_prior(
+    calibration: Calibration, prior: Calibration | None, config: Config
+) -> tuple[Calibration, tuple[str, ...]]:
+    """Adds the data of an earlier calibration's drives; and a warning for each conflict."""
+    if prior is None:
+        return calibration, ()
+    fused, conflicts = with_earlier(calibration, prior)
+    return unmet_requirements(fused, config), conflicts

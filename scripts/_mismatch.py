@@ -143,11 +143,7 @@ def _scenario(name: str) -> Scenario:
 def recording_of(task: Task, beams: Path) -> ThinnedRecording:
     """The drive of a task; `beams` is the folder of the beams that matter."""
     scenario, nominal = scenario_of(task), GroundWaves()
-    waves = replace(
-        nominal,
-        normal_sigma_rad=ROWS[task.row].waves * nominal.normal_sigma_rad,
-        height_sigma_m=ROWS[task.row].waves * nominal.height_sigma_m,
-    )
+    waves = replace(nominal, sigma_m=ROWS[task.row].waves * nominal.sigma_m)
     return ThinnedRecording(scenario, cached_selection(scenario, beams), task.seed, waves=waves)
 
 

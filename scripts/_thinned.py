@@ -68,18 +68,25 @@ NEIGHBOUR_NS = 110_000_000
 
 @dataclass(frozen=True)
 class GroundWaves:
-    """Unevenness of the ground with a wavelength longer than a cloud, drawn for every cloud.
+    """Waves of the ground, drawn anew for every drive; they stay where they are during it.
 
-    The ground of a simulated world is smooth; asphalt is not. The weights of the ground planes
-    assume these sigmas (`targets.ground.planes`). Without a draw for them, NEES would be too small.
+    Asphalt is no plane, and the weights of ground planes assume that (`targets.ground.planes`).
+    Without waves, NEES would be too small.
 
     Attributes:
-        normal_sigma_rad: sigma of its slopes along map x and y.
-        height_sigma_m: sigma of its height below the LiDAR.
+        sigma_m: 1 sigma of its height, `GroundModel.waves_sigma_m`; that of a good road.
     """
 
-    normal_sigma_rad: float = 0.5e-3
-    height_sigma_m: float = 2e-3
+    sigma_m: float = 2.2e-3
+
+    def on(self, scenario: Scenario, seed: int) -> Scenario:
+        """A scenario whose ground has waves."""
+        drawn = int(random_stream(seed, Stream.GROUND_WAVES).integers(2**31))
+        ground = scenario.world.ground.model_copy(
+            update={"waves_sigma_m": self.sigma_m, "waves_seed": drawn}
+        )
+        world = scenario.world.model_copy(update={"ground": ground})
+        return scenario.model_copy(update={"world": world})
 
 
 @dataclass(frozen=True)
@@ -403,7 +410,8 @@ class ThinnedRecording(SimulatedRecording):
             selection: its beams.
             seed: seed of all draws.
             threads: threads that cast rays; the result does not depend on it.
-            waves: unevenness of the ground; None: the ground of the world.
+            waves: of the ground, beside what the scenario has; None: none. They hardly move a
+                beam, so the selection is of the scenario without.
 
         Raises:
             ConfigError: the seed is negative, or the selection is for another scenario.
@@ -413,9 +421,8 @@ class ThinnedRecording(SimulatedRecording):
                 f"scenario '{scenario.name}': the selection of beams is another scenario's "
                 f"({selection.digest}): select them anew"
             )
-        super().__init__(scenario, seed, threads)
+        super().__init__(scenario if waves is None else waves.on(scenario, seed), seed, threads)
         self.selection = selection
-        self.waves = waves
         self._cast: dict[tuple[str, int], SimulatedScan] = {}
 
     @cached_property
@@ -460,7 +467,6 @@ class ThinnedRecording(SimulatedRecording):
             states.position_map,
             taken_ns / NANOSECONDS_PER_SECOND,
             random_stream(self.seed, Stream.THINNED_LIDAR, index, frame),
-            self._wave(index, frame),
         )
         scan = LidarScan(
             lidar=lidar,
@@ -470,11 +476,3 @@ class ThinnedRecording(SimulatedRecording):
             point_times_s=self._point_times_s(simulated, model, returns),
         )
         return SimulatedScan(scan, frame, returns.objects)
-
-    def _wave(self, index: int, frame: int) -> Array | None:
-        if self.waves is None:
-            return None
-        slope, height_m = self.waves.normal_sigma_rad, self.waves.height_sigma_m
-        rng = random_stream(self.seed, Stream.GROUND_WAVES, index, frame)
-        wave: Array = rng.standard_normal(3) * [slope, slope, height_m]
-        return wave

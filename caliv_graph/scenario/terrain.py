@@ -16,6 +16,15 @@ MESH_STEP_M = 0.1
 COARSE_STEP_M = 4.0
 """Half of the grid step of the level ground around it."""
 
+WAVE_LENGTHS_M = (10.0, 40.0)
+"""Shortest and longest wave. Shorter ones are bumps, longer ones tilt all that a LiDAR sees."""
+
+WAVES = 24
+"""Sines. With fewer the height is far from normal."""
+
+WAVES_STEP_M = 0.5
+"""Half of the grid step on waves. The mesh of a wave of 10 m is off by a 20th of its height."""
+
 
 def _rise(u: Array) -> tuple[Array, Array, Array]:
     """0 below 0, 1 above 1, between them 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7; two derivatives.
@@ -52,10 +61,53 @@ def _ramp_heights(ramp: RampModel, xy_map: Array) -> tuple[Array, Array, Array]:
 
 
 @dataclass(frozen=True)
+class Waves:
+    """Waves of a road, a sum of sines in all directions.
+
+    The power spectral density of the height falls with the square of the wave number, as in
+    ISO 8608. A road of class A (16e-6 m^3 at 0.1 cycles per metre) has 2.2 mm from 10 to 40 m.
+
+    Attributes:
+        wave_vectors: (n, 2) radians per metre, map axes.
+        phases_rad: (n,).
+        heights_m: (n,) amplitudes.
+    """
+
+    wave_vectors: Array
+    phases_rad: Array
+    heights_m: Array
+
+    @staticmethod
+    def drawn(sigma_m: float, seed: int) -> Waves:
+        """Waves whose height has 1 sigma of `sigma_m`."""
+        rng = np.random.default_rng(seed)
+        shortest_m, longest_m = WAVE_LENGTHS_M
+        cycles_per_m = rng.uniform(1.0 / longest_m, 1.0 / shortest_m, WAVES)
+        direction_rad = rng.uniform(0.0, 2.0 * math.pi, WAVES)
+        towards = np.column_stack([np.cos(direction_rad), np.sin(direction_rad)])
+        # A density that falls with the square: amplitudes as the inverse of the wave number.
+        heights = 1.0 / cycles_per_m
+        heights *= sigma_m * math.sqrt(2.0 / float((heights**2).sum()))
+        return Waves(
+            2.0 * math.pi * cycles_per_m[:, None] * towards,
+            rng.uniform(0.0, 2.0 * math.pi, WAVES),
+            heights,
+        )
+
+    def at(self, xy_map: Array) -> tuple[Array, Array, Array]:
+        """As `Terrain.heights`."""
+        phase = xy_map @ self.wave_vectors.T + self.phases_rad
+        sine, cosine = self.heights_m * np.sin(phase), self.heights_m * np.cos(phase)
+        pairs = self.wave_vectors[:, :, None] * self.wave_vectors[:, None, :]
+        return sine.sum(axis=1), cosine @ self.wave_vectors, -np.tensordot(sine, pairs, 1)
+
+
+@dataclass(frozen=True)
 class Terrain:
-    """Level ground with ramps. Where ramps overlap, their heights add up."""
+    """Level ground with ramps and waves, whose heights add up."""
 
     ramps: tuple[RampModel, ...]
+    waves: Waves | None = None
 
     def heights(self, xy_map: Array) -> tuple[Array, Array, Array]:
         """Height (n,) above the level ground at places (n, 2), metres, and its derivatives.
@@ -67,6 +119,9 @@ class Terrain:
         for ramp in self.ramps:
             h, g, b = _ramp_heights(ramp, xy_map)
             height, gradient, hessian = height + h, gradient + g, hessian + b
+        if self.waves is not None:
+            h, g, b = self.waves.at(xy_map)
+            height, gradient, hessian = height + h, gradient + g, hessian + b
         return height, gradient, hessian
 
     def height_at(self, xy_m: tuple[float, float]) -> float:
@@ -76,7 +131,8 @@ class Terrain:
     def grid_lines(self, half_size_m: float) -> tuple[Array, Array]:
         """Lines in x and in y of a grid over the square ground, fine where a ramp is."""
         # Coarse lines too: triangles as long as the ground would be too thin for float32.
-        coarse = np.linspace(-half_size_m, half_size_m, math.ceil(half_size_m / COARSE_STEP_M) + 1)
+        step_m = COARSE_STEP_M if self.waves is None else WAVES_STEP_M
+        coarse = np.linspace(-half_size_m, half_size_m, math.ceil(half_size_m / step_m) + 1)
         lines = [set(coarse.tolist()) for _ in range(2)]
         for ramp in self.ramps:
             yaw = math.radians(ramp.yaw_deg)
@@ -94,5 +150,7 @@ class Terrain:
 
 
 def make_terrain(model: GroundModel) -> Terrain | None:
-    """The ground of a scenario; None if it is flat."""
-    return Terrain(model.ramps) if model.ramps else None
+    """The ground of a scenario; None if it is flat, or has bumps, which no vehicle follows."""
+    if model.waves_sigma_m == 0.0:
+        return Terrain(model.ramps) if model.ramps else None
+    return Terrain(model.ramps, Waves.drawn(model.waves_sigma_m, model.waves_seed))

@@ -33,9 +33,9 @@ class RampModel(Section):
 
 
 class GroundModel(Section):
-    """Flat ground, a square about the map's origin, with ramps on it.
+    """Flat ground, a square about the map's origin, with ramps or waves on it.
 
-    Bumps are what the LiDARs see. The vehicle does not follow them.
+    The vehicle follows ramps and waves. Bumps are only what the LiDARs see.
     """
 
     height_m: Finite = Field(0.0, description="metres, its z in the map")
@@ -46,11 +46,19 @@ class GroundModel(Section):
     )
     bumps_cell_m: Positive = Field(2.0, description="metres, side of a cell")
     bumps_seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of its bumps")
+    waves_sigma_m: NonNegative = Field(
+        0.0,
+        description="metres, 1 sigma of its height by waves of 10 to 40 m; 0: none. A road of "
+        "class A (ISO 8608) has 0.0022",
+    )
+    waves_seed: Annotated[int, Field(ge=0)] = Field(0, description="seed of its waves")
 
     @model_validator(mode="after")
-    def _bumps_or_ramps(self) -> GroundModel:
-        if self.ramps and self.bumps_sigma_m > 0.0:
-            raise ValueError("ground: it has ramps or bumps (bumps_sigma_m above 0), not both")
+    def _bumps_or_followed(self) -> GroundModel:
+        if self.bumps_sigma_m > 0.0 and (self.ramps or self.waves_sigma_m > 0.0):
+            raise ValueError(
+                "ground: it has bumps (bumps_sigma_m above 0), or ramps and waves, not both"
+            )
         return self
 
 

@@ -189,7 +189,6 @@ class SimulatedLidar:
         t_map_vehicle: Array,
         times_s: Array,
         rng: np.random.Generator,
-        wave: Array | None = None,
     ) -> LidarReturns:
         """Like `sweep`, for some beams only. No noise is drawn for the others.
 
@@ -199,13 +198,11 @@ class SimulatedLidar:
             t_map_vehicle: see `sweep`.
             times_s: see `sweep`.
             rng: source of the noise.
-            wave: (3,) offset of the ground from the world's ground: slopes along map x and y, and
-                height in metres below the LiDAR; None: no offset.
         """
         n = len(beams)
         noise_m = self._model.range_sigma_m * rng.standard_normal(n)
         edges = None if self._model.edges is None else _edge_draws(rng, n)
-        return self._returns(beams, R_map_vehicle, t_map_vehicle, times_s, noise_m, edges, wave)
+        return self._returns(beams, R_map_vehicle, t_map_vehicle, times_s, noise_m, edges)
 
     def beams_towards(
         self, R_map_vehicle: Array, t_map_vehicle: Array, spheres_map: Sequence[tuple[Array, float]]
@@ -237,7 +234,6 @@ class SimulatedLidar:
         times_s: Array,
         noise_m: Array,
         edges: tuple[SingleArray, SingleArray] | None,
-        wave: Array | None = None,
     ) -> LidarReturns:
         """Returns of some beams, given the noise of each."""
         R_map_lidar, t_map_lidar = self._poses(R_map_vehicle, t_map_vehicle)
@@ -268,14 +264,6 @@ class SimulatedLidar:
                 same_face_m = distance_m * faced / np.einsum("ni,ni->n", beside_map, normals_map)
             distance_m, objects = _at_edges(
                 self._model.edges, distance_m, objects, aside_m, same_face_m, uniform
-            )
-        if wave is not None:
-            ground = objects == self._ground_index
-            distance_m[ground] = _on_wave(
-                wave,
-                distance_m[ground],
-                directions_map[ground],
-                (origin_map - t_map_lidar.mean(axis=0))[ground if len(column) > 1 else slice(None)],
             )
         on_vehicle = vehicle_m < distance_m
         distance_m[on_vehicle] = vehicle_m[on_vehicle]
@@ -309,17 +297,6 @@ def _cosine(directions: Array, normals: Array) -> Array:
     """(n,) cosine of the angle between beams and normals (n, 3) of length 1 on either side."""
     cosine: Array = np.abs(np.einsum("ni,ni->n", directions, normals))
     return cosine
-
-
-def _on_wave(wave: Array, distance_m: Array, directions_map: Array, origins: Array) -> Array:
-    """(n,) range to ground that is offset by `wave`; exact where the ground is level."""
-    xy = origins[:, :2] + distance_m[:, None] * directions_map[:, :2]
-    higher_m = xy @ wave[:2] + wave[2]
-    # Rate at which a beam approaches the raised ground.
-    falls = directions_map[:, 2] - directions_map[:, :2] @ wave[:2]
-    meets = falls < -1e-4
-    longer_m: Array = distance_m + higher_m / np.where(meets, falls, -1.0)
-    return np.where(meets, longer_m, np.inf)
 
 
 def _edge_draws(rng: np.random.Generator, n: int) -> tuple[SingleArray, SingleArray]:

@@ -30,7 +30,7 @@ from caliv_graph.scenario.sensor_models import (
     OutageModel,
     VelocityModel,
 )
-from caliv_graph.scenario.terrain import Terrain, make_terrain
+from caliv_graph.scenario.terrain import Terrain, Waves, make_terrain
 from caliv_graph.scenario.world_models import ChairModel, GroundModel, RampModel, WorldModel
 from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
 from caliv_graph.simulation.motion import angular_acceleration, true_imu
@@ -210,13 +210,20 @@ def test_ramp_has_its_height_its_slope_and_its_ends() -> None:
     np.testing.assert_allclose(gradient[3], [0.0, -35.0 / 16.0 * 0.8 / 6.0], atol=1e-12)
     rng = np.random.default_rng(0)
     places = rng.uniform(-6.0, 6.0, (50, 2)) + np.array([5.0, 2.0])
-    h, step = Terrain((ramp, *RAMPS)), 1e-4
+    h, step = Terrain((ramp, *RAMPS), Waves.drawn(0.02, 3)), 1e-4
     _, gradient, hessian = h.heights(places)
     for axis in (0, 1):
         shift = step * np.eye(2)[axis]
         up, down = h.heights(places + shift), h.heights(places - shift)
         np.testing.assert_allclose((up[0] - down[0]) / (2 * step), gradient[:, axis], atol=1e-6)
         np.testing.assert_allclose((up[1] - down[1]) / (2 * step), hessian[:, axis], atol=1e-5)
+
+
+def test_waves_are_as_high_as_they_say_on_average() -> None:
+    places = np.random.default_rng(0).uniform(-200.0, 200.0, (2000, 2))
+    squares = [np.mean(Waves.drawn(0.003, seed).at(places)[0] ** 2) for seed in range(20)]
+    # A hundred squares of waves of 40 m.
+    np.testing.assert_allclose(np.sqrt(np.mean(squares)), 0.003, rtol=0.05)
 
 
 def test_imu_at_rest_feels_gravity_upwards() -> None:

@@ -158,8 +158,11 @@ def _lower(L: Array, right: Array) -> Array:
     return np.asarray(scipy.linalg.solve_triangular(L, right, lower=True, check_finite=False))
 
 
-def factor_of(H: Array) -> tuple[Array, Array]:
+def factor_of(H: Array, overwrite: bool = False) -> tuple[Array, Array]:
     """Scale (D,) and lower Cholesky factor of H scaled to a unit diagonal.
+
+    What is above the diagonal is not part of it. With `overwrite` it takes the memory of H, in C
+    order.
 
     Raises:
         SolveError: it is singular.
@@ -167,10 +170,14 @@ def factor_of(H: Array) -> tuple[Array, Array]:
     scale = np.sqrt(np.diagonal(H))
     if not (scale > 0.0).all():
         raise SolveError("structure: a variable has no information")
-    scaled = H / np.outer(scale, scale)
+    scaled = np.divide(H, scale, out=H if overwrite else None)
+    scaled /= scale[:, None]
     scaled[np.arange(len(H)), np.arange(len(H))] += RIDGE
     try:
-        factor = scipy.linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+        # The transpose, which is the same, is in LAPACK's order of memory: no copy is needed.
+        factor, _ = scipy.linalg.cho_factor(
+            scaled.T, lower=True, overwrite_a=True, check_finite=False
+        )
     except scipy.linalg.LinAlgError:
         raise SolveError("structure: the system is singular") from None
     return scale, np.asarray(factor)
@@ -182,6 +189,19 @@ def solved(factor: tuple[Array, Array], right: Array) -> Array:
     shaped = scale if right.ndim == 1 else scale[:, None]
     return np.asarray(
         scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
+    )
+
+
+def half_solved(factor: tuple[Array, Array], right: Array) -> Array:
+    """F^-1 right (D, r), with `F F^T = H`, from `factor_of(H)`.
+
+    A product of two of them has H^-1 in the middle, for half the work of `solved`.
+    """
+    scale, L = factor
+    return np.asarray(
+        scipy.linalg.solve_triangular(
+            L, right / scale[:, None], lower=True, overwrite_b=True, check_finite=False
+        )
     )
 
 

@@ -9,7 +9,7 @@ process. Bags are simulated with `--seed` into a temporary folder and deleted. M
 - the drive that the CaLiV authors published (`--data`) and simulated bags, on 2 cores and on 1:
   each stage, the rest (first pass over a bag, report, files), and peak memory;
 - how processor time grows with clouds, points per cloud, LiDARs and components of the mixture,
-  each 1, 2 and 4 times;
+  each 1, 2 and 4 times, LiDARs 8 times as well;
 - the paper's own estimator, reimplemented (`benchmark_paper.py`), on the same clouds from the same
   guesses in the same process as ours, one thread each: end to end, and the optimisation alone;
 - `--help` of the program and of every command.
@@ -60,7 +60,7 @@ CLOUD_STEPS = (4, 2, 1)
 """Subsampling of the clouds of the authors' drive: every n-th cloud."""
 
 POINTS = (12_000, 24_000, 48_000)
-LIDARS = (1, 2, 4)
+LIDARS = (1, 2, 4, 8)
 COMPONENTS = (300, 600, 1200)
 MOST_COMPONENTS = 1000
 """Numbers of components to which the limit applies, besides 300."""
@@ -73,6 +73,7 @@ READING = ("reading clouds", "reading the ground")
 TOTAL_LIMIT_S = 8.0
 READING_LIMIT_S = 3.0
 DOUBLE_LIMIT = 2.2
+LINEAR_LIMIT = 1.15
 COMPONENTS_LIMIT = 2.0
 HELP_LIMIT_S = 0.4
 COMMANDS = (
@@ -113,6 +114,11 @@ class Growth:
     def ratios(self) -> tuple[float, ...]:
         """Processor times relative to the first."""
         return tuple(usage.cpu_s / self.usages[0].cpu_s for usage in self.usages)
+
+    def over_linear(self) -> float:
+        """Largest processor time relative to one in proportion to the size."""
+        pairs = zip(self.sizes, self.ratios(), strict=True)
+        return max(ratio * self.sizes[0] / size for size, ratio in pairs)
 
     def doubled(self) -> float:
         """Processor time of the last relative to the one before."""
@@ -433,6 +439,10 @@ def verdicts(found: Found) -> list[Verdict]:
         if growth.what.startswith("clouds"):
             out.append(
                 Verdict("twice the clouds, CPU", growth.doubled(), DOUBLE_LIMIT, "times as much")
+            )
+        if growth.what.startswith("LiDARs"):
+            out.append(
+                Verdict("more LiDARs, CPU", growth.over_linear(), LINEAR_LIMIT, "times linear")
             )
     if found.more_components is not None:
         what = f"{MOST_COMPONENTS} components against {COMPONENTS[0]}, CPU"

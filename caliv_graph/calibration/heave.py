@@ -25,10 +25,11 @@ def with_heave(
     """
     z = np.arange(5, POSE * poses, POSE)
     heights = information[np.ix_(z, z)] + np.eye(poses) / heave_m**2
-    known = np.column_stack([information[z], gradient[z]])
-    known = scipy.linalg.cho_solve(scipy.linalg.cho_factor(heights, lower=True), known)
-    out = information - information[:, z] @ known[:, :-1]
-    return 0.5 * (out + out.T), gradient - information[:, z] @ known[:, -1]
+    half = scipy.linalg.solve_triangular(
+        np.linalg.cholesky(heights), np.column_stack([information[z], gradient[z]]), lower=True
+    )
+    known = half[:, :-1].T @ half[:, :-1]
+    return information - known, gradient - half[:, :-1].T @ half[:, -1]
 
 
 def poses_with_heave(information: Array, heave_m: float) -> Array:

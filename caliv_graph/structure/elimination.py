@@ -77,9 +77,7 @@ class Surfaces:
         out[: self.rest] = rest
         for block, half in zip(self.blocks, halves, strict=True):
             known = half - block.coupling @ rest[block.others]
-            out[block.own] = scipy.linalg.solve_triangular(
-                block.L, known, lower=True, trans=1, check_finite=False
-            )
+            out[block.own] = _lower(block.L, known, transposed=True)
         return out
 
 
@@ -108,20 +106,20 @@ def eliminated(
     out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
     right = b[:rest].copy()
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
-    rows, V_own, V_columns = H[order], V[order], V_rest.tocsc()
+    rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
     local = np.zeros(H.shape[0], dtype=np.int64)
     done, end = [], 0
     for own in blocks:
         begin, end = end, end + len(own)
-        inside, cross, others = _dense_rows(rows[begin:end], own, rest, local)
-        of_columns = V_own[begin:end].tocoo()
-        columns, column = np.unique(of_columns.coords[1], return_inverse=True)
+        inside, cross, others = _dense_rows(rows, begin, own, rest, local)
+        row, column, value = _entries(V_own, np.arange(begin, end))
+        columns, column = np.unique(column, return_inverse=True)
         low = np.zeros((len(own), len(columns)))
-        low[of_columns.coords[0], column.ravel()] = of_columns.data
-        wide = V_columns[:, columns].tocoo()
+        low[row, column] = value
         inside -= low @ low.T
+        row, column, value = _entries(V_columns, columns)
         across = np.zeros((len(columns), len(others)))
-        across[wide.coords[1], local[wide.coords[0]]] = wide.data
+        across[row, local[column]] = value
         cross -= low @ across
         try:
             L = np.asarray(np.linalg.cholesky(inside), np.float64)
@@ -135,14 +133,15 @@ def eliminated(
 
 
 def _dense_rows(
-    rows: scipy.sparse.csr_array, own: IntArray, rest: int, local: IntArray
+    rows: scipy.sparse.csr_array, begin: int, own: IntArray, rest: int, local: IntArray
 ) -> tuple[Array, Array, IntArray]:
     """The rows of a block: within it, with others of the first `rest`, and which these are.
 
+    They are those of `rows` from `begin` on.
+
     `local` (D,) is overwritten: the places of `own` and of the others in the results.
     """
-    row = np.repeat(np.arange(len(own)), np.diff(rows.indptr))
-    column, value = rows.indices, rows.data
+    row, column, value = _entries(rows, np.arange(begin, begin + len(own)))
     across = column < rest
     others = np.unique(column[across])
     local[others] = np.arange(len(others))
@@ -154,12 +153,29 @@ def _dense_rows(
     return inside, cross, np.asarray(others, dtype=np.int64)
 
 
-def _lower(L: Array, right: Array) -> Array:
-    return np.asarray(scipy.linalg.solve_triangular(L, right, lower=True, check_finite=False))
+def _entries(matrix: scipy.sparse.csr_array, rows: IntArray) -> tuple[IntArray, IntArray, Array]:
+    """Row, as a place in `rows`, column and value of all entries of some rows.
+
+    There are hundreds of small blocks: the sparse library's own slices would take longer.
+    """
+    first, count = matrix.indptr[rows], np.diff(matrix.indptr)[rows]
+    before = np.cumsum(count) - count
+    at = np.arange(count.sum()) + np.repeat(first - before, count)
+    return np.repeat(np.arange(len(rows)), count), matrix.indices[at], matrix.data[at]
 
 
-def factor_of(H: Array) -> tuple[Array, Array]:
+def _lower(L: Array, right: Array, transposed: bool = False) -> Array:
+    """L^-1 right, or L^-T right: LAPACK without the checks, for many small matrices."""
+    # The transpose of C's order is Fortran's: L^T is upper.
+    out, _ = scipy.linalg.lapack.dtrtrs(L.T, right, lower=0, trans=0 if transposed else 1)
+    return np.asarray(out)
+
+
+def factor_of(H: Array, overwrite: bool = False) -> tuple[Array, Array]:
     """Scale (D,) and lower Cholesky factor of H scaled to a unit diagonal.
+
+    What is above the diagonal is not part of it. With `overwrite` it takes the memory of H, in C
+    order.
 
     Raises:
         SolveError: it is singular.
@@ -167,10 +183,14 @@ def factor_of(H: Array) -> tuple[Array, Array]:
     scale = np.sqrt(np.diagonal(H))
     if not (scale > 0.0).all():
         raise SolveError("structure: a variable has no information")
-    scaled = H / np.outer(scale, scale)
+    scaled = np.divide(H, scale, out=H if overwrite else None)
+    scaled /= scale[:, None]
     scaled[np.arange(len(H)), np.arange(len(H))] += RIDGE
     try:
-        factor = scipy.linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+        # The transpose, which is the same, is in LAPACK's order of memory: no copy is needed.
+        factor, _ = scipy.linalg.cho_factor(
+            scaled.T, lower=True, overwrite_a=True, check_finite=False
+        )
     except scipy.linalg.LinAlgError:
         raise SolveError("structure: the system is singular") from None
     return scale, np.asarray(factor)
@@ -182,6 +202,19 @@ def solved(factor: tuple[Array, Array], right: Array) -> Array:
     shaped = scale if right.ndim == 1 else scale[:, None]
     return np.asarray(
         scipy.linalg.cho_solve((L, True), right / shaped, check_finite=False) / shaped
+    )
+
+
+def half_solved(factor: tuple[Array, Array], right: Array) -> Array:
+    """F^-1 right (D, r), with `F F^T = H`, from `factor_of(H)`.
+
+    A product of two of them has H^-1 in the middle, for half the work of `solved`.
+    """
+    scale, L = factor
+    return np.asarray(
+        scipy.linalg.solve_triangular(
+            L, right / scale[:, None], lower=True, overwrite_b=True, check_finite=False
+        )
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.products import Array
-from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.noise import LEAST_JITTER_S, MOST_JITTER_S
 from caliv_graph.structure.system import Layout
 
@@ -35,16 +35,18 @@ def jitter_sigma_s(H: Array, b: Array, layout: Layout) -> float:
     """
     own = np.arange(layout.jitter, layout.plane)
     rest = np.arange(layout.jitter)
-    cross = H[np.ix_(rest, own)]
-    both = solved(factor_of(H[np.ix_(rest, rest)]), np.column_stack([cross, b[rest]]))
-    A = H[np.ix_(own, own)] - cross.T @ both[:, :-1]
-    u = b[own] - cross.T @ both[:, -1]
-    values, vectors = np.linalg.eigh(0.5 * (A + A.T))
+    half = half_solved(
+        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(own, rest)].T, b[rest]])
+    )
+    known = half.T @ half
+    A = H[np.ix_(own, own)] - known[:-1, :-1]
+    u = b[own] - known[:-1, -1]
+    values, vectors = np.linalg.eigh(A)
     seen = values > 1e-9 * max(float(values.max(initial=0.0)), MOST_JITTER_S**-2.0)
-    known, square = values[seen], (vectors[:, seen].T @ u) ** 2
+    told, square = values[seen], (vectors[:, seen].T @ u) ** 2
     sigmas = np.geomspace(LEAST_JITTER_S, MOST_JITTER_S, SIGMAS)
-    variance = known + np.outer(sigmas**2, known**2)
+    variance = told + np.outer(sigmas**2, told**2)
     cost = 0.5 * (square / variance + np.log(variance)).sum(axis=1)
-    without = 0.5 * float((square / known + np.log(known)).sum())
-    best = int(cost.argmin()) if len(known) else 0
-    return float(sigmas[best]) if len(known) and without - cost[best] > EVIDENCE else 0.0
+    without = 0.5 * float((square / told + np.log(told)).sum())
+    best = int(cost.argmin()) if len(told) else 0
+    return float(sigmas[best]) if len(told) and without - cost[best] > EVIDENCE else 0.0

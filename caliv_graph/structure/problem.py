@@ -200,8 +200,13 @@ def geometry_at(
 
 def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
     """The system's H and b with the guesses: they hold what structure does not determine."""
-    layout = system.layout
     H, b = system.H.copy(), system.b.copy()
+    add_guesses(problem, state, system.layout, H, b)
+    return H, b
+
+
+def add_guesses(problem: Problem, state: State, layout: Layout, H: Array, b: Array) -> None:
+    """Adds the guesses to H (R, R) and b (R,) of a system, in place."""
     own = slice(layout.extrinsic, layout.error)
     axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
     away = np.zeros(6 * layout.lidars)
@@ -214,4 +219,3 @@ def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array,
     b[own] -= axes.T @ problem.guess_information @ away
     for i in range(layout.offset, layout.extrinsic):
         H[i, i] += OFFSET_SIGMA_S**-2.0
-    return H, b

@@ -22,6 +22,7 @@ from caliv_graph.structure.noise import (
 )
 from caliv_graph.structure.problem import (
     Problem,
+    add_guesses,
     alike,
     first_state,
     geometry_at,
@@ -331,6 +332,6 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:
-    """Factor of the system with the guesses, and its right-hand side."""
-    H, b = with_guesses(found.problem, found.state, system)
-    return factor_of(H), b
+    """Factor of the system with the guesses, which takes its memory, and its right-hand side."""
+    add_guesses(found.problem, found.state, found.layout, system.H, system.b)
+    return factor_of(system.H, overwrite=True), system.b

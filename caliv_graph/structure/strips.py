@@ -77,91 +77,139 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
         gate_m: largest distance of a patch from its strip.
     """
     of_patch = np.full(len(scan), -1, dtype=np.int64)
-    centres: list[Array] = []
-    normals: list[Array] = []
-    points = moments_map[:, 3, 3]
-    positions = moments_map[:, :3, 3] / points[:, None]
-    for members in _cells(positions, normals_map):
-        for strip in _strips_of(members, moments_map, positions, normals_map, scan, gate_m):
-            own, centre, normal = strip
-            of_patch[own] = len(centres)
-            centres.append(centre)
-            normals.append(normal)
-    if not centres:
+    positions = moments_map[:, :3, 3] / moments_map[:, 3, 3, None]
+    left, cell = _cells(positions, normals_map)
+    cells: list[IntArray] = []
+    found: list[_Found] = []
+    for _ in range(STRIPS_OF_A_CELL):
+        enough = np.bincount(cell)[cell] >= MIN_SCANS if len(cell) else cell > 0
+        left, cell = left[enough], cell[enough]
+        if not len(left):
+            break
+        one = _strip_of_each(cell, moments_map[left], normals_map[left], scan[left], gate_m)
+        of_patch[left[one.of_patch >= 0]] = one.of_patch[one.of_patch >= 0] + sum(map(len, cells))
+        cells.append(one.cell)
+        found.append(one)
+        left, cell = left[~one.gone], cell[~one.gone]
+    of_cell = np.concatenate([np.zeros(0, np.int64), *cells])
+    if not len(of_cell):
         return Strips(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), of_patch)
-    return Strips(
-        np.array(centres),
-        np.array(normals),
-        _surfaces(np.array(centres), np.array(normals)),
-        of_patch,
-    )
+    order = np.argsort(of_cell, kind="stable")
+    seen = of_patch >= 0
+    of_patch[seen] = np.argsort(order)[of_patch[seen]]
+    centres = np.concatenate([one.centres_map for one in found])[order]
+    normals = np.concatenate([one.normals_map for one in found])[order]
+    return Strips(centres, normals, _surfaces(centres, normals), of_patch)
 
 
-def _cells(positions: Array, normals: Array) -> list[IntArray]:
-    """Indices of the patches of each column of the map, columns in a fixed order.
+def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray]:
+    """Indices (N,) of the patches column by column of the map, and the columns' numbers (N,).
 
     Patches whose normals are nearest to the same axis of the map and point the same way share a
     column along it. A surface must not be cut where it lies: ground at the height of a boundary
     would be two strips, of patches whose errors have the same sign.
     """
     if not len(positions):
-        return []
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     axis = np.abs(normals).argmax(axis=1)
     each = np.arange(len(axis))
     cell = np.floor(positions / CELL_M).astype(np.int64)
     cell[each, axis] = 0
     side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
-    _, inverse = np.unique(np.column_stack([side, cell]), axis=0, return_inverse=True)
-    inverse = inverse.ravel()
-    order = np.argsort(inverse, kind="stable")
-    ends = np.flatnonzero(np.diff(inverse[order])) + 1
-    return list(np.split(order, ends))
+    key = np.zeros(len(axis), dtype=np.int64)
+    for part in (side, *cell.T):
+        # In the order of the four numbers: one sort of integers.
+        key = key * (np.ptp(part) + 1) + part - part.min()
+    order = np.argsort(key, kind="stable")
+    return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1
 
 
-def _strips_of(
-    members: IntArray,
-    moments: Array,
-    positions: Array,
-    normals: Array,
-    scan: IntArray,
-    gate_m: float,
-) -> list[tuple[IntArray, Array, Array]]:
-    """Strips of the patches of a cell: their patches, centre and normal."""
-    out: list[tuple[IntArray, Array, Array]] = []
-    left = members
-    for _ in range(STRIPS_OF_A_CELL):
-        if len(left) < MIN_SCANS:
+@dataclass(frozen=True)
+class _Found:
+    """At most one strip of each of some columns: S strips.
+
+    Attributes:
+        cell: (S,) number of the column.
+        centres_map: (S, 3).
+        normals_map: (S, 3).
+        of_patch: (n,) strip of each patch that was given; -1: none.
+        gone: (n,) whether a patch is on a strip, or on what was tried as one.
+    """
+
+    cell: IntArray
+    centres_map: Array
+    normals_map: Array
+    of_patch: IntArray
+    gone: BoolArray
+
+
+def _strip_of_each(
+    cell: IntArray, moments: Array, normals: Array, scan: IntArray, gate_m: float
+) -> _Found:
+    """The strip about the patch with the most points of each column.
+
+    Args:
+        cell: (n,) number of the column of each patch, ascending.
+        moments: (n, 4, 4).
+        normals: (n, 3).
+        scan: (n,).
+        gate_m: largest distance of a patch from its strip.
+    """
+    points = moments[:, 3, 3]
+    positions = moments[:, :3, 3] / points[:, None]
+    starts = _starts(cell)
+    column = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(cell))))
+    most = np.flatnonzero(points == np.maximum.reduceat(points, starts)[column])
+    seeds = most[_starts(column[most])]
+    centres, directions = positions[seeds], normals[seeds]
+    taken = np.zeros(len(cell), dtype=bool)
+    going = np.ones(len(starts), dtype=bool)
+    for _ in range(3):
+        on = _on_plane(positions, normals, centres[column], directions[column], gate_m)
+        taken = np.where(going[column], on, taken)
+        going &= np.add.reduceat(taken, starts, dtype=np.int64) >= MIN_SCANS
+        own = np.flatnonzero(taken & going[column])
+        if not len(own):
             break
-        seed = left[np.argmax(moments[left, 3, 3])]
-        centre, normal = positions[seed], normals[seed]
-        at, facing = positions[left], normals[left]
-        for _ in range(3):
-            taken = _on_plane(at, facing, centre, normal, gate_m)
-            own = left[taken]
-            if len(own) < MIN_SCANS:
-                break
-            centre, normal = plane_of_moments(moments[own].sum(axis=0), normals[own].mean(axis=0))
-        taken[left == seed] = True
-        if len(own) >= MIN_SCANS and len(np.unique(scan[own])) >= MIN_SCANS:
-            out.append((own, centre, normal))
-        left = left[~taken]
-    return out
+        first = _starts(column[own])
+        centres[going], directions[going] = planes_of_moments(
+            np.add.reduceat(moments[own], first), np.add.reduceat(normals[own], first)
+        )
+    own = np.flatnonzero(taken & going[column])
+    scans = int(scan.max()) + 1
+    pairs = np.unique(column[own] * scans + scan[own])
+    strip = np.bincount(pairs // scans, minlength=len(starts)) >= MIN_SCANS
+    of_patch = np.full(len(cell), -1, dtype=np.int64)
+    of_patch[own] = np.where(strip, np.cumsum(strip) - 1, -1)[column[own]]
+    taken[seeds] = True
+    return _Found(cell[starts][strip], centres[strip], directions[strip], of_patch, taken)
+
+
+def _starts(ascending: IntArray) -> IntArray:
+    """Where each value begins."""
+    return np.flatnonzero(np.diff(ascending, prepend=-1))
 
 
 def _on_plane(
-    positions: Array, normals: Array, centre: Array, normal: Array, gate_m: float
+    positions: Array, normals: Array, centres: Array, planes: Array, gate_m: float
 ) -> BoolArray:
-    near = np.abs((positions - centre) @ normal) < gate_m
+    """Whether patches (n,) are on planes, one for each."""
+    near = np.abs(np.einsum("ni,ni->n", positions - centres, planes)) < gate_m
     angle = min(max(WIDE_ANGLE_RAD * gate_m / WIDE_GATE_M, NARROW_ANGLE_RAD), WIDE_ANGLE_RAD)
-    return np.asarray(near & (normals @ normal > math.cos(angle)))
+    return np.asarray(near & (np.einsum("ni,ni->n", normals, planes) > math.cos(angle)))
 
 
-def plane_of_moments(moments: Array, towards: Array) -> tuple[Array, Array]:
-    """Centre (3,) and unit normal (3,) of the plane of moments (4, 4), facing `towards` (3,)."""
-    centre = moments[:3, 3] / moments[3, 3]
-    spread = moments[:3, :3] - moments[3, 3] * np.outer(centre, centre)
-    normal = np.linalg.eigh(spread)[1][:, 0]
-    return centre, normal if normal @ towards > 0.0 else -normal
+def planes_of_moments(moments: Array, towards: Array) -> tuple[Array, Array]:
+    """Centres (S, 3) and unit normals (S, 3) of planes, facing `towards` (S, 3).
+
+    `moments` (S, 4, 4) are those of their points.
+    """
+    total = moments[:, 3, 3, None]
+    centres = moments[:, :3, 3] / total
+    spread = moments[:, :3, :3] - total[:, None] * centres[:, :, None] * centres[:, None, :]
+    normals = np.linalg.eigh(spread)[1][:, :, 0]
+    back = np.einsum("si,si->s", normals, towards) <= 0.0
+    return centres, np.where(back[:, None], -normals, normals)
 
 
 def _surfaces(centres: Array, normals: Array) -> IntArray:

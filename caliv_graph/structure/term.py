@@ -14,7 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
-from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem, relative_motions
@@ -273,17 +273,17 @@ def _marginal(
     if not rest.any():
         on_zero = np.column_stack([on_keep, np.zeros(len(rows))])
         return inside.copy(), b[keep].copy(), on_zero, np.zeros((len(rows), len(rows)))
-    cross = H[np.ix_(rest, keep)]
-    right = np.column_stack([cross, b[rest], on_rest.T])
-    both = solved(factor_of(H[np.ix_(rest, rest)]), right)
-    split = len(keep) + 1
-    information = inside - cross.T @ both[:, : split - 1]
-    follow = on_rest @ both[:, :split]
+    right = np.column_stack([H[np.ix_(keep, rest)].T, b[rest], on_rest.T])
+    half = half_solved(factor_of(H[np.ix_(rest, rest)]), right)
+    known = half.T @ half
+    k = len(keep)
+    information = inside - known[:k, :k]
+    follow = known[k + 1 :, : k + 1]
     return (
         0.5 * (information + information.T),
-        b[keep] - cross.T @ both[:, split - 1],
+        b[keep] - known[:k, k],
         np.column_stack([on_keep - follow[:, :-1], follow[:, -1]]),
-        on_rest @ both[:, split:],
+        known[k + 1 :, k + 1 :],
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.elimination import factor_of, half_solved, solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem
@@ -69,15 +69,16 @@ def _on(prior: PosePrior, poses: IntArray) -> PosePrior:
         return prior
     keep, rest = _coordinates(prior, poses)
     H, b = prior.information, prior.gradient
-    cross = H[np.ix_(rest, keep)]
-    both = solved(factor_of(H[np.ix_(rest, rest)]), np.column_stack([cross, b[rest]]))
-    information = H[np.ix_(keep, keep)] - cross.T @ both[:, :-1]
+    half = half_solved(
+        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(keep, rest)].T, b[rest]])
+    )
+    known = half.T @ half
     return replace(
         prior,
         stamps_ns=prior.stamps_ns[poses],
         T_map_vehicle=tuple(prior.T_map_vehicle[i] for i in poses),
-        information=0.5 * (information + information.T),
-        gradient=b[keep] - cross.T @ both[:, -1],
+        information=H[np.ix_(keep, keep)] - known[:-1, :-1],
+        gradient=b[keep] - known[:-1, -1],
     )
 
 

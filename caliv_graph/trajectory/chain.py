@@ -152,7 +152,6 @@ class Chain:
         width = self.diagonal.shape[1]
         m, rest, k = len(wanted), width - POSE, chain.corner.shape[0]
         pose, other = slice(0, POSE), slice(POSE, width)
-        poses = _tridiagonal(chain.diagonal[:, pose, pose], chain.coupling[:, pose, pose])
         cross = _tridiagonal(
             chain.diagonal[:, pose, other],
             chain.coupling[:, pose, other],
@@ -161,13 +160,30 @@ class Chain:
         banded = banded_of(chain.diagonal[:, other, other], chain.coupling[:, other, other])
         border_other = chain.border[:, other].reshape(m * rest, k)
         border_pose = chain.border[:, pose].reshape(m * POSE, k)
-        right = np.hstack([cross.T.toarray(), border_other])
+        # In LAPACK's order of memory: it is hundreds of megabytes on a drive with many scans.
+        right = np.empty((m * rest, m * POSE + k), order="F")
+        cross.toarray(out=right.T[: m * POSE])
+        right[:, m * POSE :] = border_other
         try:
             factor = scipy.linalg.cholesky_banded(banded, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
             raise TrajectoryError(UNDETERMINED) from None
-        solved = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
-        information = poses.toarray() - cross @ solved[:, : m * POSE]
+        solved = scipy.linalg.cho_solve_banded(
+            (factor, True), right, overwrite_b=True, check_finite=False
+        )
+        joint = np.zeros((m * POSE + len(kept),) * 2)
+        information = joint[: m * POSE, : m * POSE]
+        for i in range(m):
+            # A state is coupled with the rest of itself and of its neighbours. The rows up to the
+            # diagonal: the others are the same.
+            near = slice(max(i - 1, 0) * rest, min(i + 2, m) * rest)
+            before, own = slice(i * POSE), slice(i * POSE, (i + 1) * POSE)
+            row = -(cross[own, near].toarray() @ solved[near, : (i + 1) * POSE])
+            row[:, own] += chain.diagonal[i, pose, pose]
+            if i:
+                row[:, (i - 1) * POSE : i * POSE] += chain.coupling[i - 1, pose, pose].T
+            information[own, : (i + 1) * POSE] = row
+            information[before, own] = row[:, before].T
         edge = border_pose - cross @ solved[:, m * POSE :]
         corner = chain.corner - border_other.T @ solved[:, m * POSE :]
         gone = [i for i in range(k) if i not in kept and i not in held]
@@ -181,8 +197,10 @@ class Chain:
                 to_stay = inverse @ corner[np.ix_(gone, stay)]
                 cross_stay = cross_stay - edge[:, gone] @ to_stay
                 corner_stay = corner_stay - corner[np.ix_(stay, gone)] @ to_stay
-            information = np.block([[information, cross_stay], [cross_stay.T, corner_stay]])
-        return np.asarray(0.5 * (information + information.T))
+            joint[: m * POSE, m * POSE :] = cross_stay
+            joint[m * POSE :, : m * POSE] = cross_stay.T
+            joint[m * POSE :, m * POSE :] = corner_stay
+        return joint
 
 
 def places(

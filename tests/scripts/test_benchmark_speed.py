@@ -69,6 +69,10 @@ def test_every_limit_can_be_missed() -> None:
     quarter, half, whole = GOOD.growths[0].usages
     dear = replace(GOOD.growths[0], usages=(quarter, half, replace(whole, cpu_s=8.9)))
     assert missed(replace(GOOD, growths=(dear,))) == ["twice the clouds, CPU"]
+    lidars = benchmark.Growth("LiDARs, a figure-eight", (1, 2), (quarter, replace(half, cpu_s=5.8)))
+    assert missed(replace(GOOD, growths=(lidars,))) == ["more LiDARs, CPU"]
+    lidars = replace(lidars, usages=(quarter, replace(half, cpu_s=5.7)))
+    assert missed(replace(GOOD, growths=(lidars,))) == []
     assert missed(replace(GOOD, more_components=2.1)) == ["1000 components against 300, CPU"]
     slow_help = replace(GOOD, helps_s={"caliv-graph": 0.2, "init": 0.5})
     assert missed(slow_help) == ["--help, slowest (init)"]

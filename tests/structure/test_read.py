@@ -18,6 +18,7 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, LidarScan, Trajectory
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import (
+    MAX_POSES,
     MAX_SCANS,
     MIN_SCANS,
     chosen_scans,
@@ -126,6 +127,17 @@ def test_a_long_drive_gives_as_many_scans_as_a_short_one_spread_over_its_way() -
     _, t = TRAJECTORY.poses_at(chosen[0])
     steps = np.linalg.norm(np.diff(t, axis=0), axis=1)
     assert np.quantile(steps, 0.95) < 1.5 * np.median(steps)
+
+
+def test_the_stamps_of_many_lidars_together_are_bounded() -> None:
+    eight = [every(0.1, TRAJECTORY, 0.0125 * i) for i in range(8)]
+    apart = chosen_scans(eight, TRAJECTORY)
+    assert MAX_POSES - 16 < len(np.unique(np.concatenate(apart))) <= MAX_POSES
+    assert {len(own) for own in apart} <= {MAX_POSES // 8, MAX_POSES // 8 - 1}
+    # The vehicle drives on at the same instants: each LiDAR sees all of the way.
+    assert np.ptp(apart[0]) > 0.95 * np.ptp(eight[0])
+    for two in ([eight[0], eight[4]], [eight[0]] * 8):
+        assert all(MAX_SCANS - 10 < len(own) <= MAX_SCANS for own in chosen_scans(two, TRAJECTORY))
 
 
 def test_a_vehicle_that_stands_gives_few_scans_but_some() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.calibration.heave import poses_with_heave
+from caliv_graph.config.range_errors import UNSTATED
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, unstack
 from caliv_graph.planning.assumptions import Assumptions
 from caliv_graph.planning.faces import faces_of
@@ -129,7 +130,7 @@ def plan_structure(
         problem,
         {name: model.mounting.pose() for name, model in scenario.lidars.items()},
         np.array([model.range_sigma_m for model in scenario.lidars.values()]),
-        Levels(SIGHTING_M, STRIP_M, SHARED_M),
+        Levels.first(SIGHTING_M, STRIP_M, SHARED_M, UNSTATED),
     )
     if found is None:
         return None

@@ -12,9 +12,6 @@ from scipy.linalg import block_diag
 from caliv_graph.calibration.graph import pose_graph
 from caliv_graph.calibration.linear import cloud_rows, linearise_clouds
 from caliv_graph.calibration.range_bias import (
-    INCIDENCES_M,
-    LOG_SPREAD,
-    TYPICAL_OFFSET_M,
     BiasSizes,
     RangeBiases,
     fit_bias_sizes,
@@ -22,6 +19,7 @@ from caliv_graph.calibration.range_bias import (
     without_bias,
 )
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
+from caliv_graph.config.range_errors import INCIDENCES_M, LOG_SPREAD, TYPICAL_OFFSET_M
 from caliv_graph.products import Array, PoseNoise, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
 from tests.calibration.problems import Case, make_case

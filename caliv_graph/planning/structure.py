@@ -94,10 +94,11 @@ def plan_structure(
 ) -> PlannedStructure | None:
     """The structure of a drive; None if it passes no walls, or if none is to be used.
 
-    Without the ground where some LiDARs see it as planes only: it counts once.
+    Without the ground where some LiDARs see it as planes only, at scans of targets: it counts once.
     """
     planned = _planned(scenario, drive, sightings, assumptions)
-    if planned is None or assumptions.ground == "none" or _has_all_ground(scenario, planned.found):
+    planes = assumptions.ground != "none" and any(len(s.used) for s in sightings)
+    if planned is None or not planes or _has_all_ground(scenario, planned.found):
         return planned
     return _planned(scenario, drive, sightings, replace(assumptions, ground="none"))
 

@@ -214,12 +214,14 @@ def moved_back(
 ) -> list[tuple[Array, Array]]:
     """Poses (J, 3, 3) and (J, 3) of each placement at which clouds with biased ranges fit.
 
-    `offsets_m` (placements, L) are the biases of the LiDARs: where ranges are too long, the cloud
+    `offsets_m` (B,) are the biases of `RangeBiases.offsets`: where ranges are too long, the cloud
     fits nearer to the LiDAR.
     """
-    out = []
-    for state, (R, t), own_m in zip(states, poses, offsets_m, strict=True):
+    out, first = [], 0
+    for state, (R, t) in zip(states, poses, strict=True):
         clouds = state.clouds
+        own_m = offsets_m[first : first + clouds.lidars]
+        first += clouds.lidars
         beams = clouds.sum_per_cloud(clouds.beams) / clouds.sizes[:, None]
         along = np.einsum("jik,jk->ji", R, beams)
         out.append((R, t - own_m[clouds.lidar][:, None] * along))

@@ -98,9 +98,8 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
-    problem = state.problem
-    nothing_m = np.zeros((problem.placements, len(problem.lidars)))
-    loop = _Loop(state, states, base_graph(state), problem.guess_information(), nothing_m)
+    none_m = np.zeros(sum(of.clouds.lidars for of in states))
+    loop = _Loop(state, states, base_graph(state), state.problem.guess_information(), none_m)
     loop.begin_shapes(normals=False)
     course: list[Iteration] = []
     converged = False
@@ -117,7 +116,7 @@ def refined(
 class _Loop:
     """What the iterations carry along; `base` is the graph without clouds and guesses.
 
-    `prior` (6n, 6n) of the guesses; `offsets_m` (placements, L): biases of the ranges with which
+    `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `jackknife`: scale of the
     registration's sigmas by it.
@@ -203,7 +202,7 @@ class _Loop:
     def _applied(self, directions: Array) -> Array:
         """(B,) the offsets in sigmas, of all biases along `directions`."""
         out = np.zeros(directions.shape[1])
-        out[: self.offsets_m.size] = self.offsets_m.ravel() / self._sizes().offset_m
+        out[: len(self.offsets_m)] = self.offsets_m / self._sizes().offset_m
         return out
 
     def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array) -> None:
@@ -211,8 +210,7 @@ class _Loop:
         directions = self._directions(shapes)
         joint, applied = shapes.joint(self.state.scale), self._applied(directions)
         found = most_likely_biases(*joint, directions, applied, reduced.moved_clouds(step))
-        own = found[: self.offsets_m.size].reshape(self.offsets_m.shape)
-        self.offsets_m = self._sizes().offset_m * own
+        self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]
 
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""

@@ -37,7 +37,7 @@ PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
 
-GROUND_BIASES = 2
+GROUND_BIASES = 3
 """Number of range biases of a LiDAR on the ground: `bias_sigmas`."""
 
 TOGETHER_NS = 5_000_000
@@ -116,12 +116,13 @@ def first_heave(problem: Problem, observation: GroundObservation) -> float:
 
 
 def bias_sigmas(ranges: RangeErrors) -> Array:
-    """(2,) 1 sigma of a LiDAR's range biases on the ground, metres.
+    """(3,) 1 sigma of a LiDAR's range biases on the ground, metres.
 
-    Constant, and by 1 / cos(incidence) - 1. Every scan has the same ones, so that they do not
+    Constant, and the two of `config.range_errors.growth`. Every scan has the same ones, so that they do not
     average out: they lift and tilt its planes.
     """
-    return np.array([math.hypot(ranges.offsets.usual, ranges.ground_m), ranges.incidence_m])
+    constant_m = math.hypot(ranges.offsets.usual, ranges.ground_m)
+    return np.array([constant_m, ranges.incidence_m, ranges.incidence_m])
 
 
 def ground_graph(

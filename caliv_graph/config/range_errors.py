@@ -36,6 +36,10 @@ INCIDENCE_M = 3e-3
 """Sigma of the growth with 1 / cos(incidence) where it is not estimated. Data sheets do not state
 it; at 75 degrees it makes 9 mm, which is the repeatability of one of them."""
 
+GRAZING_COS = math.cos(math.radians(75.0))
+"""Cosine of the incidence below which the growth is an error of its own: nobody knows how ranges
+go on where footprints are metres long and echoes weak. On ground at 15 m all beams are there."""
+
 SURFACE_M = 3e-3
 """Sigma of the bias of a LiDAR on one surface where nothing tells: echoes of bright and of dark
 paint differ by millimetres in data sheets."""
@@ -76,6 +80,15 @@ def range_errors(noise: NoiseConfig) -> RangeErrors:
 
 UNSTATED = RangeErrors()
 """Of a config that says nothing."""
+
+
+def growth(cosine: Array) -> Array:
+    """(N, 2) growth of ranges with 1 / cos(incidence) - 1, and what is more of it when grazing.
+
+    By a metre of `RangeErrors.incidence_m`, each, at cosines (N,) above zero.
+    """
+    until = np.minimum(1.0 / cosine, 1.0 / GRAZING_COS)
+    return np.column_stack([until - 1.0, 1.0 / cosine - until])
 
 
 @dataclass(frozen=True)

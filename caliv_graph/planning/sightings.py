@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
@@ -275,10 +276,10 @@ def sees_ground(model: LidarModel) -> bool:
 
 
 def ground_by_range_bias(model: LidarModel) -> Array:
-    """(3, 2) change of the plane that a LiDAR sees, if its ranges are off.
+    """(3, 3) change of the plane that a LiDAR sees, if its ranges are off.
 
     Slopes along the vehicle's x and y, and height in metres below the LiDAR, by a metre of all
-    ranges, and by a metre per 1 / cos(incidence) - 1. As in `targets.ground`, square metres count
+    ranges, and by those of `config.range_errors.growth`. As in `targets.ground`, square metres count
     alike from `CELL_POINTS` points on.
     """
     points = _ground_points(model)
@@ -290,7 +291,7 @@ def ground_by_range_bias(model: LidarModel) -> Array:
     variance = (model.range_sigma_m * down) ** 2 + UNEVENNESS_M**2
     weight = np.minimum(1.0, CELL_POINTS / (of_each * count[cell.ravel()])) / variance
     J = np.column_stack([points[:, :2], np.ones(len(points))])
-    lower = -np.column_stack([down, 1.0 - down])
+    lower = -down[:, None] * np.column_stack([np.ones(len(down)), growth(down)])
     return np.asarray(np.linalg.solve(J.T @ (weight[:, None] * J), J.T @ (weight[:, None] * lower)))
 
 

@@ -283,8 +283,8 @@ def test_jacobians(offset_m: float) -> None:
         check_jacobians(ground_plane_factor((X, E), G, anchor, swept), values)
         check_jacobians(ground_plane_factor((X, E, S), G, anchor, observation), values)
         check_jacobians(ground_plane_factor((X, E), G, anchor, observation, 0.3), values)
-        biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 2)))
-        values.insert(key_ground_bias(0), np.array([0.01, -0.02]))
+        biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 3)))
+        values.insert(key_ground_bias(0), np.array([0.01, -0.02, 0.03]))
         check_jacobians(
             ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
         )

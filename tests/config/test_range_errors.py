@@ -8,12 +8,14 @@ from scipy.stats import multivariate_normal
 
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.config.range_errors import (
+    GRAZING_COS,
     GROUND_M,
     INCIDENCE_M,
     LOG_SPREAD,
     SURFACE_M,
     TYPICAL_OFFSET_M,
     flat,
+    growth,
     log_normal,
     offset_prior,
     range_errors,
@@ -32,6 +34,15 @@ def test_who_knows_all_ranges_knows_those_on_the_ground_and_at_a_slant() -> None
     large = range_errors(NoiseConfig(lidar_range_bias_m=0.02))
     assert (large.incidence_m, large.ground_m, large.surface_m) == usual
     assert large.offsets.usual == pytest.approx(0.02)
+
+
+def test_the_growth_of_ranges_is_one_over_the_cosine_until_they_graze() -> None:
+    cosine = np.array([1.0, 0.5, GRAZING_COS, 0.1])
+    steep, grazing = growth(cosine).T
+    assert steep + grazing == pytest.approx(1.0 / cosine - 1.0)
+    assert steep[:3] == pytest.approx([0.0, 1.0, 1.0 / GRAZING_COS - 1.0])
+    assert grazing[:3] == pytest.approx(0.0, abs=1e-12)
+    assert steep[3] == steep[2]
 
 
 def test_the_usual_size_is_the_root_mean_square() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.config.range_errors import growth
 from caliv_graph.planning.sightings import (
     INDEPENDENT_PART,
     POSITION_FLOOR_M,
@@ -252,18 +253,18 @@ def test_range_biases_move_the_ground_as_they_move_the_plane_that_is_fitted() ->
     beams = unit_vectors(elevation, azimuth).reshape(-1, 3) @ R.T
     beams = beams[beams[:, 2] < -0.05]
     range_m = height_m / -beams[:, 2]
-    slant = 1.0 / -beams[:, 2] - 1.0
+    by_each = np.column_stack([np.ones(len(beams)), growth(-beams[:, 2])])
 
-    def plane(bias_m: float, incidence_m: float) -> np.ndarray:
+    def plane(biases_m: np.ndarray) -> np.ndarray:
         """Slopes and height of the fitted plane."""
-        points = beams * (range_m + bias_m + incidence_m * slant)[:, None]
+        points = beams * (range_m + by_each @ biases_m)[:, None]
         up = np.array([0.0, 0.0, 1.0])
         found, why = fit_plane(points[near_points(points, up)], up, lidar.range_sigma_m)
         assert found is not None, why
         n = found.normal_lidar
         return np.array([-n[0] / n[2], -n[1] / n[2], -found.distance_m / n[2]])
 
-    shown = [(plane(*b) - plane(0.0, 0.0)) / 0.01 for b in ((0.01, 0.0), (0.0, 0.01))]
+    shown = [(plane(0.01 * one) - plane(np.zeros(3))) / 0.01 for one in np.eye(3)]
     expected = ground_by_range_bias(lidar)
     assert np.stack(shown, axis=1) == pytest.approx(expected, rel=0.25, abs=3e-3)
     assert abs(expected[0, 0]) > 0.01  # it looks ahead

@@ -118,8 +118,8 @@ def first_heave(problem: Problem, observation: GroundObservation) -> float:
 def bias_sigmas(ranges: RangeErrors) -> Array:
     """(3,) 1 sigma of a LiDAR's range biases on the ground, metres.
 
-    Constant, and the two of `config.range_errors.growth`. Every scan has the same ones, so that they do not
-    average out: they lift and tilt its planes.
+    Constant, and the two of `config.range_errors.growth`. Every scan has the same ones, so that
+    they do not average out: they lift and tilt its planes.
     """
     constant_m = math.hypot(ranges.offsets.usual, ranges.ground_m)
     return np.array([constant_m, ranges.incidence_m, ranges.incidence_m])

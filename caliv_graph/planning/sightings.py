@@ -279,8 +279,8 @@ def ground_by_range_bias(model: LidarModel) -> Array:
     """(3, 3) change of the plane that a LiDAR sees, if its ranges are off.
 
     Slopes along the vehicle's x and y, and height in metres below the LiDAR, by a metre of all
-    ranges, and by those of `config.range_errors.growth`. As in `targets.ground`, square metres count
-    alike from `CELL_POINTS` points on.
+    ranges, and by those of `config.range_errors.growth`. As in `targets.ground`, square metres
+    count alike from `CELL_POINTS` points on.
     """
     points = _ground_points(model)
     low, high = np.radians(model.horizontal_fov_deg)

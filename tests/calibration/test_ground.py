@@ -827,11 +827,7 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
     base = merged(pose_graph(problem, noise), prior_graph(problem, problem.lidars))
     weights = full_weights(problem, observations)
     for _ in range(2):
-        # The simulated ranges have no bias.
-        graph = merged(
-            base,
-            ground_graph(problem, observations, ground, weights, ranges=RangeErrors(*[1e-5] * 4)),
-        )
+        graph = merged(base, ground_graph(problem, observations, ground, weights, ranges=exact))
         values = optimise(graph, values, 50)
         weights = ground_weights(problem, observations, values)
     assert weights.planes.min() > 0.5

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -162,9 +163,8 @@ def linearised_evidence(
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
         effects.append((of.columns, _effects(of.trajectory, of.stamps_ns)))
-    ranges = range_errors(state.config.noise)
-    weak = [_weak(problem, key, sizes[key], ranges) for key in others]
-    ridge = np.concatenate([*weak, scales**-2.0])
+    weak = partial(_weak, problem, range_errors(state.config.noise))
+    ridge = np.concatenate([*(weak(key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
     return Evidence(observed, by_pose, white, effects)
@@ -202,7 +202,7 @@ def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[s
     return {of.kind: of for of in error_effects(trajectory, stamps_ns, kinds)}
 
 
-def _weak(problem: Problem, key: int, size: int, ranges: RangeErrors) -> Array:
+def _weak(problem: Problem, ranges: RangeErrors, key: int, size: int) -> Array:
     """(size,) weak information on a parameter, so that undetermined directions stay finite."""
     if key in problem.extrinsic_keys():
         sigmas = np.max([problem.prior_sigmas[name] for name in problem.lidars], axis=0)

@@ -114,19 +114,10 @@ class StructureEvidence:
 
         terms = solved(patches, config)
         twice = drives_with_ground_twice(grounds, terms)
-        if not twice:
-            return terms
-        ground = config.ground.model_copy(update={"use": False})
-        without = solved(
-            [of for of in patches if of.drive in twice],
-            config.model_copy(update={"ground": ground}),
-        )
-        return tuple(
-            sorted(
-                [*(term for term in terms if term.drive not in twice), *without],
-                key=lambda term: term.drive,
-            )
-        )
+        again = [of for of in patches if of.drive in twice]
+        without = solved(again, _without_ground(config)) if again else ()
+        others = [term for term in terms if term.drive not in twice]
+        return tuple(sorted([*others, *without], key=lambda term: term.drive))
 
     def terms_beside(
         self,
@@ -147,6 +138,10 @@ class StructureEvidence:
             for name, lidar in state.config.lidars.items()
         }
         return self.terms(trajectories, kept, start, heave_m, state.noise, state.config, grounds)
+
+
+def _without_ground(config: Config) -> Config:
+    return config.model_copy(update={"ground": config.ground.model_copy(update={"use": False})})
 
 
 def other_grounds(

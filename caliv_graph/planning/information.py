@@ -33,6 +33,7 @@ from caliv_graph.planning.sightings import (
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.targets.cloud.views import view_weights
 from caliv_graph.targets.ground.measure import MAX_APART_NS
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
@@ -306,28 +307,44 @@ def add_ground(
         info[later, 2] = 1.0 / (distance_sigma**2 + heave_variance)
         info *= view_weights(motion.position_map[at])[:, None]
         stood[at] = True
-        t = model.mounting.pose().translation()
-        R, place = motion.R_map_vehicle[at], motion.position_map[at]
-        arm = place + R @ t - origin
         J = np.zeros((len(at), 3, H.shape[1]))
-        lidar = _behind(columns.lidar(name)).start
-        plane = POSE + columns.plane
-        # Residual of the normal in map axes: LiDAR tilt minus slopes of the plane.
-        tilt = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) @ R
-        J[:, :2, :3] = J[:, :2, lidar : lidar + 3] = tilt
-        J[:, 0, plane] = J[:, 1, plane + 1] = -1.0
-        J[:, 2, :3] = -R[:, 2] @ skew(t)
-        J[:, 2, 3:6] = J[:, 2, lidar + 3 : lidar + 6] = R[:, 2]
-        J[:, 2, plane : plane + 2] = -arm[:, :2]
-        J[:, 2, plane + 2] = -1.0
-        # Predicted less measured: where the ground seems to rise, its normal leans back.
-        changed = ground_by_range_bias(model)
-        biases = _behind(columns.biases(name))
-        J[:, :2, biases] = R[:, :2, :2] @ changed[:2]
-        J[:, 2, biases] = changed[2]
+        _seen_plane(J, motion, at, origin, model, name, columns)
         np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, :, None] * J))
     if assumptions.ground == "height":
         _add_contact(H, motion, np.flatnonzero(stood), origin, columns)
+
+
+def _seen_plane(
+    J: Array,
+    motion: PlannedMotion,
+    at: IntArray,
+    origin: Array,
+    model: LidarModel,
+    name: str,
+    columns: Columns,
+) -> None:
+    """Fills the derivatives (m, 3, 6 + k) of the plane that a LiDAR sees from the nodes `at` (m,).
+
+    Two of its normal in map axes, one of its distance; heights are about `origin`.
+    """
+    t = model.mounting.pose().translation()
+    R, place = motion.R_map_vehicle[at], motion.position_map[at]
+    arm = place + R @ t - origin
+    lidar = _behind(columns.lidar(name)).start
+    plane = POSE + columns.plane
+    # Residual of the normal in map axes: LiDAR tilt minus slopes of the plane.
+    tilt = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) @ R
+    J[:, :2, :3] = J[:, :2, lidar : lidar + 3] = tilt
+    J[:, 0, plane] = J[:, 1, plane + 1] = -1.0
+    J[:, 2, :3] = -R[:, 2] @ skew(t)
+    J[:, 2, 3:6] = J[:, 2, lidar + 3 : lidar + 6] = R[:, 2]
+    J[:, 2, plane : plane + 2] = -arm[:, :2]
+    J[:, 2, plane + 2] = -1.0
+    # Predicted less measured: where the ground seems to rise, its normal leans back.
+    changed = ground_by_range_bias(model)
+    biases = _behind(columns.biases(name))
+    J[:, :2, biases] = R[:, :2, :2] @ changed[:2]
+    J[:, 2, biases] = changed[2]
 
 
 def _add_contact(

@@ -110,7 +110,7 @@ def key_ground(drive: int) -> int:
 
 
 def key_ground_bias(index: int) -> int:
-    """Key of the range biases on the ground of the LiDAR at `index`, (2,): see `ground_graph`."""
+    """Key of the range biases on the ground of the LiDAR at `index`, (3,): see `ground_graph`."""
     return int(gtsam.symbol("q", index))
 
 

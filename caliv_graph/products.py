@@ -316,8 +316,8 @@ class GroundObservation:
             the ground rise by a centimetre during a sweep.
         apart_ns: time of the scan after `stamp_ns`. The trajectory carries the observation there;
             it does not contain the heave of the body on its springs.
-        by_range_bias: (3, 2) change of (a, b, distance) if all ranges are too long by a metre, and
-            by a metre (1 / cos(incidence) - 1); None: none is assumed.
+        by_range_bias: (3, 3) change of (a, b, distance) if all ranges are too long by a metre, and
+            by the two of `config.range_errors.growth`; None: none is assumed.
     """
 
     lidar: str

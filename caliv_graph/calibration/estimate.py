@@ -154,7 +154,9 @@ def _estimate(
     terms: tuple[StructureTerm, ...] = ()
     if structure.patches:
         with progress.stage("solving walls and other surfaces", None):
-            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m)
+            terms = structure.terms_beside(
+                rough.state, problem, trajectories, noise.heave_m, grounds
+            )
         times["structure"] = time.perf_counter() - begun
 
     begun = time.perf_counter()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -18,8 +19,9 @@ import scipy.linalg
 
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.ground import (
-    BIAS_SIGMAS,
+    GROUND_BIASES,
     PLANE_SIGMAS,
+    bias_sigmas,
     biased_lidars,
     ground_centre,
     place_weights,
@@ -32,6 +34,7 @@ from caliv_graph.calibration.noise import evenly_over_drives
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.solve import SolveState, measured_poses, of_single_clouds
 from caliv_graph.calibration.variance_components import Observed
+from caliv_graph.config.range_errors import RangeErrors, range_errors
 from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
 from caliv_graph.targets.ground.planes import ground_floors
@@ -160,7 +163,8 @@ def linearised_evidence(
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
         effects.append((of.columns, _effects(of.trajectory, of.stamps_ns)))
-    ridge = np.concatenate([*(_weak(problem, key, sizes[key]) for key in others), scales**-2.0])
+    weak = partial(_weak, problem, range_errors(state.config.noise))
+    ridge = np.concatenate([*(weak(key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
     return Evidence(observed, by_pose, white, effects)
@@ -198,13 +202,13 @@ def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[s
     return {of.kind: of for of in error_effects(trajectory, stamps_ns, kinds)}
 
 
-def _weak(problem: Problem, key: int, size: int) -> Array:
+def _weak(problem: Problem, ranges: RangeErrors, key: int, size: int) -> Array:
     """(size,) weak information on a parameter, so that undetermined directions stay finite."""
     if key in problem.extrinsic_keys():
         sigmas = np.max([problem.prior_sigmas[name] for name in problem.lidars], axis=0)
         return np.asarray(sigmas**-2.0)
     if key in {key_ground_bias(index) for index in range(len(problem.lidars))}:
-        return BIAS_SIGMAS**-2.0
+        return bias_sigmas(ranges) ** -2.0
     drives = {key_ground(drive) for drive in problem.drives().tolist()}
     return PLANE_SIGMAS**-2.0 if key in drives else np.full(size, WEAK)
 
@@ -241,7 +245,7 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
     # At no biases, about which their prior is.
     values = gtsam.Values(values)
     for index in biased_lidars(problem, state.grounds, taken):
-        values.update(key_ground_bias(index), np.zeros(len(BIAS_SIGMAS)))
+        values.update(key_ground_bias(index), np.zeros(GROUND_BIASES))
     normal, distance = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
     out = []
     for n, o in enumerate(state.grounds):

@@ -22,6 +22,7 @@ from caliv_graph.calibration.ground_factors import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.model import GroundConfig
+from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.conventions import (
     key_ground,
     key_ground_bias,
@@ -30,16 +31,14 @@ from caliv_graph.conventions import (
     key_vehicle,
 )
 from caliv_graph.products import Array, GroundObservation, IntArray
-from caliv_graph.structure.solve import BIAS_M, GROUND_BIAS_M, INCIDENCE_BIAS_M
 from caliv_graph.targets.cloud.views import view_weights
 
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
 
-BIAS_SIGMAS = np.array([math.hypot(BIAS_M, GROUND_BIAS_M), INCIDENCE_BIAS_M])
-"""1 sigma of a LiDAR's range biases on the ground, metres: constant, and by 1 / cos(incidence) - 1.
-Every scan has the same ones, so that they do not average out: they lift and tilt its planes."""
+GROUND_BIASES = 3
+"""Number of range biases of a LiDAR on the ground: `bias_sigmas`."""
 
 TOGETHER_NS = 5_000_000
 """A scan nearer to a pose than this has the heave of that pose: a body that heaves by 5 mm at 2 Hz
@@ -116,17 +115,29 @@ def first_heave(problem: Problem, observation: GroundObservation) -> float:
     return math.sqrt(2.0) * problem.heave_m
 
 
+def bias_sigmas(ranges: RangeErrors) -> Array:
+    """(3,) 1 sigma of a LiDAR's range biases on the ground, metres.
+
+    Constant, and the two of `config.range_errors.growth`. Every scan has the same ones, so that
+    they do not average out: they lift and tilt its planes.
+    """
+    constant_m = math.hypot(ranges.offsets.usual, ranges.ground_m)
+    return np.array([constant_m, ranges.incidence_m, ranges.incidence_m])
+
+
 def ground_graph(
     problem: Problem,
     observations: Sequence[GroundObservation],
     config: GroundConfig,
     weights: GroundWeights | None = None,
     sway_rad: float | None = None,
+    ranges: RangeErrors = UNSTATED,
 ) -> CalibrationGraph:
     """All factors of the ground; empty if it is not to be used or was not seen.
 
     Observations of LiDARs and poses that the problem has not are left out. Without `weights` (of
-    `ground_weights`) all have full weight. `sway_rad` is 1 sigma of the body's tilt at each pose.
+    `ground_weights`) all have full weight. `sway_rad` is 1 sigma of the body's tilt at each pose;
+    `ranges` is what is stated of the errors of the ranges.
     """
     graph = CalibrationGraph()
     if not config.use:
@@ -143,7 +154,7 @@ def ground_graph(
             sigma = math.radians(config.parallel_sigma_deg)
             graph.append("ground_tilt", _centred(key_parallel(drive), np.full(2, sigma)))
     for index in biased_lidars(problem, observations, taken):
-        graph.append("ground_bias", _centred(key_ground_bias(index), BIAS_SIGMAS))
+        graph.append("ground_bias", _centred(key_ground_bias(index), bias_sigmas(ranges)))
     weight_of = weights.planes * place_weights(problem, observations, taken)
     weighted = zip(
         observations, taken.tolist(), weight_of.tolist(), weights.heave_m.tolist(), strict=True
@@ -238,5 +249,5 @@ def ground_values(
         if config.parallel_sigma_deg is not None:
             out.insert(key_parallel(drive), np.zeros(2))
     for index in biased_lidars(problem, observations, taken):
-        out.insert(key_ground_bias(index), np.zeros(len(BIAS_SIGMAS)))
+        out.insert(key_ground_bias(index), np.zeros(GROUND_BIASES))
     return out

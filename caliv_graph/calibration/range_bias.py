@@ -19,32 +19,26 @@ import scipy.linalg
 
 from caliv_graph.calibration.linear import cloud_rows
 from caliv_graph.calibration.reduced import Reduced
+from caliv_graph.config.range_errors import (
+    INCIDENCES_M,
+    OFFSETS_M,
+    flat,
+    log_normal,
+    offset_prior,
+    size_weights,
+)
 from caliv_graph.geometry.se3 import cross, skew
 from caliv_graph.products import Array
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import LEAST_SIGMA_M
 from caliv_graph.registration.register import JointRegistration
 
-TYPICAL_OFFSET_M = 3e-3
-"""Median of the prior of the offsets' sigma. Data sheets state an accuracy of 10 to 30 mm at most
-over all ranges and materials, and a repeatability of 3 to 10 mm."""
-
 TYPICAL_SMOOTH = 0.5
 """Median of the prior of the smooth errors' sigma, over the roughness: what repeated scans of the
 target share is partly the same for neighbouring beams. Between none and all."""
 
-LOG_SPREAD = math.log(2.5)
-"""1 sigma of both logarithms: the offsets of two units in three are between 1.2 and 7.5 mm."""
-
-OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
-"""Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
-
-INCIDENCES_M = np.geomspace(1e-4, 1e-2, 9)
-"""Sigmas of the growth with 1 / cos(incidence), likewise. Data sheets do not state it, so that all
-sizes are as likely: from nothing to what makes as much as the largest offset at 75 degrees."""
-
 SMOOTHS = np.geomspace(0.02, 5.0, 12)
-"""The same of the smooth errors, over the roughness."""
+"""Sigmas of the smooth errors in the integral, over the roughness."""
 
 VIEW_RAD = math.radians(20.0)
 """Angle between views, about the target, at which their smooth errors are alike by e^-1/2: what
@@ -185,12 +179,53 @@ def _root_of_views(views: Array) -> Array:
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
 
 
-def without_bias(H: Array, gradient: Array, directions: Array) -> tuple[Array, Array]:
-    """(6 J, 6 J) and (6 J,) of the clouds with biases of sigma 1 along `directions` eliminated."""
+def without_bias(
+    H: Array, gradient: Array, directions: Array, applied: Array | None = None
+) -> tuple[Array, Array]:
+    """(6 J, 6 J) and (6 J,) of the clouds with biases of sigma 1 along `directions` eliminated.
+
+    `applied` (B,) are biases with which the clouds were moved back before; None: none.
+    """
     seen = H @ directions
     factor = scipy.linalg.cho_factor(np.eye(directions.shape[1]) + directions.T @ seen, lower=True)
-    pull = scipy.linalg.cho_solve(factor, directions.T @ gradient)
+    pull = scipy.linalg.cho_solve(factor, _pull(gradient, directions, applied))
     return H - seen @ scipy.linalg.cho_solve(factor, seen.T), gradient - seen @ pull
+
+
+def most_likely_biases(
+    H: Array, gradient: Array, directions: Array, applied: Array, moved: Array
+) -> Array:
+    """(B,) the biases of sigma 1 that `without_bias` eliminates, the clouds at a step (6 J,)."""
+    both = np.eye(directions.shape[1]) + directions.T @ H @ directions
+    pull = _pull(gradient + H @ moved, directions, applied)
+    return np.asarray(applied + np.linalg.solve(both, pull))
+
+
+def _pull(gradient: Array, directions: Array, applied: Array | None) -> Array:
+    """(B,) of the quadratic in the biases: longer ranges move the poses that fit back."""
+    pull = directions.T @ gradient
+    return np.asarray(pull if applied is None else pull - applied)
+
+
+def moved_back(
+    states: Sequence[JointRegistration],
+    poses: Sequence[tuple[Array, Array]],
+    offsets_m: Array,
+) -> list[tuple[Array, Array]]:
+    """Poses (J, 3, 3) and (J, 3) of each placement at which clouds with biased ranges fit.
+
+    `offsets_m` (B,) are the biases of `RangeBiases.offsets`: where ranges are too long, the cloud
+    fits nearer to the LiDAR.
+    """
+    out, first = [], 0
+    for state, (R, t) in zip(states, poses, strict=True):
+        clouds = state.clouds
+        own_m = offsets_m[first : first + clouds.lidars]
+        first += clouds.lidars
+        beams = clouds.sum_per_cloud(clouds.beams) / clouds.sizes[:, None]
+        along = np.einsum("jik,jk->ji", R, beams)
+        out.append((R, t - own_m[clouds.lidar][:, None] * along))
+    return out
 
 
 def fit_bias_sizes(
@@ -207,37 +242,23 @@ def fit_bias_sizes(
         prior: (6n, 6n) information of the guesses, tangents of the graph's extrinsics.
         offset_m: 1 sigma of the offsets, if the user knows it.
     """
-    offsets_m = OFFSETS_M if offset_m is None else np.array([offset_m])
+    offsets = offset_prior(offset_m)
     # Who knows that all ranges are right to a millimetre knows it of those at a slant, too.
-    incidences_m = INCIDENCES_M if offset_m is None else np.minimum(INCIDENCES_M, offset_m)
+    incidences = flat(INCIDENCES_M if offset_m is None else np.minimum(INCIDENCES_M, offset_m))
     unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
     information, pull = _information(reduced, unit, prior)
-    smooths = SMOOTHS if biases.smooth.shape[1] else np.zeros(1)
+    smooths = log_normal(SMOOTHS, TYPICAL_SMOOTH) if biases.smooth.shape[1] else flat(np.zeros(1))
     count = biases.offsets.shape[1]
-    grid = (offsets_m, incidences_m, smooths)
-    cost = np.zeros([len(axis) for axis in grid])
-    for at in np.ndindex(*cost.shape):
-        sigma = np.full(len(pull), smooths[at[2]])
-        sigma[:count], sigma[count : 2 * count] = offsets_m[at[0]], incidences_m[at[1]]
-        cost[at] = _cost(sigma[:, None] * information * sigma, sigma * pull)
-    cost += _unlikely(offsets_m, TYPICAL_OFFSET_M)[:, None, None]
-    if biases.smooth.shape[1]:
-        cost += _unlikely(smooths, TYPICAL_SMOOTH)
-    weights = np.exp(cost.min() - cost)
-    weights /= weights.sum()
+    kinds = np.repeat([0, 1, 2], [count, count, biases.smooth.shape[1]])
+    weights = size_weights(information, pull, kinds, (offsets, incidences, smooths))
     of_offsets = weights.sum(axis=(1, 2))
     least = int(np.searchsorted(np.cumsum(of_offsets), 1.0 - SURE))
     return BiasSizes(
-        offset_m=float(np.sqrt(of_offsets @ offsets_m**2)),
-        smooth=float(np.sqrt(weights.sum(axis=(0, 1)) @ smooths**2)),
-        least_m=float(offsets_m[least]) if offset_m is None else 0.0,
-        incidence_m=float(np.sqrt(weights.sum(axis=(0, 2)) @ incidences_m**2)),
+        offset_m=float(np.sqrt(of_offsets @ offsets.sigmas**2)),
+        smooth=float(np.sqrt(weights.sum(axis=(0, 1)) @ smooths.sigmas**2)),
+        least_m=float(offsets.sigmas[least]) if offset_m is None else 0.0,
+        incidence_m=float(np.sqrt(weights.sum(axis=(0, 2)) @ incidences.sigmas**2)),
     )
-
-
-def _unlikely(sizes: Array, typical: float) -> Array:
-    """Minus the logarithm of the prior of sizes (n,), up to a constant."""
-    return np.asarray(0.5 * (np.log(sizes / typical) / LOG_SPREAD) ** 2)
 
 
 def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Array, Array]:
@@ -257,10 +278,3 @@ def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Arr
     # Positive semidefinite but for rounding.
     own, axes = np.linalg.eigh(0.5 * (information + information.T))
     return (axes * np.maximum(own, 0.0)) @ axes.T, pull
-
-
-def _cost(information: Array, pull: Array) -> float:
-    """Minus the logarithm of the restricted likelihood, of biases in units of their sigmas."""
-    L = np.linalg.cholesky(np.eye(len(pull)) + information)
-    y = scipy.linalg.solve_triangular(L, pull, lower=True)
-    return float(np.log(np.diag(L)).sum() - 0.5 * y @ y)

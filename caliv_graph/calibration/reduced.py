@@ -92,9 +92,16 @@ class Reduced:
 
     def move(self, step: Array) -> gtsam.Values:
         """All values after a step (6n,) of the extrinsics, the rest following."""
+        return retract(self._values, self.system.keys, self._tangents(step))
+
+    def moved_clouds(self, step: Array) -> Array:
+        """(6 J,) left perturbations of the clouds' poses by `move`, to first order."""
+        return np.asarray(cloud_rows(self.system, self.lines) @ self._tangents(step))
+
+    def _tangents(self, step: Array) -> Array:
+        """(M,) of all variables after a step (6n,) of the extrinsics."""
         tangent = np.linalg.solve(self._to_axes, step)
-        rest = self._g - self._G @ tangent
-        return retract(self._values, self.system.keys, np.concatenate([rest, tangent]))
+        return np.concatenate([self._g - self._G @ tangent, tangent])
 
     def linearised(
         self,

@@ -21,8 +21,11 @@ from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import (
+    BiasSizes,
     RangeBiases,
     fit_bias_sizes,
+    most_likely_biases,
+    moved_back,
     range_biases,
     without_bias,
 )
@@ -35,7 +38,7 @@ from caliv_graph.calibration.solve import (
     covariance_of_mode,
     step_of_mode,
 )
-from caliv_graph.geometry.se3 import stack
+from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Iteration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
@@ -95,8 +98,9 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
-    loop = _Loop(state, states, base_graph(state), state.problem.guess_information())
-    _begin_shapes(state, states, normals=False)
+    none_m = np.zeros(sum(of.clouds.lidars for of in states))
+    loop = _Loop(state, states, base_graph(state), state.problem.guess_information(), none_m)
+    loop.begin_shapes(normals=False)
     course: list[Iteration] = []
     converged = False
     while len(course) < most and not converged:
@@ -112,14 +116,17 @@ def refined(
 class _Loop:
     """What the iterations carry along; `base` is the graph without clouds and guesses.
 
-    `prior` (6n, 6n) of the guesses; `undetermined`: number of such directions once it is fixed;
-    `fine`: iterations at the noise level; `jackknife`: scale of the registration's sigmas by it.
+    `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
+    the clouds are moved back before they meet the shape; `undetermined`: number of such directions
+    once it is fixed; `fine`: iterations at the noise level; `jackknife`: scale of the
+    registration's sigmas by it.
     """
 
     state: SolveState
     states: Sequence[JointRegistration]
     base: CalibrationGraph
     prior: Array
+    offsets_m: Array
     undetermined: int | None = None
     fine: int = 0
     jackknife: float = 1.0
@@ -128,17 +135,33 @@ class _Loop:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
         state = self.state
         lines = linearise_clouds(state.problem, state.values)
-        shapes = _expect(self.states, per_placement(state.problem, lines), state.turns)
+        shapes = _expect(self.states, self.poses_of_clouds(lines), state.turns)
         begun = time.perf_counter()
         reduced = self._without_bias(shapes, lines)
         state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
+    def poses_of_clouds(self, lines: CloudLinearisation) -> list[tuple[Array, Array]]:
+        """Poses at which the clouds fit, per placement: the predicted ones, with biased ranges."""
+        return moved_back(self.states, per_placement(self.state.problem, lines), self.offsets_m)
+
+    def begin_shapes(self, normals: bool) -> None:
+        """A new mixture, and if asked for new normals, at these: EM ends near its start."""
+        _hand_weights(self.state, self.states)
+        lines = linearise_clouds(self.state.problem, self.state.values)
+        for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
+            if normals:
+                shape.refine_normals(R, t)
+            shape.seed(R, t, FINE_SIGMA_M)
+            shape.held_along = 0.0
+
     def left_out(self, reduced: Reduced) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
         problem, values = self.state.problem, self.state.values
         extrinsics = [problem.extrinsic(values, name) for name in problem.lidars]
-        return jackknife_scale(problem, extrinsics, self.states, reduced.lines)
+        fitting = [T for R, t in self.poses_of_clouds(reduced.lines) for T in unstack(R, t)]
+        lines = replace(reduced.lines, predicted=tuple(fitting))
+        return jackknife_scale(problem, extrinsics, self.states, lines)
 
     def scaled(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
         """Estimates the scale of the registration at a linearisation, and applies it to that."""
@@ -163,14 +186,31 @@ class _Loop:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """The graph with the clouds' quadratic, the biases of the ranges eliminated.
+        """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
+        joint, directions = shapes.joint(self.state.scale), self._directions(shapes)
+        return self._reduced(without_bias(*joint, directions, self._applied(directions)), lines)
 
-        At most those that LiDARs have: larger ones would hide what is wrong, a clock or a mount.
-        """
-        sizes = self.state.bias_sizes
-        sizes = replace(sizes, offset_m=min(sizes.offset_m, RANGE_BIAS_LIMIT_M))
-        clouds = without_bias(*shapes.joint(self.state.scale), shapes.biases.directions(sizes))
-        return self._reduced(clouds, lines)
+    def _sizes(self) -> BiasSizes:
+        """Sizes of the biases, at most those of LiDARs: larger ones would hide a wrong clock."""
+        sizes, stated_m = self.state.bias_sizes, self.state.config.noise.lidar_range_bias_m
+        most_m = max(RANGE_BIAS_LIMIT_M, stated_m or 0.0)
+        return replace(sizes, offset_m=min(sizes.offset_m, most_m))
+
+    def _directions(self, shapes: _Shapes) -> Array:
+        return shapes.biases.directions(self._sizes())
+
+    def _applied(self, directions: Array) -> Array:
+        """(B,) the offsets in sigmas, of all biases along `directions`."""
+        out = np.zeros(directions.shape[1])
+        out[: len(self.offsets_m)] = self.offsets_m / self._sizes().offset_m
+        return out
+
+    def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array) -> None:
+        """Moves the offsets to their most likely values after a step."""
+        directions = self._directions(shapes)
+        joint, applied = shapes.joint(self.state.scale), self._applied(directions)
+        found = most_likely_biases(*joint, directions, applied, reduced.moved_clouds(step))
+        self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]
 
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
@@ -185,14 +225,16 @@ class _Loop:
                 reduced = self.with_bias(shapes, reduced.lines)
         step, lost = self._step(reduced, number)
         squared = self._squares(shapes, reduced.lines)
+        if self.fine >= BIAS_AFTER:
+            self._follow(shapes, reduced, step)
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
         new = linearise_clouds(state.problem, state.values)
-        for shape, (R, t) in zip(self.states, per_placement(state.problem, new), strict=True):
+        for shape, (R, t) in zip(self.states, self.poses_of_clouds(new), strict=True):
             shape.maximise(R, t)
         change = self._weigh(squared)
         if number == SHAPES_BEGUN_AGAIN:
-            _begin_shapes(state, self.states, normals=True)
+            self.begin_shapes(normals=True)
         size = np.abs(step.reshape(-1, 6))
         sigmas = float(np.sqrt(step @ (reduced.D + self.prior) @ step))
         return Iteration(float(size[:, :3].max()), float(size[:, 3:].max()), sigmas, change, lost)
@@ -234,17 +276,6 @@ class _Loop:
             and (small or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
         )
-
-
-def _begin_shapes(state: SolveState, states: Sequence[JointRegistration], normals: bool) -> None:
-    """A new mixture, and if asked for new normals, at the graph's poses: EM ends near its start."""
-    _hand_weights(state, states)
-    lines = linearise_clouds(state.problem, state.values)
-    for shape, (R, t) in zip(states, per_placement(state.problem, lines), strict=True):
-        if normals:
-            shape.refine_normals(R, t)
-        shape.seed(R, t, FINE_SIGMA_M)
-        shape.held_along = 0.0
 
 
 def _expect(
@@ -337,8 +368,10 @@ def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: 
     last_step = (last.turn_rad, last.shift_m)
     registrations = []
     placements = problem.clouds_of_placements()
+    # Where the LiDARs are, not where their clouds fit.
+    predicted = per_placement(problem, reduced.lines)
     for part, shape, (R, t), (H, _) in zip(
-        placements, loop.states, shapes.poses, shapes.joints, strict=True
+        placements, loop.states, predicted, shapes.joints, strict=True
     ):
         R, t = left_step(R, t, pull[part])
         blocks = information[part] * state.scale**2

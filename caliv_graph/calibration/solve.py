@@ -43,6 +43,7 @@ from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.calibration.structure import structure_graph
 from caliv_graph.config.model import Config, RobustConfig
+from caliv_graph.config.range_errors import range_errors
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import (
     Array,
@@ -318,6 +319,7 @@ def base_graph(state: SolveState) -> CalibrationGraph:
             state.config.ground,
             state.ground_weights,
             math.radians(state.config.noise.sway_deg),
+            range_errors(state.config.noise),
         ),
         state.structure_factors,
         prior_graph(problem, sorted(problem.fixed)),

@@ -13,8 +13,9 @@ class NoiseConfig(Section):
     lidar_range_m: Positive = Field(0.01, description="metres, along the beam")
     lidar_range_bias_m: Positive | None = Field(
         None,
-        description="metres, how much all ranges of a LiDAR on one target are off, 1 sigma; "
-        "absent: integrated over, with the few millimetres of data sheets as the prior",
+        description="metres, how much all ranges of a LiDAR on one target, on walls and on the "
+        "ground are off, 1 sigma; absent: integrated over or estimated, with the millimetres of "
+        "data sheets as the prior",
     )
     pose_position_m: Positive | None = Field(
         None,

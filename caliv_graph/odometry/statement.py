@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.config.model import Config
+from caliv_graph.config.range_errors import range_errors
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
@@ -15,7 +16,6 @@ from caliv_graph.mounting.sharpness import REACH_M
 from caliv_graph.mounting.upright import SAME_M, SAME_RAD, Ground, ground_below
 from caliv_graph.odometry.track import Track
 from caliv_graph.products import Array
-from caliv_graph.structure.solve import BIAS_M
 from caliv_graph.structure.standing import UNEVEN_M
 from caliv_graph.trajectory.odometry import VehicleStatement
 from caliv_graph.trajectory.tilt import (
@@ -98,7 +98,8 @@ def statement_of(
         forward = math.atan2(x[1], x[0])
     course = course_of(found, level, forward)
     ahead = level.T @ [math.cos(course.angle_rad), math.sin(course.angle_rad), 0.0]
-    body, height = body_sigma_rad(config), math.hypot(config.ground.sigma, BIAS_M)
+    bias_m = range_errors(config.noise).offsets.usual
+    body, height = body_sigma_rad(config), math.hypot(config.ground.sigma, bias_m)
     return VehicleStatement(
         up_lidar=up,
         ahead_lidar=ahead,

@@ -7,6 +7,7 @@ from typing import Literal
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 
 Source = Literal["sensors", "poses"]
@@ -32,6 +33,7 @@ class Assumptions:
         extraction: how many points and scans are used.
         ground_everywhere: whether the ground is measured at every scan. `calibrate` measures it
             only at scans that see a target.
+        ranges: errors of the ranges that no average removes.
         structure: whether walls count, and the ground cell by cell with them.
         stride: for a quick prediction, only every n-th cloud is used, with n-fold weight.
     """
@@ -45,5 +47,6 @@ class Assumptions:
     time_offset: bool = False
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     ground_everywhere: bool = False
+    ranges: RangeErrors = UNSTATED
     structure: bool = True
     stride: int = 1

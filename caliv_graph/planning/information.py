@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.calibration.ground import TOGETHER_NS
+from caliv_graph.calibration.ground import GROUND_BIASES, TOGETHER_NS, bias_sigmas
 from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config.mounting import PoseConfig
@@ -25,6 +25,7 @@ from caliv_graph.planning.sightings import (
     SEEN_PART,
     Placement,
     Sighting,
+    ground_by_range_bias,
     placements,
     scan_stamps,
     sees_ground,
@@ -32,6 +33,7 @@ from caliv_graph.planning.sightings import (
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import Scenario
+from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.targets.cloud.views import view_weights
 from caliv_graph.targets.ground.measure import MAX_APART_NS
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
@@ -51,7 +53,8 @@ target) regular, so that they can be eliminated."""
 class Columns:
     """Columns of the coordinates that all nodes of one drive share, behind the six of a pose.
 
-    Their order is: extrinsics, time offsets, targets, ground plane, error of the vehicle's height.
+    Their order is: extrinsics, time offsets, targets, range biases of each LiDAR on the ground,
+    ground plane, error of the vehicle's height.
 
     Attributes:
         lidars: the LiDARs that take part.
@@ -84,10 +87,24 @@ class Columns:
         at = self.kept + 6 * self.targets.index(name)
         return slice(at, at + 6)
 
+    def biases(self, name: str) -> slice:
+        """Range biases of a LiDAR on the ground, those of `calibration.ground.bias_sigmas`."""
+        at = self._biases + GROUND_BIASES * self.lidars.index(name)
+        return slice(at, at + GROUND_BIASES)
+
+    @property
+    def all_biases(self) -> IntArray:
+        """Those of all LiDARs."""
+        return np.arange(self._biases, self.plane)
+
+    @property
+    def _biases(self) -> int:
+        return self.kept + 6 * len(self.targets)
+
     @property
     def plane(self) -> int:
         """Start of the ground plane."""
-        return self.kept + 6 * len(self.targets)
+        return self._biases + GROUND_BIASES * len(self.lidars) * (self.ground != "none")
 
     @property
     def height(self) -> int:
@@ -148,6 +165,7 @@ def drive_information(
     corner = H[:, POSE:, POSE:].sum(axis=0)
     rest = np.arange(columns.kept, k)
     corner[rest, rest] += RIDGE
+    corner[columns.all_biases, columns.all_biases] += bias_information(columns, assumptions)
     if assumptions.ground == "height":
         corner[columns.height, columns.height] += height_sigma_of(scenario, assumptions) ** -2.0
     last = Chain(diagonal, motion.coupling, border, corner).only(np.array([n - 1]))
@@ -168,6 +186,12 @@ def height_sigma_of(scenario: Scenario, assumptions: Assumptions) -> float:
     """1 sigma of the vehicle's height above ground, metres, above zero."""
     sigma = assumptions.ground_height_sigma_m
     return max(scenario.suspension.height_sigma_m if sigma is None else sigma, 1e-5)
+
+
+def bias_information(columns: Columns, assumptions: Assumptions) -> Array:
+    """Prior information of `Columns.all_biases`."""
+    count = len(columns.all_biases) // GROUND_BIASES
+    return np.tile(bias_sigmas(assumptions.ranges) ** -2.0, count)
 
 
 def eliminated(H: Array, keep: int) -> Array:
@@ -283,23 +307,44 @@ def add_ground(
         info[later, 2] = 1.0 / (distance_sigma**2 + heave_variance)
         info *= view_weights(motion.position_map[at])[:, None]
         stood[at] = True
-        t = model.mounting.pose().translation()
-        R, place = motion.R_map_vehicle[at], motion.position_map[at]
-        arm = place + R @ t - origin
         J = np.zeros((len(at), 3, H.shape[1]))
-        lidar = _behind(columns.lidar(name)).start
-        plane = POSE + columns.plane
-        # Residual of the normal in map axes: LiDAR tilt minus slopes of the plane.
-        tilt = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) @ R
-        J[:, :2, :3] = J[:, :2, lidar : lidar + 3] = tilt
-        J[:, 0, plane] = J[:, 1, plane + 1] = -1.0
-        J[:, 2, :3] = -R[:, 2] @ skew(t)
-        J[:, 2, 3:6] = J[:, 2, lidar + 3 : lidar + 6] = R[:, 2]
-        J[:, 2, plane : plane + 2] = -arm[:, :2]
-        J[:, 2, plane + 2] = -1.0
+        _seen_plane(J, motion, at, origin, model, name, columns)
         np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, :, None] * J))
     if assumptions.ground == "height":
         _add_contact(H, motion, np.flatnonzero(stood), origin, columns)
+
+
+def _seen_plane(
+    J: Array,
+    motion: PlannedMotion,
+    at: IntArray,
+    origin: Array,
+    model: LidarModel,
+    name: str,
+    columns: Columns,
+) -> None:
+    """Fills the derivatives (m, 3, 6 + k) of the plane that a LiDAR sees from the nodes `at` (m,).
+
+    Two of its normal in map axes, one of its distance; heights are about `origin`.
+    """
+    t = model.mounting.pose().translation()
+    R, place = motion.R_map_vehicle[at], motion.position_map[at]
+    arm = place + R @ t - origin
+    lidar = _behind(columns.lidar(name)).start
+    plane = POSE + columns.plane
+    # Residual of the normal in map axes: LiDAR tilt minus slopes of the plane.
+    tilt = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) @ R
+    J[:, :2, :3] = J[:, :2, lidar : lidar + 3] = tilt
+    J[:, 0, plane] = J[:, 1, plane + 1] = -1.0
+    J[:, 2, :3] = -R[:, 2] @ skew(t)
+    J[:, 2, 3:6] = J[:, 2, lidar + 3 : lidar + 6] = R[:, 2]
+    J[:, 2, plane : plane + 2] = -arm[:, :2]
+    J[:, 2, plane + 2] = -1.0
+    # Predicted less measured: where the ground seems to rise, its normal leans back.
+    changed = ground_by_range_bias(model)
+    biases = _behind(columns.biases(name))
+    J[:, :2, biases] = R[:, :2, :2] @ changed[:2]
+    J[:, 2, biases] = changed[2]
 
 
 def _add_contact(

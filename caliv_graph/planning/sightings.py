@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from caliv_graph.config.model import ExtractionConfig
+from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
@@ -22,6 +23,7 @@ from caliv_graph.scenario.shapes import object_mesh
 from caliv_graph.scenario.terrain import Terrain, make_terrain
 from caliv_graph.scenario.world_models import ObjectModel
 from caliv_graph.targets.cloud.views import clouds_per_lidar, evenly_spread
+from caliv_graph.targets.ground.planes import CELL_M, CELL_POINTS, UNEVENNESS_M
 
 SEEN_PART = 0.87
 """Fraction of the surface facing a LiDAR that returns points; the target occludes the rest itself.
@@ -268,22 +270,48 @@ def thinned(weights: Array, seeing: int, extraction: ExtractionConfig) -> IntArr
 
 def sees_ground(model: LidarModel) -> bool:
     """Whether a LiDAR on level ground has enough points on the ground around it."""
+    low, high = np.radians(model.horizontal_fov_deg)
+    columns = (high - low) / math.radians(model.horizontal_resolution_deg)
+    return bool(len(_ground_points(model)) * columns / GROUND_COLUMNS >= GROUND_LEAST_POINTS)
+
+
+def ground_by_range_bias(model: LidarModel) -> Array:
+    """(3, 3) change of the plane that a LiDAR sees, if its ranges are off.
+
+    Slopes along the vehicle's x and y, and height in metres below the LiDAR, by a metre of all
+    ranges, and by those of `config.range_errors.growth`. As in `targets.ground`, square metres
+    count alike from `CELL_POINTS` points on.
+    """
+    points = _ground_points(model)
+    low, high = np.radians(model.horizontal_fov_deg)
+    of_each = (high - low) / math.radians(model.horizontal_resolution_deg) / GROUND_COLUMNS
+    cells = np.floor(points[:, :2] / CELL_M).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    down = -points[:, 2] / np.linalg.norm(points, axis=1)
+    variance = (model.range_sigma_m * down) ** 2 + UNEVENNESS_M**2
+    weight = np.minimum(1.0, CELL_POINTS / (of_each * count[cell.ravel()])) / variance
+    J = np.column_stack([points[:, :2], np.ones(len(points))])
+    lower = -down[:, None] * np.column_stack([np.ones(len(down)), growth(down)])
+    return np.asarray(np.linalg.solve(J.T @ (weight[:, None] * J), J.T @ (weight[:, None] * lower)))
+
+
+def _ground_points(model: LidarModel) -> Array:
+    """(m, 3) points on level ground near a LiDAR, from it, vehicle axes; of `GROUND_COLUMNS`."""
     T = model.mounting.pose()
     elevation = np.radians(channel_elevations_deg(model))[:, None]
     low, high = np.radians(model.horizontal_fov_deg)
     azimuth = low + (high - low) * (np.arange(GROUND_COLUMNS) + 0.5) / GROUND_COLUMNS
-    beams = unit_vectors(elevation, azimuth)
-    down = -(beams @ T.rotation().matrix()[2])
+    beams = unit_vectors(elevation, azimuth) @ T.rotation().matrix().T
+    down = -beams[..., 2]
     height_m = float(T.translation()[2])
     if height_m <= 0.0:
-        return False
+        return np.zeros((0, 3))
     with np.errstate(divide="ignore"):
         distance_m = np.where(down > 0.0, height_m / np.maximum(down, 1e-9), np.inf)
     hit = (distance_m * np.sqrt(1.0 - np.minimum(down, 1.0) ** 2) < GROUND_REACH_M) & (
         distance_m > model.min_range_m
     )
-    columns = (high - low) / math.radians(model.horizontal_resolution_deg)
-    return bool(hit.sum() * columns / GROUND_COLUMNS >= GROUND_LEAST_POINTS)
+    return np.asarray(beams[hit] * distance_m[hit][:, None])
 
 
 def within(model: LidarModel, points_lidar: Array) -> tuple[BoolArray, Array]:

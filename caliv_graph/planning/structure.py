@@ -7,7 +7,7 @@ Clouds of targets are added on the same poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from caliv_graph.planning.information import (
     Columns,
     add_clouds,
     add_ground,
+    bias_information,
     eliminated,
     height_sigma_of,
     source_of,
@@ -91,7 +92,27 @@ class PlannedStructure:
 def plan_structure(
     scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
 ) -> PlannedStructure | None:
-    """The structure of a drive; None if it passes no walls, or if none is to be used."""
+    """The structure of a drive; None if it passes no walls, or if none is to be used.
+
+    Without the ground where some LiDARs see it as planes only, at scans of targets: it counts once.
+    """
+    planned = _planned(scenario, drive, sightings, assumptions)
+    planes = assumptions.ground != "none" and any(len(s.used) for s in sightings)
+    if planned is None or not planes or _has_all_ground(scenario, planned.found):
+        return planned
+    return _planned(scenario, drive, sightings, replace(assumptions, ground="none"))
+
+
+def _has_all_ground(scenario: Scenario, found: Solved) -> bool:
+    """Whether the strips have the ground of all LiDARs that see it."""
+    seeing = {name for name, model in scenario.lidars.items() if sees_ground(model)}
+    return seeing <= lidars_with_ground(found)
+
+
+def _planned(
+    scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
+) -> PlannedStructure | None:
+    """`plan_structure`, with the ground wherever strips have it."""
     faces = faces_of(scenario)
     if not assumptions.structure or not faces.flat.any():
         return None
@@ -124,12 +145,13 @@ def plan_structure(
             sway_rad=0.0,
         ),
         views=views_of(patches, pose_of_scan, prior),
+        range_errors=assumptions.ranges,
     )
     found = linearised(
         problem,
         {name: model.mounting.pose() for name, model in scenario.lidars.items()},
         np.array([model.range_sigma_m for model in scenario.lidars.values()]),
-        Levels(SIGHTING_M, STRIP_M, SHARED_M),
+        Levels.first(SIGHTING_M, STRIP_M, SHARED_M, assumptions.ranges),
     )
     if found is None:
         return None
@@ -173,9 +195,7 @@ def information_with_structure(
     used = [s for s in sightings if len(s.used)]
     layout, nodes = structure.found.layout, structure.nodes
     names = list(scenario.lidars)
-    with_planes = assumptions.ground != "none" and not {
-        name for name, model in scenario.lidars.items() if sees_ground(model)
-    } <= lidars_with_ground(structure.found)
+    with_planes = assumptions.ground != "none" and not _has_all_ground(scenario, structure.found)
     columns = Columns(
         names,
         assumptions.time_offset,
@@ -202,6 +222,7 @@ def information_with_structure(
     total[:k, k : k + POSE * m] = total[k : k + POSE * m, :k].T
     rest = np.arange(columns.kept, k)
     total[rest, rest] += RIDGE
+    total[columns.all_biases, columns.all_biases] += bias_information(columns, assumptions)
     if columns.ground == "height":
         total[columns.height, columns.height] += height_sigma_of(scenario, assumptions) ** -2.0
     own = np.concatenate(

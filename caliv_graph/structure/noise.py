@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import nnls
 
+from caliv_graph.config.range_errors import RangeErrors, size_weights
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.sightings import BEAM_RAD, Sightings
-from caliv_graph.structure.system import Geometry, Layout, Nuisances
+from caliv_graph.structure.system import BIASES, Geometry, Layout, Nuisances
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
@@ -27,11 +28,6 @@ INCIDENCES = 8
 
 LEAST_RANGE_M = 1e-3
 """Smallest noise along the beam: no LiDAR for vehicles has less."""
-
-SURFACE_BIAS_M = 0.003
-"""1 sigma of the bias of a LiDAR on a surface where nothing tells: echoes of bright and of dark
-paint differ by millimetres in data sheets. It counts as one bias beside those that the drive
-determines."""
 
 OWN_STRIP = 10.0
 """Number of sightings that the common sigma counts as when the sigma of one strip is estimated."""
@@ -118,6 +114,7 @@ def fitted_noise(
     layout: Layout,
     nuisances: Nuisances,
     errors: Array,
+    ranges: RangeErrors,
 ) -> Nuisances:
     """Noise levels from the residuals at an estimate (REML: what was fitted is counted).
 
@@ -133,6 +130,7 @@ def fitted_noise(
         layout: its coordinates.
         nuisances: the levels that it was solved with.
         errors: (D,) estimated errors of the LiDARs.
+        ranges: what is stated of the errors of the ranges.
     """
     offsets = geometry.offsets_m(sightings)
     sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
@@ -155,7 +153,8 @@ def fitted_noise(
         nuisances,
         sighting=np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2)),
         shared=math.sqrt(shared),
-        surface=_surface_sigma(solve, layout, nuisances.surface, errors),
+        bias=_bias_sigma(solve, layout, nuisances.bias, errors, ranges),
+        surface=_surface_sigma(solve, layout, nuisances.surface, errors, ranges.surface_m),
         strip=np.maximum(
             _strip_sigmas(solve, layout, nuisances.strip, errors),
             ONE_VIEW_M if one else LEAST_M,
@@ -231,13 +230,40 @@ def _jitter_sigma(
     return float(np.clip(found, LEAST_JITTER_S, MOST_JITTER_S))
 
 
-def _surface_sigma(
-    solve: Callable[[Array], Array], layout: Layout, before: float, errors: Array
+def _bias_sigma(
+    solve: Callable[[Array], Array],
+    layout: Layout,
+    before: float,
+    errors: Array,
+    ranges: RangeErrors,
 ) -> float:
-    """1 sigma of the biases of LiDARs on surfaces: a fixed-point step of its likelihood."""
+    """1 sigma of the biases of the LiDARs' ranges: the root mean square of its posterior.
+
+    A LiDAR for whose bias its place makes up says nothing of it.
+    """
+    own = np.arange(layout.error, layout.standing, BIASES)
+    unit = np.zeros((layout.size, len(own)))
+    unit[own, np.arange(len(own))] = 1.0
+    known = np.linalg.inv(solve(unit)[own])
+    # Positive semidefinite but for rounding.
+    values, axes = np.linalg.eigh(0.5 * (known + known.T) - before**-2.0 * np.eye(len(own)))
+    information = (axes * np.maximum(values, 0.0)) @ axes.T
+    kinds = np.zeros(len(own), dtype=np.int64)
+    prior = ranges.offsets
+    weights = size_weights(information, known @ errors[own], kinds, [prior])
+    return math.sqrt(float(weights @ prior.sigmas**2))
+
+
+def _surface_sigma(
+    solve: Callable[[Array], Array], layout: Layout, before: float, errors: Array, usual: float
+) -> float:
+    """1 sigma of the biases of LiDARs on surfaces: a fixed-point step of its likelihood.
+
+    The usual one counts as one bias beside those that the drive determines.
+    """
     own = slice(layout.surface_error, layout.strip_error)
     known = max(float(_known(solve, layout, own, before).sum()), 0.0)
-    total = SURFACE_BIAS_M**2 + float((errors[own] ** 2).sum())
+    total = usual**2 + float((errors[own] ** 2).sum())
     return math.sqrt(total / (1.0 + known))
 
 

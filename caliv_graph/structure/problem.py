@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.patches import DrivePatches
@@ -43,6 +44,7 @@ class Problem:
         range_sigma_m: noise along the beam as stated.
         standing: what is known of how the vehicle stands on the ground.
         views: which scans are from one place.
+        range_errors: what is stated of the errors of the ranges.
     """
 
     patches: DrivePatches
@@ -56,6 +58,7 @@ class Problem:
     range_sigma_m: float
     standing: Standing
     views: Views
+    range_errors: RangeErrors = UNSTATED
 
 
 def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
@@ -23,7 +23,7 @@ TILT_LENGTH_M = 1.0
 fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
 
 
-MIN_COS = math.cos(math.radians(75.0))
+MIN_COS = GRAZING_COS
 """Smallest cosine of the incidence: beyond, footprints are metres long."""
 
 

@@ -10,12 +10,12 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
-    SURFACE_BIAS_M,
     fitted_noise,
     range_sigmas,
     robust_weights,
@@ -65,12 +65,6 @@ STEPS = (2, LAST_STEPS)
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
-
-BIAS_M = 0.005
-INCIDENCE_BIAS_M = 0.003
-GROUND_BIAS_M = 0.003
-"""1 sigma of the biases of ranges: of a LiDAR, per unit of 1 / cos(incidence), and on the ground,
-which is of one colour: the accuracy that data sheets state, 1 to 3 cm at most, 3 to 5 mm mostly."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +127,13 @@ class Levels:
     sighting_m: float
     strip_m: float
     shared_m: float
-    surface_m: float = SURFACE_BIAS_M
+    surface_m: float
+    bias_m: float
+
+    @staticmethod
+    def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
+        """Some levels, and what is known of the ranges before any data."""
+        return Levels(sighting_m, strip_m, shared_m, ranges.surface_m, ranges.offsets.usual)
 
     @staticmethod
     def of(found: Nuisances) -> Levels:
@@ -143,6 +143,7 @@ class Levels:
             strip_m=float(np.median(found.strip)),
             shared_m=found.shared,
             surface_m=found.surface,
+            bias_m=found.bias,
         )
 
 
@@ -180,7 +181,9 @@ def _rough(
     """The estimate after the rounds with wide gates, of some of the scans, and noise levels."""
     some, poses = with_scans(problem, some_scans(problem.patches))
     rough = first_state(some, start)
-    levels = Levels(FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M)
+    levels = Levels.first(
+        FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M, problem.range_errors
+    )
     for gate in ROUGH_GATES_M:
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
@@ -276,9 +279,9 @@ def _round(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
     )
     nuisances = Nuisances(
-        bias=BIAS_M,
-        incidence=INCIDENCE_BIAS_M,
-        ground=GROUND_BIAS_M,
+        bias=levels.bias_m,
+        incidence=problem.range_errors.incidence_m,
+        ground=problem.range_errors.ground_m,
         surface=levels.surface_m,
         strip=np.full(strips.count, levels.strip_m),
         sighting=np.full(strips.count, levels.sighting_m),
@@ -323,6 +326,7 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         layout,
         found.nuisances,
         state.errors,
+        problem.range_errors,
     )
     weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
     step = d[layout.extrinsic : layout.error]

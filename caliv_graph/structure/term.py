@@ -11,6 +11,7 @@ import numpy as np
 
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
+from caliv_graph.config.range_errors import range_errors
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
@@ -152,6 +153,7 @@ def problem_of(
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
         views=views_of(patches, pose_of_scan, prior),
+        range_errors=range_errors(config.noise),
     )
 
 

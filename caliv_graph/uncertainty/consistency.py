@@ -44,9 +44,9 @@ SCALE_LIMIT = 5.0
 channel's calibration error: with about 25 points of a channel on a chair 8 m away, sigmas are
 sqrt(25) times as large. No known LiDAR effect exceeds this."""
 
-RANGE_BIAS_LIMIT_M = 0.005
-"""1 sigma of the biases of ranges that a calibration may have: data sheets of LiDARs state a
-repeatability of 3 to 10 mm, and what is left of it on one material is less."""
+RANGE_BIAS_LIMIT_M = 0.01
+"""1 sigma of the biases of ranges that a calibration may have: data sheets of LiDARs state an
+accuracy of 20 to 30 mm mostly, which is taken for two to three sigmas."""
 
 OUTLIERS = 0.1
 """Fraction of a LiDAR's clouds that may be outliers: the paper's k = 10 percent."""

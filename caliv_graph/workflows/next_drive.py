@@ -14,6 +14,7 @@ from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
+from caliv_graph.config.range_errors import range_errors
 from caliv_graph.errors import ConfigError, RecordingError, TrajectoryError
 from caliv_graph.pipeline import Look, look
 from caliv_graph.planning.assumptions import Assumptions
@@ -151,6 +152,7 @@ def _assumptions(config: Config) -> Assumptions:
         heave_sigma_m=HEAVE_SIGMA_M if heave_m is None else heave_m,
         time_offset=config.solve.time_offset,
         extraction=config.extraction,
+        ranges=range_errors(config.noise),
         structure=config.structure.use,
     )
 

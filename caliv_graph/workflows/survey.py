@@ -23,6 +23,7 @@ from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
+    other_grounds,
     solved_with_structure,
 )
 from caliv_graph.common.progress import Progress
@@ -135,7 +136,7 @@ def survey_observations(
         problem, used, tuple(grounds), config, progress, limit, look_for_symmetries=True
     )
     state = rough.state
-    terms = structure.terms_beside(state, problem, trajectories, problem.heave_m)
+    terms = structure.terms_beside(state, problem, trajectories, problem.heave_m, grounds)
     if terms:
         others = lidars_with_structure(terms)
         problem = pose_problem(used, trajectories, config, None, others)
@@ -144,7 +145,13 @@ def survey_observations(
             name: state.problem.extrinsic(state.values, name) for name in state.problem.lidars
         }
         state, offsets_s = solved_with_structure(
-            problem, rough.registrations, tuple(grounds), config, state.turns, terms, extrinsics
+            problem,
+            rough.registrations,
+            other_grounds(tuple(grounds), terms),
+            config,
+            state.turns,
+            terms,
+            extrinsics,
         )
         rough = replace(rough, offsets_s=offsets_s)
     D = reduced_registered(state, rough.registrations).D

@@ -39,6 +39,7 @@ from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, moved_map
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import GroundConfig
+from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.conventions import (
     key_extrinsic,
     key_ground,
@@ -283,8 +284,8 @@ def test_jacobians(offset_m: float) -> None:
         check_jacobians(ground_plane_factor((X, E), G, anchor, swept), values)
         check_jacobians(ground_plane_factor((X, E, S), G, anchor, observation), values)
         check_jacobians(ground_plane_factor((X, E), G, anchor, observation, 0.3), values)
-        biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 2)))
-        values.insert(key_ground_bias(0), np.array([0.01, -0.02]))
+        biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 3)))
+        values.insert(key_ground_bias(0), np.array([0.01, -0.02, 0.03]))
         check_jacobians(
             ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
         )
@@ -817,6 +818,7 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
         cloud_placement=none,
         placements=0,
     )
+    exact = RangeErrors(*[1e-5] * 4)  # as they are simulated
     # The poses do not know of the heave.
     noise = PoseNoise(3e-4, math.hypot(2e-3, HEAVE_SIGMA_M), 1e-5, 1e-4, 4.0)
     ground = GroundConfig(vehicle_height=0.0)
@@ -825,7 +827,7 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
     base = merged(pose_graph(problem, noise), prior_graph(problem, problem.lidars))
     weights = full_weights(problem, observations)
     for _ in range(2):
-        graph = merged(base, ground_graph(problem, observations, ground, weights))
+        graph = merged(base, ground_graph(problem, observations, ground, weights, ranges=exact))
         values = optimise(graph, values, 50)
         weights = ground_weights(problem, observations, values)
     assert weights.planes.min() > 0.5

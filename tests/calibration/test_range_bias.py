@@ -12,16 +12,16 @@ from scipy.linalg import block_diag
 from caliv_graph.calibration.graph import pose_graph
 from caliv_graph.calibration.linear import cloud_rows, linearise_clouds
 from caliv_graph.calibration.range_bias import (
-    INCIDENCES_M,
-    LOG_SPREAD,
-    TYPICAL_OFFSET_M,
     BiasSizes,
     RangeBiases,
     fit_bias_sizes,
+    most_likely_biases,
+    moved_back,
     range_biases,
     without_bias,
 )
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
+from caliv_graph.config.range_errors import INCIDENCES_M, LOG_SPREAD, TYPICAL_OFFSET_M
 from caliv_graph.products import Array, PoseNoise, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
 from tests.calibration.problems import Case, make_case
@@ -62,6 +62,38 @@ def test_biases_are_eliminated_as_variables_are() -> None:
     np.testing.assert_allclose(
         found_gradient, pull[:18] - full[:18, 18:] @ follows[:, 18], atol=1e-9
     )
+
+
+def test_biases_that_were_taken_off_before_are_pulled_back_by_their_prior() -> None:
+    # Longer ranges by b move what fits back by D b; b0 of them are in the poses already.
+    H, gradient = quadratic(3, 11)
+    D, applied = any_directions(3, 2, 12), np.array([0.4, -1.3])
+    moved = np.random.default_rng(13).normal(size=18)
+
+    def cost(d: Array, b: Array) -> float:
+        x = d - D @ (b - applied)
+        return float(0.5 * x @ H @ x + gradient @ x + 0.5 * b @ b)
+
+    def best(d: Array) -> Array:
+        """The least of a quadratic, by its derivatives."""
+        eye = np.eye(2)
+        slope = np.array([0.5 * (cost(d, e) - cost(d, -e)) for e in eye])
+        bend = np.array(
+            [
+                [
+                    0.25 * sum(p * q * cost(d, p * a + q * b) for p in (1, -1) for q in (1, -1))
+                    for a in eye
+                ]
+                for b in eye
+            ]
+        )
+        return np.asarray(-np.linalg.solve(bend, slope))
+
+    less, less_gradient = without_bias(H, gradient, D, applied)
+    found = most_likely_biases(H, gradient, D, applied, moved)
+    np.testing.assert_allclose(found, best(moved), rtol=1e-6)
+    difference = cost(moved, best(moved)) - cost(np.zeros(18), best(np.zeros(18)))
+    assert 0.5 * moved @ less @ moved + less_gradient @ moved == pytest.approx(difference)
 
 
 def test_eliminated_biases_add_to_the_covariance() -> None:
@@ -131,6 +163,21 @@ def test_an_offset_moves_the_clouds_of_one_lidar_and_placement_along_their_beams
         beam = by_cloud[j, 3:, own]
         assert np.linalg.norm(beam) == pytest.approx(1.0, abs=1e-3)
         assert beam == pytest.approx(-t[j] / np.linalg.norm(t[j]), abs=0.01)
+
+
+def test_clouds_with_longer_ranges_fit_nearer_to_their_lidar() -> None:
+    """Each LiDAR and target has its own bias; the points are then where they were without."""
+    names = [("front", "rear", "front"), ("rear", "front", "rear", "left")]
+    states, poses = zip(*[placement(m, n) for m, n in enumerate(names)], strict=True)
+    offsets_m = 1e-3 * np.array([5.0, -8.0, 3.0, -2.0, 12.0])
+    column = [[0, 1, 0], [2, 3, 2, 4]]
+    fitting = moved_back(states, poses, offsets_m)
+    for state, (R, t), (R_fit, t_fit), of in zip(states, poses, fitting, column, strict=True):
+        clouds = state.clouds
+        longer = clouds.points + offsets_m[np.array(of)[clouds.cloud], None] * clouds.beams
+        moved = np.einsum("nij,nj->ni", R_fit[clouds.cloud], longer) + t_fit[clouds.cloud]
+        # The beams of a cloud spread by a degree: 12 mm across them by 0.2 mm.
+        np.testing.assert_allclose(moved, clouds.moved(R, t), atol=3e-4)
 
 
 def tilted_plate(tilt_deg: float) -> tuple[JointRegistration, tuple[Array, Array], Array]:

@@ -16,7 +16,7 @@ from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.planning.assumptions import Assumptions, Ground
 from caliv_graph.planning.information import Columns, add_clouds, add_ground, eliminate_heave
 from caliv_graph.planning.motion import NODE_NS, PlannedMotion, nearest, plan_motion
-from caliv_graph.planning.sightings import Sighting, placements, sight
+from caliv_graph.planning.sightings import Sighting, ground_by_range_bias, placements, sight
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, SCurveDrive, StraightDrive
 from caliv_graph.scenario.drives import Drive, make_drive
@@ -257,11 +257,14 @@ def test_grounds_information_is_that_of_numerical_derivatives() -> None:
         normal = np.array([-a, -b, 1.0]) / math.sqrt(1.0 + a * a + b * b)
         foot = np.array([*anchor[:2], height + anchor[2]])
         T = X.compose(E)
-        over = normal @ (T.translation() - foot)
+        rises = ground_by_range_bias(scan.scenario.lidars["front"])
+        rises = rises @ d[6 + columns.all_biases]
+        normal_seen = normal + X.rotation().matrix()[:, :2] @ rises[:2]
+        over = normal @ (T.translation() - foot) + rises[2]
         stands = normal @ (X.translation() - foot) - error
         return np.concatenate(
             [
-                T.rotation().matrix().T @ normal / NORMAL_FLOOR_RAD,
+                T.rotation().matrix().T @ normal_seen / NORMAL_FLOOR_RAD,
                 [over / DISTANCE_FLOOR_M, stands / 0.005],
             ]
         )

@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caliv_graph.calibration.ground import bias_sigmas
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TargetError
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.assumptions import Ground
 from caliv_graph.planning.predict import Prediction, predict_drives, sigma_of
+from caliv_graph.planning.sightings import ground_by_range_bias
 from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
@@ -42,7 +45,11 @@ RADIUS_M = 9.16
 
 # ------------------------------------------------------------------ lower bounds
 
+EXACT = RangeErrors(*[1e-6] * 4)
+"""Ranges without biases."""
+
 BOUND = Assumptions(
+    ranges=EXACT,
     heave_sigma_m=0.0,
     # Of about 300 independent points at 10 m, 50 are left at 24.5 m; SEEN_PART / INDEPENDENT_PART
     # as many points are counted.
@@ -173,7 +180,8 @@ GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
 
 def planned(name: str, ground: Ground, **changes: Any) -> Prediction:
     first, *others = DRIVES[name]
-    return predict(first, others, replace(Assumptions(ground=ground), **changes))
+    assumptions = Assumptions(ground=ground, ranges=EXACT)
+    return predict(first, others, replace(assumptions, **changes))
 
 
 def said(prediction: Prediction) -> set[str]:
@@ -265,7 +273,8 @@ def test_scans_at_other_times_see_another_heave() -> None:
         rear = first.lidars["rear"].model_copy(update={"phase_s": phase_s})
         lidars = {**first.lidars, "rear": rear}
         scenarios = [s.model_copy(update={"lidars": lidars}) for s in (first, *others)]
-        prediction = predict(scenarios[0], scenarios[1:], Assumptions(ground="plane"))
+        assumptions = Assumptions(ground="plane", ranges=EXACT)
+        prediction = predict(scenarios[0], scenarios[1:], assumptions)
         (pair,) = prediction.sigma_s2s.values()
         sigma.append(pair[5])
     assert sigma[1] == pytest.approx(sigma[0], rel=0.05)
@@ -278,6 +287,22 @@ def test_height_is_as_good_as_that_of_the_vehicle() -> None:
         prediction = planned("figure-eight", "height", ground_height_sigma_m=sigma_m)
 
         assert prediction.sigma_s2v["front"][5] == pytest.approx(sigma_m, rel=0.05)
+
+
+def test_range_biases_lift_the_ground_of_each_lidar() -> None:
+    """By the ground alone S2S z is no better than they let it be; the target knows it to 4 mm."""
+    sigmas = bias_sigmas(UNSTATED)
+    lidars = DRIVES["figure-eight"][0].lidars.values()
+    lifts = [ground_by_range_bias(model)[2] * sigmas for model in lidars]
+    by_ground_m = float(np.linalg.norm(lifts))
+    z = {}
+    for ground in GROUNDS[:2]:
+        for ranges in (EXACT, UNSTATED):
+            (pair,) = planned("figure-eight", ground, ranges=ranges).sigma_s2s.values()
+            z[ground, ranges] = float(pair[5])
+    assert z["none", UNSTATED] == pytest.approx(z["none", EXACT], rel=1e-6)
+    assert z["plane", EXACT] < 0.3 * by_ground_m < z["plane", UNSTATED]
+    assert z["plane", UNSTATED] < min(by_ground_m, z["none", EXACT])
 
 
 def test_twice_the_noise_of_everything_is_twice_the_sigma() -> None:

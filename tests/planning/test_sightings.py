@@ -9,17 +9,20 @@ import pytest
 
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.config.range_errors import growth
 from caliv_graph.planning.sightings import (
     INDEPENDENT_PART,
     POSITION_FLOOR_M,
     ROTATION_FLOOR_RAD,
     SEEN_PART,
+    ground_by_range_bias,
     placements,
     scan_stamps,
     sees_ground,
     sight,
     thinned,
 )
+from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
 from caliv_graph.scenario.drive_models import StandstillDrive, StraightDrive
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario
@@ -33,6 +36,7 @@ from caliv_graph.scenario.world_models import (
     WorldModel,
 )
 from caliv_graph.simulation.recording import simulate_drive
+from caliv_graph.targets.ground.planes import fit_plane, near_points
 from tests.drives_with_chair import ARC, paper_lidar, paper_scenario
 
 EXTRACTION = ExtractionConfig()
@@ -236,6 +240,34 @@ def test_who_sees_ground(
     )
 
     assert sees_ground(lidar) is seen
+
+
+def test_range_biases_move_the_ground_as_they_move_the_plane_that_is_fitted() -> None:
+    """The points of every beam on level ground, with and without a centimetre of bias."""
+    lidar = paper_lidar(x_m=2.0, yaw_deg=0.0)
+    T = lidar.mounting.pose()
+    R, height_m = T.rotation().matrix(), float(T.translation()[2])
+    low, high = np.radians(lidar.horizontal_fov_deg)
+    azimuth = np.arange(low, high, math.radians(lidar.horizontal_resolution_deg))
+    elevation = np.radians(channel_elevations_deg(lidar))[:, None]
+    beams = unit_vectors(elevation, azimuth).reshape(-1, 3) @ R.T
+    beams = beams[beams[:, 2] < -0.05]
+    range_m = height_m / -beams[:, 2]
+    by_each = np.column_stack([np.ones(len(beams)), growth(-beams[:, 2])])
+
+    def plane(biases_m: np.ndarray) -> np.ndarray:
+        """Slopes and height of the fitted plane."""
+        points = beams * (range_m + by_each @ biases_m)[:, None]
+        up = np.array([0.0, 0.0, 1.0])
+        found, why = fit_plane(points[near_points(points, up)], up, lidar.range_sigma_m)
+        assert found is not None, why
+        n = found.normal_lidar
+        return np.array([-n[0] / n[2], -n[1] / n[2], -found.distance_m / n[2]])
+
+    shown = [(plane(0.01 * one) - plane(np.zeros(3))) / 0.01 for one in np.eye(3)]
+    expected = ground_by_range_bias(lidar)
+    assert np.stack(shown, axis=1) == pytest.approx(expected, rel=0.25, abs=3e-3)
+    assert abs(expected[0, 0]) > 0.01  # it looks ahead
 
 
 def test_the_parts_of_the_points_are_in_order() -> None:

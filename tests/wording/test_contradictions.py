@@ -162,4 +162,4 @@ def test_ranges_that_disagree_give_no_advice_after_a_suspect() -> None:
     found = RangesDisagree(0.013, ("front", "rear"))
     alone, after = contradiction_sentence(found), contradiction_sentence(found, led=True)
     assert alone.startswith(f"{after}. Check the range calibration of the LiDARs")
-    assert after.endswith("off by at least 13 mm (1 sigma; limit 5 mm)")
+    assert after.endswith("off by at least 13 mm (1 sigma; limit 10 mm)")

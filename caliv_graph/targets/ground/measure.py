@@ -11,6 +11,7 @@ import numpy as np
 
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import (
     GroundObservation,
@@ -85,11 +86,12 @@ class GroundMeter:
         beams = points / np.linalg.norm(points, axis=1)[:, None]
         # As on the plane: what stands on it, nearly upright to the beams, has no part in the fit.
         across = np.maximum(-beams @ plane.normal_lidar, MIN_SLOPE)
-        moved = [beams, beams * (1.0 / across - 1.0)[:, None]]
+        moved = [beams, *(beams * more[:, None] for more in growth(across).T)]
+        biases = len(moved)
         if times_s.any():
             moved += [(of_rotated - points) / EXTRINSIC_STEP_RAD for of_rotated in by_guess]
         changes = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
-        by_extrinsic = changes[:, 2:] if times_s.any() else None
+        by_extrinsic = changes[:, biases:] if times_s.any() else None
         return GroundObservation(
             lidar=scan.lidar,
             drive=self._drive,
@@ -103,7 +105,7 @@ class GroundMeter:
             R_vehicle_lidar=None if by_extrinsic is None else guess.rotation().matrix(),
             by_extrinsic=by_extrinsic,
             apart_ns=scan.stamp_ns - at_ns,
-            by_range_bias=changes[:, :2],
+            by_range_bias=changes[:, :biases],
         )
 
     def warnings(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import pytest
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config, parse_config
 from caliv_graph.config.model import Config
+from caliv_graph.config.range_errors import growth
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import (
     Array,
@@ -151,7 +152,7 @@ def test_meter_tells_what_range_biases_change() -> None:
     true = measured(ranges)
     assert true.by_range_bias is not None
     size_m = 2e-3
-    for column, wrong in enumerate((np.ones(len(ranges)), 1.0 / across - 1.0)):
+    for column, wrong in enumerate((np.ones(len(ranges)), *growth(across).T)):
         found = measured(ranges + size_m * wrong)
         tilts = true.axes_lidar @ found.normal_lidar
         change = np.append(tilts, found.distance_m - true.distance_m) / size_m

@@ -1,0 +1,158 @@
+"""How large the errors of a LiDAR's ranges are that no average removes: for every part.
+
+Data sheets state an accuracy of 10 to 50 mm at most over all ranges and materials, and a
+repeatability of 3 to 10 mm. A size is unknown by a factor: it has a prior on a grid, is integrated
+over where the data say something of it, and is the prior's root mean square where they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from caliv_graph.config.noise import NoiseConfig
+from caliv_graph.products import Array, IntArray
+
+TYPICAL_OFFSET_M = 3e-3
+"""Median of the prior of the offsets' sigma, of all ranges of a LiDAR: less than the repeatability
+that data sheets state, as most of that is noise."""
+
+LOG_SPREAD = math.log(2.5)
+"""1 sigma of the logarithm of a size: the offsets of two units in three are between 1.2 and 7.5 mm,
+and those of one in forty are beyond 18 mm, as those who state an accuracy of 30 mm allow for."""
+
+OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
+"""Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
+
+INCIDENCES_M = np.geomspace(1e-4, 1e-2, 9)
+"""Sigmas of the growth with 1 / cos(incidence), likewise. Data sheets do not state it, so that all
+sizes are as likely: from nothing to what makes as much as the largest offset at 75 degrees."""
+
+INCIDENCE_M = 3e-3
+"""Sigma of the growth with 1 / cos(incidence) where it is not estimated. Data sheets do not state
+it; at 75 degrees it makes 9 mm, which is the repeatability of one of them."""
+
+GRAZING_COS = math.cos(math.radians(75.0))
+"""Cosine of the incidence below which the growth is an error of its own: nobody knows how ranges
+go on where footprints are metres long and echoes weak. On ground at 15 m all beams are there."""
+
+SURFACE_M = 3e-3
+"""Sigma of the bias of a LiDAR on one surface where nothing tells: echoes of bright and of dark
+paint differ by millimetres in data sheets."""
+
+GROUND_M = 3e-3
+"""Sigma of one more bias on the ground, which is of one colour, likewise."""
+
+
+@dataclass(frozen=True)
+class RangeErrors:
+    """What a config says of them, metres.
+
+    Attributes:
+        offset_m: 1 sigma of the bias of all ranges of a LiDAR; None: unknown.
+        incidence_m: 1 sigma of its growth with 1 / cos(incidence).
+        ground_m: 1 sigma of one more bias on the ground.
+        surface_m: 1 sigma of one more bias on a surface, where nothing tells.
+    """
+
+    offset_m: float | None = None
+    incidence_m: float = INCIDENCE_M
+    ground_m: float = GROUND_M
+    surface_m: float = SURFACE_M
+
+    @property
+    def offsets(self) -> SizePrior:
+        """The prior of the offsets' sigma."""
+        return offset_prior(self.offset_m)
+
+
+def range_errors(noise: NoiseConfig) -> RangeErrors:
+    """The sizes that a config states; who knows all ranges knows those at a slant, too."""
+    stated_m = noise.lidar_range_bias_m
+    most_m = math.inf if stated_m is None else stated_m
+    others_m = (min(usual_m, most_m) for usual_m in (INCIDENCE_M, GROUND_M, SURFACE_M))
+    return RangeErrors(stated_m, *others_m)
+
+
+UNSTATED = RangeErrors()
+"""Of a config that says nothing."""
+
+
+def growth(cosine: Array) -> Array:
+    """(N, 2) growth of ranges with 1 / cos(incidence) - 1, and what is more of it when grazing.
+
+    By a metre of `RangeErrors.incidence_m`, each, at cosines (N,) above zero.
+    """
+    until = np.minimum(1.0 / cosine, 1.0 / GRAZING_COS)
+    return np.column_stack([until - 1.0, 1.0 / cosine - until])
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """The prior of the sigma of some errors on a grid.
+
+    Attributes:
+        sigmas: (n,).
+        cost: (n,) minus the logarithm of their probability, up to a constant.
+    """
+
+    sigmas: Array
+    cost: Array
+
+    @property
+    def usual(self) -> float:
+        """The root mean square: 1 sigma of an error of which the data say nothing."""
+        weights = np.exp(self.cost.min() - self.cost)
+        return float(np.sqrt(weights @ self.sigmas**2 / weights.sum()))
+
+
+def log_normal(sigmas: Array, typical: float) -> SizePrior:
+    """The prior of sigmas (n,) about a median, by `LOG_SPREAD`."""
+    return SizePrior(sigmas, 0.5 * (np.log(sigmas / typical) / LOG_SPREAD) ** 2)
+
+
+def flat(sigmas: Array) -> SizePrior:
+    """A prior for which sigmas (n,) are equally likely; one of them: it is known."""
+    return SizePrior(sigmas, np.zeros(len(sigmas)))
+
+
+def offset_prior(stated_m: float | None) -> SizePrior:
+    """The prior of the offsets' sigma; what is stated is known."""
+    if stated_m is not None:
+        return flat(np.array([stated_m]))
+    return log_normal(OFFSETS_M, TYPICAL_OFFSET_M)
+
+
+def size_weights(
+    information: Array, pull: Array, kinds: IntArray, priors: Sequence[SizePrior]
+) -> Array:
+    """Posterior of the sizes of some errors, as weights on the product of their grids.
+
+    By the restricted likelihood: everything else is integrated out, so that errors that other
+    variables can make up for say nothing.
+
+    Args:
+        information: (B, B) of the errors, everything else eliminated, without their own priors.
+        pull: (B,) minus the gradient of the negative logarithm of the likelihood, at no errors.
+        kinds: (B,) index of the prior that each error's size has.
+        priors: of the sizes.
+    """
+    cost = np.zeros([len(prior.sigmas) for prior in priors])
+    for at in np.ndindex(*cost.shape):
+        sizes = np.array([prior.sigmas[i] for prior, i in zip(priors, at, strict=True)])
+        sigma = sizes[kinds]
+        cost[at] = _cost(sigma[:, None] * information * sigma, sigma * pull)
+        cost[at] += sum(prior.cost[i] for prior, i in zip(priors, at, strict=True))
+    weights = np.exp(cost.min() - cost)
+    return np.asarray(weights / weights.sum())
+
+
+def _cost(information: Array, pull: Array) -> float:
+    """Minus the logarithm of the restricted likelihood, of errors in units of their sigmas."""
+    L = np.linalg.cholesky(np.eye(len(pull)) + information)
+    y = scipy.linalg.solve_triangular(L, pull, lower=True)
+    return float(np.log(np.diag(L)).sum() - 0.5 * y @ y)

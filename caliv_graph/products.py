@@ -254,6 +254,12 @@ class TargetCloud:
     cut: frozenset[Side] = frozenset()
     swept: LidarScan | None = None
 
+    @property
+    def apart_s(self) -> float:
+        """Mean time of the points after the stamp, seconds; 0 if the LiDAR gives none."""
+        times_s = None if self.swept is None else self.swept.point_times_s
+        return 0.0 if times_s is None or not len(times_s) else float(times_s.mean())
+
 
 @dataclass(frozen=True)
 class TargetObservation:
@@ -318,6 +324,8 @@ class GroundObservation:
             it does not contain the heave of the body on its springs.
         by_range_bias: (3, 2) change of (a, b, distance) if all ranges are too long by a metre, and
             by a metre (1 / cos(incidence) - 1); None: none is assumed.
+        by_rates: (3, 6) change of (a, b, distance) if the angular (rad/s) and linear velocity (m/s)
+            that moved the points to `stamp_ns` were larger, vehicle axes; None: none were moved.
     """
 
     lidar: str
@@ -333,6 +341,7 @@ class GroundObservation:
     by_extrinsic: Array | None = None
     apart_ns: int = 0
     by_range_bias: Array | None = None
+    by_rates: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ their keys.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -33,28 +34,56 @@ def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Arr
     return product, jacobians
 
 
+@dataclass(frozen=True)
+class CloudMotion:
+    """How a cloud moves with errors of time and rates; of neither by itself.
+
+    Attributes:
+        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second, if
+            the time offset of the LiDAR is free.
+        apart_s: tau, mean time of the points after the stamp, to which they were moved with rates
+            that err; 0: none were.
+    """
+
+    twist: Array | None = None
+    apart_s: float = 0.0
+
+    def moves(self, keys: Sequence[int], values: gtsam.Values) -> list[tuple[gtsam.Pose3, Array]]:
+        """Each motion, and (6, size) its right perturbation by that of its variable."""
+        out, left = [], list(keys)
+        if self.twist is not None:
+            offset_s = float(values.atVector(left.pop(0))[0])
+            out.append((gtsam.Pose3.Expmap(-offset_s * self.twist), -self.twist[:, None]))
+        if self.apart_s:
+            d = self.apart_s * values.atVector(left.pop(0))
+            by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
+            out.append((gtsam.Pose3.Expmap(d), by_rates))
+        return out
+
+
+STILL = CloudMotion()
+
+
 def predict_cloud(
-    keys: Sequence[int], values: gtsam.Values, twist: Array | None = None
+    keys: Sequence[int], values: gtsam.Values, motion: CloudMotion = STILL
 ) -> tuple[gtsam.Pose3, list[Array]]:
-    """The pose that a cloud should have, `C X_i Exp(-o xi) E S_a`, and how it moves.
+    """The pose that a cloud should have, `C X_i Exp(-o xi) Exp(tau e) E S_a`, and how it moves.
 
     Args:
-        keys: of C, X_i, the time offset o if `twist` is given, E and, unless the LiDAR is the
-            reference, S_a.
+        keys: of C, X_i, of `motion` the time offset o and the errors of the rates e, E and, unless
+            the LiDAR is the reference, S_a.
         values: of all of them.
-        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second;
-            stamps are late by o.
+        motion: stamps are late by o, rates wrong by e.
 
     Returns:
         T_target_lidar; and per key the (6, size) derivative of its left perturbation.
     """
-    if twist is None:
-        return chain_jacobians([values.atPose3(key) for key in keys])
-    target, vehicle, offset, *extrinsic = keys
-    back = gtsam.Pose3.Expmap(-float(values.atVector(offset)[0]) * twist)
-    chain = [values.atPose3(target), values.atPose3(vehicle), back]
-    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in extrinsic])
-    moves[2] = moves[2] @ -twist[:, None]
+    target, vehicle, *others = keys
+    moved = motion.moves(others, values)
+    chain = [values.atPose3(target), values.atPose3(vehicle), *(T for T, _ in moved)]
+    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in others[len(moved) :]])
+    for i, (_, by_variable) in enumerate(moved, start=2):
+        moves[i] = moves[i] @ by_variable
     return Z, moves
 
 
@@ -62,18 +91,18 @@ def target_pose_factor(
     keys: Sequence[int],
     T_target_lidar: gtsam.Pose3,
     information: Array,
-    twist: Array | None = None,
+    motion: CloudMotion = STILL,
 ) -> gtsam.CustomFactor:
     """A registered cloud: `r = Log(Zhat Z^-1)`, the residual at the target (`README.md` says why).
 
     Z is `T_target_lidar` as registered, `information` (6, 6) of its left perturbation (target
-    frame), rad and m. `predict_cloud` gives Zhat from `keys` and `twist`.
+    frame), rad and m. `predict_cloud` gives Zhat from `keys` and `motion`.
     """
     Z_inverse = T_target_lidar.inverse()
     order = list(keys)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        predicted, moves = predict_cloud(order, values, twist)
+        predicted, moves = predict_cloud(order, values, motion)
         r = gtsam.Pose3.Logmap(predicted.compose(Z_inverse))
         if jacobians is not None:
             J_left = left_jacobian_inverse(r)

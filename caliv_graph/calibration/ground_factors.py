@@ -115,13 +115,14 @@ def ground_plane_factor(
     weight: float = 1.0,
     heave_m: float = 0.0,
     key_bias: int | None = None,
+    key_rates: int | None = None,
 ) -> gtsam.CustomFactor:
     """Role a: the plane as a LiDAR sees it.
 
     `r = [u . n, v . n, d] - [a, b, distance]`, n the plane's normal in the lidar frame and d the
     LiDAR's distance from it, both predicted from `X E S_a`; u and v are the observation's axes;
-    a, b and distance its values, motion compensated with the present extrinsic `E S_a`, less what
-    the range biases of the LiDAR change of them.
+    a, b and distance its values, motion compensated with the present extrinsic `E S_a` and rates,
+    less what the range biases of the LiDAR change of them.
 
     Args:
         pose_keys: of X_i, E and, unless the LiDAR is the reference, S_a.
@@ -132,11 +133,16 @@ def ground_plane_factor(
         heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
         key_bias: of the LiDAR's range biases; None, or an observation that does not tell what they
             change: none.
+        key_rates: of the errors of the drive's rates, likewise.
     """
     poses = list(pose_keys)
     axes = observation.axes_lidar
-    by_bias = observation.by_range_bias
-    biases = {} if key_bias is None or by_bias is None else {key_bias: by_bias}
+    by_bias, by_rates = observation.by_range_bias, observation.by_rates
+    nuisances: dict[int, Array] = {}
+    if key_bias is not None and by_bias is not None:
+        nuisances[key_bias] = by_bias
+    if key_rates is not None and by_rates is not None:
+        nuisances[key_rates] = -by_rates
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
@@ -156,14 +162,14 @@ def ground_plane_factor(
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
-            for i, by_one in enumerate(biases.values(), start=len(moves) + 1):
+            for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
-        for key, by_one in biases.items():
+        for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
-    return gtsam.CustomFactor(noise, [*poses, key_plane, *biases], error)
+    return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

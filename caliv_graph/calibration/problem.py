@@ -10,6 +10,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.factors import CloudMotion
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
@@ -26,6 +27,7 @@ from caliv_graph.conventions import (
     key_extrinsic,
     key_offset,
     key_pose_error,
+    key_rates,
     key_sensor,
     key_target,
     key_vehicle,
@@ -35,6 +37,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
+from caliv_graph.trajectory.rates import rate_rows
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -81,6 +84,10 @@ class Problem:
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
         heave_m: 1 sigma of the heave at each pose.
+        rate_rows: per drive the (6, 6 m) derivatives of its mean rates by its m poses
+            (`trajectory.rates`); none where an odometry gave them.
+        cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
+            were moved with the rates of the trajectory, seconds; None: zero.
     """
 
     lidars: tuple[str, ...]
@@ -103,6 +110,8 @@ class Problem:
     stated_cov: Array | None = None
     views: Array | None = None
     heave_m: float = field(default_factory=usual_heave_m)
+    rate_rows: Mapping[int, Array] = field(default_factory=dict)
+    cloud_apart_s: Array | None = None
 
     @property
     def clouds(self) -> int:
@@ -156,21 +165,33 @@ class Problem:
         return tuple(key_target(m) for m in range(self.placements))
 
     def cloud_keys(self, j: int) -> tuple[int, ...]:
-        """Keys of C, X_i, the time offset if it is free, E and S_a of cloud j, in that order."""
+        """Keys of C, X_i, of `cloud_motion`, E and S_a of cloud j, in that order."""
         lidar = self.lidars[self.cloud_lidar[j]]
-        offset = (key_offset(int(self.cloud_lidar[j])),) if lidar in self.offsets else ()
+        motion = self.cloud_motion(j)
+        offset = () if motion.twist is None else (key_offset(int(self.cloud_lidar[j])),)
+        rates = (key_rates(self.poses[self.cloud_pose[j]][0]),) if motion.apart_s else ()
         return (
             key_target(int(self.cloud_placement[j])),
             key_vehicle(int(self.cloud_pose[j])),
             *offset,
+            *rates,
             *self.extrinsic_keys_of(lidar),
         )
 
-    def cloud_twist(self, j: int) -> Array | None:
-        """(6,) velocity at cloud j, if the time offset of its LiDAR is free."""
-        if self.twists is None or self.lidars[self.cloud_lidar[j]] not in self.offsets:
-            return None
-        return np.asarray(self.twists[self.cloud_pose[j]])
+    def cloud_motion(self, j: int) -> CloudMotion:
+        """How cloud j moves with the time offset of its LiDAR, if it is free, and with rates."""
+        pose, twist = int(self.cloud_pose[j]), None
+        if self.twists is not None and self.lidars[self.cloud_lidar[j]] in self.offsets:
+            twist = np.asarray(self.twists[pose])
+        apart_s = 0.0
+        if self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows:
+            apart_s = float(self.cloud_apart_s[j])
+        return CloudMotion(twist, apart_s)
+
+    def swept_drives(self) -> set[int]:
+        """Drives with a cloud whose points were moved with the rates of its trajectory."""
+        moved = (j for j in range(self.clouds) if self.cloud_motion(j).apart_s)
+        return {self.poses[self.cloud_pose[j]][0] for j in moved}
 
     def offset_keys(self) -> tuple[int, ...]:
         """Time offsets that are free."""
@@ -326,7 +347,25 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
+        rate_rows=_rate_rows(trajectories, of_pose),
+        cloud_apart_s=np.array([c.apart_s for _, c in clouds]),
     )
+
+
+def _rate_rows(
+    trajectories: Sequence[VehicleTrajectory], T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3]
+) -> dict[int, Array]:
+    """`Problem.rate_rows` of the drives of poses by (drive, stamp), ascending."""
+    out = {}
+    for drive in sorted({drive for drive, _ in T_map_vehicle}):
+        trajectory = trajectories[drive]
+        if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
+            continue
+        own = {stamp: T for (d, stamp), T in T_map_vehicle.items() if d == drive}
+        rows = rate_rows(list(own), list(own.values()))
+        if rows is not None:
+            out[drive] = rows
+    return out
 
 
 def _views(

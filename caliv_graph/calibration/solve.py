@@ -39,6 +39,7 @@ from caliv_graph.calibration.noise import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
+from caliv_graph.calibration.rates import rates_graph
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.calibration.structure import structure_graph
@@ -312,6 +313,7 @@ def base_graph(state: SolveState) -> CalibrationGraph:
     return merged(
         pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
+        rates_graph(problem, state.grounds),
         ground_graph(
             problem,
             state.grounds,

@@ -57,7 +57,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     state = state_of(rng)
     h = np.concatenate([rng.uniform(3.0, 9.0, (4, 3)), np.ones((4, 1))], axis=1)
     moments = h[:, :, None] * h[:, None, :]
-    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments))
+    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments), np.zeros(len(POSE)))
     return state, sightings, h, 0.5 * rng.standard_normal((2, 6))
 
 
@@ -112,7 +112,7 @@ def test_a_range_that_is_too_long_is_undone_all_over_a_strip() -> None:
         errors,
     )
     zero = np.zeros(1, np.int64)
-    sightings = Sightings(zero, zero, (h.T @ h)[None], np.zeros((1, 4, 4)))
+    sightings = Sightings(zero, zero, (h.T @ h)[None], np.zeros((1, 4, 4)), np.zeros(1))
     plain = geometry_of(state, sightings, layout, zero, zero, None).plain[0]
     assert np.abs(q[:, 2] + 2.0).max() > 3e-3
     assert np.abs(h @ plain).max() < 2e-4
@@ -215,7 +215,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
     for count in (50, 200):
         of = np.zeros(count, np.int64)
         moments = np.tile(1e7 * h.T @ h, (count, 1, 1))
-        sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)))
+        sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)), np.zeros(count))
         geometry = geometry_of(state, sightings, layout, of, of, None)
         own = np.ones(count, np.int64)
         rows = whitened(

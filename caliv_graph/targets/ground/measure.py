@@ -13,6 +13,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import (
+    Array,
     GroundObservation,
     IntArray,
     LidarScan,
@@ -88,8 +89,9 @@ class GroundMeter:
         moved = [beams, beams * (1.0 / across - 1.0)[:, None]]
         if times_s.any():
             moved += [(of_rotated - points) / EXTRINSIC_STEP_RAD for of_rotated in by_guess]
+            moved += by_rates(points, times_s, guess)
         changes = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
-        by_extrinsic = changes[:, 2:] if times_s.any() else None
+        by_extrinsic = changes[:, 2:5] if times_s.any() else None
         return GroundObservation(
             lidar=scan.lidar,
             drive=self._drive,
@@ -104,6 +106,7 @@ class GroundMeter:
             by_extrinsic=by_extrinsic,
             apart_ns=scan.stamp_ns - at_ns,
             by_range_bias=changes[:, :2],
+            by_rates=changes[:, 5:] if times_s.any() else None,
         )
 
     def warnings(self) -> tuple[str, ...]:
@@ -118,6 +121,19 @@ class GroundMeter:
                     f"{self._drive + 1}: {why}"
                 )
         return tuple(lines)
+
+
+def by_rates(points_lidar: Array, times_s: Array, T_vehicle_lidar: gtsam.Pose3) -> list[Array]:
+    """How points (N, 3) move with each of the six rates that moved them over their times (N,).
+
+    The derivative is that of `tau (w x p + v)`, p in the vehicle frame at the pose: the rotation
+    within a sweep, a hundredth of a radian or two, is neglected.
+    """
+    R_vehicle_lidar = T_vehicle_lidar.rotation().matrix()
+    # In lidar axes: arms from the vehicle's origin, and the vehicle's axes.
+    arms = points_lidar - T_vehicle_lidar.inverse().translation()
+    by_turn = [times_s[:, None] * np.cross(axis, arms) for axis in R_vehicle_lidar]
+    return by_turn + [times_s[:, None] * axis for axis in R_vehicle_lidar]
 
 
 def nearest_scans(

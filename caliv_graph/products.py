@@ -326,6 +326,7 @@ class GroundObservation:
             by a metre (1 / cos(incidence) - 1); None: none is assumed.
         by_rates: (3, 6) change of (a, b, distance) if the angular (rad/s) and linear velocity (m/s)
             that moved the points to `stamp_ns` were larger, vehicle axes; None: none were moved.
+        taken_s: first and last time of the points after `stamp_ns`, seconds.
     """
 
     lidar: str
@@ -342,6 +343,7 @@ class GroundObservation:
     apart_ns: int = 0
     by_range_bias: Array | None = None
     by_rates: Array | None = None
+    taken_s: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

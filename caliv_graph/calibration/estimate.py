@@ -21,6 +21,7 @@ from caliv_graph.calibration.no_target import (
     solve_structure_and_ground,
 )
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
+from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import estimated_noise, with_floors, with_noise
@@ -115,8 +116,9 @@ def _estimate(
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         noise = estimated_noise(rough.state, rough.registrations, trajectories)
-        trajectories = with_noise(noise, trajectories)
+        before, trajectories = trajectories, with_noise(noise, trajectories)
         grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
+        grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     solved = rough.state.problem
     # All clouds from here on: those that the field of view cuts off have predicted poses now.

@@ -90,7 +90,14 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     Where clouds are put together with that extrinsic as well, both turn alike, and neither says
     anything about it.
     """
-    a, b, distance = compensated(observation, R_vehicle_lidar)[0].tolist()
+    change = compensated(observation, R_vehicle_lidar)[0]
+    change[2] -= observation.distance_m
+    return replace(moved(observation, change), R_vehicle_lidar=None, by_extrinsic=None)
+
+
+def moved(observation: GroundObservation, change: Array) -> GroundObservation:
+    """An observation whose (a, b, distance) have changed by a little, (3,)."""
+    a, b, further_m = change.tolist()
     u, v = observation.axes_lidar
     normal = observation.normal_lidar + a * u + b * v
     normal /= np.linalg.norm(normal)
@@ -100,10 +107,8 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     return replace(
         observation,
         normal_lidar=normal,
-        distance_m=distance,
+        distance_m=observation.distance_m + further_m,
         axes_lidar=np.stack([u, v / np.linalg.norm(v)]),
-        R_vehicle_lidar=None,
-        by_extrinsic=None,
     )
 
 

@@ -11,16 +11,36 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.ground_factors import moved
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import key_rates, key_vehicle
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND, key_rates, key_vehicle
+from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.rates import RATE_SIGMAS, RATES
+from caliv_graph.trajectory.select import VehicleTrajectory
 
 
 def swept_drives(problem: Problem, grounds: Sequence[GroundObservation]) -> list[int]:
     """Drives with a variable for the errors of their rates, ascending: by clouds or ground."""
     by_ground = {o.drive for o in grounds if o.by_rates is not None}
     return sorted(problem.swept_drives() | (by_ground & set(problem.rate_rows)))
+
+
+def with_rates_of(
+    observation: GroundObservation, before: VehicleTrajectory, after: VehicleTrajectory
+) -> GroundObservation:
+    """An observation as the rates of another trajectory of its drive would have made it."""
+    if observation.by_rates is None or before is after:
+        return observation
+    first, last = (round(s * NANOSECONDS_PER_SECOND) for s in observation.taken_s)
+    ends_ns = observation.stamp_ns + np.array([min(first, 0), max(last, 0)])
+    twists = []
+    for trajectory in (before, after):
+        ends = np.clip(ends_ns, *trajectory.span_ns)
+        begin, end = unstack(*trajectory.poses_at(ends))
+        seconds = max(int(ends[1] - ends[0]), 1) / NANOSECONDS_PER_SECOND
+        twists.append(gtsam.Pose3.Logmap(begin.between(end)) / seconds)
+    return moved(observation, observation.by_rates @ (twists[1] - twists[0]))
 
 
 def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:

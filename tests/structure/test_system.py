@@ -20,10 +20,13 @@ from caliv_graph.structure.system import (
     whitened,
 )
 
-LAYOUT = Layout(poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2)
+LAYOUT = Layout(
+    poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2, rates=6
+)
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
 STRIP = np.array([0, 1, 2, 1])
+TIME_S = (-0.05, 0.02, 0.0, 0.1)
 
 
 def state_of(rng: np.random.Generator) -> State:
@@ -37,7 +40,7 @@ def state_of(rng: np.random.Generator) -> State:
     return State(
         R_map_vehicle=R,
         t_map_vehicle=t,
-        moved=np.zeros(15),
+        moved=np.append(np.zeros(15), 1e-3 * rng.standard_normal(6)),
         T_vehicle_lidar=tuple(gtsam.Pose3.Expmap(v) for v in rng.uniform(-0.5, 0.5, (2, 6))),
         offsets_s=np.zeros(2),
         centres_map=np.array([[8.0, 1.0, 0.0], [1.0, 9.0, 1.0], [2.0, -7.0, 0.5]]),
@@ -57,7 +60,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     state = state_of(rng)
     h = np.concatenate([rng.uniform(3.0, 9.0, (4, 3)), np.ones((4, 1))], axis=1)
     moments = h[:, :, None] * h[:, None, :]
-    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments), np.zeros(len(POSE)))
+    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments), np.array(TIME_S))
     return state, sightings, h, 0.5 * rng.standard_normal((2, 6))
 
 
@@ -65,6 +68,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     ("first", "count"),
     [
         (0, 12),
+        (LAYOUT.rate, 6),
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
         (LAYOUT.error, 6),

@@ -107,6 +107,7 @@ class GroundMeter:
             apart_ns=scan.stamp_ns - at_ns,
             by_range_bias=changes[:, :2],
             by_rates=changes[:, 5:] if times_s.any() else None,
+            taken_s=(float(times_s.min()), float(times_s.max())),
         )
 
     def warnings(self) -> tuple[str, ...]:

@@ -39,35 +39,48 @@ class CloudMotion:
     """How a cloud moves with errors of time and rates; of neither by itself.
 
     Attributes:
-        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second, if
-            the time offset of the LiDAR is free.
+        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second.
+        offset: whether the time offset of the LiDAR is free.
         apart_s: tau, mean time of the points after the stamp, to which they were moved with rates
             that err; 0: none were.
+        T_vehicle_lidar: the extrinsic with which they were moved; None likewise.
     """
 
-    twist: Array | None = None
+    twist: Array
+    offset: bool = False
     apart_s: float = 0.0
+    T_vehicle_lidar: gtsam.Pose3 | None = None
 
     def moves(self, keys: Sequence[int], values: gtsam.Values) -> list[tuple[gtsam.Pose3, Array]]:
         """Each motion, and (6, size) its right perturbation by that of its variable."""
         out, left = [], list(keys)
-        if self.twist is not None:
+        if self.offset:
             offset_s = float(values.atVector(left.pop(0))[0])
             out.append((gtsam.Pose3.Expmap(-offset_s * self.twist), -self.twist[:, None]))
         if self.apart_s:
-            d = self.apart_s * values.atVector(left.pop(0))
+            d = self.apart_s * (self.twist + values.atVector(left.pop(0)))
             by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
             out.append((gtsam.Pose3.Expmap(d), by_rates))
         return out
 
+    def undone(self) -> gtsam.Pose3:
+        """From the points as they were moved to the points as they were measured."""
+        if self.T_vehicle_lidar is None:
+            return gtsam.Pose3()
+        back = gtsam.Pose3.Expmap(-self.apart_s * self.twist)
+        return self.T_vehicle_lidar.inverse().compose(back).compose(self.T_vehicle_lidar)
 
-STILL = CloudMotion()
+
+STILL = CloudMotion(np.zeros(6))
 
 
 def predict_cloud(
     keys: Sequence[int], values: gtsam.Values, motion: CloudMotion = STILL
 ) -> tuple[gtsam.Pose3, list[Array]]:
-    """The pose that a cloud should have, `C X_i Exp(-o xi) Exp(tau e) E S_a`, and how it moves.
+    """The pose that a cloud should have, and how it moves.
+
+    It is `C X_i Exp(-o xi) Exp(tau (xi + e)) E S_a U`, U (`undone`) what the present rates and
+    extrinsic do to points that were not moved.
 
     Args:
         keys: of C, X_i, of `motion` the time offset o and the errors of the rates e, E and, unless
@@ -82,6 +95,8 @@ def predict_cloud(
     moved = motion.moves(others, values)
     chain = [values.atPose3(target), values.atPose3(vehicle), *(T for T, _ in moved)]
     Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in others[len(moved) :]])
+    if motion.apart_s:
+        Z = Z.compose(motion.undone())
     for i, (_, by_variable) in enumerate(moved, start=2):
         moves[i] = moves[i] @ by_variable
     return Z, moves

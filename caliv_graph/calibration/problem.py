@@ -10,7 +10,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.factors import CloudMotion
+from caliv_graph.calibration.factors import STILL, CloudMotion
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
@@ -77,7 +77,7 @@ class Problem:
         parameters: the prior of each of them, one for all drives.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
-            if no offset is.
+            if no offset is, and no points were moved.
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
             it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
             one.
@@ -88,6 +88,7 @@ class Problem:
             (`trajectory.rates`); none where an odometry gave them.
         cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
             were moved with the rates of the trajectory, seconds; None: zero.
+        moved_with: T_vehicle_lidar with which they were moved; the guess, of one that it has not.
     """
 
     lidars: tuple[str, ...]
@@ -112,6 +113,7 @@ class Problem:
     heave_m: float = field(default_factory=usual_heave_m)
     rate_rows: Mapping[int, Array] = field(default_factory=dict)
     cloud_apart_s: Array | None = None
+    moved_with: Mapping[str, gtsam.Pose3] = field(default_factory=dict)
 
     @property
     def clouds(self) -> int:
@@ -168,7 +170,7 @@ class Problem:
         """Keys of C, X_i, of `cloud_motion`, E and S_a of cloud j, in that order."""
         lidar = self.lidars[self.cloud_lidar[j]]
         motion = self.cloud_motion(j)
-        offset = () if motion.twist is None else (key_offset(int(self.cloud_lidar[j])),)
+        offset = (key_offset(int(self.cloud_lidar[j])),) if motion.offset else ()
         rates = (key_rates(self.poses[self.cloud_pose[j]][0]),) if motion.apart_s else ()
         return (
             key_target(int(self.cloud_placement[j])),
@@ -180,13 +182,15 @@ class Problem:
 
     def cloud_motion(self, j: int) -> CloudMotion:
         """How cloud j moves with the time offset of its LiDAR, if it is free, and with rates."""
-        pose, twist = int(self.cloud_pose[j]), None
-        if self.twists is not None and self.lidars[self.cloud_lidar[j]] in self.offsets:
-            twist = np.asarray(self.twists[pose])
-        apart_s = 0.0
-        if self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows:
-            apart_s = float(self.cloud_apart_s[j])
-        return CloudMotion(twist, apart_s)
+        if self.twists is None:
+            return STILL
+        pose, lidar = int(self.cloud_pose[j]), self.lidars[self.cloud_lidar[j]]
+        twist, offset = np.asarray(self.twists[pose]), lidar in self.offsets
+        swept = self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows
+        if self.cloud_apart_s is None or not swept or not self.cloud_apart_s[j]:
+            return CloudMotion(twist, offset)
+        extrinsic = self.moved_with.get(lidar, self.guesses[lidar])
+        return CloudMotion(twist, offset, float(self.cloud_apart_s[j]), extrinsic)
 
     def swept_drives(self) -> set[int]:
         """Drives with a cloud whose points were moved with the rates of its trajectory."""
@@ -303,10 +307,11 @@ def pose_problem(
     index = {pose: i for i, pose in enumerate(poses)}
     T_map_vehicle: list[gtsam.Pose3] = []
     twists: list[Array] = []
+    apart_s = np.array([c.apart_s for _, c in clouds])
     for d in sorted({drive for drive, _ in poses}):
         stamps = [stamp for drive, stamp in poses if drive == d]
         T_map_vehicle += unstack(*trajectories[d].poses_at(stamps))
-        if config.solve.time_offset:
+        if config.solve.time_offset or apart_s.any():
             twists.append(twists_at(trajectories[d], stamps))
     origins = {
         d: np.asarray(T.translation(), np.float64)
@@ -348,7 +353,7 @@ def pose_problem(
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
         rate_rows=_rate_rows(trajectories, of_pose),
-        cloud_apart_s=np.array([c.apart_s for _, c in clouds]),
+        cloud_apart_s=apart_s,
     )
 
 

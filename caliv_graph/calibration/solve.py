@@ -202,7 +202,7 @@ def keep_determined_offsets(problem: Problem, reduced: Reduced) -> tuple[Problem
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
     sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
     kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_DETERMINED_S)
-    return replace(problem, offsets=kept, twists=problem.twists if kept else None), sigmas
+    return replace(problem, offsets=kept), sigmas
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:

@@ -401,6 +401,10 @@ def geometry_of(
     by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
+    if twists is not None and layout.rates:
+        by_extrinsic = by_extrinsic + _by_compensation(
+            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
+        )
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R
@@ -419,6 +423,20 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:
+    """(Q, 6, 4) further derivatives by the extrinsic: points were moved in time with it.
+
+    A point taken tau later is at `X Exp(tau xi) E p`: a right perturbation of E there is one by
+    `Ad(Exp(tau xi_lidar))` at the stamp. With it, a turn of the LiDAR on the vehicle that the
+    vehicle's poses make up for is told by nothing, the rates following the poses.
+    """
+    turn, shift = skew(twists_lidar[:, :3]), skew(twists_lidar[:, 3:])
+    ad = np.zeros((len(time_s), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = turn
+    ad[:, 3:, :3] = shift
+    return np.asarray(time_s[:, None, None] * (np.swapaxes(ad, 1, 2) @ by_extrinsic))
 
 
 def _by_motion(

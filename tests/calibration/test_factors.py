@@ -15,6 +15,7 @@ from caliv_graph.calibration.factors import (
     extrinsic_prior,
     gauss_markov_factor,
     given_pose_factor,
+    predict_cloud,
     target_pose_factor,
 )
 from caliv_graph.calibration.rates import rates_factor
@@ -112,13 +113,35 @@ def test_jacobians_of_a_cloud_that_wrong_rates_moved(offset_m: float) -> None:
         C=random_pose(rng, offset_m), X=random_pose(rng, offset_m), E=random_pose(rng, 2.0)
     )
     values.insert(V, 0.1 * rng.normal(size=6))
-    late = gtsam.Pose3.Expmap(0.05 * values.atVector(V))
-    Z, _ = chain_jacobians([values.atPose3(C), values.atPose3(X), late, values.atPose3(E)])
+    used, twist = random_pose(rng, 2.0), rng.normal(size=6)
+    motion = CloudMotion(twist, apart_s=0.05, T_vehicle_lidar=used)
+    # A point as it was measured is where the true rates have it, and the cloud had it elsewhere.
+    point = rng.normal(size=3)
+    stamped = used.inverse().compose(gtsam.Pose3.Expmap(0.05 * twist)).compose(used)
+    true = gtsam.Pose3.Expmap(0.05 * (twist + values.atVector(V))).compose(values.atPose3(E))
+    Z, _ = predict_cloud((C, X, V, E), values, motion)
+    there = values.atPose3(C).compose(values.atPose3(X)).compose(true).transformFrom(point)
+    assert Z.transformFrom(stamped.transformFrom(point)) == pytest.approx(there)
     measured = gtsam.Pose3.Expmap(1e-3 * rng.uniform(-1.0, 1.0, 6)).compose(Z)
-    motion = CloudMotion(apart_s=0.05)
     factor = target_pose_factor((C, X, V, E), measured, correlated_information(rng), motion)
     assert np.abs(factor.unwhitenedError(values)).max() < 2e-3
     check_jacobians(factor, values, (C, X, V, E))
+
+
+def test_a_turn_of_the_lidar_that_poses_and_rates_follow_changes_no_cloud() -> None:
+    """The vehicle frame is turned by 2 mrad: a sweep does not show it."""
+    rng = np.random.default_rng(8)
+    values = values_of(C=random_pose(rng, 9.0), X=random_pose(rng, 9.0), E=random_pose(rng, 2.0))
+    values.insert(V, np.zeros(6))
+    twist = np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0])
+    motion = CloudMotion(twist, apart_s=0.05, T_vehicle_lidar=values.atPose3(E))
+    before, _ = predict_cloud((C, X, V, E), values, motion)
+    turn = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([2e-3, 1e-3, 0.0])), np.zeros(3))
+    values.update(X, values.atPose3(X).compose(turn))
+    values.update(E, turn.inverse().compose(values.atPose3(E)))
+    values.update(V, turn.inverse().AdjointMap() @ twist - twist)
+    after, _ = predict_cloud((C, X, V, E), values, motion)
+    assert after.equals(before, 1e-12)
 
 
 def test_rates_of_a_drive_follow_from_its_poses() -> None:

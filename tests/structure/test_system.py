@@ -82,15 +82,22 @@ def test_derivatives_are_those_of_the_residual(
     state, sightings, h, twists = world
     J = geometry_at(state, sightings, twists).offset_rows(sightings, LAYOUT.size).toarray()
     step = 1e-6
+
+    def residuals(at: State) -> np.ndarray:
+        """Points are at the stamps as the extrinsics of `at` move them there."""
+        now = []
+        for q, (i, p) in enumerate(zip(LIDAR, h[:, :3], strict=True)):
+            turn = gtsam.Pose3.Expmap(TIME_S[q] * twists[POSE[q]])
+            taken, new = state.T_vehicle_lidar[i], at.T_vehicle_lidar[i]
+            own = taken.inverse().compose(turn.inverse()).compose(taken).transformFrom(p)
+            there = new.inverse().compose(turn).compose(new).transformFrom(own)
+            now.append(np.append(there, 1.0))
+        return np.asarray(np.einsum("qi,qi->q", geometry_at(at, sightings, twists).plain, now))
+
     for k in range(first, first + count):
         d = np.zeros(LAYOUT.size)
         d[k] = step
-        up = np.einsum(
-            "qi,qi->q", geometry_at(stepped(state, LAYOUT, d), sightings, twists).plain, h
-        )
-        down = np.einsum(
-            "qi,qi->q", geometry_at(stepped(state, LAYOUT, -d), sightings, twists).plain, h
-        )
+        up, down = (residuals(stepped(state, LAYOUT, s * d)) for s in (1.0, -1.0))
         # The incidence, by which errors of ranges count, moves little with the estimate, and so
         # does what a jitter shifts.
         assert J[:, k] == pytest.approx((up - down) / (2.0 * step), abs=0.02)

@@ -115,9 +115,9 @@ def key_ground_bias(index: int) -> int:
 
 
 def key_rates(drive: int) -> int:
-    """Key of the errors of a drive's mean rates, (6,): angular (rad/s) and linear velocity (m/s).
+    """Key of the errors of a drive's mean rates, (6,): angular velocity (rad/s), velocity (m/s).
 
-    In vehicle axes, true ones less those of the trajectory.
+    Along vehicle axes, true ones less those of the trajectory; the velocity is that in the map.
     """
     return int(gtsam.symbol("t", drive))
 

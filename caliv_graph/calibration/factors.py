@@ -15,6 +15,7 @@ import numpy as np
 from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
     right_to_vehicle_axes,
+    skew,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
@@ -39,29 +40,41 @@ class CloudMotion:
     """How a cloud moves with errors of time and rates; of neither by itself.
 
     Attributes:
-        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second.
+        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second, where
+            the pose is the given or smoothed one.
         offset: whether the time offset of the LiDAR is free.
         apart_s: tau, mean time of the points after the stamp, to which they were moved with rates
             that err; 0: none were.
         T_vehicle_lidar: the extrinsic with which they were moved; None likewise.
+        R_map_vehicle: (3, 3) of that pose; None likewise.
     """
 
     twist: Array
     offset: bool = False
     apart_s: float = 0.0
     T_vehicle_lidar: gtsam.Pose3 | None = None
+    R_map_vehicle: Array | None = None
 
-    def moves(self, keys: Sequence[int], values: gtsam.Values) -> list[tuple[gtsam.Pose3, Array]]:
-        """Each motion, and (6, size) its right perturbation by that of its variable."""
+    def moves(
+        self, pose: gtsam.Pose3, keys: Sequence[int], values: gtsam.Values
+    ) -> list[tuple[gtsam.Pose3, Array]]:
+        """Each motion from a pose, and (6, size) its right perturbation by that of its variable."""
         out, left = [], list(keys)
         if self.offset:
             offset_s = float(values.atVector(left.pop(0))[0])
             out.append((gtsam.Pose3.Expmap(-offset_s * self.twist), -self.twist[:, None]))
         if self.apart_s:
-            d = self.apart_s * (self.twist + values.atVector(left.pop(0)))
+            d = self.apart_s * (self.twist_from(pose) + values.atVector(left.pop(0)))
             by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
             out.append((gtsam.Pose3.Expmap(d), by_rates))
         return out
+
+    def twist_from(self, pose: gtsam.Pose3) -> Array:
+        """(6,) the twist with the same angular velocity, and the same velocity in the map."""
+        if self.R_map_vehicle is None:
+            return self.twist
+        velocity_map = self.R_map_vehicle @ self.twist[3:]
+        return np.concatenate([self.twist[:3], pose.rotation().matrix().T @ velocity_map])
 
     def undone(self) -> gtsam.Pose3:
         """From the points as they were moved to the points as they were measured."""
@@ -92,13 +105,18 @@ def predict_cloud(
         T_target_lidar; and per key the (6, size) derivative of its left perturbation.
     """
     target, vehicle, *others = keys
-    moved = motion.moves(others, values)
-    chain = [values.atPose3(target), values.atPose3(vehicle), *(T for T, _ in moved)]
+    X = values.atPose3(vehicle)
+    moved = motion.moves(X, others, values)
+    chain = [values.atPose3(target), X, *(T for T, _ in moved)]
     Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in others[len(moved) :]])
-    if motion.apart_s:
-        Z = Z.compose(motion.undone())
     for i, (_, by_variable) in enumerate(moved, start=2):
         moves[i] = moves[i] @ by_variable
+    if motion.apart_s:
+        Z = Z.compose(motion.undone())
+        # A turn of the pose turns the velocity in vehicle axes; rates are the last of `moved`.
+        if motion.R_map_vehicle is not None:
+            by_turn = moves[len(moved) + 1][:, 3:] @ skew(motion.twist_from(X)[3:])
+            moves[1] = np.hstack([moves[1][:, :3] + by_turn, moves[1][:, 3:]])
     return Z, moves
 
 

@@ -155,9 +155,8 @@ def ground_plane_factor(
         d, by_plane, n = height_over(g, centre, T.translation())
         R_lidar_map = T.rotation().matrix().T
         n_lidar = R_lidar_map @ n
-        said, by_turn = compensated(
-            observation, values.atPose3(poses[0]).rotation().between(T.rotation()).matrix()
-        )
+        R_map_vehicle = values.atPose3(poses[0]).rotation()
+        said, by_turn = compensated(observation, R_map_vehicle.between(T.rotation()).matrix())
         if jacobians is not None:
             J = np.zeros((3, 6))
             J[:2, :3] = axes @ skew(n_lidar)
@@ -169,12 +168,30 @@ def ground_plane_factor(
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
             for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
+            if key_rates in nuisances:
+                jacobians[0][:, :3] -= with_velocity(observation, R_map_vehicle.matrix())[1]
         for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
+        if key_rates in nuisances:
+            said = said + with_velocity(observation, R_map_vehicle.matrix())[0]
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
+
+
+def with_velocity(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Array, Array]:
+    """(3,) change of an observation whose points moved with the same velocity in the map.
+
+    By another rotation of the vehicle than that of the trajectory; and (3, 3) its derivative by a
+    right perturbation of that rotation.
+    """
+    V, R_0, by_rates = observation.velocity_map, observation.R_map_vehicle, observation.by_rates
+    if V is None or R_0 is None or by_rates is None:
+        return np.zeros(3), np.zeros((3, 3))
+    velocity = R_map_vehicle.T @ V
+    by_velocity = by_rates[:, 3:]
+    return by_velocity @ (velocity - R_0.T @ V), by_velocity @ skew(velocity)
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

@@ -190,7 +190,8 @@ class Problem:
         if self.cloud_apart_s is None or not swept or not self.cloud_apart_s[j]:
             return CloudMotion(twist, offset)
         extrinsic = self.moved_with.get(lidar, self.guesses[lidar])
-        return CloudMotion(twist, offset, float(self.cloud_apart_s[j]), extrinsic)
+        R_map_vehicle = self.T_map_vehicle[pose].rotation().matrix()
+        return CloudMotion(twist, offset, float(self.cloud_apart_s[j]), extrinsic, R_map_vehicle)
 
     def swept_drives(self) -> set[int]:
         """Drives with a cloud whose points were moved with the rates of its trajectory."""

@@ -6,6 +6,7 @@ Points are moved to the time of their pose with the rates of the trajectory (REA
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -32,6 +33,7 @@ def with_rates_of(
     """An observation as the rates of another trajectory of its drive would have made it."""
     if observation.by_rates is None or before is after:
         return observation
+    R, _ = after.poses_at([observation.stamp_ns])
     first, last = (round(s * NANOSECONDS_PER_SECOND) for s in observation.taken_s)
     ends_ns = observation.stamp_ns + np.array([min(first, 0), max(last, 0)])
     twists = []
@@ -40,7 +42,8 @@ def with_rates_of(
         begin, end = unstack(*trajectory.poses_at(ends))
         seconds = max(int(ends[1] - ends[0]), 1) / NANOSECONDS_PER_SECOND
         twists.append(gtsam.Pose3.Logmap(begin.between(end)) / seconds)
-    return moved(observation, observation.by_rates @ (twists[1] - twists[0]))
+    changed = moved(observation, observation.by_rates @ (twists[1] - twists[0]))
+    return replace(changed, velocity_map=R[0] @ twists[1][3:], R_map_vehicle=R[0])
 
 
 def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:

@@ -417,6 +417,14 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
+    if twists is not None and layout.rates:
+        # Points move with the velocity in the map, whatever way the vehicle is turned.
+        by_turn = sightings.time_s[:, None, None] * (
+            np.swapaxes(skew(twists[pose, 3:]), 1, 2) @ by_pose[:, 3:]
+        )
+        turned = state.moved[6 * pose[:, None] + np.arange(3)]
+        plain += np.einsum("qc,qci->qi", turned, by_turn)
+        parts[0] = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
     moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
     for by, own, value in moved:
         plain += np.einsum("qc,qci->qi", value, by)

@@ -14,10 +14,11 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
 
 RATES = 6
-"""Angular (rad/s) and linear velocity (m/s) of the vehicle, a right perturbation per second."""
+"""Angular velocity (rad/s) and velocity in the map (m/s), both along the vehicle's axes."""
 
 MOST_TURN_RAD = 1.0
 """Largest rotation between two poses whose difference counts: the motion between them is taken as
@@ -33,7 +34,9 @@ def rate_rows(
 ) -> Array | None:
     """(6, 6 m) derivatives of the mean rates by right perturbations of m poses.
 
-    The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`; their mean is over time.
+    The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`; their mean is over time. What a
+    turn of the pose changes of the velocity in vehicle axes, which the velocity in the map is not,
+    is taken out: it is another at every speed, and follows from each pose by itself.
 
     Args:
         stamps_ns: (m,) of the poses, strictly increasing.
@@ -53,6 +56,9 @@ def rate_rows(
         by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
         out[:, 6 * i + 6 : 6 * i + 12] += by_later
         out[:, 6 * i : 6 * i + 6] -= by_later @ step.inverse().AdjointMap()
+        half = 0.5 * skew(np.asarray(gtsam.Pose3.Logmap(step))[3:])
+        out[3:, 6 * i : 6 * i + 3] -= half
+        out[3:, 6 * i + 6 : 6 * i + 9] -= half
         total_s += int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND
     if not math.isclose(total_s, 0.0):
         return out / total_s

@@ -289,7 +289,12 @@ def test_jacobians(offset_m: float) -> None:
         check_jacobians(
             ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
         )
-        moved = replace(observation, by_rates=np.random.default_rng(seed).normal(size=(3, 6)))
+        moved = replace(
+            observation,
+            by_rates=np.random.default_rng(seed).normal(size=(3, 6)),
+            velocity_map=np.array([2.0, -1.0, 0.1]),
+            R_map_vehicle=random_values(seed + 9, 1.0)[0].atPose3(X).rotation().matrix(),
+        )
         values.insert(key_rates(0), np.random.default_rng(seed).normal(size=6))
         check_jacobians(
             ground_plane_factor((X, E), G, anchor, moved, key_rates=key_rates(0)), values

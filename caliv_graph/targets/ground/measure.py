@@ -28,7 +28,7 @@ from caliv_graph.targets.ground.planes import (
     response,
 )
 from caliv_graph.trajectory.deskew import deskewed
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 EXTRINSIC_STEP_RAD = 1e-3
 """Step of the numerical derivative with respect to the extrinsic's rotation: the displacement of
@@ -108,6 +108,8 @@ class GroundMeter:
             by_range_bias=changes[:, :2],
             by_rates=changes[:, 5:] if times_s.any() else None,
             taken_s=(float(times_s.min()), float(times_s.max())),
+            velocity_map=R_map_vehicle[0] @ twists_at(self._trajectory, [at_ns])[0, 3:],
+            R_map_vehicle=R_map_vehicle[0],
         )
 
     def warnings(self) -> tuple[str, ...]:

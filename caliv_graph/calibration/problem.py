@@ -37,7 +37,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.rates import rate_rows
+from caliv_graph.trajectory.rates import rate_rows_of_drives
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -353,25 +353,9 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
-        rate_rows=_rate_rows(trajectories, of_pose),
+        rate_rows=rate_rows_of_drives(trajectories, of_pose),
         cloud_apart_s=apart_s,
     )
-
-
-def _rate_rows(
-    trajectories: Sequence[VehicleTrajectory], T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3]
-) -> dict[int, Array]:
-    """`Problem.rate_rows` of the drives of poses by (drive, stamp), ascending."""
-    out = {}
-    for drive in sorted({drive for drive, _ in T_map_vehicle}):
-        trajectory = trajectories[drive]
-        if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
-            continue
-        own = {stamp: T for (d, stamp), T in T_map_vehicle.items() if d == drive}
-        rows = rate_rows(list(own), list(own.values()))
-        if rows is not None:
-            out[drive] = rows
-    return out
 
 
 def _views(

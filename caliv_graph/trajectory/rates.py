@@ -8,7 +8,7 @@ section 9).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 
 RATES = 6
 """Angular velocity (rad/s) and velocity in the map (m/s), both along the vehicle's axes."""
@@ -63,6 +64,25 @@ def rate_rows(
     if not math.isclose(total_s, 0.0):
         return out / total_s
     return None
+
+
+def rate_rows_of_drives(
+    trajectories: Sequence[VehicleTrajectory], T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3]
+) -> dict[int, Array]:
+    """`rate_rows` of each drive that has them, of its poses by (drive, stamp), ascending.
+
+    None where an odometry of a LiDAR gave the poses: its rates have no error apart from the scans.
+    """
+    out = {}
+    for drive in sorted({drive for drive, _ in T_map_vehicle}):
+        trajectory = trajectories[drive]
+        if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
+            continue
+        own = {stamp: T for (d, stamp), T in T_map_vehicle.items() if d == drive}
+        rows = rate_rows(list(own), list(own.values()))
+        if rows is not None:
+            out[drive] = rows
+    return out
 
 
 def with_rates(information: Array, gradient: Array, rows: Array) -> tuple[Array, Array]:

@@ -114,6 +114,14 @@ def key_ground_bias(index: int) -> int:
     return int(gtsam.symbol("q", index))
 
 
+def key_rates(drive: int) -> int:
+    """Key of the errors of a drive's mean rates, (6,): angular velocity (rad/s), velocity (m/s).
+
+    Along vehicle axes, true ones less those of the trajectory; the velocity is that in the map.
+    """
+    return int(gtsam.symbol("t", drive))
+
+
 def key_height(drive: int) -> int:
     """Key of the error of the vehicle's height above ground of a drive, (1,) metres."""
     return int(gtsam.symbol("h", drive))

@@ -254,6 +254,12 @@ class TargetCloud:
     cut: frozenset[Side] = frozenset()
     swept: LidarScan | None = None
 
+    @property
+    def apart_s(self) -> float:
+        """Mean time of the points after the stamp, seconds; 0 if the LiDAR gives none."""
+        times_s = None if self.swept is None else self.swept.point_times_s
+        return 0.0 if times_s is None or not len(times_s) else float(times_s.mean())
+
 
 @dataclass(frozen=True)
 class TargetObservation:
@@ -318,6 +324,11 @@ class GroundObservation:
             it does not contain the heave of the body on its springs.
         by_range_bias: (3, 3) change of (a, b, distance) if all ranges are too long by a metre, and
             by the two of `config.range_errors.growth`; None: none is assumed.
+        by_rates: (3, 6) change of (a, b, distance) if the angular (rad/s) and linear velocity (m/s)
+            that moved the points to `stamp_ns` were larger, vehicle axes; None: none were moved.
+        taken_s: first and last time of the points after `stamp_ns`, seconds.
+        velocity_map: (3,) m/s that moved them; None likewise.
+        R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
     """
 
     lidar: str
@@ -333,6 +344,10 @@ class GroundObservation:
     by_extrinsic: Array | None = None
     apart_ns: int = 0
     by_range_bias: Array | None = None
+    by_rates: Array | None = None
+    taken_s: tuple[float, float] = (0.0, 0.0)
+    velocity_map: Array | None = None
+    R_map_vehicle: Array | None = None
 
 
 @dataclass(frozen=True)

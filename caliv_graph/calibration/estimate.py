@@ -21,6 +21,7 @@ from caliv_graph.calibration.no_target import (
     solve_structure_and_ground,
 )
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
+from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import estimated_noise, with_floors, with_noise
@@ -111,16 +112,17 @@ def _estimate(
     grounds, structure = surroundings
     limit = config.registration.max_iterations
     guesses = {name: problem.guesses[name] for name in problem.lidars}
-    guessed = _held_grounds(grounds, guesses)
+    guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         noise = estimated_noise(rough.state, rough.registrations, trajectories)
-        trajectories = with_noise(noise, trajectories)
+        before, trajectories = trajectories, with_noise(noise, trajectories)
         grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
+        grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     solved = rough.state.problem
     # All clouds from here on: those that the field of view cuts off have predicted poses now.
-    problem = replace(problem, offsets=solved.offsets, twists=solved.twists)
+    problem = replace(problem, offsets=solved.offsets)
     times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
@@ -128,7 +130,8 @@ def _estimate(
     begun = time.perf_counter()
     lines = linearise_clouds(problem, rough.state.values)
     extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
-    grounds = _held_grounds(grounds, extrinsics)
+    problem = replace(problem, moved_with=extrinsics)
+    grounds = _held_grounds(grounds, extrinsics, problem)
     states = [
         JointRegistration(
             _deskewed(o, extrinsics, trajectories),
@@ -164,6 +167,7 @@ def _estimate(
         others = lidars_with_structure(terms)
         grounds = other_grounds(grounds, terms)
         problem = pose_problem(observations, trajectories, config, noise.heave_m, others)
+        problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics
         )
@@ -187,15 +191,20 @@ def _estimate(
 
 
 def _held_grounds(
-    grounds: Sequence[GroundObservation], extrinsics: Mapping[str, gtsam.Pose3]
+    grounds: Sequence[GroundObservation],
+    extrinsics: Mapping[str, gtsam.Pose3],
+    problem: Problem,
 ) -> tuple[GroundObservation, ...]:
     """The ground, its motion compensated with the extrinsics of the clouds.
 
-    Left free, it says roll and pitch of the LiDARs to milliradians, which clouds contradict that
-    were put together with a guess: S2V would be pulled towards that guess.
+    It stays so where the rates of a drive are taken as exact. Left free, it would say roll and
+    pitch of the LiDARs to milliradians: what turns a LiDAR on the vehicle changes its clouds as
+    rates do that are off.
     """
     return tuple(
-        held(o, extrinsics[o.lidar].rotation().matrix()) if o.lidar in extrinsics else o
+        held(o, extrinsics[o.lidar].rotation().matrix())
+        if o.lidar in extrinsics and o.drive not in problem.rate_rows
+        else o
         for o in grounds
     )
 

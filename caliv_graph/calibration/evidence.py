@@ -114,7 +114,8 @@ def linearised_evidence(
     trajectories: Sequence[VehicleTrajectory],
 ) -> Evidence | None:
     """The residuals of smoothed drives at the smoothed poses; None: too few clouds."""
-    problem = state.problem
+    # Rates err by what does not matter for noise levels.
+    problem = replace(state.problem, cloud_apart_s=None)
     smoothed = ~problem.given()[problem.cloud_pose]
     usable = state.sound & smoothed & (state.weights.values > SEEN)
     if usable.sum() < FEWEST_CLOUDS:

@@ -7,6 +7,7 @@ their keys.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
     right_to_vehicle_axes,
+    skew,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
@@ -33,28 +35,88 @@ def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Arr
     return product, jacobians
 
 
+@dataclass(frozen=True)
+class CloudMotion:
+    """How a cloud moves with errors of time and rates; of neither by itself.
+
+    Attributes:
+        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second, where
+            the pose is the given or smoothed one.
+        offset: whether the time offset of the LiDAR is free.
+        apart_s: tau, mean time of the points after the stamp, to which they were moved with rates
+            that err; 0: none were.
+        T_vehicle_lidar: the extrinsic with which they were moved; None likewise.
+        R_map_vehicle: (3, 3) of that pose; None likewise.
+    """
+
+    twist: Array
+    offset: bool = False
+    apart_s: float = 0.0
+    T_vehicle_lidar: gtsam.Pose3 | None = None
+    R_map_vehicle: Array | None = None
+
+    def moves(
+        self, pose: gtsam.Pose3, keys: Sequence[int], values: gtsam.Values
+    ) -> list[tuple[gtsam.Pose3, Array]]:
+        """Each motion from a pose, and (6, size) its right perturbation by that of its variable."""
+        out, left = [], list(keys)
+        if self.offset:
+            offset_s = float(values.atVector(left.pop(0))[0])
+            out.append((gtsam.Pose3.Expmap(-offset_s * self.twist), -self.twist[:, None]))
+        if self.apart_s:
+            d = self.apart_s * (self.twist_from(pose) + values.atVector(left.pop(0)))
+            by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
+            out.append((gtsam.Pose3.Expmap(d), by_rates))
+        return out
+
+    def twist_from(self, pose: gtsam.Pose3) -> Array:
+        """(6,) the twist with the same angular velocity, and the same velocity in the map."""
+        if self.R_map_vehicle is None:
+            return self.twist
+        velocity_map = self.R_map_vehicle @ self.twist[3:]
+        return np.concatenate([self.twist[:3], pose.rotation().matrix().T @ velocity_map])
+
+    def undone(self) -> gtsam.Pose3:
+        """From the points as they were moved to the points as they were measured."""
+        if self.T_vehicle_lidar is None:
+            return gtsam.Pose3()
+        back = gtsam.Pose3.Expmap(-self.apart_s * self.twist)
+        return self.T_vehicle_lidar.inverse().compose(back).compose(self.T_vehicle_lidar)
+
+
+STILL = CloudMotion(np.zeros(6))
+
+
 def predict_cloud(
-    keys: Sequence[int], values: gtsam.Values, twist: Array | None = None
+    keys: Sequence[int], values: gtsam.Values, motion: CloudMotion = STILL
 ) -> tuple[gtsam.Pose3, list[Array]]:
-    """The pose that a cloud should have, `C X_i Exp(-o xi) E S_a`, and how it moves.
+    """The pose that a cloud should have, and how it moves.
+
+    It is `C X_i Exp(-o xi) Exp(tau (xi + e)) E S_a U`, U (`undone`) what the present rates and
+    extrinsic do to points that were not moved.
 
     Args:
-        keys: of C, X_i, the time offset o if `twist` is given, E and, unless the LiDAR is the
-            reference, S_a.
+        keys: of C, X_i, of `motion` the time offset o and the errors of the rates e, E and, unless
+            the LiDAR is the reference, S_a.
         values: of all of them.
-        twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second;
-            stamps are late by o.
+        motion: stamps are late by o, rates wrong by e.
 
     Returns:
         T_target_lidar; and per key the (6, size) derivative of its left perturbation.
     """
-    if twist is None:
-        return chain_jacobians([values.atPose3(key) for key in keys])
-    target, vehicle, offset, *extrinsic = keys
-    back = gtsam.Pose3.Expmap(-float(values.atVector(offset)[0]) * twist)
-    chain = [values.atPose3(target), values.atPose3(vehicle), back]
-    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in extrinsic])
-    moves[2] = moves[2] @ -twist[:, None]
+    target, vehicle, *others = keys
+    X = values.atPose3(vehicle)
+    moved = motion.moves(X, others, values)
+    chain = [values.atPose3(target), X, *(T for T, _ in moved)]
+    Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in others[len(moved) :]])
+    for i, (_, by_variable) in enumerate(moved, start=2):
+        moves[i] = moves[i] @ by_variable
+    if motion.apart_s:
+        Z = Z.compose(motion.undone())
+        # A turn of the pose turns the velocity in vehicle axes; rates are the last of `moved`.
+        if motion.R_map_vehicle is not None:
+            by_turn = moves[len(moved) + 1][:, 3:] @ skew(motion.twist_from(X)[3:])
+            moves[1] = np.hstack([moves[1][:, :3] + by_turn, moves[1][:, 3:]])
     return Z, moves
 
 
@@ -62,18 +124,18 @@ def target_pose_factor(
     keys: Sequence[int],
     T_target_lidar: gtsam.Pose3,
     information: Array,
-    twist: Array | None = None,
+    motion: CloudMotion = STILL,
 ) -> gtsam.CustomFactor:
     """A registered cloud: `r = Log(Zhat Z^-1)`, the residual at the target (`README.md` says why).
 
     Z is `T_target_lidar` as registered, `information` (6, 6) of its left perturbation (target
-    frame), rad and m. `predict_cloud` gives Zhat from `keys` and `twist`.
+    frame), rad and m. `predict_cloud` gives Zhat from `keys` and `motion`.
     """
     Z_inverse = T_target_lidar.inverse()
     order = list(keys)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        predicted, moves = predict_cloud(order, values, twist)
+        predicted, moves = predict_cloud(order, values, motion)
         r = gtsam.Pose3.Logmap(predicted.compose(Z_inverse))
         if jacobians is not None:
             J_left = left_jacobian_inverse(r)

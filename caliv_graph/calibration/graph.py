@@ -16,10 +16,17 @@ from caliv_graph.calibration.factors import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
+from caliv_graph.conventions import (
+    key_extrinsic,
+    key_pose_error,
+    key_rates,
+    key_target,
+    key_vehicle,
+)
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise
 from caliv_graph.trajectory.factors import marginal_factor
+from caliv_graph.trajectory.rates import RATES
 
 OFFSET_SIGMA_S = 0.05
 """Prior sigma of a LiDAR's time offset: half a revolution at 10 Hz."""
@@ -41,6 +48,7 @@ FactorKind = Literal[
     "standing",
     "parallel",
     "structure",
+    "rates",
 ]
 
 
@@ -162,7 +170,7 @@ def cloud_graph(
     for j, Z in enumerate(measured):
         graph.append(
             "cloud",
-            target_pose_factor(problem.cloud_keys(j), Z, information[j], problem.cloud_twist(j)),
+            target_pose_factor(problem.cloud_keys(j), Z, information[j], problem.cloud_motion(j)),
         )
     return graph
 
@@ -184,6 +192,8 @@ def initial_values(
         values.insert(key, np.zeros(6))
     for key in problem.offset_keys():
         values.insert(key, np.zeros(1))
+    for drive in sorted(problem.swept_drives()):
+        values.insert(key_rates(drive), np.zeros(RATES))
     for key, value in problem.parameter_values().items():
         values.insert(key, value)
     E = extrinsics[problem.reference]
@@ -208,6 +218,9 @@ def with_given_poses(problem: Problem, values: gtsam.Values) -> gtsam.Values:
         out.update(key_vehicle(i), T)
     for key in problem.pose_error_keys():
         out.update(key, np.zeros(6))
+    for drive in problem.rate_rows:
+        if out.exists(key_rates(drive)):
+            out.update(key_rates(drive), np.zeros(RATES))
     for key, value in problem.parameter_values().items():
         out.update(key, value)
     return out

@@ -21,6 +21,7 @@ from caliv_graph.calibration.ground_factors import (
     standing_factor,
 )
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.rates import swept_drives
 from caliv_graph.config.model import GroundConfig
 from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.conventions import (
@@ -28,10 +29,12 @@ from caliv_graph.conventions import (
     key_ground_bias,
     key_height,
     key_parallel,
+    key_rates,
     key_vehicle,
 )
 from caliv_graph.products import Array, GroundObservation, IntArray
 from caliv_graph.targets.cloud.views import view_weights
+from caliv_graph.trajectory.rates import RATES
 
 PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
@@ -164,7 +167,8 @@ def ground_graph(
             keys = (key_vehicle(i), *problem.extrinsic_keys_of(o.lidar))
             plane, centre = key_ground(o.drive), centres[o.drive]
             bias = key_ground_bias(problem.lidars.index(o.lidar))
-            factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias)
+            rates = key_rates(o.drive) if o.drive in problem.rate_rows else None
+            factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias, rates)
             graph.append("ground_plane", factor)
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)
@@ -250,4 +254,7 @@ def ground_values(
             out.insert(key_parallel(drive), np.zeros(2))
     for index in biased_lidars(problem, observations, taken):
         out.insert(key_ground_bias(index), np.zeros(GROUND_BIASES))
+    for drive in swept_drives(problem, observations):
+        if not values.exists(key_rates(drive)):
+            out.insert(key_rates(drive), np.zeros(RATES))
     return out

@@ -90,7 +90,14 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     Where clouds are put together with that extrinsic as well, both turn alike, and neither says
     anything about it.
     """
-    a, b, distance = compensated(observation, R_vehicle_lidar)[0].tolist()
+    change = compensated(observation, R_vehicle_lidar)[0]
+    change[2] -= observation.distance_m
+    return replace(moved(observation, change), R_vehicle_lidar=None, by_extrinsic=None)
+
+
+def moved(observation: GroundObservation, change: Array) -> GroundObservation:
+    """An observation whose (a, b, distance) have changed by a little, (3,)."""
+    a, b, further_m = change.tolist()
     u, v = observation.axes_lidar
     normal = observation.normal_lidar + a * u + b * v
     normal /= np.linalg.norm(normal)
@@ -100,10 +107,8 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     return replace(
         observation,
         normal_lidar=normal,
-        distance_m=distance,
+        distance_m=observation.distance_m + further_m,
         axes_lidar=np.stack([u, v / np.linalg.norm(v)]),
-        R_vehicle_lidar=None,
-        by_extrinsic=None,
     )
 
 
@@ -115,13 +120,14 @@ def ground_plane_factor(
     weight: float = 1.0,
     heave_m: float = 0.0,
     key_bias: int | None = None,
+    key_rates: int | None = None,
 ) -> gtsam.CustomFactor:
     """Role a: the plane as a LiDAR sees it.
 
     `r = [u . n, v . n, d] - [a, b, distance]`, n the plane's normal in the lidar frame and d the
     LiDAR's distance from it, both predicted from `X E S_a`; u and v are the observation's axes;
-    a, b and distance its values, motion compensated with the present extrinsic `E S_a`, less what
-    the range biases of the LiDAR change of them.
+    a, b and distance its values, motion compensated with the present extrinsic `E S_a` and rates,
+    less what the range biases of the LiDAR change of them.
 
     Args:
         pose_keys: of X_i, E and, unless the LiDAR is the reference, S_a.
@@ -132,11 +138,16 @@ def ground_plane_factor(
         heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
         key_bias: of the LiDAR's range biases; None, or an observation that does not tell what they
             change: none.
+        key_rates: of the errors of the drive's rates, likewise.
     """
     poses = list(pose_keys)
     axes = observation.axes_lidar
-    by_bias = observation.by_range_bias
-    biases = {} if key_bias is None or by_bias is None else {key_bias: by_bias}
+    by_bias, by_rates = observation.by_range_bias, observation.by_rates
+    nuisances: dict[int, Array] = {}
+    if key_bias is not None and by_bias is not None:
+        nuisances[key_bias] = by_bias
+    if key_rates is not None and by_rates is not None:
+        nuisances[key_rates] = -by_rates
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
@@ -144,9 +155,8 @@ def ground_plane_factor(
         d, by_plane, n = height_over(g, centre, T.translation())
         R_lidar_map = T.rotation().matrix().T
         n_lidar = R_lidar_map @ n
-        said, by_turn = compensated(
-            observation, values.atPose3(poses[0]).rotation().between(T.rotation()).matrix()
-        )
+        R_map_vehicle = values.atPose3(poses[0]).rotation()
+        said, by_turn = compensated(observation, R_map_vehicle.between(T.rotation()).matrix())
         if jacobians is not None:
             J = np.zeros((3, 6))
             J[:2, :3] = axes @ skew(n_lidar)
@@ -156,14 +166,32 @@ def ground_plane_factor(
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
-            for i, by_one in enumerate(biases.values(), start=len(moves) + 1):
+            for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
-        for key, by_one in biases.items():
+            if key_rates in nuisances:
+                jacobians[0][:, :3] -= with_velocity(observation, R_map_vehicle.matrix())[1]
+        for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
+        if key_rates in nuisances:
+            said = said + with_velocity(observation, R_map_vehicle.matrix())[0]
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
-    return gtsam.CustomFactor(noise, [*poses, key_plane, *biases], error)
+    return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
+
+
+def with_velocity(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Array, Array]:
+    """(3,) change of an observation whose points moved with the same velocity in the map.
+
+    By another rotation of the vehicle than that of the trajectory; and (3, 3) its derivative by a
+    right perturbation of that rotation.
+    """
+    V, R_0, by_rates = observation.velocity_map, observation.R_map_vehicle, observation.by_rates
+    if V is None or R_0 is None or by_rates is None:
+        return np.zeros(3), np.zeros((3, 3))
+    velocity = R_map_vehicle.T @ V
+    by_velocity = by_rates[:, 3:]
+    return by_velocity @ (velocity - R_0.T @ V), by_velocity @ skew(velocity)
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

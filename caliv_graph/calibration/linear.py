@@ -48,7 +48,7 @@ def linearise_clouds(problem: Problem, values: gtsam.Values) -> CloudLinearisati
     predicted, keys, jacobians = [], [], []
     for j in range(problem.clouds):
         chain = problem.cloud_keys(j)
-        Z, moves = predict_cloud(chain, values, problem.cloud_twist(j))
+        Z, moves = predict_cloud(chain, values, problem.cloud_motion(j))
         predicted.append(Z)
         keys.append(chain)
         jacobians.append(tuple(moves))

@@ -10,6 +10,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.factors import STILL, CloudMotion
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
@@ -26,6 +27,7 @@ from caliv_graph.conventions import (
     key_extrinsic,
     key_offset,
     key_pose_error,
+    key_rates,
     key_sensor,
     key_target,
     key_vehicle,
@@ -35,6 +37,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
+from caliv_graph.trajectory.rates import rate_rows_of_drives
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -74,13 +77,18 @@ class Problem:
         parameters: the prior of each of them, one for all drives.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
-            if no offset is.
+            if no offset is, and no points were moved.
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
             it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
             one.
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
         heave_m: 1 sigma of the heave at each pose.
+        rate_rows: per drive the (6, 6 m) derivatives of its mean rates by its m poses
+            (`trajectory.rates`); none where an odometry gave them.
+        cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
+            were moved with the rates of the trajectory, seconds; None: zero.
+        moved_with: T_vehicle_lidar with which they were moved; the guess, of one that it has not.
     """
 
     lidars: tuple[str, ...]
@@ -103,6 +111,9 @@ class Problem:
     stated_cov: Array | None = None
     views: Array | None = None
     heave_m: float = field(default_factory=usual_heave_m)
+    rate_rows: Mapping[int, Array] = field(default_factory=dict)
+    cloud_apart_s: Array | None = None
+    moved_with: Mapping[str, gtsam.Pose3] = field(default_factory=dict)
 
     @property
     def clouds(self) -> int:
@@ -156,21 +167,36 @@ class Problem:
         return tuple(key_target(m) for m in range(self.placements))
 
     def cloud_keys(self, j: int) -> tuple[int, ...]:
-        """Keys of C, X_i, the time offset if it is free, E and S_a of cloud j, in that order."""
+        """Keys of C, X_i, of `cloud_motion`, E and S_a of cloud j, in that order."""
         lidar = self.lidars[self.cloud_lidar[j]]
-        offset = (key_offset(int(self.cloud_lidar[j])),) if lidar in self.offsets else ()
+        motion = self.cloud_motion(j)
+        offset = (key_offset(int(self.cloud_lidar[j])),) if motion.offset else ()
+        rates = (key_rates(self.poses[self.cloud_pose[j]][0]),) if motion.apart_s else ()
         return (
             key_target(int(self.cloud_placement[j])),
             key_vehicle(int(self.cloud_pose[j])),
             *offset,
+            *rates,
             *self.extrinsic_keys_of(lidar),
         )
 
-    def cloud_twist(self, j: int) -> Array | None:
-        """(6,) velocity at cloud j, if the time offset of its LiDAR is free."""
-        if self.twists is None or self.lidars[self.cloud_lidar[j]] not in self.offsets:
-            return None
-        return np.asarray(self.twists[self.cloud_pose[j]])
+    def cloud_motion(self, j: int) -> CloudMotion:
+        """How cloud j moves with the time offset of its LiDAR, if it is free, and with rates."""
+        if self.twists is None:
+            return STILL
+        pose, lidar = int(self.cloud_pose[j]), self.lidars[self.cloud_lidar[j]]
+        twist, offset = np.asarray(self.twists[pose]), lidar in self.offsets
+        swept = self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows
+        if self.cloud_apart_s is None or not swept or not self.cloud_apart_s[j]:
+            return CloudMotion(twist, offset)
+        extrinsic = self.moved_with.get(lidar, self.guesses[lidar])
+        R_map_vehicle = self.T_map_vehicle[pose].rotation().matrix()
+        return CloudMotion(twist, offset, float(self.cloud_apart_s[j]), extrinsic, R_map_vehicle)
+
+    def swept_drives(self) -> set[int]:
+        """Drives with a cloud whose points were moved with the rates of its trajectory."""
+        moved = (j for j in range(self.clouds) if self.cloud_motion(j).apart_s)
+        return {self.poses[self.cloud_pose[j]][0] for j in moved}
 
     def offset_keys(self) -> tuple[int, ...]:
         """Time offsets that are free."""
@@ -282,10 +308,11 @@ def pose_problem(
     index = {pose: i for i, pose in enumerate(poses)}
     T_map_vehicle: list[gtsam.Pose3] = []
     twists: list[Array] = []
+    apart_s = np.array([c.apart_s for _, c in clouds])
     for d in sorted({drive for drive, _ in poses}):
         stamps = [stamp for drive, stamp in poses if drive == d]
         T_map_vehicle += unstack(*trajectories[d].poses_at(stamps))
-        if config.solve.time_offset:
+        if config.solve.time_offset or apart_s.any():
             twists.append(twists_at(trajectories[d], stamps))
     origins = {
         d: np.asarray(T.translation(), np.float64)
@@ -326,6 +353,8 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
+        rate_rows=rate_rows_of_drives(trajectories, of_pose),
+        cloud_apart_s=apart_s,
     )
 
 

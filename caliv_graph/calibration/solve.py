@@ -39,6 +39,7 @@ from caliv_graph.calibration.noise import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
+from caliv_graph.calibration.rates import rates_graph
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
 from caliv_graph.calibration.structure import structure_graph
@@ -202,7 +203,7 @@ def keep_determined_offsets(problem: Problem, reduced: Reduced) -> tuple[Problem
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
     sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
     kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_DETERMINED_S)
-    return replace(problem, offsets=kept, twists=problem.twists if kept else None), sigmas
+    return replace(problem, offsets=kept), sigmas
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:
@@ -313,6 +314,7 @@ def base_graph(state: SolveState) -> CalibrationGraph:
     return merged(
         pose_graph(problem, state.noise, state.motion),
         offset_graph(problem),
+        rates_graph(problem, state.grounds),
         ground_graph(
             problem,
             state.grounds,

@@ -135,20 +135,21 @@ def prepare(
     kept = kept_stamps(patches)
     if no_target is not None and not kept:
         raise no_target
+    with progress.stage("smoothing the trajectory at the scans", None):
+        stamps = _stamps_seen(len(recordings), observations, patches)
+        scales = noise_scales(rough)
+        del rough  # a graph of its own, which nobody asks any more
+        trajectories = smooth_trajectories(recordings, config, stamps, motions, scales)
     grounds: Sequence[GroundObservation] = ()
     ground_warnings: Sequence[str] = ()
     others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}
     # Without motion data the ground is in the structure, and in how the vehicle stands on it.
     if not any(isinstance(motion.poses, OdometryPoses) for motion in motions.values()):
         kept_ns = None if observations else kept
+        # Points are moved with the rates of the trajectory whose poses the graph has.
         grounds, ground_warnings = measure_grounds(
-            recordings, rough, observations, config, progress, others, kept_ns
+            recordings, trajectories, observations, config, progress, others, kept_ns
         )
-    with progress.stage("smoothing the trajectory at the scans", None):
-        stamps = _stamps_seen(len(recordings), observations, patches)
-        scales = noise_scales(rough)
-        del rough  # a graph of its own, which nobody asks any more
-        trajectories = smooth_trajectories(recordings, config, stamps, motions, scales)
     warnings = [w for r in recordings for w in r.warnings()]
     warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.rates import rate_rows, with_rates
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,9 @@ class PosePrior:
 
     Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are right perturbations of
     the poses (rotation then translation, rad and m), then of the parameters, three each: metres of
-    the lever arm; right perturbation of R_vehicle_imu. Heave of the body, a sigma of its own at
-    each pose, is part of the poses; the priors of the parameters are apart.
+    the lever arm; right perturbation of R_vehicle_imu; and, where points were moved by the rates of
+    the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a sigma of its own
+    at each pose, is part of the poses; the priors of the parameters are apart.
 
     Attributes:
         stamps_ns: (m,) of the poses, strictly increasing.
@@ -25,8 +27,9 @@ class PosePrior:
         parameters: name of the input (`gnss.lever_arm`, `imu.T_vehicle_imu`) -> the value at which
             d is zero: (3,) metres, or R_vehicle_imu. Empty: none is uncertain, or it was given
             poses.
-        information: (6 m + 3 k, 6 m + 3 k), positive definite with `parameter_information` added.
-        gradient: (6 m + 3 k,).
+        information: (6 m + 3 k, 6 m + 3 k), positive definite with `parameter_information` added;
+            with rates 6 more.
+        gradient: (6 m + 3 k,), or 6 more.
         parameter_information: (3 k, 3 k) of the priors of the parameters, one for all drives.
         parameter_offset: (3 k,) the present values less the means of these priors: the priors add
             `parameter_information` and `-parameter_information parameter_offset`.
@@ -39,3 +42,17 @@ class PosePrior:
     gradient: Array
     parameter_information: Array
     parameter_offset: Array
+
+    @property
+    def rates(self) -> int:
+        """Number of coordinates of the errors of the rates, the last ones: 6 or none."""
+        poses, parameters = 6 * len(self.stamps_ns), len(self.parameter_information)
+        return len(self.gradient) - poses - parameters
+
+    def with_rates(self) -> PosePrior:
+        """The same with the errors of the rates (`trajectory.rates`), where the poses tell them."""
+        rows = rate_rows(self.stamps_ns, self.T_map_vehicle)
+        if rows is None:
+            return self
+        information, gradient = with_rates(self.information, self.gradient, rows)
+        return replace(self, information=information, gradient=gradient)

@@ -153,6 +153,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
     return Layout(
         poses=len(problem.prior.stamps_ns),
         parameters=len(problem.prior.parameter_information),
+        rates=problem.prior.rates,
         offsets=problem.offsets,
         lidars=len(problem.patches.lidars),
         surface_of=tuple(strips.surface.tolist()),

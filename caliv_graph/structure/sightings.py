@@ -39,12 +39,14 @@ class Sightings:
         noise: (Q, 4, 4) what the noise of the points adds to `moments` in the mean. A plane that
             is fitted to moments with noise in them turns towards the beams: on ground seen under 70
             degrees by 0.1 mrad, of each LiDAR to its own side.
+        time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
     """
 
     scan: IntArray
     strip: IntArray
     moments: Array
     noise: Array
+    time_s: Array
 
     @property
     def count(self) -> int:
@@ -64,6 +66,7 @@ class Sightings:
             strip=self.strip[keep],
             moments=self.moments[keep],
             noise=self.noise[keep],
+            time_s=self.time_s[keep],
         )
 
 
@@ -112,7 +115,7 @@ def sightings_of(
     own, key = own[order], key[order]
     if not len(own):
         none = np.zeros(0, np.int64)
-        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros((0, 4, 4)))
+        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0))
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
     sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
@@ -126,6 +129,7 @@ def sightings_of(
         strip=strips.of_patch[own[starts]],
         moments=moments,
         noise=noise,
+        time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
     )
 
 

@@ -75,7 +75,8 @@ class State:
     Attributes:
         R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
-        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior.
+        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior; with
+            the errors of the rates, 6 more.
         T_vehicle_lidar: n poses.
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
@@ -97,11 +98,12 @@ class State:
 class Layout:
     """Where each variable is among the D coordinates of the system.
 
-    In this order: poses (6 each), parameters of the vehicle, time offsets, extrinsics (6), bias of
-    each LiDAR, its growth with incidence, and that on the ground (3), error of the vehicle's height
-    and tilt above the ground (3), jitter of the stamp of each scan, if there is any; and what
-    belongs to one surface each: planes (two tilts, offset), bias of each LiDAR on each surface,
-    offset of each LiDAR on each strip.
+    In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
+    were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
+    incidence, and that on the ground (3), error of the vehicle's height and tilt above the ground
+    (3), jitter of the stamp of each scan, if there is any; and what belongs to one surface each:
+    planes (two tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each
+    strip.
     """
 
     poses: int
@@ -110,6 +112,7 @@ class Layout:
     lidars: int
     surface_of: tuple[int, ...]
     jitters: int = 0
+    rates: int = 0
 
     @property
     def strips(self) -> int:
@@ -122,9 +125,14 @@ class Layout:
         return max(self.surface_of, default=-1) + 1
 
     @property
-    def offset(self) -> int:
-        """First time offset."""
+    def rate(self) -> int:
+        """First error of the rates."""
         return 6 * self.poses + self.parameters
+
+    @property
+    def offset(self) -> int:
+        """First time offset; before it is what the pose prior is on."""
+        return self.rate + self.rates
 
     @property
     def extrinsic(self) -> int:
@@ -393,6 +401,10 @@ def geometry_of(
     by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
+    if twists is not None and layout.rates:
+        by_extrinsic = by_extrinsic + _by_compensation(
+            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
+        )
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R
@@ -405,21 +417,70 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    if twists is not None and (layout.offsets or layout.jitters):
-        by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
-    if twists is not None and layout.jitters:
-        of_scan = layout.jitter + sightings.scan
-        plain += state.errors[of_scan, None] * by_time[:, 0]
-        parts.append(by_time)
-        columns.append(of_scan[:, None])
-    if twists is not None and layout.offsets:
+    if twists is not None and layout.rates:
+        # Points move with the velocity in the map, whatever way the vehicle is turned.
+        by_turn = sightings.time_s[:, None, None] * (
+            np.swapaxes(skew(twists[pose, 3:]), 1, 2) @ by_pose[:, 3:]
+        )
+        turned = state.moved[6 * pose[:, None] + np.arange(3)]
+        plain += np.einsum("qc,qci->qi", turned, by_turn)
+        parts[0] = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
+    moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
+    for by, own, value in moved:
+        plain += np.einsum("qc,qci->qi", value, by)
+        parts.append(by)
+        columns.append(own)
+    return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:
+    """(Q, 6, 4) further derivatives by the extrinsic: points were moved in time with it.
+
+    A point taken tau later is at `X Exp(tau xi) E p`: a right perturbation of E there is one by
+    `Ad(Exp(tau xi_lidar))` at the stamp. With it, a turn of the LiDAR on the vehicle that the
+    vehicle's poses make up for is told by nothing, the rates following the poses.
+    """
+    turn, shift = skew(twists_lidar[:, :3]), skew(twists_lidar[:, 3:])
+    ad = np.zeros((len(time_s), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = turn
+    ad[:, 3:, :3] = shift
+    return np.asarray(time_s[:, None, None] * (np.swapaxes(ad, 1, 2) @ by_extrinsic))
+
+
+def _by_motion(
+    state: State,
+    sightings: Sightings,
+    layout: Layout,
+    lidar: IntArray,
+    pose: IntArray,
+    twists: Array | None,
+    by_pose: Array,
+) -> list[tuple[Array, IntArray, Array]]:
+    """What moves a whole scan, or its points by their times, as errors of its pose do.
+
+    Each with its derivatives (Q, c, 4), their coordinates (Q, c), and the values (Q, c) that are
+    not in the poses of `state` yet.
+    """
+    q = sightings.count
+    out = []
+    if layout.rates:
+        # Points taken tau later: X Exp(tau e) in the place of X.
+        own = np.broadcast_to(layout.rate + np.arange(layout.rates), (q, layout.rates))
+        by_rates = sightings.time_s[:, None, None] * by_pose
+        out.append((by_rates, own, state.moved[own]))
+    if twists is None or not (layout.offsets or layout.jitters):
+        return out
+    by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+    if layout.jitters:
+        own = layout.jitter + sightings.scan[:, None]
+        out.append((by_time, own, state.errors[own]))
+    if layout.offsets:
         by_offset = by_time.copy()
         place = np.full(layout.lidars, -1)
         place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
         by_offset[place[lidar] < 0] = 0.0
-        parts.append(by_offset)
-        columns.append(np.maximum(place[lidar], 0)[:, None])
-    return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+        out.append((by_offset, np.maximum(place[lidar], 0)[:, None], np.zeros((q, 1))))
+    return out
 
 
 def smooth_normals(normals_map: Array, layout: Layout) -> Array:
@@ -478,8 +539,8 @@ class System:
         H: (R, R) of the first R = `layout.plane` coordinates, without guesses of extrinsics.
         b: (R,).
         surfaces: what was eliminated.
-        H_prior: (P, P) of it what the motion data say, P coordinates of poses and parameters,
-            without the parameters' own priors.
+        H_prior: (P, P) of it what the motion data say, P coordinates of poses, parameters and
+            rates, without the parameters' own priors.
         b_prior: (P,).
     """
 
@@ -528,13 +589,13 @@ def system_of(
         weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
-    size = 6 * layout.poses + layout.parameters
+    size = layout.offset
     H, b, surfaces = eliminated(sparse, less, right, layout.plane, layout.of_surfaces())
     b_prior = prior.gradient - prior.information @ state.moved
     H[:size, :size] += prior.information
     b[:size] += b_prior
     if layout.parameters:
-        own = slice(6 * layout.poses, size)
+        own = slice(6 * layout.poses, layout.rate)
         H[own, own] += prior.parameter_information
         b[own] -= prior.parameter_information @ (prior.parameter_offset + state.moved[own])
     return System(layout, H, b, surfaces, prior.information, b_prior)
@@ -560,7 +621,7 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
         state,
         R_map_vehicle=state.R_map_vehicle @ R_d,
         t_map_vehicle=state.t_map_vehicle + np.einsum("mij,mj->mi", state.R_map_vehicle, t_d),
-        moved=state.moved + d[: 6 * m + layout.parameters],
+        moved=state.moved + d[: layout.offset],
         T_vehicle_lidar=tuple(
             T.retract(v) for T, v in zip(state.T_vehicle_lidar, tangents, strict=True)
         ),

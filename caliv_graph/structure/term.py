@@ -140,6 +140,9 @@ def problem_of(
     offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)
     stamps = prior.stamps_ns.tolist()
     pose_of_scan = np.searchsorted(prior.stamps_ns, patches.stamps_ns)
+    # An odometry is made of the same scans: its rates have no error apart from them.
+    if patches.time_s.any() and odometry_of([trajectory]) is None:
+        prior = prior.with_rates()
     guesses = [configured_guess(config, name) for name in patches.lidars]
     return Problem(
         patches=patches,
@@ -178,7 +181,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     """
     layout, system, prior = found.layout, found.system, found.problem.prior
     poses = (6 * kept[:, None] + np.arange(6)).ravel()
-    parameters = np.arange(6 * layout.poses, layout.offset)
+    parameters = np.arange(6 * layout.poses, layout.rate)
     of_motion = np.concatenate([poses, parameters])
     keep = np.concatenate([of_motion, np.arange(layout.offset, layout.error)])
     H, b = system.H.copy(), system.b.copy()

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.factors import (
+    CloudMotion,
     chain_jacobians,
     extrinsic_prior,
     gauss_markov_factor,
     given_pose_factor,
+    predict_cloud,
     target_pose_factor,
 )
+from caliv_graph.calibration.rates import rates_factor
 from caliv_graph.conventions import (
     key_extrinsic,
     key_pose_error,
+    key_rates,
     key_sensor,
     key_target,
     key_vehicle,
@@ -29,6 +33,7 @@ from tests.calibration.problems import correlated_information, numerical_jacobia
 from tests.samples import MOUNTINGS, pose
 
 C, X, B, E, S = key_target(0), key_vehicle(0), key_pose_error(0), key_extrinsic(), key_sensor(1)
+V = key_rates(0)
 
 OFFSETS_M = (0.0, 30.0, 2000.0)
 """How far poses are from their origin: at it, on a drive, and in a map of a city."""
@@ -99,6 +104,62 @@ def test_jacobians_of_a_cloud_of_the_reference(offset_m: float) -> None:
     measured = gtsam.Pose3.Expmap(rng.uniform(-0.5, 0.5, 6)).compose(Z)
     factor = target_pose_factor((C, X, E), measured, correlated_information(rng))
     check_jacobians(factor, values, (C, X, E))
+
+
+@pytest.mark.parametrize("offset_m", OFFSETS_M)
+def test_jacobians_of_a_cloud_that_wrong_rates_moved(offset_m: float) -> None:
+    rng = np.random.default_rng(6)
+    values = values_of(
+        C=random_pose(rng, offset_m), X=random_pose(rng, offset_m), E=random_pose(rng, 2.0)
+    )
+    values.insert(V, 0.1 * rng.normal(size=6))
+    used, twist = random_pose(rng, 2.0), rng.normal(size=6)
+    R = gtsam.Rot3.Expmap(1e-2 * rng.normal(size=3)).compose(values.atPose3(X).rotation())
+    motion = CloudMotion(twist, apart_s=0.05, T_vehicle_lidar=used, R_map_vehicle=R.matrix())
+    # A point as it was measured is where the true rates have it, and the cloud had it elsewhere.
+    point = rng.normal(size=3)
+    stamped = used.inverse().compose(gtsam.Pose3.Expmap(0.05 * twist)).compose(used)
+    now = np.append(twist[:3], values.atPose3(X).rotation().unrotate(R.rotate(twist[3:])))
+    true = gtsam.Pose3.Expmap(0.05 * (now + values.atVector(V))).compose(values.atPose3(E))
+    Z, _ = predict_cloud((C, X, V, E), values, motion)
+    there = values.atPose3(C).compose(values.atPose3(X)).compose(true).transformFrom(point)
+    assert Z.transformFrom(stamped.transformFrom(point)) == pytest.approx(there)
+    measured = gtsam.Pose3.Expmap(1e-3 * rng.uniform(-1.0, 1.0, 6)).compose(Z)
+    factor = target_pose_factor((C, X, V, E), measured, correlated_information(rng), motion)
+    assert np.abs(factor.unwhitenedError(values)).max() < 2e-3
+    check_jacobians(factor, values, (C, X, V, E))
+
+
+def test_a_turn_of_the_lidar_that_poses_and_rates_follow_changes_no_cloud() -> None:
+    """The vehicle frame is turned by 2 mrad: a sweep does not show it."""
+    rng = np.random.default_rng(8)
+    values = values_of(C=random_pose(rng, 9.0), X=random_pose(rng, 9.0), E=random_pose(rng, 2.0))
+    values.insert(V, np.zeros(6))
+    twist = np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0])
+    R = values.atPose3(X).rotation().matrix()
+    motion = CloudMotion(twist, apart_s=0.05, T_vehicle_lidar=values.atPose3(E), R_map_vehicle=R)
+    before, _ = predict_cloud((C, X, V, E), values, motion)
+    turn = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([2e-3, 1e-3, 0.0])), np.zeros(3))
+    values.update(X, values.atPose3(X).compose(turn))
+    values.update(E, turn.inverse().compose(values.atPose3(E)))
+    values.update(V, np.append(turn.rotation().unrotate(twist[:3]) - twist[:3], np.zeros(3)))
+    after, _ = predict_cloud((C, X, V, E), values, motion)
+    assert after.equals(before, 1e-12)
+
+
+def test_rates_of_a_drive_follow_from_its_poses() -> None:
+    rng = np.random.default_rng(7)
+    poses = {X: random_pose(rng, 30.0), key_vehicle(1): random_pose(rng, 30.0)}
+    factor = rates_factor(V, poses, rng.normal(size=(6, 12)))
+    values = gtsam.Values()
+    for key, T in poses.items():
+        values.insert(key, T)
+    values.insert(V, np.zeros(6))
+    assert factor.error(values) == pytest.approx(0.0, abs=1e-15)
+    for key, T in poses.items():
+        values.update(key, T.retract(0.1 * rng.normal(size=6)))
+    values.update(V, rng.normal(size=6))
+    check_jacobians(factor, values, (*poses, V))
 
 
 def a_drive_past_a_target() -> gtsam.Values:

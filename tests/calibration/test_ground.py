@@ -46,6 +46,7 @@ from caliv_graph.conventions import (
     key_ground_bias,
     key_height,
     key_parallel,
+    key_rates,
     key_sensor,
     key_vehicle,
 )
@@ -288,6 +289,16 @@ def test_jacobians(offset_m: float) -> None:
         values.insert(key_ground_bias(0), np.array([0.01, -0.02, 0.03]))
         check_jacobians(
             ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
+        )
+        moved = replace(
+            observation,
+            by_rates=np.random.default_rng(seed).normal(size=(3, 6)),
+            velocity_map=np.array([2.0, -1.0, 0.1]),
+            R_map_vehicle=random_values(seed + 9, 1.0)[0].atPose3(X).rotation().matrix(),
+        )
+        values.insert(key_rates(0), np.random.default_rng(seed).normal(size=6))
+        check_jacobians(
+            ground_plane_factor((X, E), G, anchor, moved, key_rates=key_rates(0)), values
         )
         check_jacobians(standing_factor(X, G, H, anchor, 0.4), values)
         check_jacobians(parallel_factor(X, G, P), values)

@@ -20,10 +20,13 @@ from caliv_graph.structure.system import (
     whitened,
 )
 
-LAYOUT = Layout(poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2)
+LAYOUT = Layout(
+    poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2, rates=6
+)
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
 STRIP = np.array([0, 1, 2, 1])
+TIME_S = (-0.05, 0.02, 0.0, 0.1)
 
 
 def state_of(rng: np.random.Generator) -> State:
@@ -37,7 +40,7 @@ def state_of(rng: np.random.Generator) -> State:
     return State(
         R_map_vehicle=R,
         t_map_vehicle=t,
-        moved=np.zeros(15),
+        moved=np.append(np.zeros(15), 1e-3 * rng.standard_normal(6)),
         T_vehicle_lidar=tuple(gtsam.Pose3.Expmap(v) for v in rng.uniform(-0.5, 0.5, (2, 6))),
         offsets_s=np.zeros(2),
         centres_map=np.array([[8.0, 1.0, 0.0], [1.0, 9.0, 1.0], [2.0, -7.0, 0.5]]),
@@ -57,7 +60,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     state = state_of(rng)
     h = np.concatenate([rng.uniform(3.0, 9.0, (4, 3)), np.ones((4, 1))], axis=1)
     moments = h[:, :, None] * h[:, None, :]
-    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments))
+    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments), np.array(TIME_S))
     return state, sightings, h, 0.5 * rng.standard_normal((2, 6))
 
 
@@ -65,6 +68,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     ("first", "count"),
     [
         (0, 12),
+        (LAYOUT.rate, 6),
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
         (LAYOUT.error, 6),
@@ -78,15 +82,22 @@ def test_derivatives_are_those_of_the_residual(
     state, sightings, h, twists = world
     J = geometry_at(state, sightings, twists).offset_rows(sightings, LAYOUT.size).toarray()
     step = 1e-6
+
+    def residuals(at: State) -> np.ndarray:
+        """Points are at the stamps as the extrinsics of `at` move them there."""
+        now = []
+        for q, (i, p) in enumerate(zip(LIDAR, h[:, :3], strict=True)):
+            turn = gtsam.Pose3.Expmap(TIME_S[q] * twists[POSE[q]])
+            taken, new = state.T_vehicle_lidar[i], at.T_vehicle_lidar[i]
+            own = taken.inverse().compose(turn.inverse()).compose(taken).transformFrom(p)
+            there = new.inverse().compose(turn).compose(new).transformFrom(own)
+            now.append(np.append(there, 1.0))
+        return np.asarray(np.einsum("qi,qi->q", geometry_at(at, sightings, twists).plain, now))
+
     for k in range(first, first + count):
         d = np.zeros(LAYOUT.size)
         d[k] = step
-        up = np.einsum(
-            "qi,qi->q", geometry_at(stepped(state, LAYOUT, d), sightings, twists).plain, h
-        )
-        down = np.einsum(
-            "qi,qi->q", geometry_at(stepped(state, LAYOUT, -d), sightings, twists).plain, h
-        )
+        up, down = (residuals(stepped(state, LAYOUT, s * d)) for s in (1.0, -1.0))
         # The incidence, by which errors of ranges count, moves little with the estimate, and so
         # does what a jitter shifts.
         assert J[:, k] == pytest.approx((up - down) / (2.0 * step), abs=0.02)
@@ -112,7 +123,7 @@ def test_a_range_that_is_too_long_is_undone_all_over_a_strip() -> None:
         errors,
     )
     zero = np.zeros(1, np.int64)
-    sightings = Sightings(zero, zero, (h.T @ h)[None], np.zeros((1, 4, 4)))
+    sightings = Sightings(zero, zero, (h.T @ h)[None], np.zeros((1, 4, 4)), np.zeros(1))
     plain = geometry_of(state, sightings, layout, zero, zero, None).plain[0]
     assert np.abs(q[:, 2] + 2.0).max() > 3e-3
     assert np.abs(h @ plain).max() < 2e-4
@@ -215,7 +226,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
     for count in (50, 200):
         of = np.zeros(count, np.int64)
         moments = np.tile(1e7 * h.T @ h, (count, 1, 1))
-        sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)))
+        sightings = Sightings(of, of, moments, np.zeros((count, 4, 4)), np.zeros(count))
         geometry = geometry_of(state, sightings, layout, of, of, None)
         own = np.ones(count, np.int64)
         rows = whitened(

@@ -14,6 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import (
+    Array,
     GroundObservation,
     IntArray,
     LidarScan,
@@ -28,7 +29,7 @@ from caliv_graph.targets.ground.planes import (
     response,
 )
 from caliv_graph.trajectory.deskew import deskewed
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 
 EXTRINSIC_STEP_RAD = 1e-3
 """Step of the numerical derivative with respect to the extrinsic's rotation: the displacement of
@@ -90,8 +91,9 @@ class GroundMeter:
         biases = len(moved)
         if times_s.any():
             moved += [(of_rotated - points) / EXTRINSIC_STEP_RAD for of_rotated in by_guess]
+            moved += by_rates(points, times_s, guess)
         changes = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
-        by_extrinsic = changes[:, biases:] if times_s.any() else None
+        by_extrinsic = changes[:, biases : biases + 3] if times_s.any() else None
         return GroundObservation(
             lidar=scan.lidar,
             drive=self._drive,
@@ -106,6 +108,10 @@ class GroundMeter:
             by_extrinsic=by_extrinsic,
             apart_ns=scan.stamp_ns - at_ns,
             by_range_bias=changes[:, :biases],
+            by_rates=changes[:, biases + 3 :] if times_s.any() else None,
+            taken_s=(float(times_s.min()), float(times_s.max())),
+            velocity_map=R_map_vehicle[0] @ twists_at(self._trajectory, [at_ns])[0, 3:],
+            R_map_vehicle=R_map_vehicle[0],
         )
 
     def warnings(self) -> tuple[str, ...]:
@@ -120,6 +126,19 @@ class GroundMeter:
                     f"{self._drive + 1}: {why}"
                 )
         return tuple(lines)
+
+
+def by_rates(points_lidar: Array, times_s: Array, T_vehicle_lidar: gtsam.Pose3) -> list[Array]:
+    """How points (N, 3) move with each of the six rates that moved them over their times (N,).
+
+    The derivative is that of `tau (w x p + v)`, p in the vehicle frame at the pose: the rotation
+    within a sweep, a hundredth of a radian or two, is neglected.
+    """
+    R_vehicle_lidar = T_vehicle_lidar.rotation().matrix()
+    # In lidar axes: arms from the vehicle's origin, and the vehicle's axes.
+    arms = points_lidar - T_vehicle_lidar.inverse().translation()
+    by_turn = [times_s[:, None] * np.cross(axis, arms) for axis in R_vehicle_lidar]
+    return by_turn + [times_s[:, None] * axis for axis in R_vehicle_lidar]
 
 
 def nearest_scans(

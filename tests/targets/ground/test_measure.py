@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config, parse_config
 from caliv_graph.config.model import Config
@@ -26,8 +27,14 @@ from caliv_graph.products import (
     Trajectory,
 )
 from caliv_graph.readers.caliv_folder import CalivFolder
-from caliv_graph.targets.ground.measure import GroundMeter, measure_grounds, nearest_scans
+from caliv_graph.targets.ground.measure import (
+    GroundMeter,
+    by_rates,
+    measure_grounds,
+    nearest_scans,
+)
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
+from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
@@ -133,6 +140,53 @@ def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
     at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
     assert at_once is not None
     assert at_once.by_extrinsic is None
+
+
+def turning(twist: Array) -> GivenTrajectory:
+    """A second at constant velocities (6,), at the origin in the middle of it."""
+    stamps = np.arange(0, SECOND_NS + 1, 10_000_000)
+    moving = tuple(gtsam.Pose3.Expmap((t / SECOND_NS - 0.5) * twist) for t in stamps)
+    return GivenTrajectory(Trajectory(stamps.astype(np.int64), moving))
+
+
+def test_meter_tells_what_other_rates_would_have_made_of_it() -> None:
+    twist = np.array([0.0, 0.02, 0.3, 2.0, 0.0, 0.1])
+    directions = beams(120, 26)
+    times_s = np.repeat(np.arange(120) / 120 * 0.1 - 0.1, 26)
+    T = CONFIG.lidars["front"].guess()
+    down = -(directions @ T.rotation().matrix().T)[:, 2]
+    seen = down > 0.02
+    points = directions[seen] * (HEIGHT_M / down[seen])[:, None]
+    scan = LidarScan("front", SECOND_NS // 2, points, "sweep", times_s[seen])
+
+    def measured(rates: Array) -> GroundObservation:
+        found = GroundMeter(CONFIG, turning(rates), 0).measure(scan)
+        assert found is not None
+        return found
+
+    usual = measured(twist)
+    assert usual.by_rates is not None
+    assert scan.point_times_s is not None
+    (still,) = deskewed(scan, [T], turning(twist))
+    moves = by_rates(still, scan.point_times_s, T)
+    for k, d in enumerate(1e-3 * np.eye(6)):
+        found = measured(twist + d)
+        tilts = usual.axes_lidar @ (found.normal_lidar - usual.normal_lidar)
+        change = 1e3 * np.append(tilts, found.distance_m - usual.distance_m)
+        assert change == pytest.approx(usual.by_rates[:, k], rel=0.1, abs=0.02)
+        # The same from the observation alone, where a drive was smoothed again.
+        again = with_rates_of(usual, turning(twist), turning(twist + d))
+        assert again.normal_lidar == pytest.approx(found.normal_lidar, abs=5e-6)
+        assert again.distance_m == pytest.approx(found.distance_m, abs=1e-5)
+        (moved,) = deskewed(scan, [T], turning(twist + d))
+        left = np.linalg.norm(1e3 * (moved - still) - moves[k], axis=1)
+        arm = np.linalg.norm(points, axis=1) + 3.0 if k < 3 else 1.0
+        # Half of the turn during the sweep, 0.03 rad, is neglected.
+        assert (left <= 0.02 * np.abs(scan.point_times_s) * arm + 1e-9).all()
+    assert np.abs(usual.by_rates).max() > 0.05
+    at_once = GroundMeter(CONFIG, turning(twist), 0).measure(replace(scan, point_times_s=None))
+    assert at_once is not None
+    assert at_once.by_rates is None
 
 
 def test_meter_tells_what_range_biases_change() -> None:

@@ -1,0 +1,86 @@
+"""Errors of the rates of a drive in the graph: variables that follow from its poses.
+
+Points are moved to the time of their pose with the rates of the trajectory (README, section 2a).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.ground_factors import moved
+from caliv_graph.calibration.problem import Problem
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND, key_rates, key_vehicle
+from caliv_graph.geometry.se3 import unstack
+from caliv_graph.products import Array, GroundObservation
+from caliv_graph.trajectory.rates import RATE_SIGMAS, RATES
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+
+def swept_drives(problem: Problem, grounds: Sequence[GroundObservation]) -> list[int]:
+    """Drives with a variable for the errors of their rates, ascending: by clouds or ground."""
+    by_ground = {o.drive for o in grounds if o.by_rates is not None}
+    return sorted(problem.swept_drives() | (by_ground & set(problem.rate_rows)))
+
+
+def with_rates_of(
+    observation: GroundObservation, before: VehicleTrajectory, after: VehicleTrajectory
+) -> GroundObservation:
+    """An observation as the rates of another trajectory of its drive would have made it."""
+    if observation.by_rates is None or before is after:
+        return observation
+    R, _ = after.poses_at([observation.stamp_ns])
+    first, last = (round(s * NANOSECONDS_PER_SECOND) for s in observation.taken_s)
+    ends_ns = observation.stamp_ns + np.array([min(first, 0), max(last, 0)])
+    twists = []
+    for trajectory in (before, after):
+        ends = np.clip(ends_ns, *trajectory.span_ns)
+        begin, end = unstack(*trajectory.poses_at(ends))
+        seconds = max(int(ends[1] - ends[0]), 1) / NANOSECONDS_PER_SECOND
+        twists.append(gtsam.Pose3.Logmap(begin.between(end)) / seconds)
+    changed = moved(observation, observation.by_rates @ (twists[1] - twists[0]))
+    return replace(changed, velocity_map=R[0] @ twists[1][3:], R_map_vehicle=R[0])
+
+
+def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:
+    """What ties the rates of each drive to its poses; empty where no points were moved."""
+    graph = CalibrationGraph()
+    drives = problem.drives()
+    for drive in swept_drives(problem, grounds):
+        poses = {
+            key_vehicle(i): problem.T_map_vehicle[i]
+            for i in np.flatnonzero(drives == drive).tolist()
+        }
+        graph.append("rates", rates_factor(key_rates(drive), poses, problem.rate_rows[drive]))
+    return graph
+
+
+def rates_factor(
+    key: int, T_map_vehicle: Mapping[int, gtsam.Pose3], rows: Array
+) -> gtsam.CustomFactor:
+    """`r = e - rows d`: the mean rates of some poses are off by e, as these poses are by d.
+
+    Args:
+        key: of e, (6,) rad/s and m/s, true rates less those that points were moved with.
+        T_map_vehicle: the poses that gave these rates, by key: where d, right perturbations, is 0.
+        rows: (6, 6 m) of `trajectory.rates.rate_rows`.
+    """
+    parts = np.split(rows, len(T_map_vehicle), axis=1)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        r = values.atVector(key).copy()
+        for i, ((pose, T), by_pose) in enumerate(zip(T_map_vehicle.items(), parts, strict=True)):
+            away = T.between(values.atPose3(pose))
+            r -= by_pose @ gtsam.Pose3.Logmap(away)
+            if jacobians is not None:
+                jacobians[i] = -by_pose @ gtsam.Pose3.LogmapDerivative(away)
+        if jacobians is not None:
+            jacobians[len(parts)] = np.eye(RATES)
+        return np.asarray(r)
+
+    noise = gtsam.noiseModel.Diagonal.Sigmas(RATE_SIGMAS)
+    return gtsam.CustomFactor(noise, [*T_map_vehicle, key], error)

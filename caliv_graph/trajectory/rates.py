@@ -1,0 +1,105 @@
+"""Errors of the rates of a trajectory: what errors of its poses do to the motion within sweeps.
+
+Points are moved over the time between their own and that of their pose with the rates of the
+trajectory. These are the differences of its poses, so that they err as the poses do (`README.md`,
+section 9).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import skew
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+
+RATES = 6
+"""Angular velocity (rad/s) and velocity in the map (m/s), both along the vehicle's axes."""
+
+MOST_TURN_RAD = 1.0
+"""Largest rotation between two poses whose difference counts: the motion between them is taken as
+one of constant velocities. A step of a radian is long, a chord 4 percent short of its arc."""
+
+RATE_SIGMAS = np.repeat([1e-5, 1e-4], 3)
+"""1 sigma of what ties the mean rates to the poses, rad/s and m/s. None is meant: over 0.1 s it
+moves a point 20 m away by 0.02 mm."""
+
+
+def rate_rows(
+    stamps_ns: Sequence[int] | IntArray, T_map_vehicle: Sequence[gtsam.Pose3]
+) -> Array | None:
+    """(6, 6 m) derivatives of the mean rates by right perturbations of m poses.
+
+    The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`; their mean is over time. What a
+    turn of the pose changes of the velocity in vehicle axes, which the velocity in the map is not,
+    is taken out: it is another at every speed, and follows from each pose by itself.
+
+    Args:
+        stamps_ns: (m,) of the poses, strictly increasing.
+        T_map_vehicle: m poses.
+
+    Returns:
+        None, if no two poses follow each other within `MOST_TURN_RAD`.
+    """
+    m = len(stamps_ns)
+    out = np.zeros((RATES, 6 * m))
+    total_s = 0.0
+    for i in range(m - 1):
+        step = T_map_vehicle[i].between(T_map_vehicle[i + 1])
+        if np.linalg.norm(gtsam.Rot3.Logmap(step.rotation())) > MOST_TURN_RAD:
+            continue
+        # Log(Exp(-d_i) step Exp(d_j)); the time by which each difference is divided is its weight.
+        by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
+        out[:, 6 * i + 6 : 6 * i + 12] += by_later
+        out[:, 6 * i : 6 * i + 6] -= by_later @ step.inverse().AdjointMap()
+        half = 0.5 * skew(np.asarray(gtsam.Pose3.Logmap(step))[3:])
+        out[3:, 6 * i : 6 * i + 3] -= half
+        out[3:, 6 * i + 6 : 6 * i + 9] -= half
+        total_s += int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND
+    if not math.isclose(total_s, 0.0):
+        return out / total_s
+    return None
+
+
+def rate_rows_of_drives(
+    trajectories: Sequence[VehicleTrajectory], T_map_vehicle: Mapping[tuple[int, int], gtsam.Pose3]
+) -> dict[int, Array]:
+    """`rate_rows` of each drive that has them, of its poses by (drive, stamp), ascending.
+
+    None where an odometry of a LiDAR gave the poses: its rates have no error apart from the scans.
+    """
+    out = {}
+    for drive in sorted({drive for drive, _ in T_map_vehicle}):
+        trajectory = trajectories[drive]
+        if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
+            continue
+        own = {stamp: T for (d, stamp), T in T_map_vehicle.items() if d == drive}
+        rows = rate_rows(list(own), list(own.values()))
+        if rows is not None:
+            out[drive] = rows
+    return out
+
+
+def with_rates(information: Array, gradient: Array, rows: Array) -> tuple[Array, Array]:
+    """A Gaussian on poses and what follows them, with the errors of the mean rates at its end.
+
+    Args:
+        information: (n, n), right perturbations of m poses first.
+        gradient: (n,).
+        rows: (6, 6 m) of `rate_rows`.
+
+    Returns:
+        (n + 6, n + 6) and (n + 6,); with the rates eliminated, what was given.
+    """
+    n, m = len(gradient), rows.shape[1]
+    tie = np.zeros((RATES, n + RATES))
+    tie[:, :m], tie[:, n:] = -rows, np.eye(RATES)
+    tie /= RATE_SIGMAS[:, None]
+    out = tie.T @ tie
+    out[:n, :n] += information
+    return out, np.concatenate([gradient, np.zeros(RATES)])

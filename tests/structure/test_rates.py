@@ -1,0 +1,79 @@
+"""Rates that moved the points within sweeps are wrong: with honest sigmas all the same."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.geometry.se3 import stack, vehicle_axes_difference
+from caliv_graph.products import Array
+from caliv_graph.structure.problem import Problem
+from caliv_graph.structure.sightings import moved_moments
+from caliv_graph.structure.solve import Solved
+from caliv_graph.structure.term import term_of
+from caliv_graph.trajectory.rates import rate_rows
+from tests.structure.test_solve import GUESS_SIGMAS, between, information_of, problem_of, solve
+from tests.structure.yards import TRUE, Noise, draw_prior, figure_eight, poses, yard
+
+POSES = 12
+NOISE = Noise(range_m=0.005, sighting_m=1e-4, bump_m=0.0, bias_m=0.0)
+
+
+@pytest.fixture(scope="module")
+def swept() -> Problem:
+    """The front LiDAR sweeps from left to right; poses err, and their rates with them.
+
+    The yard is driven through at 50 m/s, in sweeps of 0.04 s: as in 0.1 s at 20 m/s.
+    """
+    path = figure_eight(POSES)
+    problem = problem_of(yard(), path, 11, NOISE)
+    rng = np.random.default_rng(1)
+    true = poses(*path)
+    prior = draw_prior(true, rng, rotation_rad=5e-3, heave_m=1e-3)
+    rows = rate_rows(prior.stamps_ns, prior.T_map_vehicle)
+    assert rows is not None
+    d = np.array([s.localCoordinates(T) for s, T in zip(prior.T_map_vehicle, true, strict=True)])
+    assert problem.twists is not None
+    off = np.tile(rows @ d.ravel(), (POSES, 1))
+    off[:, 3:] += np.cross(problem.twists[:, 3:], d[:, :3])
+    patches = problem.patches
+    centre = patches.centres_lidar
+    front = patches.scan_lidar[patches.scan] == 0
+    time_s = np.where(front, -0.02 * np.arctan2(centre[:, 1], centre[:, 0]), 0.0)
+    pose = problem.pose_of_scan[patches.scan]
+    moved = problem.twists[pose] * time_s[:, None]
+    back = [TRUE["front"].inverse().compose(gtsam.Pose3.Expmap(-v)) for v in moved]
+    R, t = stack([T.compose(TRUE["front"]) for T in back])
+    swept = moved - off[pose] * time_s[:, None]
+    return replace(
+        problem,
+        patches=replace(
+            patches,
+            time_s=time_s,
+            moments=moved_moments(patches.moments, R, t),
+            normal_lidar=np.einsum("nij,nj->ni", R, patches.normal_lidar),
+        ),
+        prior=prior,
+        relative=np.array([gtsam.Pose3.Expmap(v).matrix() for v in swept]),
+    )
+
+
+def nees(found: Solved, motion: Array) -> float:
+    """Of S2S, its z aside, which walls do not tell."""
+    error = [
+        vehicle_axes_difference(T, TRUE[name])
+        for T, name in zip(found.state.T_vehicle_lidar, TRUE, strict=True)
+    ]
+    term = term_of(found, np.arange(POSES))
+    cov = np.linalg.inv(information_of(term, motion) + np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)))
+    axes = np.array([between(column) for column in np.eye(12)]).T[:5]
+    e = axes @ np.concatenate(error)
+    return float(e @ np.linalg.solve(axes @ cov @ axes.T, e))
+
+
+def test_wrong_rates_are_no_error_of_the_extrinsics(swept: Problem) -> None:
+    motion = swept.prior.information
+    assert nees(solve(swept), motion) > 30.0
+    found = nees(solve(replace(swept, prior=swept.prior.with_rates())), motion)
+    assert found < 15.1  # 5 degrees of freedom, one of 100

@@ -35,7 +35,13 @@ from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
 from caliv_graph.targets.ground.planes import ground_floors
+from caliv_graph.trajectory.correlated import MOVES
 from caliv_graph.trajectory.effects import ErrorEffects, error_effects, smoothed_in_time
+from caliv_graph.trajectory.error_likelihood import (
+    ErrorLikelihood,
+    error_likelihood,
+    white_sigmas,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -62,12 +68,16 @@ class Evidence:
         by_pose: (N, 6 p) derivatives by right perturbations of p poses.
         white: name of `LEVELS` -> (N, N) covariance at sigma 1.
         effects: per drive, the columns of its poses in `by_pose`, and what errors do to them.
+        motion: per drive, what its motion data say of these errors.
+        sensor_sigmas: kind of sensor -> (3,) white 1 sigma of one measurement, map axes.
     """
 
     observed: Observed
     by_pose: Array
     white: dict[str, Array]
     effects: list[tuple[IntArray, dict[str, ErrorEffects]]] = field(default_factory=list)
+    motion: list[ErrorLikelihood] = field(default_factory=list)
+    sensor_sigmas: dict[str, Array] = field(default_factory=dict)
     _moved: dict[tuple[str, tuple[int, ...]], list[tuple[Array, IntArray]]] = field(
         default_factory=dict
     )
@@ -144,7 +154,7 @@ def linearised_evidence(
             *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
         )
     known = scipy.linalg.block_diag(*(row.known for row in rows))
-    effects, inputs, scales = [], np.zeros((starts[-1], 0)), np.zeros(0)
+    effects, motion, inputs, scales = [], [], np.zeros((starts[-1], 0)), np.zeros(0)
     drives = _of_drives(problem, poses, trajectories)
     if drives:
         # What the user typed may be wrong: an arm that is off moves the poses as slowly as the
@@ -159,11 +169,16 @@ def linearised_evidence(
         information = of.trajectory.joint_information(of.stamps_ns)[0]
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
-        effects.append((of.columns, _effects(of.trajectory, of.stamps_ns)))
+        kinds = _kinds(of.trajectory)
+        found = error_effects(of.trajectory, of.stamps_ns, kinds)
+        effects.append((of.columns, {effect.kind: effect for effect in found}))
+        if kinds:
+            motion.append(error_likelihood(of.trajectory, kinds))
     ridge = np.concatenate([*(_weak(problem, key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
-    return Evidence(observed, by_pose, white, effects)
+    sigmas = _sensor_sigmas([of.trajectory for of in drives.values()])
+    return Evidence(observed, by_pose, white, effects, motion, sigmas)
 
 
 @dataclass(frozen=True)
@@ -190,12 +205,20 @@ def _of_drives(
     return out
 
 
-def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[str, ErrorEffects]:
-    """What errors that are correlated over time do to the poses; none if some are in use."""
+def _kinds(trajectory: SmoothedTrajectory) -> list[str]:
+    """Sensors that a drive has and whose errors may be correlated; none if some are in use."""
     if trajectory.correlated:
-        return {}
-    kinds = [kind for kind in ("gnss", "orientation") if kind in trajectory.factor_kinds]
-    return {of.kind: of for of in error_effects(trajectory, stamps_ns, kinds)}
+        return []
+    return [kind for kind in MOVES if kind in trajectory.factor_kinds]
+
+
+def _sensor_sigmas(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Array]:
+    """Sensor -> (3,) white 1 sigma of one measurement: the median of the drives."""
+    found: dict[str, list[Array]] = {}
+    for trajectory in trajectories:
+        for kind in _kinds(trajectory):
+            found.setdefault(kind, []).append(white_sigmas(trajectory.data, kind))
+    return {kind: np.median(sigmas, axis=0) for kind, sigmas in found.items()}
 
 
 def _weak(problem: Problem, key: int, size: int) -> Array:

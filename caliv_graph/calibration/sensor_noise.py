@@ -8,13 +8,14 @@ extrinsics, targets and planes integrated out (`README.md`, "Noise levels").
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.calibration.evidence import Evidence, linearised_evidence
 from caliv_graph.calibration.noise import LOG_SPREAD
+from caliv_graph.calibration.open_errors import open_errors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -68,6 +69,9 @@ SLOW: Mapping[str, Slow] = {
 """By kind of factor; the prior is that of a receiver with corrections, and of an AHRS."""
 
 START_TIMES_S = (8.0, 40.0)
+
+OPEN = "expected: LiDARs and motion data leave it open"
+"""Source of the figure of an error whose size is integrated out."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +139,15 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
             break
         best = better
         kinds.remove(start[0])
+    parts = [evidence.white[name] for name in names]
+    opened = open_errors(evidence, parts, best.white, best.errors, kinds)
     values = dict(zip(names, best.white.tolist(), strict=True))
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
-    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, best.errors)
-    return replace(fitted, levels=_levels(fitted, noise, names))
+    errors = (*best.errors, *opened)
+    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, errors)
+    levels = _levels(fitted, noise, names, {error.kind for error in opened})
+    return replace(fitted, levels=levels)
 
 
 def heave_of(levels: Sequence[NoiseLevel]) -> float:
@@ -169,9 +177,12 @@ def with_floors(
 
 
 def _levels(
-    noise: SensorNoise, config: NoiseConfig, estimated: Sequence[str]
+    noise: SensorNoise,
+    config: NoiseConfig,
+    estimated: Sequence[str],
+    opened: Set[str] = frozenset(),
 ) -> tuple[NoiseLevel, ...]:
-    """The figures in use and where they are from."""
+    """The figures in use and where they are from; `opened` are kinds of errors of open size."""
     given = {
         "heave": config.heave_m,
         "ground_normal": config.ground_normal_deg,
@@ -196,7 +207,8 @@ def _levels(
             parts = {"": error.sigmas[0]}
         for part, sigma in parts.items():
             name = "_".join(filter(None, (error.kind, "correlated", part)))
-            out.append(NoiseLevel(name, sigma, unit, "residuals of the LiDARs", error.time_s))
+            told = OPEN if error.kind in opened else "residuals of the LiDARs"
+            out.append(NoiseLevel(name, sigma, unit, told, error.time_s))
     return tuple(out)
 
 
@@ -266,18 +278,17 @@ def _cost(
         slow += [evidence.slow(kind, group, time_s) for group in groups]
         sigmas += range(at, at + len(groups))
         at = times[-1] + 1
-    value, by_sigma = evidence.observed.cost([*parts, *slow], x[sigmas])
     slope = np.zeros(len(x))
-    slope[sigmas] = by_sigma
     if not slopes:
-        return value, slope
+        return evidence.observed.value([*parts, *slow], x[sigmas]), slope
+    value, slope[sigmas] = evidence.observed.cost([*parts, *slow], x[sigmas])
     step = 1e-2
     for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
         first = sum(len(SLOW[k].groups) for k in kinds[:number])
         groups = SLOW[kind].groups
         later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
         changed = [*slow[:first], *later, *slow[first + len(groups) :]]
-        slope[index] = (evidence.observed.cost([*parts, *changed], x[sigmas])[0] - value) / step
+        slope[index] = (evidence.observed.value([*parts, *changed], x[sigmas]) - value) / step
     return value, slope
 
 

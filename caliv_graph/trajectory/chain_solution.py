@@ -78,14 +78,24 @@ def inverse_columns(chain: Chain, coordinates: IntArray) -> Array:
         TrajectoryError: the chain is singular.
     """
     n, w = chain.diagonal.shape[:2]
-    k = len(chain.corner)
+    right = np.zeros((n * w + len(chain.corner), len(coordinates)))
+    right[coordinates, np.arange(len(coordinates))] = 1.0
+    return solved_columns(chain, right)
+
+
+def solved_columns(chain: Chain, right: Array) -> Array:
+    """The inverse of a chain's information times columns (n w + k, m).
+
+    Raises:
+        TrajectoryError: the chain is singular.
+    """
+    n, w = chain.diagonal.shape[:2]
     size, factor, border = _factorised(chain)
-    right = np.zeros((n * w, len(coordinates) + k))
-    right[coordinates, np.arange(len(coordinates))] = 1.0 / size.ravel()[coordinates]
-    right[:, len(coordinates) :] = border
-    by_state = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False)
-    alone, to_border = np.split(by_state, [len(coordinates)], axis=1)
-    common = -np.linalg.solve(chain.corner - border.T @ to_border, border.T @ alone)
+    columns = np.hstack([right[: n * w] / size.reshape(-1, 1), border])
+    by_state = scipy.linalg.cho_solve_banded((factor, True), columns, check_finite=False)
+    alone, to_border = np.split(by_state, [right.shape[1]], axis=1)
+    left = chain.corner - border.T @ to_border
+    common = np.linalg.solve(left, right[n * w :] - border.T @ alone)
     return np.vstack([(alone - to_border @ common) / size.reshape(-1, 1), common])
 
 

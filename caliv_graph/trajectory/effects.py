@@ -77,12 +77,19 @@ def error_effects(
         gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
         shape = gain.shape
         turned = Ad @ gain.reshape(len(i), POSE, -1)
-        stamps = trajectory.nodes_ns
-        step = (stamps - stamps[0]) // STEP_NS
-        first = np.flatnonzero(np.diff(step, prepend=-1))
-        middle = stamps[0] + step[first] * STEP_NS + STEP_NS // 2
+        first, middle = error_steps(trajectory.nodes_ns)
         out.append(ErrorEffects(kind, middle, np.add.reduceat(turned.reshape(shape), first, 2)))
     return tuple(out)
+
+
+def error_steps(nodes_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """First nodes (m,) of the steps over which an error is taken to be constant, and middles (m,).
+
+    `nodes_ns` (n,) are stamps; the middles too.
+    """
+    step = (nodes_ns - nodes_ns[0]) // STEP_NS
+    first = np.flatnonzero(np.diff(step, prepend=-1))
+    return first, nodes_ns[0] + step[first] * STEP_NS + STEP_NS // 2
 
 
 def smoothed_in_time(rows: Array, stamps_ns: IntArray, time_s: float) -> Array:

@@ -80,7 +80,7 @@ class ErrorLikelihood:
         half = np.linalg.cholesky(np.exp(-apart / error.time_s))
         m = AXES * len(self.stamps_ns)
         first = m * self.kinds.index(error.kind)
-        spread: Array = np.kron(np.diag(error.sigmas), half)
+        spread: Array = scipy.linalg.block_diag(*(sigma * half for sigma in error.sigmas))
         return np.arange(first, first + m, dtype=np.int64), spread
 
 

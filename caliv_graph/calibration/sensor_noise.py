@@ -8,7 +8,7 @@ extrinsics, targets and planes integrated out (`README.md`, "Noise levels").
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,12 +82,14 @@ class SensorNoise:
         heave_m: 1 sigma of the heave.
         floors: (3,) 1 sigma of (a, b, distance) of a ground plane by the waves of the ground.
         correlated: errors of sensors that are correlated over time.
+        opened: kinds of those whose size is integrated out (`open_errors.py`).
         levels: for the report.
     """
 
     heave_m: float
     floors: Array
     correlated: tuple[CorrelatedError, ...] = ()
+    opened: tuple[str, ...] = ()
     levels: tuple[NoiseLevel, ...] = ()
 
 
@@ -145,9 +147,9 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
     errors = (*best.errors, *opened)
-    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, errors)
-    levels = _levels(fitted, noise, names, {error.kind for error in opened})
-    return replace(fitted, levels=levels)
+    kinds = [error.kind for error in opened]
+    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, errors, tuple(kinds))
+    return replace(fitted, levels=_levels(fitted, noise, names))
 
 
 def heave_of(levels: Sequence[NoiseLevel]) -> float:
@@ -158,12 +160,17 @@ def heave_of(levels: Sequence[NoiseLevel]) -> float:
 def with_noise(
     noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
 ) -> list[VehicleTrajectory]:
-    """The trajectories, smoothed again where a sensor's error was found to be correlated."""
+    """The trajectories, smoothed again where a sensor's error is correlated.
+
+    An error that nothing shows contradicts no stated sigma: those that held still hold.
+    """
+    open_only = len(noise.opened) == len(noise.correlated)
     out: list[VehicleTrajectory] = []
     for t in trajectories:
         if noise.correlated and isinstance(t, SmoothedTrajectory) and t.data is not None:
             stamps = t.trajectory.stamps_ns
-            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated)
+            known: dict[str, float] | None = {} if open_only and not t.data.scales else None
+            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)
         out.append(t)
     return out
 
@@ -177,12 +184,9 @@ def with_floors(
 
 
 def _levels(
-    noise: SensorNoise,
-    config: NoiseConfig,
-    estimated: Sequence[str],
-    opened: Set[str] = frozenset(),
+    noise: SensorNoise, config: NoiseConfig, estimated: Sequence[str]
 ) -> tuple[NoiseLevel, ...]:
-    """The figures in use and where they are from; `opened` are kinds of errors of open size."""
+    """The figures in use and where they are from."""
     given = {
         "heave": config.heave_m,
         "ground_normal": config.ground_normal_deg,
@@ -207,7 +211,7 @@ def _levels(
             parts = {"": error.sigmas[0]}
         for part, sigma in parts.items():
             name = "_".join(filter(None, (error.kind, "correlated", part)))
-            told = OPEN if error.kind in opened else "residuals of the LiDARs"
+            told = OPEN if error.kind in noise.opened else "residuals of the LiDARs"
             out.append(NoiseLevel(name, sigma, unit, told, error.time_s))
     return tuple(out)
 

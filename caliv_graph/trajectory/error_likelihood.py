@@ -157,14 +157,20 @@ def eliminated(
     first, middles = error_steps(nodes_ns)
     step, m = np.cumsum(np.isin(np.arange(n), first)) - 1, len(first)
     # An error of a sensor acts at its own node: the coupling of neighbours has none.
+    mixed = both.diagonal[:, of_state, of_error]
     cross = np.zeros((n, STATE, e, m))
-    cross[np.arange(n), :, :, step] = both.diagonal[:, of_state, of_error]
+    cross[np.arange(n), :, :, step] = mixed
+    border = np.add.reduceat(both.border[:, of_error], first, 0)
     right = np.zeros((n * STATE + k, e * m + 1))
     right[: n * STATE, :-1] = cross.reshape(n * STATE, e * m)
-    border = np.add.reduceat(both.border[:, of_error], first, 0)
     right[n * STATE :, :-1] = border.transpose(2, 1, 0).reshape(k, e * m)
     right[:, -1] = np.concatenate([by_node[:, of_state].ravel(), slope[n * width :]])
-    taken = right[:, :-1].T @ solved_columns(alone, right)
+    solution = solved_columns(alone, right)
+    # A dense product would take ten times as long: a step touches the states of few nodes.
+    by_state = solution[: n * STATE].reshape(n, STATE, -1)
+    near = np.add.reduceat(np.swapaxes(mixed, 1, 2) @ by_state, first, 0)
+    taken = np.swapaxes(near, 0, 1).reshape(e * m, -1)
+    taken = taken + right[n * STATE :, :-1].T @ solution[n * STATE :]
     own = np.zeros((e, m, e, m))
     blocks = np.add.reduceat(both.diagonal[:, of_error, of_error], first, 0)
     own[:, np.arange(m), :, np.arange(m)] = blocks

@@ -45,6 +45,24 @@ class OpenError:
     expected: CorrelatedError
 
 
+def of_expected_size(
+    evidence: Evidence, parts: Sequence[Array], sigmas: Array, found: Sequence[CorrelatedError]
+) -> tuple[CorrelatedError, ...]:
+    """The errors of greatest likelihood with their expected sizes and times instead.
+
+    The greatest likelihood of an error that barely shows is too small as often as too large, and
+    sigmas would be wrong by as much. Those beyond `SIZES` stay. Arguments as in `open_errors`.
+    """
+    known = [(s**2) * part for s, part in zip(sigmas, parts, strict=True)]
+    out = list(found)
+    for i, error in enumerate(found):
+        white = evidence.sensor_sigmas.get(error.kind)
+        if white is not None and (np.array(error.sigmas) <= SIZES[-1] * white).all():
+            others = [*out[:i], *out[i + 1 :]]
+            out[i] = open_error(evidence, known, others, error.kind).expected
+    return tuple(out)
+
+
 def open_errors(
     evidence: Evidence,
     parts: Sequence[Array],

@@ -15,7 +15,7 @@ import numpy as np
 
 from caliv_graph.calibration.evidence import Evidence, linearised_evidence
 from caliv_graph.calibration.noise import LOG_SPREAD
-from caliv_graph.calibration.open_errors import open_errors
+from caliv_graph.calibration.open_errors import of_expected_size, open_errors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -82,7 +82,7 @@ class SensorNoise:
         heave_m: 1 sigma of the heave.
         floors: (3,) 1 sigma of (a, b, distance) of a ground plane by the waves of the ground.
         correlated: errors of sensors that are correlated over time.
-        opened: kinds of those whose size is integrated out (`open_errors.py`).
+        opened: kinds of those that nothing shows (`open_errors.py`).
         levels: for the report.
     """
 
@@ -142,11 +142,12 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
         best = better
         kinds.remove(start[0])
     parts = [evidence.white[name] for name in names]
-    opened = open_errors(evidence, parts, best.white, best.errors, kinds)
+    shown = of_expected_size(evidence, parts, best.white, best.errors)
+    opened = open_errors(evidence, parts, best.white, shown, kinds)
     values = dict(zip(names, best.white.tolist(), strict=True))
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
-    errors = (*best.errors, *opened)
+    errors = (*shown, *opened)
     kinds = [error.kind for error in opened]
     fitted = SensorNoise(values.get("heave", usual.heave_m), floors, errors, tuple(kinds))
     return replace(fitted, levels=_levels(fitted, noise, names))

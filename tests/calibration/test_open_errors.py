@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.evidence import Evidence
-from caliv_graph.calibration.open_errors import NONE, SIZES, TIMES_S, open_error, open_errors
+from caliv_graph.calibration.open_errors import (
+    NONE,
+    SIZES,
+    TIMES_S,
+    of_expected_size,
+    open_error,
+    open_errors,
+)
 from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.products import Array
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError
@@ -113,6 +120,20 @@ def test_an_error_that_is_plain_has_its_size_and_a_known_one_counts_once() -> No
     assert error.sigmas[0] == pytest.approx(1.5 * WHITE[0], rel=0.4)
     again = open_error(evidence(fixes), [], [error], "gnss")
     assert again.none > 0.5
+
+
+def test_the_most_likely_size_makes_room_for_the_expected_one() -> None:
+    rng = np.random.default_rng(4)
+    seen = evidence(drawn(rng)[0])
+    barely = CorrelatedError("gnss", (1e-3, 1e-3, 2e-3), 3.0)
+    plain = CorrelatedError("gnss", (3.0 * WHITE[0], 1e-3, 1e-3), 3.0)
+    other = CorrelatedError("orientation", (1e-3, 1e-3, 1e-3), 3.0)
+
+    assert of_expected_size(seen, [], np.zeros(0), [barely, other]) == (
+        open_error(seen, [], [other], "gnss").expected,
+        other,
+    )
+    assert of_expected_size(seen, [], np.zeros(0), [plain]) == (plain,)
 
 
 def test_time_and_variance_are_those_of_the_expected_error() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.evidence import Evidence
-from caliv_graph.calibration.sensor_noise import LEVELS, SLOW, estimated, with_floors
+from caliv_graph.calibration.sensor_noise import LEVELS, OPEN, SLOW, estimated, with_floors
 from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation
@@ -98,6 +98,34 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert found.heave_m == pytest.approx(5e-3, rel=0.35)
     names = {level.name: level for level in found.levels}
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
+
+
+def test_an_error_that_the_lidars_neither_show_nor_rule_out_is_called_open() -> None:
+    white_m = 5e-3
+    made = replace(evidence(2, 5e-3, None), sensor_sigmas={"gnss": np.full(3, white_m)})
+
+    found = estimated(made, NoiseConfig())
+
+    (error,) = found.correlated
+    assert found.opened == ("gnss",)
+    assert 0.02 < error.sigmas[0] / white_m < 0.7
+    sources = {level.name: level.source for level in found.levels}
+    assert sources["gnss_correlated_vertical"] == OPEN
+    assert estimated(made, NoiseConfig(gnss_correlated_horizontal_m=0.0)).correlated == ()
+    precise = replace(made, sensor_sigmas={"gnss": np.full(3, 0.05)})
+    assert estimated(precise, NoiseConfig()).correlated == ()  # it would show
+
+
+def test_an_error_that_the_lidars_show_has_its_expected_size() -> None:
+    true = CorrelatedError("gnss", (0.02, 0.02, 0.02), 10.0)
+    made = replace(evidence(2, 5e-3, true), sensor_sigmas={"gnss": np.full(3, 0.02)})
+
+    found = estimated(made, NoiseConfig())
+
+    (error,) = found.correlated
+    assert found.opened == ()
+    assert error.sigmas == pytest.approx(true.sigmas, rel=0.5)
+    assert OPEN not in {level.source for level in found.levels}
 
 
 def test_a_lever_arm_that_is_off_is_no_error_of_the_fixes_once_it_is_free() -> None:

@@ -155,22 +155,16 @@ def eliminated(
     )
     by_node = slope[: n * width].reshape(n, width)
     first, middles = error_steps(nodes_ns)
-    step, m = np.cumsum(np.isin(np.arange(n), first)) - 1, len(first)
-    # An error of a sensor acts at its own node: the coupling of neighbours has none.
-    mixed = both.diagonal[:, of_state, of_error]
-    cross = np.zeros((n, STATE, e, m))
-    cross[np.arange(n), :, :, step] = mixed
-    border = np.add.reduceat(both.border[:, of_error], first, 0)
-    right = np.zeros((n * STATE + k, e * m + 1))
-    right[: n * STATE, :-1] = cross.reshape(n * STATE, e * m)
-    right[n * STATE :, :-1] = border.transpose(2, 1, 0).reshape(k, e * m)
-    right[:, -1] = np.concatenate([by_node[:, of_state].ravel(), slope[n * width :]])
+    m = len(first)
+    shared = _shared(both, first)
+    right = np.column_stack([shared, np.append(by_node[:, of_state], slope[n * width :])])
     solution = solved_columns(alone, right)
     # A dense product would take ten times as long: a step touches the states of few nodes.
     by_state = solution[: n * STATE].reshape(n, STATE, -1)
-    near = np.add.reduceat(np.swapaxes(mixed, 1, 2) @ by_state, first, 0)
+    mixed = both.diagonal[:, of_error, of_state]
+    near = np.add.reduceat(mixed @ by_state, first, 0)
     taken = np.swapaxes(near, 0, 1).reshape(e * m, -1)
-    taken = taken + right[n * STATE :, :-1].T @ solution[n * STATE :]
+    taken = taken + shared[n * STATE :].T @ solution[n * STATE :]
     own = np.zeros((e, m, e, m))
     blocks = np.add.reduceat(both.diagonal[:, of_error, of_error], first, 0)
     own[:, np.arange(m), :, np.arange(m)] = blocks
@@ -179,6 +173,24 @@ def eliminated(
     return ErrorLikelihood(
         tuple(kinds), middles, np.asarray(0.5 * (information + information.T)), -pull
     )
+
+
+def _shared(both: Chain, first: IntArray) -> Array:
+    """(n STATE + k, e m) between states with common coordinates and errors by step.
+
+    An error of a sensor acts at its own node: the coupling of neighbours has none.
+    """
+    n, width = both.diagonal.shape[:2]
+    k, e, m = len(both.corner), width - STATE, len(first)
+    of_state, of_error = slice(0, STATE), slice(STATE, width)
+    out = np.zeros((n * STATE + k, e * m))
+    step = np.searchsorted(first, np.arange(n), "right") - 1
+    columns = step[:, None] + m * np.arange(e)
+    by_state = out[: n * STATE].reshape(n, STATE, -1)
+    by_state[np.arange(n)[:, None], :, columns] = both.diagonal[:, of_error, of_state]
+    border = np.add.reduceat(both.border[:, of_error], first, 0)
+    out[n * STATE :] = border.transpose(2, 1, 0).reshape(k, e * m)
+    return out
 
 
 def white_sigmas(data: SmootherInput, kind: str) -> Array:

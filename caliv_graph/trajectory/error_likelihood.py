@@ -147,18 +147,12 @@ def eliminated(
     of_state, of_error = slice(0, STATE), slice(STATE, width)
     at = np.arange(len(common_keys), k)
     both.corner[at, at] += priors
-    alone = Chain(
-        both.diagonal[:, of_state, of_state],
-        both.coupling[:, of_state, of_state],
-        both.border[:, of_state],
-        both.corner,
-    )
     by_node = slope[: n * width].reshape(n, width)
     first, middles = error_steps(nodes_ns)
     m = len(first)
     shared = _shared(both, first)
     right = np.column_stack([shared, np.append(by_node[:, of_state], slope[n * width :])])
-    solution = solved_columns(alone, right)
+    solution = solved_columns(both.leading(STATE), right)
     # A dense product would take ten times as long: a step touches the states of few nodes.
     by_state = solution[: n * STATE].reshape(n, STATE, -1)
     mixed = both.diagonal[:, of_error, of_state]

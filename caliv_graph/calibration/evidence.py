@@ -98,6 +98,15 @@ class Evidence:
         return out
 
 
+def motion_evidence(trajectories: Sequence[VehicleTrajectory]) -> Evidence:
+    """What the motion data of smoothed drives say of their sensors, without any LiDAR."""
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    motion = [error_likelihood(t, kinds) for t in smoothed for kinds in [_kinds(t)] if kinds]
+    nothing = Observed(np.zeros(1), np.ones((1, 1)), np.ones(1), np.eye(1))
+    sigmas = _sensor_sigmas(smoothed)
+    return Evidence(nothing, np.zeros((1, 6)), {}, motion=motion, sensor_sigmas=sigmas)
+
+
 @dataclass
 class _Rows:
     """One observation.

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.calibration.evidence import Evidence, linearised_evidence
+from caliv_graph.calibration.evidence import Evidence, linearised_evidence, motion_evidence
 from caliv_graph.calibration.noise import LOG_SPREAD
-from caliv_graph.calibration.open_errors import of_expected_size, open_errors
+from caliv_graph.calibration.open_errors import RATHER_NONE, of_expected_size, open_errors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -104,7 +104,19 @@ def estimated_noise(
     """
     noise = state.config.noise
     evidence = linearised_evidence(state, registrations, trajectories)
-    return usual_noise(noise) if evidence is None else estimated(evidence, noise)
+    if evidence is None:
+        return noise_of_motion(trajectories, noise)
+    return estimated(evidence, noise)
+
+
+def noise_of_motion(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
+    """`usual_noise`, and the correlated errors that the motion data alone rather have than not."""
+    evidence = motion_evidence(trajectories)
+    kinds = _looked_for(noise, evidence)
+    errors = open_errors(evidence, (), np.zeros(0), (), kinds, RATHER_NONE)
+    opened = tuple(error.kind for error in errors)
+    found = replace(_usual(noise), correlated=errors, opened=opened)
+    return replace(found, levels=_levels(found, noise, ()))
 
 
 def usual_noise(noise: NoiseConfig) -> SensorNoise:
@@ -330,5 +342,5 @@ def _looked_for(noise: NoiseConfig, evidence: Evidence) -> list[str]:
         "gnss": (noise.gnss_correlated_horizontal_m, noise.gnss_correlated_vertical_m),
         "orientation": (noise.orientation_correlated_deg,),
     }
-    has = {kind for _, of in evidence.effects for kind in of}
+    has = {kind for _, of in evidence.effects for kind in of} | evidence.sensor_sigmas.keys()
     return [k for k, values in configured.items() if k in has and all(v is None for v in values)]

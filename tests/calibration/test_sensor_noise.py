@@ -9,12 +9,27 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.evidence import Evidence
-from caliv_graph.calibration.sensor_noise import LEVELS, OPEN, SLOW, estimated, with_floors
+from caliv_graph.calibration.sensor_noise import (
+    LEVELS,
+    OPEN,
+    SLOW,
+    estimated,
+    noise_of_motion,
+    with_floors,
+)
 from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
+from tests.trajectory.test_variances import recorded, shifted, smoothed
+
+STATED = {
+    "gnss_horizontal_m": 0.0167,
+    "gnss_vertical_m": 0.02,
+    "accelerometer_density_m_s2_sqrthz": 5e-3,
+}
+"""Figures of the config for the drives of test_variances: no white level takes up an error."""
 
 POSES = 16
 STEPS = 48
@@ -177,3 +192,26 @@ def test_floors_are_replaced() -> None:
 
     expected = replace(observation).cov + np.diag(after**2 - before**2)
     assert changed.cov == pytest.approx(expected)
+
+
+def test_without_lidars_the_motion_data_must_rather_have_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Fixes that swing by 50 mm, where 17 mm are stated."""
+    motion = recorded()
+    assert motion.gnss is not None
+    seconds = 1e-9 * (motion.gnss.stamps_ns - motion.gnss.stamps_ns[0])
+    wave = smoothed(shifted(motion, 0.05 * np.sin(2.0 * seconds)), (), **STATED)
+
+    wavy = noise_of_motion([wave], NoiseConfig())
+
+    (error,) = wavy.correlated
+    assert error.kind == "gnss"
+    assert wavy.opened == ("gnss",)
+    assert 0.015 < error.sigmas[0] < 0.04
+    assert {level.source for level in wavy.levels} == {"the usual figure", OPEN}
+    none = NoiseConfig(gnss_correlated_horizontal_m=0.0, orientation_correlated_deg=0.0)
+    assert noise_of_motion([wave], none).correlated == ()
+    assert noise_of_motion([], NoiseConfig()).correlated == ()
+    monkeypatch.setattr("caliv_graph.calibration.sensor_noise.RATHER_NONE", 0.0)
+    assert noise_of_motion([wave], NoiseConfig()).correlated == ()

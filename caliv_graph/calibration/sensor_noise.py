@@ -106,11 +106,38 @@ def estimated_noise(
     evidence = linearised_evidence(state, registrations, trajectories)
     if evidence is None:
         return noise_of_motion(trajectories, noise)
-    return estimated(evidence, noise)
+    found = estimated(evidence, noise)
+    if again := _with_other_levels(found, trajectories):
+        evidence = replace(evidence, motion=motion_evidence(again).motion)
+        found = estimated(evidence, noise)
+    return found
 
 
 def noise_of_motion(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
     """`usual_noise`, and the correlated errors that the motion data alone rather have than not."""
+    found = _rather_errors(trajectories, noise)
+    again = _with_other_levels(found, trajectories)
+    return _rather_errors(again, noise) if again else found
+
+
+def _with_other_levels(
+    noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
+) -> list[SmoothedTrajectory]:
+    """The drives with the white levels that they have beside correlated errors; empty: the same.
+
+    Without these, the accelerometer's level takes up a part of an error of the fixes, and hides it.
+    """
+    if not any(t.data.scales for t in trajectories if isinstance(t, SmoothedTrajectory)):
+        return []
+    out, changed = [], False
+    for before, after in zip(trajectories, with_noise(noise, trajectories), strict=True):
+        if isinstance(before, SmoothedTrajectory) and isinstance(after, SmoothedTrajectory):
+            changed |= before.data.scales != after.data.scales
+            out.append(replace(after, correlated=()))
+    return out if changed else []
+
+
+def _rather_errors(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
     evidence = motion_evidence(trajectories)
     kinds = _looked_for(noise, evidence)
     errors = open_errors(evidence, (), np.zeros(0), (), kinds, RATHER_NONE)
@@ -138,9 +165,9 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
         "ground_distance": noise.ground_distance_m,
     }
     names = [name for name in evidence.white if given.get(name) is None]
-    for name, sigma in given.items():
-        if sigma is not None and name in evidence.white:
-            evidence.observed.known[:] += sigma**2 * evidence.white[name]
+    stated = [s**2 * evidence.white[n] for n, s in given.items() if s and n in evidence.white]
+    known = np.sum([evidence.observed.known, *stated], axis=0)
+    evidence = replace(evidence, observed=replace(evidence.observed, known=known))
     best = _fitted(evidence, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:

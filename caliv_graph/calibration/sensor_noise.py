@@ -27,6 +27,7 @@ from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.variances import LARGEST_RIGHT
 
 EVIDENCE = 3.0
 """Gain of the log-likelihood from which an error is taken to be correlated over time: one for each
@@ -132,9 +133,15 @@ def _with_other_levels(
     out, changed = [], False
     for before, after in zip(trajectories, with_noise(noise, trajectories), strict=True):
         if isinstance(before, SmoothedTrajectory) and isinstance(after, SmoothedTrajectory):
-            changed |= before.data.scales != after.data.scales
+            changed |= _differ(before.data.scales, after.data.scales)
             out.append(replace(after, correlated=()))
     return out if changed else []
+
+
+def _differ(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether a scale on stated sigmas is another one, by more than is left alone."""
+    ratios = [one.get(name, 1.0) / other.get(name, 1.0) for name in {*one, *other}]
+    return any(max(ratio, 1.0 / ratio) > LARGEST_RIGHT for ratio in ratios)
 
 
 def _rather_errors(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:

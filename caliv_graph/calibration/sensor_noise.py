@@ -15,7 +15,7 @@ import numpy as np
 
 from caliv_graph.calibration.evidence import Evidence, linearised_evidence, motion_evidence
 from caliv_graph.calibration.noise import LOG_SPREAD
-from caliv_graph.calibration.open_errors import RATHER_NONE, of_expected_size, open_errors
+from caliv_graph.calibration.open_errors import RATHER_NONE, SIZES, of_expected_size, open_errors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -108,7 +108,7 @@ def estimated_noise(
     if evidence is None:
         return noise_of_motion(trajectories, noise)
     found = estimated(evidence, noise)
-    if again := _with_other_levels(found, trajectories):
+    if again := _with_other_levels(found, evidence, trajectories):
         evidence = replace(evidence, motion=motion_evidence(again).motion)
         found = estimated(evidence, noise)
     return found
@@ -116,19 +116,25 @@ def estimated_noise(
 
 def noise_of_motion(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
     """`usual_noise`, and the correlated errors that the motion data alone rather have than not."""
-    found = _rather_errors(trajectories, noise)
-    again = _with_other_levels(found, trajectories)
-    return _rather_errors(again, noise) if again else found
+    evidence = motion_evidence(trajectories)
+    found = _rather_errors(evidence, noise)
+    again = _with_other_levels(found, evidence, trajectories)
+    return _rather_errors(motion_evidence(again), noise) if again else found
 
 
 def _with_other_levels(
-    noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
+    noise: SensorNoise, evidence: Evidence, trajectories: Sequence[VehicleTrajectory]
 ) -> list[SmoothedTrajectory]:
     """The drives with the white levels that they have beside correlated errors; empty: the same.
 
     Without these, the accelerometer's level takes up a part of an error of the fixes, and hides it.
+    One that is smaller than all that are looked for (`open_errors.SIZES`) leaves them as they are.
     """
-    if not any(t.data.scales for t in trajectories if isinstance(t, SmoothedTrajectory)):
+    white = evidence.sensor_sigmas
+    large = [e for e in noise.correlated if (e.sigmas >= SIZES[0] * white[e.kind]).any()]
+    if not large or not any(
+        t.data.scales for t in trajectories if isinstance(t, SmoothedTrajectory)
+    ):
         return []
     out, changed = [], False
     for before, after in zip(trajectories, with_noise(noise, trajectories), strict=True):
@@ -144,8 +150,7 @@ def _differ(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
     return any(max(ratio, 1.0 / ratio) > LARGEST_RIGHT for ratio in ratios)
 
 
-def _rather_errors(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
-    evidence = motion_evidence(trajectories)
+def _rather_errors(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
     kinds = _looked_for(noise, evidence)
     errors = open_errors(evidence, (), np.zeros(0), (), kinds, RATHER_NONE)
     opened = tuple(error.kind for error in errors)

@@ -24,7 +24,12 @@ from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import per_placement, refined, refinements
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
-from caliv_graph.calibration.sensor_noise import estimated_noise, with_floors, with_noise
+from caliv_graph.calibration.sensor_noise import (
+    estimated_noise,
+    noise_of_motion,
+    with_floors,
+    with_noise,
+)
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.calibration.structure import lidars_with_structure
@@ -87,8 +92,11 @@ def estimate_with_noise(
     used = usable(observations)
     if not used and structure.patches:
         with threadpool_limits(limits=1):
+            with progress.stage("estimating the noise of the sensors", None):
+                noise = noise_of_motion(trajectories, config.noise)
+                trajectories = with_noise(noise, trajectories)
             solved = solve_structure_and_ground(
-                trajectories, config, progress, tuple(grounds), structure
+                trajectories, config, progress, tuple(grounds), structure, noise
             )
             return solution_without_target(solved), tuple(trajectories)
     problem = pose_problem(used, trajectories, config)

@@ -38,7 +38,13 @@ from caliv_graph.config.range_errors import RangeErrors, range_errors
 from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
 from caliv_graph.targets.ground.planes import ground_floors
+from caliv_graph.trajectory.correlated import MOVES
 from caliv_graph.trajectory.effects import ErrorEffects, error_effects, smoothed_in_time
+from caliv_graph.trajectory.error_likelihood import (
+    ErrorLikelihood,
+    error_likelihood,
+    white_sigmas,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -65,12 +71,16 @@ class Evidence:
         by_pose: (N, 6 p) derivatives by right perturbations of p poses.
         white: name of `LEVELS` -> (N, N) covariance at sigma 1.
         effects: per drive, the columns of its poses in `by_pose`, and what errors do to them.
+        motion: per drive, what its motion data say of these errors.
+        sensor_sigmas: kind of sensor -> (3,) white 1 sigma of one measurement, map axes.
     """
 
     observed: Observed
     by_pose: Array
     white: dict[str, Array]
     effects: list[tuple[IntArray, dict[str, ErrorEffects]]] = field(default_factory=list)
+    motion: list[ErrorLikelihood] = field(default_factory=list)
+    sensor_sigmas: dict[str, Array] = field(default_factory=dict)
     _moved: dict[tuple[str, tuple[int, ...]], list[tuple[Array, IntArray]]] = field(
         default_factory=dict
     )
@@ -89,6 +99,15 @@ class Evidence:
             for a in range(len(axes)):
                 out += smoothed_in_time(moved[:, a], stamps_ns, time_s) @ moved[:, a].T
         return out
+
+
+def motion_evidence(trajectories: Sequence[VehicleTrajectory]) -> Evidence:
+    """What the motion data of smoothed drives say of their sensors, without any LiDAR."""
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    motion = [error_likelihood(t, kinds) for t in smoothed for kinds in [_kinds(t)] if kinds]
+    nothing = Observed(np.zeros(1), np.ones((1, 1)), np.ones(1), np.eye(1))
+    sigmas = _sensor_sigmas(smoothed)
+    return Evidence(nothing, np.zeros((1, 6)), {}, motion=motion, sensor_sigmas=sigmas)
 
 
 @dataclass
@@ -148,7 +167,7 @@ def linearised_evidence(
             *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
         )
     known = scipy.linalg.block_diag(*(row.known for row in rows))
-    effects, inputs, scales = [], np.zeros((starts[-1], 0)), np.zeros(0)
+    effects, motion, inputs, scales = [], [], np.zeros((starts[-1], 0)), np.zeros(0)
     drives = _of_drives(problem, poses, trajectories)
     if drives:
         # What the user typed may be wrong: an arm that is off moves the poses as slowly as the
@@ -163,12 +182,17 @@ def linearised_evidence(
         information = of.trajectory.joint_information(of.stamps_ns)[0]
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
-        effects.append((of.columns, _effects(of.trajectory, of.stamps_ns)))
+        kinds = _kinds(of.trajectory)
+        found = error_effects(of.trajectory, of.stamps_ns, kinds)
+        effects.append((of.columns, {effect.kind: effect for effect in found}))
+        if kinds:
+            motion.append(error_likelihood(of.trajectory, kinds))
     weak = partial(_weak, problem, range_errors(state.config.noise))
     ridge = np.concatenate([*(weak(key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
-    return Evidence(observed, by_pose, white, effects)
+    sigmas = _sensor_sigmas([of.trajectory for of in drives.values()])
+    return Evidence(observed, by_pose, white, effects, motion, sigmas)
 
 
 @dataclass(frozen=True)
@@ -195,12 +219,20 @@ def _of_drives(
     return out
 
 
-def _effects(trajectory: SmoothedTrajectory, stamps_ns: Sequence[int]) -> dict[str, ErrorEffects]:
-    """What errors that are correlated over time do to the poses; none if some are in use."""
+def _kinds(trajectory: SmoothedTrajectory) -> list[str]:
+    """Sensors that a drive has and whose errors may be correlated; none if some are in use."""
     if trajectory.correlated:
-        return {}
-    kinds = [kind for kind in ("gnss", "orientation") if kind in trajectory.factor_kinds]
-    return {of.kind: of for of in error_effects(trajectory, stamps_ns, kinds)}
+        return []
+    return [kind for kind in MOVES if kind in trajectory.factor_kinds]
+
+
+def _sensor_sigmas(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Array]:
+    """Sensor -> (3,) white 1 sigma of one measurement: the median of the drives."""
+    found: dict[str, list[Array]] = {}
+    for trajectory in trajectories:
+        for kind in _kinds(trajectory):
+            found.setdefault(kind, []).append(white_sigmas(trajectory.data, kind))
+    return {kind: np.median(sigmas, axis=0) for kind, sigmas in found.items()}
 
 
 def _weak(problem: Problem, ranges: RangeErrors, key: int, size: int) -> Array:

@@ -93,6 +93,7 @@ def solve_structure_and_ground(
     progress: Progress,
     grounds: tuple[GroundObservation, ...],
     structure: StructureEvidence,
+    noise: SensorNoise | None = None,
 ) -> StructureSolve:
     """Solves for the extrinsics by structure and ground.
 
@@ -102,6 +103,7 @@ def solve_structure_and_ground(
         progress: reports every stage.
         grounds: the ground at the poses of `kept_stamps`.
         structure: the patches.
+        noise: of the drives; None: the usual figures.
 
     Raises:
         TargetError: structure says nothing, or the mode is the paper's, which needs a target.
@@ -109,7 +111,7 @@ def solve_structure_and_ground(
     """
     if config.solve.mode == "staged":
         raise TargetError("solve.mode staged needs a target", "Set it to auto or joint")
-    noise = usual_noise(config.noise)
+    noise = noise or usual_noise(config.noise)
     kept = kept_stamps(structure.patches)
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
     begun = time.perf_counter()

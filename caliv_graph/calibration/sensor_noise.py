@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.calibration.evidence import Evidence, linearised_evidence
+from caliv_graph.calibration.evidence import Evidence, linearised_evidence, motion_evidence
 from caliv_graph.calibration.noise import LOG_SPREAD
+from caliv_graph.calibration.open_errors import RATHER_NONE, SIZES, of_expected_size, open_errors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -26,6 +27,7 @@ from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.variances import LARGEST_RIGHT
 
 EVIDENCE = 3.0
 """Gain of the log-likelihood from which an error is taken to be correlated over time: one for each
@@ -69,6 +71,9 @@ SLOW: Mapping[str, Slow] = {
 
 START_TIMES_S = (8.0, 40.0)
 
+OPEN = "expected: LiDARs and motion data leave it open"
+"""Source of the figure of an error whose size is integrated out."""
+
 
 @dataclass(frozen=True)
 class SensorNoise:
@@ -78,12 +83,14 @@ class SensorNoise:
         heave_m: 1 sigma of the heave.
         floors: (3,) 1 sigma of (a, b, distance) of a ground plane by the waves of the ground.
         correlated: errors of sensors that are correlated over time.
+        opened: kinds of those that nothing shows (`open_errors.py`).
         levels: for the report.
     """
 
     heave_m: float
     floors: Array
     correlated: tuple[CorrelatedError, ...] = ()
+    opened: tuple[str, ...] = ()
     levels: tuple[NoiseLevel, ...] = ()
 
 
@@ -98,7 +105,57 @@ def estimated_noise(
     """
     noise = state.config.noise
     evidence = linearised_evidence(state, registrations, trajectories)
-    return usual_noise(noise) if evidence is None else estimated(evidence, noise)
+    if evidence is None:
+        return noise_of_motion(trajectories, noise)
+    found = estimated(evidence, noise)
+    if again := _with_other_levels(found, evidence, trajectories):
+        evidence = replace(evidence, motion=motion_evidence(again).motion)
+        found = estimated(evidence, noise)
+    return found
+
+
+def noise_of_motion(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
+    """`usual_noise`, and the correlated errors that the motion data alone rather have than not."""
+    evidence = motion_evidence(trajectories)
+    found = _rather_errors(evidence, noise)
+    again = _with_other_levels(found, evidence, trajectories)
+    return _rather_errors(motion_evidence(again), noise) if again else found
+
+
+def _with_other_levels(
+    noise: SensorNoise, evidence: Evidence, trajectories: Sequence[VehicleTrajectory]
+) -> list[SmoothedTrajectory]:
+    """The drives with the white levels that they have beside correlated errors; empty: the same.
+
+    Without these, the accelerometer's level takes up a part of an error of the fixes, and hides it.
+    One that is smaller than all that are looked for (`open_errors.SIZES`) leaves them as they are.
+    """
+    white = evidence.sensor_sigmas
+    large = [e for e in noise.correlated if (e.sigmas >= SIZES[0] * white[e.kind]).any()]
+    if not large or not any(
+        t.data.scales for t in trajectories if isinstance(t, SmoothedTrajectory)
+    ):
+        return []
+    out, changed = [], False
+    for before, after in zip(trajectories, with_noise(noise, trajectories), strict=True):
+        if isinstance(before, SmoothedTrajectory) and isinstance(after, SmoothedTrajectory):
+            changed |= _differ(before.data.scales, after.data.scales)
+            out.append(replace(after, correlated=()))
+    return out if changed else []
+
+
+def _differ(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether a scale on stated sigmas is another one, by more than is left alone."""
+    ratios = [one.get(name, 1.0) / other.get(name, 1.0) for name in {*one, *other}]
+    return any(max(ratio, 1.0 / ratio) > LARGEST_RIGHT for ratio in ratios)
+
+
+def _rather_errors(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
+    kinds = _looked_for(noise, evidence)
+    errors = open_errors(evidence, (), np.zeros(0), (), kinds, RATHER_NONE)
+    opened = tuple(error.kind for error in errors)
+    found = replace(_usual(noise), correlated=errors, opened=opened)
+    return replace(found, levels=_levels(found, noise, ()))
 
 
 def usual_noise(noise: NoiseConfig) -> SensorNoise:
@@ -120,9 +177,9 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
         "ground_distance": noise.ground_distance_m,
     }
     names = [name for name in evidence.white if given.get(name) is None]
-    for name, sigma in given.items():
-        if sigma is not None and name in evidence.white:
-            evidence.observed.known[:] += sigma**2 * evidence.white[name]
+    stated = [s**2 * evidence.white[n] for n, s in given.items() if s and n in evidence.white]
+    known = np.sum([evidence.observed.known, *stated], axis=0)
+    evidence = replace(evidence, observed=replace(evidence.observed, known=known))
     best = _fitted(evidence, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:
@@ -135,10 +192,15 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
             break
         best = better
         kinds.remove(start[0])
+    parts = [evidence.white[name] for name in names]
+    shown = of_expected_size(evidence, parts, best.white, best.errors)
+    opened = open_errors(evidence, parts, best.white, shown, kinds)
     values = dict(zip(names, best.white.tolist(), strict=True))
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
-    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, best.errors)
+    errors = (*shown, *opened)
+    kinds = [error.kind for error in opened]
+    fitted = SensorNoise(values.get("heave", usual.heave_m), floors, errors, tuple(kinds))
     return replace(fitted, levels=_levels(fitted, noise, names))
 
 
@@ -150,12 +212,17 @@ def heave_of(levels: Sequence[NoiseLevel]) -> float:
 def with_noise(
     noise: SensorNoise, trajectories: Sequence[VehicleTrajectory]
 ) -> list[VehicleTrajectory]:
-    """The trajectories, smoothed again where a sensor's error was found to be correlated."""
+    """The trajectories, smoothed again where a sensor's error is correlated.
+
+    An error that nothing shows contradicts no stated sigma: those that held still hold.
+    """
+    open_only = len(noise.opened) == len(noise.correlated)
     out: list[VehicleTrajectory] = []
     for t in trajectories:
         if noise.correlated and isinstance(t, SmoothedTrajectory) and t.data is not None:
             stamps = t.trajectory.stamps_ns
-            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated)
+            known: dict[str, float] | None = {} if open_only and not t.data.scales else None
+            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)
         out.append(t)
     return out
 
@@ -196,7 +263,8 @@ def _levels(
             parts = {"": error.sigmas[0]}
         for part, sigma in parts.items():
             name = "_".join(filter(None, (error.kind, "correlated", part)))
-            out.append(NoiseLevel(name, sigma, unit, "residuals of the LiDARs", error.time_s))
+            told = OPEN if error.kind in noise.opened else "residuals of the LiDARs"
+            out.append(NoiseLevel(name, sigma, unit, told, error.time_s))
     return tuple(out)
 
 
@@ -266,18 +334,17 @@ def _cost(
         slow += [evidence.slow(kind, group, time_s) for group in groups]
         sigmas += range(at, at + len(groups))
         at = times[-1] + 1
-    value, by_sigma = evidence.observed.cost([*parts, *slow], x[sigmas])
     slope = np.zeros(len(x))
-    slope[sigmas] = by_sigma
     if not slopes:
-        return value, slope
+        return evidence.observed.value([*parts, *slow], x[sigmas]), slope
+    value, slope[sigmas] = evidence.observed.cost([*parts, *slow], x[sigmas])
     step = 1e-2
     for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
         first = sum(len(SLOW[k].groups) for k in kinds[:number])
         groups = SLOW[kind].groups
         later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
         changed = [*slow[:first], *later, *slow[first + len(groups) :]]
-        slope[index] = (evidence.observed.cost([*parts, *changed], x[sigmas])[0] - value) / step
+        slope[index] = (evidence.observed.value([*parts, *changed], x[sigmas]) - value) / step
     return value, slope
 
 
@@ -314,5 +381,5 @@ def _looked_for(noise: NoiseConfig, evidence: Evidence) -> list[str]:
         "gnss": (noise.gnss_correlated_horizontal_m, noise.gnss_correlated_vertical_m),
         "orientation": (noise.orientation_correlated_deg,),
     }
-    has = {kind for _, of in evidence.effects for kind in of}
+    has = {kind for _, of in evidence.effects for kind in of} | evidence.sensor_sigmas.keys()
     return [k for k, values in configured.items() if k in has and all(v is None for v in values)]

@@ -109,6 +109,16 @@ class Chain:
         self.border[a[edge], r[edge], column[edge] - width * n] += value[edge]
         self.corner[row[common] - width * n, column[common] - width * n] += value[common]
 
+    def leading(self, width: int) -> Chain:
+        """The chain of the first `width` coordinates of every state, the others held."""
+        first = slice(0, width)
+        return Chain(
+            self.diagonal[:, first, first],
+            self.coupling[:, first, first],
+            self.border[:, first],
+            self.corner,
+        )
+
     def only(self, wanted: IntArray) -> Chain:
         """The chain of the states of ascending indices `wanted` (m,), all others eliminated."""
         keep = set(wanted.tolist())

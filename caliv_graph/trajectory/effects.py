@@ -58,31 +58,31 @@ def error_effects(
     J, _ = linearised(linear, trajectory.factor_kinds, kinds, R, common)
     both = Chain.zero(n, width, len(common))
     both.add(J)
-    of_state = slice(0, STATE)
-    states = Chain(
-        both.diagonal[:, of_state, of_state],
-        both.coupling[:, of_state, of_state],
-        both.border[:, of_state],
-        both.corner,
-    )
     wanted = (STATE * i[:, None] + np.arange(POSE)).ravel()
-    inverse = inverse_columns(states, wanted)
+    inverse = inverse_columns(both.leading(STATE), wanted)
     by_state = inverse[: n * STATE].reshape(n, STATE, len(wanted))
     Ad = np.asarray(trajectory.T_vehicle_imu.AdjointMap())
     out = []
     for number, kind in enumerate(kinds):
         of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
         # An error of a sensor acts at its own node: the coupling of neighbours has none.
-        gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, of_state, of_error])
+        gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, :STATE, of_error])
         gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
         shape = gain.shape
         turned = Ad @ gain.reshape(len(i), POSE, -1)
-        stamps = trajectory.nodes_ns
-        step = (stamps - stamps[0]) // STEP_NS
-        first = np.flatnonzero(np.diff(step, prepend=-1))
-        middle = stamps[0] + step[first] * STEP_NS + STEP_NS // 2
+        first, middle = error_steps(trajectory.nodes_ns)
         out.append(ErrorEffects(kind, middle, np.add.reduceat(turned.reshape(shape), first, 2)))
     return tuple(out)
+
+
+def error_steps(nodes_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """First nodes (m,) of the steps over which an error is taken to be constant, and middles (m,).
+
+    `nodes_ns` (n,) are stamps; the middles too.
+    """
+    step = (nodes_ns - nodes_ns[0]) // STEP_NS
+    first = np.flatnonzero(np.diff(step, prepend=-1))
+    return first, nodes_ns[0] + step[first] * STEP_NS + STEP_NS // 2
 
 
 def smoothed_in_time(rows: Array, stamps_ns: IntArray, time_s: float) -> Array:

@@ -9,12 +9,20 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.evidence import Evidence
-from caliv_graph.calibration.sensor_noise import LEVELS, SLOW, estimated, with_floors
+from caliv_graph.calibration.sensor_noise import (
+    LEVELS,
+    OPEN,
+    SLOW,
+    estimated,
+    noise_of_motion,
+    with_floors,
+)
 from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
+from tests.trajectory.test_variances import recorded, shifted, smoothed
 
 POSES = 16
 STEPS = 48
@@ -100,6 +108,34 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
 
 
+def test_an_error_that_the_lidars_neither_show_nor_rule_out_is_called_open() -> None:
+    white_m = 5e-3
+    made = replace(evidence(2, 5e-3, None), sensor_sigmas={"gnss": np.full(3, white_m)})
+
+    found = estimated(made, NoiseConfig())
+
+    (error,) = found.correlated
+    assert found.opened == ("gnss",)
+    assert 0.02 < error.sigmas[0] / white_m < 0.7
+    sources = {level.name: level.source for level in found.levels}
+    assert sources["gnss_correlated_vertical"] == OPEN
+    assert estimated(made, NoiseConfig(gnss_correlated_horizontal_m=0.0)).correlated == ()
+    precise = replace(made, sensor_sigmas={"gnss": np.full(3, 0.05)})
+    assert estimated(precise, NoiseConfig()).correlated == ()  # it would show
+
+
+def test_an_error_that_the_lidars_show_has_its_expected_size() -> None:
+    true = CorrelatedError("gnss", (0.02, 0.02, 0.02), 10.0)
+    made = replace(evidence(2, 5e-3, true), sensor_sigmas={"gnss": np.full(3, 0.02)})
+
+    found = estimated(made, NoiseConfig())
+
+    (error,) = found.correlated
+    assert found.opened == ()
+    assert error.sigmas == pytest.approx(true.sigmas, rel=0.5)
+    assert OPEN not in {level.source for level in found.levels}
+
+
 def test_a_lever_arm_that_is_off_is_no_error_of_the_fixes_once_it_is_free() -> None:
     """Its effect turns with the vehicle, as slowly as an error of seconds."""
     heading = np.linspace(0.0, 4.0 * math.pi, POSES)
@@ -149,3 +185,27 @@ def test_floors_are_replaced() -> None:
 
     expected = replace(observation).cov + np.diag(after**2 - before**2)
     assert changed.cov == pytest.approx(expected)
+
+
+def test_without_lidars_the_motion_data_must_rather_have_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Fixes that swing by 50 mm, 35 mm RMS; the accelerometer's level has taken up most of it."""
+    motion = recorded()
+    assert motion.gnss is not None
+    seconds = 1e-9 * (motion.gnss.stamps_ns - motion.gnss.stamps_ns[0])
+    wave = smoothed(shifted(motion, 0.05 * np.sin(seconds)))
+    assert wave.data.scales["accelerometer"] > 3.0
+
+    found = noise_of_motion([wave], NoiseConfig())
+
+    (error,) = found.correlated
+    assert error.kind == "gnss"
+    assert found.opened == ("gnss",)
+    assert 0.02 < error.sigmas[0] < 0.04
+    assert {level.source for level in found.levels} == {"the usual figure", OPEN}
+    none = NoiseConfig(gnss_correlated_horizontal_m=0.0, orientation_correlated_deg=0.0)
+    assert noise_of_motion([wave], none).correlated == ()
+    assert noise_of_motion([], NoiseConfig()).correlated == ()
+    monkeypatch.setattr("caliv_graph.calibration.sensor_noise.RATHER_NONE", 0.0)
+    assert noise_of_motion([wave], NoiseConfig()).correlated == ()

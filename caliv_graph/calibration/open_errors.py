@@ -1,0 +1,150 @@
+"""Errors that are correlated over time, of a size that neither LiDARs nor motion data tell.
+
+The size is integrated out (`trajectory/README.md`, section 9). Where nothing tells it, neither zero
+nor the most likely value is a sigma to trust.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caliv_graph.calibration.evidence import Evidence
+from caliv_graph.products import Array
+from caliv_graph.trajectory.correlated import AXES, CorrelatedError
+
+NONE = 0.5
+"""Prior probability that the errors of a sensor are white: neither is presumed."""
+
+SIZES = np.geomspace(0.1, 2.0, 6)
+"""Of a correlated error, over the white sigma of the sensor: equally probable. The sigma that a
+driver states is meant for the whole error: one of twice as much shows itself, and a tenth does not
+matter."""
+
+TIMES_S = np.geomspace(1.0, 100.0, 5)
+"""Correlation times, equally probable: shorter ones are as good as white, longer ones constant over
+a drive."""
+
+SURELY_NONE = 0.95
+"""Posterior probability from which the errors count as white: nothing is smoothed again."""
+
+
+RATHER_NONE = 0.5
+"""The same where motion data alone tell. On a sound drive they leave it at 0.6 to 0.8, and sigmas
+by walls and ground would grow by a quarter to two thirds."""
+
+
+@dataclass(frozen=True)
+class OpenError:
+    """A correlated error whose size and time are integrated out.
+
+    Attributes:
+        none: posterior probability that there is none.
+        expected: the Gauss-Markov error of the expected variance, that probability included.
+    """
+
+    none: float
+    expected: CorrelatedError
+
+
+def of_expected_size(
+    evidence: Evidence, parts: Sequence[Array], sigmas: Array, found: Sequence[CorrelatedError]
+) -> tuple[CorrelatedError, ...]:
+    """The errors of greatest likelihood with their expected sizes and times instead.
+
+    The greatest likelihood of an error that barely shows is too small as often as too large, and
+    sigmas would be wrong by as much. Those beyond `SIZES` stay. Arguments as in `open_errors`.
+    """
+    known = [(s**2) * part for s, part in zip(sigmas, parts, strict=True)]
+    out = list(found)
+    for i, error in enumerate(found):
+        white = evidence.sensor_sigmas.get(error.kind)
+        if white is not None and (np.array(error.sigmas) <= SIZES[-1] * white).all():
+            others = [*out[:i], *out[i + 1 :]]
+            out[i] = open_error(evidence, known, others, error.kind).expected
+    return tuple(out)
+
+
+def open_errors(
+    evidence: Evidence,
+    parts: Sequence[Array],
+    sigmas: Array,
+    found: Sequence[CorrelatedError],
+    kinds: Sequence[str],
+    none_from: float = SURELY_NONE,
+) -> tuple[CorrelatedError, ...]:
+    """The errors of some sensors that may be there, of expected size; the most probable first.
+
+    Args:
+        evidence: of LiDARs and motion data.
+        parts: (N, N) covariances at sigma 1 of the white errors of what the LiDARs see.
+        sigmas: of these.
+        found: errors whose size is known.
+        kinds: of the sensors that are left.
+        none_from: posterior probability of none from which there is none.
+    """
+    known = [(s**2) * part for s, part in zip(sigmas, parts, strict=True)]
+    out: list[CorrelatedError] = []
+    left = [kind for kind in kinds if kind in evidence.sensor_sigmas]
+    while left:
+        posteriors = [open_error(evidence, known, [*found, *out], kind) for kind in left]
+        first = min(posteriors, key=lambda of: of.none)
+        if first.none > none_from:
+            break
+        out.append(first.expected)
+        left.remove(first.expected.kind)
+    return tuple(out)
+
+
+def open_error(
+    evidence: Evidence, known: Sequence[Array], found: Sequence[CorrelatedError], kind: str
+) -> OpenError:
+    """The posterior of one sensor's error.
+
+    `known` are (N, N) covariances of all other errors of what the LiDARs see, but for those of
+    `found`.
+    """
+    white = evidence.sensor_sigmas[kind]
+    others = [*known, *(_covariance(evidence, e.kind, np.array(e.sigmas), e.time_s) for e in found)]
+    total = [np.sum(others, axis=0)] if others else []
+    at_one = np.zeros(len(total))
+    of_none = evidence.observed.value(total, at_one)
+    motion = [of.given(found) for of in evidence.motion]
+    gain = np.zeros((len(SIZES), len(TIMES_S)))
+    for j, time_s in enumerate(TIMES_S.tolist()):
+        moved = _covariance(evidence, kind, white, time_s)
+        seen = [
+            evidence.observed.value([*total, moved], np.append(at_one, math.log(size)))
+            for size in SIZES.tolist()
+        ]
+        unit = _error(kind, white, time_s)
+        gain[:, j] = of_none - np.array(seen) + sum(of.gains(unit, SIZES) for of in motion)
+    return _summary(kind, white, gain)
+
+
+def _summary(kind: str, white: Array, gain: Array) -> OpenError:
+    """From the gain of log-likelihood by each size (rows) and time (columns) over no error."""
+    highest = max(0.0, float(gain.max()))
+    none = NONE * math.exp(-highest)
+    weight = (1.0 - NONE) * np.exp(gain - highest) / gain.size
+    total = none + weight.sum()
+    variance = weight * SIZES[:, None] ** 2 / total
+    # Variance and slope at zero of the expected covariance.
+    time_s = float(variance.sum() / (variance / TIMES_S).sum())
+    expected = _error(kind, math.sqrt(variance.sum()) * white, time_s)
+    return OpenError(float(none / total), expected)
+
+
+def _error(kind: str, sigmas: Array, time_s: float) -> CorrelatedError:
+    east, north, up = sigmas.tolist()
+    return CorrelatedError(kind, (east, north, up), time_s)
+
+
+def _covariance(evidence: Evidence, kind: str, sigmas: Array, time_s: float) -> Array:
+    """(N, N) of what the LiDARs see, by an error with sigmas (3,) along the map's axes."""
+    return np.asarray(
+        sum(sigmas[axis] ** 2 * evidence.slow(kind, (axis,), time_s) for axis in range(AXES))
+    )

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.check import check
-from caliv_graph.calibration.choose import choose_static, displaced
+from caliv_graph.calibration.choose import choose_static, displaced, displaced_or_misguessed
 from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure_evidence import (
@@ -329,7 +329,9 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
         near, misplaced, observations = _targets([recording], trajectories, config, progress)
-        problems += (*misplaced, *displaced(observations, trajectories, near))
+        kept = [name for name in near.lidars if near.lidars[name] is config.lidars[name]]
+        said = displaced_or_misguessed(observations, trajectories, near, kept)
+        problems += (*misplaced, *said)
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         observations = None

@@ -71,7 +71,7 @@ def prior_factors(
     keys = [key(name) for name in names]
     if len(set(keys)) < len(keys):
         raise ExportError(
-            f"keys of {', '.join(names)} are not different: each LiDAR needs its own variable"
+            f"keys of {', '.join(names)} are not different: give each LiDAR its own variable"
         )
     order = list(calibration.lidars)
     rows = [6 * order.index(name) + axis for name in names for axis in range(6)]

@@ -243,10 +243,8 @@ class Bag:
             for name, text in DEFINITIONS.items():
                 store.register(get_types_from_msg(text, name))
             return store
-        raise RecordingError(
-            f"{self._path}: holds no definition of the type {type_name}. "
-            "Record the topic as another type, or with the driver's package sourced"
-        )
+        what = f"{self._path}: holds no definition of the type {type_name}"
+        raise RecordingError(what, "Record it with its package sourced, or as another type")
 
     @contextmanager
     def _readers(self) -> Iterator[list[_Reader]]:

@@ -4,9 +4,25 @@ The command line turns a `CalivError` into one line on stderr and exit code 2; a
 escapes is a defect of the program (exit code 1).
 """
 
+from __future__ import annotations
+
 
 class CalivError(Exception):
-    """Base of all errors that a user can cause and correct."""
+    """Base of all errors that a user can cause and correct.
+
+    Attributes:
+        what: the message without the remedy, which is wrong where another cause is known.
+        remedy: what to do about it, unless `what` says it.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        self.what = what
+        self.remedy = remedy
+        super().__init__(f"{what}. {remedy}" if remedy else what)
+
+    def __reduce__(self) -> tuple[type[CalivError], tuple[str, str]]:
+        """Copies between processes have the same two parts."""
+        return type(self), (self.what, self.remedy)
 
 
 class ConfigError(CalivError):
@@ -22,23 +38,24 @@ class TrajectoryError(CalivError):
 
 
 class TargetError(CalivError):
-    """The target was not found in the clouds.
-
-    Attributes:
-        what: the message without the remedy, which is wrong where another cause is known.
-    """
-
-    def __init__(self, what: str, remedy: str = "") -> None:
-        self.what = what
-        super().__init__(f"{what}. {remedy}" if remedy else what)
+    """The target was not found in the clouds."""
 
 
 class RegistrationError(CalivError):
     """The clouds of a target could not be registered to one shape."""
 
 
+_SOLVE_REMEDY = (
+    "Run 'caliv-graph inspect --config' and 'caliv-graph observability': check clocks and guesses, "
+    "and what the drive shows"
+)
+
+
 class SolveError(CalivError):
     """The factor graph could not be solved."""
+
+    def __init__(self, what: str, remedy: str = _SOLVE_REMEDY) -> None:
+        super().__init__(what, remedy)
 
 
 class ExportError(CalivError):

@@ -30,10 +30,11 @@ def pytest_configure(config: pytest.Config) -> None:
     if VARIABLE not in os.environ:
         raise pytest.UsageError(f"{VARIABLE}: give the file to write to")
 
-    def made(self: BaseException, *args: object) -> None:
-        Exception.__init__(self, *args)
-        if args:
-            _note(2, type(self).__name__, str(args[0]))
+    begin = CalivError.__init__
+
+    def made(self: CalivError, what: str, remedy: str = "") -> None:
+        begin(self, what, remedy)
+        _note(2, type(self).__name__, str(self))
 
     CalivError.__init__ = made  # type: ignore[method-assign]
     init = Calibration.__init__

@@ -31,12 +31,16 @@ PLUGIN = "scripts._messages"
 VARIABLE = "MESSAGES_FILE"
 
 REMEDY = re.compile(
-    r"(?:(?<=[.;:?)] )|(?<=, )|^)(?:or |and |then |first )?("
-    r"Add|Build|Calibrate|Check|Choose|Copy|Correct|Delete|Drive|Export|Free|Give|Install|Leave|"
-    r"Let|Lower|Make|Measure|Merge|Move|Name|Open|Pass|Put|Quote|Raise|Record|Recreate|Remove|"
-    r"Rename|Repair|Repeat|Run|Set|Start|State|Switch|Turn|Use|Wait|Widen|Write|"
-    r"add|check|choose|correct|give|install|leave|let|measure|move|name|put|remove|rename|run|set|"
-    r"use|write|expected|needs|must|known keys|did you mean|Is it|allowed)\b"
+    r"(?:(?<=[.;:?)] )|(?<=, )|^)(?:or |and |then |first |For [^.,;]{1,40} )?("
+    r"Add|Build|Calibrate|Check|Choose|Convert|Copy|Correct|Delete|Drive|Enter|Expand|Expected|"
+    r"Export|Free|Give|Install|Leave|Let|Lower|Make|Measure|Mend|Merge|Move|Name|Omit|Open|Pass|"
+    r"Put|Quote|Raise|Record|Recover|Recreate|Remove|Rename|Repair|Repeat|Run|Set|Split|Start|State|"
+    r"Switch|Take|Turn|Unpack|Use|Wait|Widen|Write|"
+    r"add|check|choose|convert|correct|enter|give|install|leave|let|make|measure|move|name|put|"
+    r"remove|rename|run|set|take|use|write|"
+    r"expected|needs|must|known keys|[Dd]id you mean|Is it|allowed|Topics that fit: [^n])\b"
+    r"|(?<= )must (?:be|not|lie|have|match|ascend|exceed)\b"
+    r"|(?<= )\S+ (?:rpy_deg )?about .{1,40}? would fit|(?<=: )vehicle_height .{1,40}? would fit"
 )
 """Where a message begins to say what to do: an imperative at the start of a clause, or what was
 expected."""

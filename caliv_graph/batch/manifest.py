@@ -91,7 +91,9 @@ class _JobEntry(_Settings):
     def _plain_name(cls, raw: Any) -> Any:
         name = _plain(raw, _NAME, "")
         if name.casefold() in RESERVED:
-            raise ValueError(f"is the name of a file of the batch: {', '.join(RESERVED)}")
+            raise ValueError(
+                f"is the name of a file of the batch, must be none of {', '.join(RESERVED)}"
+            )
         return name
 
     @field_validator("data", mode="before")
@@ -204,7 +206,7 @@ def _plain(raw: Any, pattern: re.Pattern[str], also: str) -> str:
     # One spelling of what looks the same.
     name = unicodedata.normalize("NFC", raw)
     if len(name) > MOST_CHARACTERS or len(name.encode(errors="replace")) > 2 * MOST_CHARACTERS:
-        raise ValueError(f"is too long: at most {MOST_CHARACTERS} characters")
+        raise ValueError(f"must have at most {MOST_CHARACTERS} characters")
     if not pattern.fullmatch(name):
         raise ValueError(
             f"must be letters, digits, {also}'_', '-' and '.', beginning with a letter or digit"

@@ -80,7 +80,7 @@ def check(
     try:
         suspects = ranked_suspects(solution, trajectories, motions, config, displaced)
     except (SolveError, TrajectoryError) as e:
-        untested = (*untested, f"the inputs were not tested against each other: {e}")
+        untested = (*untested, f"the inputs were not tested against each other: {e.what}")
     found = consistency.contradictions(
         consistency.CheckInputs(
             lidars=calibration.lidars,
@@ -122,7 +122,7 @@ def _between_parts(
     try:
         return score_tests(solution, trajectories, trusted), ()
     except SolveError as e:
-        return (), (f"parts of the drive were not tested against each other: {e}",)
+        return (), (f"parts of the drive were not tested against each other: {e.what}",)
 
 
 def unexplained(

@@ -9,7 +9,7 @@ is visible; and one place, the guesses with their sigmas, must explain all centr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -17,14 +17,18 @@ import numpy as np
 
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
+from caliv_graph.conventions import AXES
 from caliv_graph.errors import RegistrationError, TargetError
-from caliv_graph.geometry.se3 import unstack, vehicle_axes_difference
-from caliv_graph.products import Array, TargetObservation
+from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack, vehicle_axes_difference
+from caliv_graph.products import Array, LidarResult, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.uncertainty.consistency import against_guesses
+from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
+from caliv_graph.wording.contradictions import contradiction_sentence
 
 CLOUDS = 16
 """Clouds of a LiDAR that decide: evenly spread over the views."""
@@ -131,15 +135,56 @@ def displaced(
     The clouds of a circle to the left agree on one place, and those of a circle to the right on
     another: the registration takes both for one target, and no residual of the graph shows it.
     """
-    out = []
-    for observation in observations:
-        if not observation.clouds:
-            continue
-        found = _agreement(observation, trajectories[observation.clouds[0].drive], config)
-        cause = cause_of(found, config)
+    found = _agreements(observations, trajectories, config)
+    causes = [(observation.name, cause_of(of, config)) for observation, of in found]
+    return tuple(f"{name}: {cause}" for name, cause in causes if cause is not None)
+
+
+def displaced_or_misguessed(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    given: Collection[str],
+) -> tuple[str, ...]:
+    """The same, and guesses with which the clouds of an object are not where they are seen.
+
+    Guesses that are off alike bring the clouds of all LiDARs to one place, but not where the poses
+    have it: the fit of the place moves them by many of their sigmas. The solve says the same, in
+    the same words. `given` are the LiDARs whose guess is tested.
+    """
+    out: dict[str, None] = {}
+    for observation, of in _agreements(observations, trajectories, config):
+        cause = cause_of(of, config)
         if cause is not None:
-            out.append(f"{observation.name}: {cause}")
+            out[f"{observation.name}: {cause}"] = None
+        elif of.place is not None and of.sightings is not None and of.scatter_m <= AGREE_M:
+            speed_m_s = float(np.median(np.linalg.norm(of.sightings.twists[:, 3:], axis=1)))
+            lidars = {n: _as_result(n, of.place, config) for n in of.place.cov if n in given}
+            found = against_guesses(lidars, speed_m_s)
+            out.update(dict.fromkeys(map(contradiction_sentence, found)))
     return tuple(out)
+
+
+def _as_result(name: str, place: Place, config: Config) -> LidarResult:
+    """A LiDAR as the fit of a place has it; an axis is determined if it is known better by it."""
+    guess = configured_guess(config, name)
+    T, cov = place.T_vehicle_lidar[name], place.cov[name]
+    axes = right_to_vehicle_axes(T)
+    known = np.sqrt(np.diag(axes @ cov @ axes.T)) <= UNDETERMINED_RATIO * guess.sigmas
+    determined = dict(zip(AXES, known.tolist(), strict=True))
+    return LidarResult(T, cov, determined, scans_used=0, saw_target=True, guess=guess)
+
+
+def _agreements(
+    observations: Sequence[TargetObservation],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+) -> list[tuple[TargetObservation, Agreement]]:
+    return [
+        (seen, _agreement(seen, trajectories[seen.clouds[0].drive], config))
+        for seen in observations
+        if seen.clouds
+    ]
 
 
 def cause_of(of: Agreement, config: Config) -> str | None:

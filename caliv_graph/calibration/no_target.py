@@ -122,7 +122,9 @@ def solve_structure_and_ground(
     others = lidars_with_structure(terms)
     if not others:
         raise TargetError(
-            "the LiDARs see neither a target nor structure that stands still, such as walls"
+            "the LiDARs see neither a target nor structure that stands still, such as walls",
+            "Drive past walls or a chair within 20 m, and check topics and guesses with "
+            "'caliv-graph inspect --html'",
         )
     grounds = other_grounds(grounds, terms)
     times = {"structure": time.perf_counter() - begun}

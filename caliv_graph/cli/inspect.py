@@ -55,6 +55,7 @@ def inspect(
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.report.bag_inspection import add_any_targets, inspect_any
     from caliv_graph.report.inspection_table import inspection_table
+    from caliv_graph.wording.inspection import untested_guesses_sentence
 
     if html is not None:
         check_output_file(html, force)
@@ -73,6 +74,9 @@ def inspect(
             problems = (*inspection.problems, *seen.problems)
             inspection = replace(inspection, findings=seen.findings, problems=problems)
             warnings += [*(found.sentence for found in seen.findings), *seen.problems, *seen.notes]
+            given = [name for name, lidar in settings.lidars.items() if lidar.initial is not None]
+            if seen.trajectory is not None and not seen.observations and given:
+                warnings.append(untested_guesses_sentence(given))
         scene = None if html is None else _scene(data, recording, settings, seen, progress)
         warnings = [*recording.warnings(), *warnings]
     if html is not None and scene is not None:

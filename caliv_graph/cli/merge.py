@@ -45,7 +45,7 @@ def merge(
     )
 
     if len(calibrations) < 2:
-        raise ConfigError(f"{calibrations[0]}: is one calibration; merge needs two or more")
+        raise ConfigError(f"{calibrations[0]}: is one calibration. Give two or more")
     each_once(calibrations, "", "a calibration")
     check_output_file(out, force)
     merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)

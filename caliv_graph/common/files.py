@@ -258,5 +258,5 @@ def each_once(paths: Sequence[Path], where: str, what: str) -> None:
     seen: set[Path] = set()
     for path in paths:
         if path.resolve() in seen:
-            raise ConfigError(f"{where}{path}: given twice; {what} counts once")
+            raise ConfigError(f"{where}{path}: given twice, and {what} counts once. Give it once")
         seen.add(path.resolve())

@@ -7,6 +7,16 @@ import os
 import stat
 from pathlib import Path
 
+_STEPS = {
+    errno.EISDIR: "Give a file",
+    errno.ENOENT: "Check the path",
+    errno.ENAMETOOLONG: "Check the path",
+    errno.EACCES: "Check its permissions",
+    errno.EINVAL: "Give a file",
+    errno.EFBIG: "",
+}
+"""What to do about a file that cannot be read; a file that is too large says so itself."""
+
 MOST_BYTES = 4 * 1024**3
 """Of a file that is read whole: no cloud is larger, but a recording given by mistake may be."""
 
@@ -28,3 +38,10 @@ def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         message = f"has {size:.0f} MB, expected at most {most:.0f} MB. Is it the right file?"
         raise OSError(errno.EFBIG, message, os.fspath(path))
     return path.read_bytes()
+
+
+def unreadable(error: OSError) -> str:
+    """Why a file cannot be read, and what to do: `cannot be read: Is a directory. Give a file`."""
+    step = _STEPS.get(error.errno or 0, "Check the path, its permissions and the disk")
+    why = f"cannot be read: {error.strerror or error}"
+    return f"{why}. {step}" if step else why

@@ -35,8 +35,17 @@ _WHOLE_NUMBER = re.compile(r"^[-+]?(0|[1-9][0-9]*)$")
 """Without the leading zeros, underscores, colons and bases of YAML 1.1."""
 
 
+_CORRECT = "Correct this line or the one before: brackets, quotes, colons, spaces before keys"
+"""What to do where the parser stops."""
+
+
 class YamlProblemError(Exception):
-    """A problem of a text, with its line where that is known: `in line 3: ...`."""
+    """A problem of a text, with its line where that is known, and what to do: `in line 3: ...`."""
+
+
+def _refused(mark: Any, problem: str) -> YamlProblemError:
+    """What this module itself refuses, at a place of the text."""
+    return YamlProblemError(f"in line {mark.line + 1}: {problem}")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -52,19 +61,16 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
                     continue
                 if isinstance(key_node, yaml.ScalarNode):
                     if key_node.value in seen:
-                        raise yaml.MarkedYAMLError(
-                            problem=f"key '{key_node.value}' is given twice",
-                            problem_mark=key_node.start_mark,
-                        )
+                        twice = f"key '{key_node.value}' is given twice. Remove one of them"
+                        raise _refused(key_node.start_mark, twice)
                     seen.add(key_node.value)
         return super().construct_mapping(node, deep=deep)
 
     def construct_yaml_int(self, node: Any) -> Any:
         """Builds a whole number."""
         if isinstance(node, yaml.ScalarNode) and len(node.value) > MOST_DIGITS:
-            raise yaml.MarkedYAMLError(
-                problem=f"a number of {len(node.value)} digits", problem_mark=node.start_mark
-            )
+            digits = f"a number of {len(node.value)} digits. Write it in quotes if it is text"
+            raise _refused(node.start_mark, digits)
         return super().construct_yaml_int(node)
 
 
@@ -88,14 +94,14 @@ def parse_yaml(text: str) -> Any:
     except yaml.MarkedYAMLError as e:
         line = f"in line {e.problem_mark.line + 1}: " if e.problem_mark else ""
         problem = e.problem or e.context or "cannot be read"
-        raise YamlProblemError(f"{line}{problem[:_MOST_CHARACTERS]}") from None
+        raise YamlProblemError(f"{line}{problem[:_MOST_CHARACTERS]}. {_CORRECT}") from None
     except yaml.YAMLError as e:
         said = (str(e).splitlines() or ["cannot be read"])[0]
-        raise YamlProblemError(said[:_MOST_CHARACTERS]) from None
+        raise YamlProblemError(f"{said[:_MOST_CHARACTERS]}. {_CORRECT}") from None
     except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as e:
         # The loader trusts a tag: !!int of nothing, !!timestamp of no time.
         said = str(e)[:_MOST_CHARACTERS]
-        raise YamlProblemError(f"a value does not fit its type ({said})") from None
+        raise YamlProblemError(f"a value does not fit its tag ({said}). Remove the tag") from None
 
 
 def _check_size(text: str) -> None:
@@ -109,7 +115,10 @@ def _check_size(text: str) -> None:
             values += 1
             open_nodes.append((event.anchor, values))
             if len(open_nodes) > MOST_LEVELS:
-                _refuse(event, f"lists or keys are nested deeper than {MOST_LEVELS} levels")
+                raise _refused(
+                    event.start_mark,
+                    f"over {MOST_LEVELS} levels of lists or keys. Give another file",
+                )
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, before = open_nodes.pop()
             if anchor is not None:
@@ -120,13 +129,12 @@ def _check_size(text: str) -> None:
                 sizes[event.anchor] = 1
         elif isinstance(event, yaml.AliasEvent):
             if any(anchor == event.anchor for anchor, _ in open_nodes):
-                _refuse(event, f"'*{event.anchor}' contains itself")
+                raise _refused(
+                    event.start_mark, f"'*{event.anchor}' contains itself. Write out its values"
+                )
             size = sizes.get(event.anchor or "", 1)
             values += size
             aliased += size
             if aliased > MOST_VALUES_BY_ALIAS + 10 * (values - aliased):
-                _refuse(event, f"aliases expand to {aliased} values, far more than are written")
-
-
-def _refuse(event: Any, problem: str) -> None:
-    raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+                many = f"aliases expand to {aliased} values, far more than are written"
+                raise _refused(event.start_mark, f"{many}. Write them out")

@@ -133,7 +133,10 @@ class LidarConfig(Section):
     @model_validator(mode="after")
     def _trusts_something(self) -> LidarConfig:
         if self.fixed and self.initial is None:
-            raise ValueError("fixed: true trusts the initial guess, and initial is not given")
+            raise ValueError(
+                "fixed: true trusts the initial guess, and initial is not given: enter it, or "
+                "remove fixed"
+            )
         return self
 
     @property

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.common.yaml_text import YamlProblemError, parse_yaml
 from caliv_graph.config.model import Config
 from caliv_graph.config.sections import first_problem
@@ -31,13 +31,13 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
     try:
         text = read_input(path, _MOST_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
-        raise error(f"{path}: no such file") from None
+        raise error(f"{path}: no such file. Check the path") from None
     except IsADirectoryError:
         raise error(f"{path}: is a folder, expected a YAML file") from None
     except UnicodeDecodeError:
-        raise error(f"{path}: is not text in UTF-8") from None
+        raise error(f"{path}: is not text in UTF-8. Give a YAML file") from None
     except OSError as e:
-        raise error(f"{path}: {e.strerror}") from None
+        raise error(f"{path}: {unreadable(e)}") from None
     try:
         return parse_yaml(text)
     except YamlProblemError as e:
@@ -45,10 +45,11 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
         raise error(f"{path}: not valid YAML{where}{e}") from None
 
 
-def validated(model: type[Model], raw: Any, source: str, expected: str) -> Model:
+def validated(model: type[Model], raw: Any, source: str, expected: str, remedy: str = "") -> Model:
     """Validates what a YAML file held, with the model of the whole file.
 
-    `source` names the file in messages; `expected` is for the message about a file without keys.
+    `source` names the file in messages; `expected` is for the message about a file without keys;
+    `remedy` ends messages about a file that nobody writes by hand.
 
     Raises:
         ConfigError: with the first problem, in one line.
@@ -58,7 +59,7 @@ def validated(model: type[Model], raw: Any, source: str, expected: str) -> Model
     try:
         return model.model_validate(raw)
     except ValidationError as e:
-        raise ConfigError(f"{source}: {first_problem(e, model)}") from None
+        raise ConfigError(f"{source}: {first_problem(e, model, remedy)}") from None
 
 
 def parse_config(raw: Any, source: str, base: Path) -> Config:
@@ -96,11 +97,11 @@ def _no_config(path: Path) -> str:
         return f"is a folder. Give {inside}"
     if path.is_dir():
         return (
-            f"is a folder, expected a YAML file. 'caliv-graph init {path} --out config.yaml' "
-            "drafts one, if this is a drive"
+            "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph init "
+            f"{path} --out config.yaml'"
         )
     if not path.exists():
-        return f"no such file. 'caliv-graph init DRIVE --out {path}' drafts it for a drive"
+        return f"no such file. Write it for a drive by 'caliv-graph init DRIVE --out {path}'"
     return ""
 
 

@@ -52,7 +52,8 @@ class DataConfig(Section):
     def _poses_of_its_own(self) -> DataConfig:
         if self.format == "caliv" and (self.poses is not None or self.pose_axes != "flu"):
             raise ValueError(
-                "poses, pose_axes: a CaLiV folder has its own, in input/ego_poses.yaml, with z up"
+                "poses, pose_axes: a CaLiV folder has its own, in input/ego_poses.yaml, with z up: "
+                "remove these keys, or set format to clouds"
             )
         return self
 
@@ -258,7 +259,7 @@ class Config(Section):
         if self.target is False and not self.structure.use:
             raise ValueError(
                 "target: false leaves structure alone, and 'structure.use' is false: nothing is "
-                "left to calibrate by"
+                "left to calibrate by: remove one of the two"
             )
         if self.target is False and self.solve.mode == "staged":
             raise ValueError(
@@ -304,7 +305,7 @@ class Config(Section):
     def _reference_is_a_lidar(self) -> Config:
         if self.reference and self.reference not in self.lidars:
             raise ValueError(
-                f"reference '{self.reference}' is not a LiDAR of this config: "
+                f"reference '{self.reference}' is not a LiDAR of this config: set it to one of "
                 f"{', '.join(self.lidars)}"
             )
         if not self.reference:
@@ -312,7 +313,9 @@ class Config(Section):
         topics = [lidar.topic for lidar in self.lidars.values()]
         for topic in topics:
             if topics.count(topic) > 1:
-                raise ValueError(f"topic '{topic}' belongs to more than one LiDAR")
+                raise ValueError(
+                    f"topic '{topic}' belongs to more than one LiDAR: give each its own"
+                )
         return self
 
     def names_motion(self) -> bool:

@@ -35,6 +35,9 @@ _SENTENCES = {
     "string_type": "is not text in YAML: write it in quotes",
     "path_type": "is not text in YAML: write it in quotes",
     "too_short": "must have {min_length} or more items, has {actual_length}",
+    "union_tag_invalid": "must have {discriminator} one of {expected_tags}, has '{tag}'",
+    "string_pattern_mismatch": "must match the pattern {pattern}",
+    "int_parsing_size": "must be a smaller whole number",
     "too_long": "must have {max_length} or fewer items, has {actual_length}",
 }
 """Instead of pydantic's, which speak of Python, by the type of the error."""
@@ -85,11 +88,19 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
+def first_problem(error: ValidationError, root: type[BaseModel], remedy: str = "") -> str:
     """The first problem of a YAML file in one line: the place, what is wrong there, the value.
 
     An unknown key comes first: a typo also causes a missing key. `root` models the whole file.
+    `remedy` is what to do about it, if it is not to correct the value.
     """
+    problem, own = _first_problem(error, root)
+    step = remedy or own
+    return f"{problem}. {step}" if step else problem
+
+
+def _first_problem(error: ValidationError, root: type[BaseModel]) -> tuple[str, str]:
+    """Place and problem; what to do where the problem does not say it."""
     errors = error.errors(include_url=False)
     # That a value is not the one word or `false` of another branch of a union says nothing.
     errors = [e for e in errors if not str(e["loc"][-1:]).startswith("('literal[")] or errors
@@ -107,15 +118,24 @@ def first_problem(error: ValidationError, root: type[BaseModel]) -> str:
     rest = f" (and {others} more)" if others > 0 else ""
     if is_unknown:
         models = _models_in(section) or [root]
-        return f"unknown key '{where}': {_nearest(str(keys[-1]), models[0])}{rest}"
+        return f"unknown key '{where}': {_nearest(str(keys[-1]), models[0])}{rest}", ""
     if first["type"] == "missing":
-        return f"'{where}' is missing{rest}"
+        return f"'{where}' is missing{rest}", _to_add(known, root)
     message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     if first["type"] in _SENTENCES:
         message = _SENTENCES[first["type"]].format(**first.get("ctx", {}))
     if not keys:
-        return f"{message}{rest}"
-    return f"'{where}': {message}{_shown(first['input'])}{rest}"
+        return f"{message}{rest}", ""
+    return f"'{where}': {message}{_shown(first['input'])}{rest}", ""
+
+
+def _to_add(location: Sequence[int | str], root: type[BaseModel]) -> str:
+    """What a missing value is, if its model says it."""
+    _, section = _follow(location[:-1], root)
+    key = str(location[-1])
+    fields = [m.model_fields[key] for m in _models_in(section) if key in m.model_fields]
+    described = fields[0].description if fields else None
+    return f"Add it: {described}" if described else "Add it"
 
 
 def _shown(value: Any) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.errors import ExportError
 from caliv_graph.export.request import Base
 from caliv_graph.export.text import number, without_notice
@@ -43,9 +43,9 @@ def read_base(path: Path) -> Base:
             f"{path}: no such file. Give --base an existing file, or leave it out"
         ) from None
     except UnicodeDecodeError:
-        raise ExportError(f"{path}: is not text in UTF-8") from None
+        raise ExportError(f"{path}: is not text in UTF-8. Give another --base") from None
     except OSError as e:
-        raise ExportError(f"{path}: cannot be read: {e.strerror or e}") from None
+        raise ExportError(f"{path}: {unreadable(e)}") from None
 
 
 def spliced(text: str, edits: Sequence[Edit]) -> str:
@@ -90,10 +90,15 @@ class YamlFile:
             root = yaml.compose(base.text, Loader=yaml.SafeLoader)
         except yaml.MarkedYAMLError as e:
             line = f" in line {e.problem_mark.line + 1}" if e.problem_mark else ""
-            raise ExportError(f"{base.path}: not valid YAML{line}: {e.problem}") from None
+            raise ExportError(
+                f"{base.path}: not valid YAML{line}: {e.problem}. Correct it there, or give "
+                "another --base"
+            ) from None
         except (yaml.YAMLError, RecursionError) as e:
             first = (str(e).splitlines() or ["nested too deeply"])[0]
-            raise ExportError(f"{base.path}: not valid YAML: {first}") from None
+            raise ExportError(
+                f"{base.path}: not valid YAML: {first}. Give another --base"
+            ) from None
         if not isinstance(root, yaml.MappingNode):
             raise ExportError(f"{base.path}: has no keys with values. Give another --base")
         self._root = root

@@ -27,7 +27,7 @@ def parse_pose(text: str, what: str) -> gtsam.Pose3:
         values = []
     if len(values) not in (3, 6) or not all(map(math.isfinite, values)):
         raise ExportError(
-            f"{what}: '{text}' is not x,y,z,roll,pitch,yaw: six numbers, metres and radians, or "
+            f"{what}: '{text}', expected x,y,z,roll,pitch,yaw: six numbers, metres and radians, or "
             "three for no rotation"
         )
     roll, pitch, yaw = values[3:] or (0.0, 0.0, 0.0)
@@ -44,9 +44,9 @@ def parse_named(texts: Sequence[str], what: str) -> dict[str, str]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals and value):
-            raise ExportError(f"{what}: '{text}' is not NAME=VALUE")
+            raise ExportError(f"{what}: '{text}', expected NAME=VALUE")
         if name in named:
-            raise ExportError(f"{what}: '{name}' is given twice")
+            raise ExportError(f"{what}: '{name}' is given twice. Remove one")
         named[name] = value
     return named
 

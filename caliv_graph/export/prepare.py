@@ -130,7 +130,7 @@ def _chosen(names: Sequence[str], calibration: Calibration, path: Path) -> tuple
 def _check_lidar(name: str, calibration: Calibration, path: Path, option: str) -> None:
     if name not in calibration.lidars:
         raise ExportError(
-            f"{option}: {path} has no LiDAR '{name}', but {', '.join(calibration.lidars)}"
+            f"{option}: {path} has no LiDAR '{name}'. Give one of {', '.join(calibration.lidars)}"
         )
 
 

@@ -56,8 +56,8 @@ def serialise(graph: gtsam.NonlinearFactorGraph) -> str:
     custom = [i for i in range(graph.size()) if isinstance(graph.at(i), gtsam.CustomFactor)]
     if custom:
         raise ExportError(
-            f"graph: factor {custom[0]} is a CustomFactor, which GTSAM cannot serialise. Linearise "
-            "it (fusion.factors.serialisable)"
+            f"graph: factor {custom[0]} is a CustomFactor, which GTSAM cannot serialise. Pass the "
+            "graph to fusion.factors.serialisable first, which linearises it"
         )
     return str(graph.serialize())
 

@@ -65,13 +65,13 @@ def prior_factors(
     unknown = [name for name in names if name not in calibration.lidars]
     if unknown or not names:
         raise ExportError(
-            f"lidar {', '.join(map(repr, unknown)) or '(none)'}: is not in the calibration, which "
-            f"has {', '.join(calibration.lidars)}"
+            f"lidar {', '.join(map(repr, unknown)) or '(none)'}: is not in the calibration. "
+            f"Name some of {', '.join(calibration.lidars)}"
         )
     keys = [key(name) for name in names]
     if len(set(keys)) < len(keys):
         raise ExportError(
-            f"keys of {', '.join(names)} are not different: each LiDAR needs its own variable"
+            f"keys of {', '.join(names)} are not different: give each LiDAR its own variable"
         )
     order = list(calibration.lidars)
     rows = [6 * order.index(name) + axis for name in names for axis in range(6)]
@@ -100,7 +100,10 @@ def _information(cov: Array) -> Array:
     """Inverse of a covariance whose entries differ by orders of magnitude."""
     sigma = np.sqrt(np.diag(cov))
     if not np.all(sigma > 0.0):
-        raise ExportError("joint.covariance: has a sigma of zero, so its information is infinite")
+        raise ExportError(
+            "joint.covariance: has a sigma of zero, so its information is infinite. Calibrate "
+            "without lidars.<name>.fixed, or hold the variable constant"
+        )
     values, vectors = np.linalg.eigh(cov / np.outer(sigma, sigma))
     half = vectors / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)) / sigma[:, None]
     return np.asarray(half @ half.T)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from caliv_graph.calibration.choose import displaced
+from caliv_graph.calibration.choose import displaced_or_misguessed
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, TargetError
@@ -74,7 +74,9 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
         findings += heading_findings(trajectories, motions, config, raw)
         near, misplaced, observations = targets_of([recording], trajectories, config, progress)
-        problems += (*misplaced, *displaced(observations, trajectories, near))
+        kept = [name for name in near.lidars if near.lidars[name] is config.lidars[name]]
+        said = displaced_or_misguessed(observations, trajectories, near, kept)
+        problems += (*misplaced, *said)
     except CalivError as error:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         observations = None

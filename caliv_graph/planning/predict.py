@@ -110,7 +110,7 @@ def predict(
         ):
             raise ConfigError(
                 f"scenario '{other.name}': its lidars are not those of '{scenario.name}': several "
-                "drives have to be of one vehicle"
+                "drives must be of one vehicle: rename them alike"
             )
     planned = [(s, make_drive(s.drive, make_terrain(s.world.ground))) for s in scenarios]
     return predict_drives(planned, assumptions)

@@ -76,7 +76,7 @@ class SeenBeams:
         if len(every) < LEAST_POINTS:
             raise RecordingError(
                 f"{source}: {len(clouds)} clouds have {len(every)} points beyond {NEAREST_M:g} m: "
-                "too few to tell the LiDAR's field of view. Is it the right topic?"
+                "too few to tell the LiDAR's field of view. Check its topic"
             )
         edges = azimuth_edges(every)
         azimuths = (-180.0, 180.0)

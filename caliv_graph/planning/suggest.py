@@ -119,9 +119,11 @@ def parse_goals(items: Sequence[str]) -> dict[str, float]:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) and value > 0.0):
-            raise ConfigError(f"--sigma {item}: '{text}' is not a number above zero")
+            raise ConfigError(
+                f"--sigma {item}: '{text}' is not a number above zero, expected such as 0.05"
+            )
         if key in goals:
-            raise ConfigError(f"--sigma {item}: {key} is given twice")
+            raise ConfigError(f"--sigma {item}: {key} is given twice. Remove one")
         goals[key] = value
     return goals
 
@@ -231,7 +233,9 @@ def candidates(
         ConfigError: the scenario has no target.
     """
     if not scenario.world.targets:
-        raise ConfigError(f"scenario '{scenario.name}': world.targets names no target to place")
+        raise ConfigError(
+            f"scenario '{scenario.name}': world.targets names no target to place: add one"
+        )
     for words, model in _manoeuvres(scenario, both_turns):
         drive = make_drive(model)
         ramps: list[tuple[str, tuple[RampModel, ...]]] = [("", ())]

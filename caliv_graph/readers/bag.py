@@ -22,6 +22,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from caliv_graph.common.inputs import unreadable
 from caliv_graph.config.load import read_yaml
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
@@ -242,7 +243,8 @@ class Bag:
             for name, text in DEFINITIONS.items():
                 store.register(get_types_from_msg(text, name))
             return store
-        raise RecordingError(f"{self._path}: holds no definition of the type {type_name}")
+        what = f"{self._path}: holds no definition of the type {type_name}"
+        raise RecordingError(what, "Record it with its package sourced, or as another type")
 
     @contextmanager
     def _readers(self) -> Iterator[list[_Reader]]:
@@ -281,7 +283,7 @@ class Bag:
         except RecordingError:
             raise
         except OSError as e:
-            raise RecordingError(f"{file}: cannot be read: {e.strerror or e}") from None
+            raise RecordingError(f"{file}: {unreadable(e)}") from None
         except Exception as e:  # struct.error, KeyError, MemoryError of a size gone wrong, ...
             said = " ".join(str(e).split()).rstrip(".") or type(e).__name__
             advice = _RECOVERY.get(Path(file).suffix, "Record the drive again, or recover the bag")
@@ -344,7 +346,7 @@ def _find_files(path: Path) -> list[Path]:
         if not path.is_file():
             raise RecordingError(f"{path}: is a pipe or a device. Give a bag on a disk")
     except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
     if path.suffix not in BAG_SUFFIXES:
         packed = path.suffix in (".zst", ".zstd", ".gz", ".lz4", ".active")
         hint = " Unpack it first" if packed else ""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.errors import RecordingError
 from caliv_graph.readers.bag import DamagedMessageError
 from caliv_graph.readers.pointcloud2 import (
@@ -89,7 +89,7 @@ def _as_message(path: Path, fields: Sequence[str]) -> Any:
     try:
         data = read_input(path)
     except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from None
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
     step = point_size(fields)
     if len(data) % step:
         raise RecordingError(

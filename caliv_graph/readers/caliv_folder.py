@@ -18,6 +18,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.common.inputs import unreadable
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import read_yaml
 from caliv_graph.errors import RecordingError
@@ -150,7 +151,7 @@ def _system_errors_named() -> Iterator[None]:
     try:
         yield
     except OSError as e:
-        raise RecordingError(f"{e.filename}: cannot be read: {e.strerror}") from None
+        raise RecordingError(f"{e.filename}: {unreadable(e)}") from None
 
 
 @_system_errors_named()
@@ -194,7 +195,7 @@ def _parse_poses(entries: Any, where: str) -> dict[int, gtsam.Pose3]:
     for number, entry in enumerate(entries, start=1):
         if not (isinstance(entry, list) and len(entry) == 2):
             raise RecordingError(
-                f"{where}, entry {number}: {_shorten(entry)} is not "
+                f"{where}, entry {number}: {_shorten(entry)}, expected "
                 "[file, [x, y, z, qx, qy, qz, qw]]"
             )
         file, values = entry
@@ -217,7 +218,7 @@ def _parse_pose(values: Any, where: str) -> gtsam.Pose3:
     numbers = [_to_float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != 7 or None in numbers:
         raise RecordingError(
-            f"{where}: {_shorten(values)} are not the 7 numbers of a pose: x, y, z in metres, "
+            f"{where}: {_shorten(values)}, expected the 7 numbers of a pose: x, y, z in metres, "
             "qx, qy, qz, qw"
         )
     pose = np.array(numbers, dtype=np.float64)

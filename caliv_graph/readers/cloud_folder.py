@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -251,7 +251,7 @@ def cloud_folders(path: Path) -> tuple[str, ...]:
             if folder.is_dir() and next(folder.glob("*.bin"), None) is not None
         )
     except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
 
 
 def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
@@ -321,18 +321,20 @@ def _listed_times(folder: Path, root: Path, count: int, name: str) -> list[int |
                 continue
             try:
                 text = read_input(path, _MOST_BYTES).decode("utf-8")
-            except (OSError, UnicodeDecodeError) as e:
-                raise RecordingError(f"{path}: cannot be read: {e}") from None
+            except OSError as e:
+                raise RecordingError(f"{path}: {unreadable(e)}") from None
+            except UnicodeDecodeError:
+                raise RecordingError(f"{path}: is not text in UTF-8. Write it so") from None
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             if len(lines) != count:
                 raise RecordingError(
-                    f"{path}: has {len(lines)} times, {folder} has {count} clouds. Each line is "
-                    "the time of a cloud"
+                    f"{path}: has {len(lines)} times, {folder} has {count} clouds. Write "
+                    "one line per cloud: its time in seconds"
                 )
             stamps = [_time_of_line(line) for line in lines]
             if None in stamps:
                 line = lines[stamps.index(None)]
-                raise RecordingError(f"{path}: {line[:60]!r} is not a time")
+                raise RecordingError(f"{path}: {line[:60]!r} is not a time. Write seconds")
             return stamps
     raise RecordingError(
         f"{folder}: the names of the clouds (LiDAR '{name}') hold no time. Add {_TIMES_FILES[0]} "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from caliv_graph.common.inputs import unreadable
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import read_yaml
 from caliv_graph.config.model import TopicsConfig
@@ -107,9 +108,10 @@ def is_recorded_bag(path: Path) -> bool:
         if _is_caliv_folder(path) or folders_of_clouds(path):
             return False
         raise RecordingError(f"{path}: {_no_drive(path)}")
-    except (OSError, ValueError) as e:
-        said = getattr(e, "strerror", None) or e
-        raise RecordingError(f"{path}: cannot be read: {said}") from None
+    except OSError as e:
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
+    except ValueError as e:
+        raise RecordingError(f"{path}: cannot be read: {e}. Check the path") from None
 
 
 def _is_caliv_folder(path: Path) -> bool:
@@ -222,7 +224,8 @@ def choose_lidar_topics(bag: Bag) -> LidarTopics:
             if hint := packets_hint(topic.type):
                 raise RecordingError(f"{bag.name}: topic '{topic.name}': {hint}")
         raise RecordingError(
-            f"{bag.name}: has no clouds ({', '.join(CLOUD_TYPES)}). It has: {shown or 'nothing'}"
+            f"{bag.name}: has no clouds ({', '.join(CLOUD_TYPES)}). It has: {shown or 'nothing'}. "
+            "Record the topics of the LiDARs"
         )
     others: dict[str, str] = {}
     own = [topic for topic in frames if not _DERIVED.search(topic.lower())]

@@ -12,7 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.errors import ConfigError
 
 VEHICLE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle")
@@ -130,18 +130,18 @@ def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file. Give --urdf the vehicle's URDF") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not text in UTF-8, as a URDF is") from None
+        raise ConfigError(f"{path}: is not text in UTF-8. Give a URDF") from None
     except OSError as e:
-        raise ConfigError(f"{path}: cannot be read: {e.strerror or e}") from None
+        raise ConfigError(f"{path}: {unreadable(e)}") from None
     # Entities can unfold to gigabytes, and no URDF has them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ConfigError(f"{path}: has a DOCTYPE, which no URDF needs. Remove it")
     try:
         root = ET.fromstring(text)
     except (ET.ParseError, ValueError, RecursionError) as e:
-        raise ConfigError(f"{path}: is not valid XML: {e}") from None
+        raise ConfigError(f"{path}: is not valid XML: {e}. Correct it there") from None
     if root.tag != "robot":
-        raise ConfigError(f"{path}: its root is <{root.tag}>, that of a URDF is <robot>")
+        raise ConfigError(f"{path}: its root is <{root.tag}>, expected <robot>: give a URDF")
     if "${" in text or "$(" in text or "<xacro:" in text:
         raise ConfigError(
             f"{path}: is a xacro. Expand it first: 'xacro {path.name} > vehicle.urdf'"
@@ -170,5 +170,5 @@ def _triple(origin: ET.Element | None, name: str, where: str) -> tuple[float, fl
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        raise ConfigError(f"{where}: {name}='{text[:60]}' is not three finite numbers")
+        raise ConfigError(f"{where}: {name}='{text[:60]}', expected three finite numbers")
     return x, y, z

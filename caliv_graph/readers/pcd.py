@@ -17,7 +17,7 @@ import lzf  # type: ignore[import-not-found]
 import numpy as np
 import numpy.typing as npt
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.errors import RecordingError
 from caliv_graph.products import Array
 
@@ -90,7 +90,7 @@ def read_pcd(path: Path) -> Array:
     try:
         data = read_input(path)
     except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror}") from None
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
     try:
         header = _read_header(data)
         if header.encoding == "ascii":

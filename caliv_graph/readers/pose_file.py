@@ -20,7 +20,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.common.inputs import read_input
+from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.config.model import PoseAxes
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
@@ -88,9 +88,9 @@ def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> Give
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file. Set data.poses to the poses' file") from None
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not text in UTF-8, as files of poses are") from None
+        raise RecordingError(f"{path}: is not text in UTF-8. Write the poses as text") from None
     except OSError as e:
-        raise RecordingError(f"{path}: cannot be read: {e.strerror or e}") from None
+        raise RecordingError(f"{path}: {unreadable(e)}") from None
     if text.lstrip().startswith("["):
         return _given(*_json_rows(text, path), path)
     names, lines = _table(text)
@@ -110,11 +110,15 @@ def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> Give
             )
         stamp_ns = stamp_of(values[columns["time"]])
         if stamp_ns is None:
-            raise RecordingError(f"{where}: {values[columns['time']][:40]!r} is not a time")
+            raise RecordingError(
+                f"{where}: {values[columns['time']][:40]!r} is not a time. Write seconds"
+            )
         if "nanoseconds" in columns:
             part_ns = _number(values[columns["nanoseconds"]], where)
             if not 0 <= part_ns < NANOSECONDS_PER_SECOND:
-                raise RecordingError(f"{where}: {part_ns:g} ns is not a part of a second")
+                raise RecordingError(
+                    f"{where}: {part_ns:g} ns is not a part of a second, expected 0 to 999999999"
+                )
             stamp_ns += int(part_ns)
         stamps[i] = stamp_ns
         rows[i] = [_number(values[columns[name]], where) for name in _TUM[1:]]
@@ -197,7 +201,9 @@ def _number(text: str, where: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise RecordingError(f"{where}: {text[:40]!r} is not a number") from None
+        raise RecordingError(
+            f"{where}: {text[:40]!r} is not a number. Mend or remove the line"
+        ) from None
 
 
 def _json_rows(text: str, path: Path) -> tuple[IntArray, Array]:
@@ -215,7 +221,7 @@ def _json_rows(text: str, path: Path) -> tuple[IntArray, Array]:
             raise ValueError
     except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
         raise RecordingError(
-            f"{path}: is JSON, but not a list of poses with timestamp (us), translation and "
+            f"{path}: is JSON, expected a list of poses with timestamp (us), translation and "
             "rotation (w, x, y, z), as ego_pose.json of nuScenes"
         ) from None
     return stamps, rows

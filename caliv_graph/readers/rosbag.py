@@ -213,7 +213,11 @@ class RosbagRecording:
         there = self._bag.topics
         fitting = [topic.name for topic in there.values() if topic.type in types]
         topic = there.get(name) or there.get(f"/{name.strip('/')}")
-        will_do = f"Topics that fit: {_enumerate(fitting)}"
+        will_do = (
+            f"Topics that fit: {_enumerate(fitting)}"
+            if fitting
+            else f"No topic of the bag fits: record one, or leave {key} out"
+        )
         if topic is None:
             near = difflib.get_close_matches(name, fitting or list(there), n=1, cutoff=0.5)
             hint = f"Did you mean '{near[0]}'? " if near else ""
@@ -341,4 +345,4 @@ def _seconds(stamp_ns: int) -> str:
 
 
 def _enumerate(names: Iterable[str]) -> str:
-    return textwrap.shorten(", ".join(names), 300, placeholder=" ...") or "none"
+    return textwrap.shorten(", ".join(names), 300, placeholder=" ...")

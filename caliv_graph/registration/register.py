@@ -125,7 +125,8 @@ class JointRegistration:
         """
         if len(observation.clouds) < 2:
             raise RegistrationError(
-                f"{observation.name}: {len(observation.clouds)} cloud(s) to register, needs 2"
+                f"{observation.name}: {len(observation.clouds)} cloud(s) to register, needs 2. "
+                "Lower extraction.min_points, or widen target.min and target.max"
             )
         self.observation = observation
         most = config.registration.max_points
@@ -353,7 +354,8 @@ def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: in
         if not np.isfinite(d).all():
             raise RegistrationError(
                 f"{state.observation.name}: the clouds do not overlap enough to register "
-                f"({state.clouds.count} clouds, {len(state.clouds.points)} points)"
+                f"({state.clouds.count} clouds, {len(state.clouds.points)} points). Check the "
+                "guesses with 'caliv-graph inspect --html', and drive around the target"
             )
         R, t = left_step(R, t, d)
         state.maximise(R, t)

@@ -144,7 +144,9 @@ def inspect_recording(recording: Recording, progress: Progress) -> Inspection:
             lidars[lidar] = _summarise_lidar(frames, counts)
     given = recording.motion().poses
     if given is None:
-        raise TrajectoryError(f"{recording.name}: has no vehicle poses")
+        raise TrajectoryError(
+            f"{recording.name}: has no vehicle poses. Add them to input/ego_poses.yaml"
+        )
     return Inspection(
         data=recording.name,
         lidars=lidars,

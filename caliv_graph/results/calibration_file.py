@@ -30,6 +30,8 @@ from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sens
 _DIGITS = 12
 """Significant digits of the numbers in a file, and decimals of a pose: a picometre."""
 
+_REMEDY = "Give a calibration.yaml as 'caliv-graph calibrate' wrote it, unchanged"
+
 _HEADER = """\
 # Extrinsics of LiDARs on a vehicle, written by caliv-graph. Metres, radians, seconds.
 # T_a_b maps points of frame b into frame a. Roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll).
@@ -122,7 +124,7 @@ def read_calibration_file(path: Path) -> CalibrationFile:
         ConfigError: it is missing, of another schema, or a field is not what it should be.
     """
     expected = "calibration: expected keys such as 'schema', 'lidars'"
-    model = validated(CalibrationModel, read_yaml(path), str(path), expected)
+    model = validated(CalibrationModel, read_yaml(path), str(path), expected, _REMEDY)
     calibration = model.calibration()
     return CalibrationFile(calibration, model.cov_pairs(calibration))
 

@@ -42,7 +42,7 @@ class _TimedSection(_MovingSection):
         if self.duration_s < least:
             raise ValueError(
                 f"duration_s ({self.duration_s} s) leaves no time to start and stop: "
-                f"standstill_s + 2 ramp_s is {least} s"
+                f"it must be at least standstill_s + 2 ramp_s, {least} s"
             )
         return self
 

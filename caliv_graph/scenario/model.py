@@ -118,7 +118,8 @@ class Scenario(Section):
     def _reference_is_a_lidar(self) -> Scenario:
         if self.reference and self.reference not in self.lidars:
             raise ValueError(
-                f"reference '{self.reference}' is not one of the lidars: {', '.join(self.lidars)}"
+                f"reference '{self.reference}' is not one of the lidars: set it to one of "
+                f"{', '.join(self.lidars)}"
             )
         if not self.reference:
             object.__setattr__(self, "reference", next(iter(self.lidars)))
@@ -158,8 +159,8 @@ def load_scenario(path: Path) -> Scenario:
     if _is_recording_config(raw):
         raise ConfigError(
             f"{path}: is a config of a recorded drive: it has neither 'drive' nor 'world', which a "
-            f"scenario has. 'caliv-graph plan {path} --out scenario.yaml' makes one with its "
-            "vehicle, and configs/scenarios has others"
+            f"scenario has. Make one with its vehicle by 'caliv-graph plan {path} --out "
+            "scenario.yaml', or choose one of configs/scenarios"
         )
     return parse_scenario(raw, str(path))
 

@@ -155,7 +155,7 @@ class LidarModel(Section):
     def _sweep_within_the_period(self) -> LidarModel:
         if self.sweep_s > (1.0 + 1e-9) / self.rate_hz:
             raise ValueError(
-                f"sweep.duration_s ({self.sweep_s} s) exceeds the {1.0 / self.rate_hz:g} s "
+                f"sweep.duration_s ({self.sweep_s} s) must not exceed the {1.0 / self.rate_hz:g} s "
                 f"between two clouds at {self.rate_hz:g} Hz"
             )
         return self
@@ -168,11 +168,11 @@ class LidarModel(Section):
                 raise ValueError(f"{name}: {low} degrees must be below {high} degrees")
         low, high = self.horizontal_fov_deg
         if high - low > 360.0:
-            raise ValueError(f"horizontal_fov_deg spans {high - low} degrees: 360 at most")
+            raise ValueError(f"horizontal_fov_deg spans {high - low} degrees, must not exceed 360")
         if self.horizontal_resolution_deg > high - low:
             raise ValueError(
-                f"horizontal_resolution_deg ({self.horizontal_resolution_deg}) exceeds "
-                f"the field of view of {high - low} degrees"
+                f"horizontal_resolution_deg ({self.horizontal_resolution_deg}) must not "
+                f"exceed the field of view of {high - low} degrees"
             )
         if min(self.vertical_fov_deg) < -90.0 or max(self.vertical_fov_deg) > 90.0:
             raise ValueError("vertical_fov_deg must lie within -90 and 90 degrees")

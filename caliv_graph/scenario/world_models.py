@@ -237,7 +237,8 @@ class WallModel(_ObjectSection):
             if top_m >= self.height_m or self.reveals.size_m[0] >= self.length_m:
                 raise ValueError(
                     f"a wall of {self.length_m} m x {self.height_m} m is too small for windows of "
-                    f"{self.reveals.size_m[0]} m up to a height of {top_m} m"
+                    f"{self.reveals.size_m[0]} m up to a height of {top_m} m: make it larger, or "
+                    "lower reveals.sill_m or reveals.size_m"
                 )
         return self
 
@@ -314,7 +315,10 @@ class WalkerModel(Section):
     @model_validator(mode="after")
     def _somewhere_to_go(self) -> WalkerModel:
         if math.dist(self.from_xy_m, self.to_xy_m) < 0.1:
-            raise ValueError("from_xy_m and to_xy_m are less than 0.1 m apart: nowhere to walk")
+            raise ValueError(
+                f"from_xy_m and to_xy_m are {math.dist(self.from_xy_m, self.to_xy_m):.2f} m apart, "
+                "must be 0.1 m or more"
+            )
         return self
 
 
@@ -339,11 +343,12 @@ class WorldModel(Section):
         for name in self.targets:
             if name not in self.objects:
                 raise ValueError(
-                    f"target '{name}' is not one of the objects: {', '.join(self.objects)}"
+                    f"target '{name}' is not one of the objects: name one of "
+                    f"{', '.join(self.objects)}"
                 )
         for name in self.walkers:
             if name in self.objects:
-                raise ValueError(f"'{name}' is the name of an object and of a walker")
+                raise ValueError(f"'{name}' is the name of an object and of a walker: rename one")
         for name in (*self.objects, *self.walkers):
             if name in ("ground", "vehicle"):
                 raise ValueError(f"'{name}' is the name of something else: give another one")

@@ -116,7 +116,7 @@ def baselines_of(second: GnssFixes, first: Positions, config: Config, name: str)
     if not kept.any():
         raise TrajectoryError(
             f"{name}: no fix of topics.heading is within {MAX_APART_NS * 1e-9:g} s of fixes of "
-            "topics.gnss before and after it. Do their clocks agree?"
+            "topics.gnss before and after it. Check their clocks with 'caliv-graph inspect'"
         )
     cov, source = gnss_covariances(second, config)
     stamps = np.asarray(second.stamps_ns, np.int64)[kept]
@@ -144,8 +144,8 @@ def directions_of(
         return None, None
     if positions is None:
         raise TrajectoryError(
-            f"{motion.name}: topics.heading has fixes of a second antenna, and topics.gnss has "
-            "none of the first"
+            f"{motion.name}: topics.heading has fixes of a second antenna, and topics.gnss none "
+            "of the first: set it to the topic of the first antenna"
         )
     return None, baselines_of(motion.heading, positions, config, motion.name)
 

@@ -27,7 +27,10 @@ POSE = 6
 FACTORS_AT_A_TIME = 100
 """Factors of a graph that are turned into a part of the chain at once."""
 
-UNDETERMINED = "the motion data do not determine the trajectory"
+UNDETERMINED = (
+    "the motion data do not determine the trajectory. Check units, axes and gaps with 'caliv-graph "
+    "inspect', and noise and the sigmas of imu and gnss in the config"
+)
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def deskewed(
     if not begin <= scan.stamp_ns <= end:
         raise TrajectoryError(
             f"{scan.source}: stamp {scan.stamp_ns} ns is outside the trajectory's span, {begin} to "
-            f"{end} ns"
+            f"{end} ns. Check the clocks with 'caliv-graph inspect'"
         )
     at = np.clip(scan.stamp_ns + np.append(knots, 0), begin, end)
     R, t = trajectory.poses_at(at)

@@ -18,10 +18,11 @@ def given_trajectory(motion: MotionData) -> Trajectory:
     """
     poses = motion.poses
     if poses is None:
-        raise TrajectoryError(f"{motion.name}: has no vehicle poses")
+        raise TrajectoryError(f"{motion.name}: has no vehicle poses. Set topics.pose or data.poses")
     if len(poses.stamps_ns) < 2:
         raise TrajectoryError(
-            f"{motion.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2"
+            f"{motion.name}: {len(poses.stamps_ns)} vehicle pose(s), needs at least 2. "
+            "Choose another topics.pose or data.poses"
         )
     return Trajectory(poses.stamps_ns, poses.T_map_vehicle, poses.cov)
 

@@ -48,7 +48,8 @@ def positions_in_map(
     warnings = (f"{name}: {lost} of {len(usable)} GNSS fixes are not usable",) if lost else ()
     if not usable.any():
         raise TrajectoryError(
-            f"{name}: none of {len(usable)} GNSS fixes has finite latitude, longitude and altitude"
+            f"{name}: none of {len(usable)} GNSS fixes has finite latitude, longitude and "
+            "altitude. Choose another topics.gnss, or remove it"
         )
     cov, source = gnss_covariances(gnss, config)
     latitude, longitude = gnss.latitude_deg[usable], gnss.longitude_deg[usable]

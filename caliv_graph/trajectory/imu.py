@@ -130,7 +130,10 @@ def longest_piece(samples: Inertial, name: str, sensor: str) -> tuple[Inertial, 
         )
     stamps, gyro, force = stamps[a:b], gyro[a:b], force[a:b]
     if b - a < 2:
-        raise TrajectoryError(f"{name}: the {sensor}'s messages are all more than 2 s apart")
+        raise TrajectoryError(
+            f"{name}: the {sensor}'s messages are all more than 2 s apart. Record them faster, or "
+            "choose another topic"
+        )
     at_gap = np.flatnonzero(np.diff(stamps) > 1e9 * longest)
     gaps = np.stack([stamps[at_gap], stamps[at_gap + 1]], axis=1).reshape(-1, 2)
     if len(gaps):
@@ -161,13 +164,15 @@ def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array,
         )
     if len(stamps) < 2:
         raise TrajectoryError(
-            f"{name}: {len(stamps)} usable IMU message(s), needs at least 2. See topics.imu"
+            f"{name}: {len(stamps)} usable IMU message(s), needs at least 2. Choose another "
+            "topics.imu"
         )
     steps = np.diff(stamps)
     if (steps <= 0).any():
         at = int(np.argmax(steps <= 0))
         raise TrajectoryError(
-            f"{name}: IMU stamps do not increase: {stamps[at]} ns, then {stamps[at + 1]} ns"
+            f"{name}: IMU stamps do not increase: {stamps[at]} ns, then {stamps[at + 1]} ns. "
+            "Sort the messages by stamp, or choose another topics.imu"
         )
     gyro, force = imu.angular_velocity[finite], imu.specific_force[finite]
     median = float(np.median(np.linalg.norm(force, axis=1)))

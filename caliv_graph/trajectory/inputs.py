@@ -241,7 +241,7 @@ def _positions(
         raise TrajectoryError(
             f"{motion.name}: no GNSS fix lies within {span}, {begin * 1e-9:.3f} s to "
             f"{end * 1e-9:.3f} s; fixes from {stamps[0] * 1e-9:.3f} s to {stamps[-1] * 1e-9:.3f} "
-            "s. Do their clocks agree?"
+            "s. Check their clocks with 'caliv-graph inspect', or remove topics.gnss"
         )
     unused = f"{motion.name}: no GNSS fix lies within {span}: GNSS is not used"
     return None, gravity, [*lines, unused]

@@ -157,7 +157,8 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     if len(lost) and len(lost) == len(stamps):
         raise TrajectoryError(
             f"{motion.name}: all {len(stamps)} scans are outside the given poses' span, "
-            f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s. Do their clocks agree?"
+            f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s. Check their clocks with "
+            "'caliv-graph inspect'"
         )
     warnings = []
     if len(lost):

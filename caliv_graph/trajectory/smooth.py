@@ -185,7 +185,8 @@ def _within_span(
         raise TrajectoryError(
             f"{data.name}: all {len(wanted)} scans are outside the trajectory's span: {sensor} "
             f"from {inertial.begin_ns * 1e-9:.3f} s to {inertial.end_ns * 1e-9:.3f} s, scans from "
-            f"{wanted[0] * 1e-9:.3f} s to {wanted[-1] * 1e-9:.3f} s. Do their clocks agree?"
+            f"{wanted[0] * 1e-9:.3f} s to {wanted[-1] * 1e-9:.3f} s. Check their clocks "
+            "with 'caliv-graph inspect'"
         )
     line = (
         f"{data.name}: {len(lost)} of {len(wanted)} scans are outside the trajectory's span, lost"

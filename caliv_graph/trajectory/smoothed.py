@@ -90,7 +90,10 @@ def within_span(
     outside = (stamps < begin) | (stamps > end)
     if outside.any():
         at = int(stamps[np.argmax(outside)])
-        raise TrajectoryError(f"trajectory: stamp {at} ns is outside {whose}, {begin} to {end} ns")
+        raise TrajectoryError(
+            f"trajectory: stamp {at} ns is outside {whose}, {begin} to {end} ns. Check the clocks "
+            "with 'caliv-graph inspect'"
+        )
     return stamps
 
 

@@ -101,7 +101,8 @@ def wheel_samples(twist: TwistSamples, name: str) -> tuple[Inertial, tuple[str, 
     stamps = np.asarray(twist.stamps_ns, np.int64)[np.isfinite(twist.velocity).all(axis=1)]
     if len(stamps) < 2:
         raise TrajectoryError(
-            f"{name}: {len(stamps)} usable velocities, needs at least 2. See topics.twist"
+            f"{name}: {len(stamps)} usable velocities, needs at least 2. Choose another "
+            "topics.twist, or remove it"
         )
     nothing = np.zeros((len(stamps), 3))
     piece, lines = longest_piece(Inertial(stamps, nothing, nothing, NO_GAPS), name, "velocities")

@@ -229,7 +229,8 @@ def read_clouds(
                 advance()
     if not reader.scans:
         raise RecordingError(
-            f"{recording.name}: has no cloud of {', '.join(names)} within the trajectory's span"
+            f"{recording.name}: has no cloud of {', '.join(names)} within the trajectory's span. "
+            "Check the clocks with 'caliv-graph inspect'"
         )
     counts = [lidar for lidar, _ in reader.scans]
     at = np.repeat(np.arange(len(counts)), [len(points[first]) for _, points in reader.scans])

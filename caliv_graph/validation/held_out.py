@@ -95,7 +95,7 @@ def measure_held_out(
         try:
             other = _without(drive, trajectory, config)
         except SolveError as error:
-            return None, (no_held_out_sentence(str(error)),)
+            return None, (no_held_out_sentence(error.what),)
         if other is None:
             return None, (no_held_out_sentence("too little of it stands still"),)
         measured = {

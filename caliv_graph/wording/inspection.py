@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 def no_trajectory_sentence(reason: str) -> str:
     """Why no clouds along the drive are shown."""
@@ -22,3 +24,12 @@ def unreadable_sentence(name: str, first: str, count: int) -> str:
     """How many clouds of a LiDAR cannot be read, and why the first of them."""
     in_all = f". In all {count} clouds of lidar '{name}' cannot be read" if count > 1 else ""
     return f"{first}{in_all}"
+
+
+def untested_guesses_sentence(lidars: Sequence[str]) -> str:
+    """What `inspect` cannot say of guesses where no target is in view."""
+    names = " and ".join(f"'{name}'" for name in lidars)
+    return (
+        f"Yaw, x and y of the initial guesses of lidars {names} are not tested here, for no target "
+        "is seen: 'caliv-graph calibrate' tests them by walls"
+    )

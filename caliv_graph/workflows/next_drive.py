@@ -164,8 +164,8 @@ def _span(recording: Recording, trajectory: VehicleTrajectory) -> tuple[int, int
     within = stamps[(stamps >= begin) & (stamps <= end)]
     if len(within) < 2:
         raise RecordingError(
-            f"{recording.name}: {len(within)} clouds are within the time of the motion data: do "
-            "their clocks agree? 'caliv-graph inspect' shows both"
+            f"{recording.name}: {len(within)} clouds are within the time of the motion data. "
+            "Check their clocks with 'caliv-graph inspect'"
         )
     return int(within.min()), int(within.max())
 

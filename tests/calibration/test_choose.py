@@ -10,7 +10,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.choose import choose_static, displaced
+from caliv_graph.calibration.choose import (
+    choose_static,
+    displaced,
+    displaced_or_misguessed,
+)
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config, SolveConfig, TargetRegion
 from caliv_graph.config.mounting import PoseConfig
@@ -135,17 +139,39 @@ def test_late_stamps_of_all_lidars_are_named_with_their_value() -> None:
     assert displaced([late], [trajectory()], freed) == ()
 
 
-def test_nothing_is_said_of_a_good_drive_from_rough_guesses() -> None:
-    off = gtsam.Pose3.Expmap(np.array([0.04, -0.05, 0.05, 0.08, -0.1, 0.05]))
+def guessed(error: gtsam.Pose3, in_vehicle: bool) -> Config:
+    """The config with guesses that are off alike, in vehicle or in LiDAR axes."""
     lidars = {}
     for name, mount in MOUNTS.items():
-        T = mount.pose().compose(off)
+        T = error.compose(mount.pose()) if in_vehicle else mount.pose().compose(error)
         x, y, z = T.translation().tolist()
         roll, pitch, yaw = np.degrees(T.rotation().rpy()).tolist()
         lidars[name] = CONFIG.lidars[name].model_copy(
             update={"initial": PoseConfig(xyz=(x, y, z), rpy_deg=(roll, pitch, yaw))}
         )
-    config = CONFIG.model_copy(update={"lidars": lidars})
+    return CONFIG.model_copy(update={"lidars": lidars})
+
+
+def test_guesses_that_are_off_alike_are_named_as_the_solve_names_them() -> None:
+    """The clouds of both lie at one place, and at the wrong one: nothing scatters."""
+    off = gtsam.Pose3(gtsam.Rot3.Rz(np.radians(15.0)), np.array([0.6, -0.5, 0.0]))
+    seen, path, config = [observation(CHAIR)], [trajectory()], guessed(off, in_vehicle=True)
+    assert displaced(seen, path, config) == ()
+
+    front, rear = displaced_or_misguessed(seen, path, config, ["front", "rear"])
+
+    assert front.startswith("lidar 'front': ")
+    assert "yaw differs from the initial guess" in front
+    assert "yaw differs from the initial guess" in rear
+    assert "T_vehicle_lidar and not its inverse" in rear
+    # What another search replaced is said there.
+    assert displaced_or_misguessed(seen, path, config, ["rear"]) == (rear,)
+
+
+def test_nothing_is_said_of_a_good_drive_from_rough_guesses() -> None:
+    off = gtsam.Pose3.Expmap(np.array([0.04, -0.05, 0.05, 0.08, -0.1, 0.05]))
+    config = guessed(off, in_vehicle=False)
+    assert displaced_or_misguessed([observation(CHAIR)], [trajectory()], config, MOUNTS) == ()
     assert displaced([observation(CHAIR)], [trajectory()], config) == ()
     nothing = replace(observation(CHAIR), clouds=())
     assert displaced([nothing], [trajectory()], config) == ()

@@ -195,7 +195,7 @@ def test_an_earlier_calibration_that_is_not_there(pipeline: Pipeline, config: Pa
     result = calibrate(config, "--prior", earlier, "--out", config.parent / "out")
 
     assert isinstance(result.exception, ConfigError)
-    assert str(result.exception) == f"{earlier}: no such file"
+    assert str(result.exception) == f"{earlier}: no such file. Check the path"
     assert pipeline.config is None
     assert not (config.parent / "out").exists()
 

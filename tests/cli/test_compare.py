@@ -118,5 +118,6 @@ def test_what_cannot_be_compared(files: tuple[Path, Path], tmp_path: Path) -> No
     refused = compare(*files)
     assert isinstance(refused.exception, ConfigError)
     assert str(refused.exception) == (
-        f"{files[1]}: 'joint.data_gradient': must be 12 numbers, has 13"
+        f"{files[1]}: 'joint.data_gradient': must be 12 numbers, has 13. Give a calibration.yaml "
+        "as 'caliv-graph calibrate' wrote it, unchanged"
     )

@@ -161,13 +161,13 @@ def test_version() -> None:
         (["calibrate", "a.yaml"], "error: Missing option '--out'"),
         (["calibrate", "a.yaml", "--out"], "error: Option '--out' requires an argument"),
         (["evaluate", "a", "b", "c"], "error: Got unexpected extra argument"),
-        (["evaluate", "nowhere.yaml", "b"], "error: nowhere.yaml: no such file\n"),
+        (["evaluate", "nowhere.yaml", "b"], "error: nowhere.yaml: no such file. Check the path\n"),
         (["inspect", "nowhere"], "error: nowhere: no such file or folder. Give a bag (.bag, "),
         (["inspect", "drive.mcap"], "error: drive.mcap: no such file or folder"),
         (["init", "nowhere", "--out", "c.yaml"], "error: nowhere: no such file or folder. Give a "),
         (
             ["calibrate", "nowhere.yaml", "--out", "o"],
-            "error: nowhere.yaml: no such file. 'caliv-graph init DRIVE --out nowhere.yaml' drafts",
+            "error: nowhere.yaml: no such file. Write it for a drive by 'caliv-graph init",
         ),
     ],
 )

@@ -97,8 +97,8 @@ def test_what_cannot_be_merged(files: tuple[Path, Path], tmp_path: Path) -> None
     )
     assert not (tmp_path / "merged.yaml").exists()
     for arguments, message in (
-        ((files[0],), "is one calibration; merge needs two or more"),
-        ((files[0], files[0]), "given twice; a calibration counts once"),
+        ((files[0],), "is one calibration. Give two or more"),
+        ((files[0], files[0]), "given twice, and a calibration counts once. Give it once"),
     ):
         refused = merge(*arguments, "--out", tmp_path / "merged.yaml")
         assert isinstance(refused.exception, ConfigError)

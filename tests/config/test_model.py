@@ -125,7 +125,7 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
         ({"lidars": lidar(min_range=5, max_range=4)}, "min_range (5.0 m) must be below max_range "
          "(4.0 m)"),
         ({"lidars": {**lidar(), "rear": lidar()["front"]}}, "topic 'a' belongs to more than one"),
-        ({"reference": "roof"}, "reference 'roof' is not a LiDAR of this config: front, rear"),
+        ({"reference": "roof"}, "'roof' is not a LiDAR of this config: set it to one of"),
         ({"target": {"min": [0, 0, 0], "max": [1, 0, 1]}}, "min y (0.0 m) must be below max y "
          "(0.0 m)"),
         ({"target": {"min": [0, 0, 0], "max": [1, 1, math.inf]}}, "must be a finite number"),
@@ -256,9 +256,9 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "empty.yaml").write_text("")
 
     for name, part in {
-        "nowhere.yaml": "no such file. 'caliv-graph init DRIVE --out",
+        "nowhere.yaml": "no such file. Write it for a drive by 'caliv-graph init DRIVE --out",
         "x" * 300: "File name too long",
-        ".": "is a folder, expected a YAML file. 'caliv-graph init",
+        ".": "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",
         "empty.yaml": "holds no configuration",

@@ -55,14 +55,14 @@ def test_a_pose_in_metres_and_radians(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "1,2,3,4,5,6,7", "a,b,c", "1,2,nan"])
 def test_what_is_no_pose(text: str) -> None:
-    with pytest.raises(ExportError, match=r"--imu: '.*' is not x,y,z,roll,pitch,yaw"):
+    with pytest.raises(ExportError, match=r"--imu: '.*', expected x,y,z,roll,pitch,yaw"):
         parse_pose(text, "--imu")
 
 
 def test_named_values() -> None:
     assert parse_named(["a=1,2", "b=c=d"], "--frame") == {"a": "1,2", "b": "c=d"}
     for wrong in ("a", "a=", "=1"):
-        with pytest.raises(ExportError, match=f"--frame: '{wrong}' is not NAME=VALUE"):
+        with pytest.raises(ExportError, match=f"--frame: '{wrong}', expected NAME=VALUE"):
             parse_named([wrong], "--frame")
     with pytest.raises(ExportError, match="'a' is given twice"):
         parse_named(["a=1", "a=2"], "--frame")

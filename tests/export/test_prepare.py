@@ -145,10 +145,16 @@ def test_the_imu_is_where_the_config_or_the_option_says(calibration: Path, tmp_p
             "--base: is not for --to npz, but for .*autoware,",
         ),
         (Options("urdf", OUT, letter="l"), "--letter: is not for --to urdf, but for gtsam"),
-        (Options("urdf", OUT, lidars=["top"]), "--lidar: .* has no LiDAR 'top', but front, rear"),
-        (Options("tf", OUT, frames=["top=x"]), "--frame: .* has no LiDAR 'top', but front, rear"),
-        (Options("urdf", OUT, housings=["front=1"]), "--housing front: '1' is not x,y,z,roll"),
-        (Options("urdf", OUT, parents=["a"]), "--parent: 'a' is not NAME=VALUE"),
+        (
+            Options("urdf", OUT, lidars=["top"]),
+            "--lidar: .* has no LiDAR 'top'. Give one of front, rear",
+        ),
+        (
+            Options("tf", OUT, frames=["top=x"]),
+            "--frame: .* has no LiDAR 'top'. Give one of front, rear",
+        ),
+        (Options("urdf", OUT, housings=["front=1"]), "--housing front: '1', expected x,y,z,roll"),
+        (Options("urdf", OUT, parents=["a"]), "--parent: 'a', expected NAME=VALUE"),
         (Options("urdf", OUT, base=Path("none.urdf")), "none.urdf: no such file. Give --base an"),
     ],
 )

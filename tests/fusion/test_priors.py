@@ -85,7 +85,7 @@ def test_some_lidars_keep_their_marginal() -> None:
 def test_what_cannot_be_a_prior() -> None:
     calibration = make_calibration()
 
-    with pytest.raises(ExportError, match="lidar 'roof': is not in the calibration, which has"):
+    with pytest.raises(ExportError, match=r"lidar 'roof': is not in .*\. Name some of"):
         prior_factors(calibration, key, lidars=["roof"])
     with pytest.raises(ExportError, match="keys of front, rear are not different"):
         prior_factors(calibration, lambda _: 5)

@@ -303,8 +303,8 @@ def test_cloud_that_is_no_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
-        ([entry(1), ["2.pcd"]], ["entry 2", "['2.pcd'] is not [file, [x, y, z"]),
-        ([{"file": "1.pcd"}], ["entry 1", "is not [file, [x, y, z"]),
+        ([entry(1), ["2.pcd"]], ["entry 2", "['2.pcd'], expected [file, [x, y, z"]),
+        ([{"file": "1.pcd"}], ["entry 1", ", expected [file, [x, y, z"]),
         ([[1, IDENTITY]], ["entry 1", "1 is not the name of a cloud"]),
         ([["../../etc/1.pcd", IDENTITY]], ["entry 1", "'../../etc/1.pcd' is not the name"]),
         ([["/etc/1.pcd", IDENTITY]], ["'/etc/1.pcd' is not the name"]),

@@ -112,8 +112,8 @@ def test_fixed_joints_of_a_urdf(tmp_path: Path) -> None:
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot>&a;</robot>', "has a DOCTYPE"),
         ('<robot xmlns:xacro="x"><xacro:include filename="a"/></robot>', "is a xacro"),
         ('<robot><joint name="j" type="fixed"/></robot>', "joint 'j': needs one <parent"),
-        (URDF.replace("0.5 0 0", "0.5 0"), r"lidar_joint': xyz='0\.5 0' is not three"),
-        (URDF.replace("0 0.1 0", "0 nan 0"), "rpy='0 nan 0' is not three finite"),
+        (URDF.replace("0.5 0 0", "0.5 0"), r"lidar_joint': xyz='0\.5 0', expected three"),
+        (URDF.replace("0 0.1 0", "0 nan 0"), "rpy='0 nan 0', expected three finite"),
     ],
 )
 def test_what_is_no_urdf(tmp_path: Path, text: str, message: str) -> None:

@@ -127,9 +127,12 @@ def test_poses_of_a_camera_are_turned_into_those_of_a_vehicle(tmp_path: Path, ca
         ("1 0 0 0 0 0 0 1\nx 0 0 0 0 0 0 1\n", "line 2: 'x' is not a time"),
         ("1 0 0 o 0 0 0 1\n", "line 1: 'o' is not a number"),
         ("t,x,y,z,roll\n1,0,0,0,0\n", "no column for qx, qy, qz, qw"),
-        ("[1, 2]", "is JSON, but not a list of poses"),
+        ("[1, 2]", "is JSON, expected a list of poses"),
         ("sec,nsec,x,y,z,qx,qy,qz,qw\n1,nan,0,0,0,0,0,0,1\n", "nan ns is not a part of a second"),
-        ('[{"timestamp": -1, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]}]', "is JSON, but"),
+        (
+            '[{"timestamp": -1, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]}]',
+            "is JSON, expected",
+        ),
         (kitti(True), "5 poses of 12 numbers have no times"),
     ],
 )

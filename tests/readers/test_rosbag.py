@@ -343,7 +343,11 @@ def test_clouds_without_coordinates(tmp_path: Path) -> None:
         ({"imu": "/gnss/fix"}, {}, r"for IMU it takes sensor_msgs/msg/Imu\. Topics .* /imu/data$"),
         ({"gnss": "/fix"}, {}, r"no topic '/fix' \(topics\.gnss\).* Topics that fit: /gnss/fix$"),
         ({"twist": FRONT}, {}, r"for velocity it takes .* Topics that fit: /vehicle/twist$"),
-        ({"pose": "/imu/data"}, {}, r"Topics that fit: none$"),
+        (
+            {"pose": "/imu/data"},
+            {},
+            r"No topic of the bag fits: record one, or leave topics.pose out$",
+        ),
     ],
 )
 def test_missing_topics_and_wrong_types(

@@ -37,13 +37,18 @@ def edit(path: Path, change: Callable[[Any], object]) -> Path:
     return path
 
 
+REMEDY = ". Give a calibration.yaml as 'caliv-graph calibrate' wrote it, unchanged"
+
+
 def error_of(path: Path) -> str:
+    """A message about a damaged file, without the name of the file and what to do."""
     with pytest.raises(ConfigError) as caught:
         read_calibration(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
-    return message.removeprefix(f"{path}: ")
+    assert message.endswith(REMEDY)
+    return message.removeprefix(f"{path}: ").removesuffix(REMEDY)
 
 
 def set_at(*keys: Any, value: Any) -> Callable[[Any], None]:

@@ -157,24 +157,32 @@ def broken(path: str, value: Any) -> dict[str, Any]:
             "key 'drive.radius_m': known keys: duration_s, kind,",
         ),
         ("drive", {"kind": "loop"}, "'loop'"),
-        ("drive", {"kind": "arc"}, "'drive.duration_s' is missing"),
-        ("drive/duration_s", 3.5, "standstill_s + 2 ramp_s is 4.0 s"),
+        ("drive", {"kind": "arc"}, "'drive.duration_s' is missing. Add it: seconds"),
+        ("drive/duration_s", 3.5, "at least standstill_s + 2 ramp_s, 4.0 s"),
         ("drive/speed_m_s", -2.0, "greater than 0"),
         ("lidars", {}, "lidars"),
         ("lidars/front/channels", 1, "greater than or equal to 2"),
         ("lidars/front/vertical_fov_deg", [12.5, -12.5], "12.5 degrees must be below -12.5"),
         ("lidars/front/vertical_fov_deg", [-95.0, 0.0], "within -90 and 90 degrees"),
-        ("lidars/front/horizontal_fov_deg", [-180.0, 200.0], "spans 380.0 degrees: 360 at most"),
-        ("lidars/front/horizontal_resolution_deg", 130.0, "exceeds the field of view of 120"),
+        (
+            "lidars/front/horizontal_fov_deg",
+            [-180.0, 200.0],
+            "spans 380.0 degrees, must not exceed 360",
+        ),
+        (
+            "lidars/front/horizontal_resolution_deg",
+            130.0,
+            "must not exceed the field of view of 120",
+        ),
         ("lidars/front/max_range_m", 0.5, "min_range_m (1.0 m) must be below max_range_m (0.5 m)"),
         ("lidars/front/range_sigma_m", float("nan"), "range_sigma_m"),
-        ("reference", "back", "reference 'back' is not one of the lidars: front"),
-        ("world/targets", ["table"], "target 'table' is not one of the objects: chair"),
+        ("reference", "back", "reference 'back' is not one of the lidars: set it to one of front"),
+        ("world/targets", ["table"], "target 'table' is not one of the objects: name one of chair"),
         ("world/objects/chair/shape", "sofa", "'sofa'"),
         ("name", "two\nlines", "name"),
         ("lidars/front/elevations_deg", [-3.0, -3.0, 1.0], "elevations_deg must ascend"),
         ("lidars/front/elevations_deg", [-95.0, 1.0], "elevations_deg must lie within -90 and 90"),
-        ("lidars/front/sweep", {"duration_s": 0.2}, "exceeds the 0.1 s between two clouds"),
+        ("lidars/front/sweep", {"duration_s": 0.2}, "must not exceed the 0.1 s between two clouds"),
         (
             "lidars/front/sweep",
             {"stamp_at": "end"},
@@ -188,7 +196,11 @@ def broken(path: str, value: Any) -> dict[str, Any]:
             {"chair": {"from_xy_m": [1, 1], "to_xy_m": [4, 4]}},
             "'chair' is the name of an object and of a walker",
         ),
-        ("world/walkers", {"who": {"from_xy_m": [1, 1], "to_xy_m": [1, 1]}}, "nowhere to walk"),
+        (
+            "world/walkers",
+            {"who": {"from_xy_m": [1, 1], "to_xy_m": [1, 1]}},
+            "0.00 m apart, must be 0.1 m or more",
+        ),
         ("imu", {"rate_hz": 0.0}, "greater than 0"),
         ("imu", {"acc_sigma": 0.1}, "unknown key 'imu.acc_sigma'"),
         ("gnss", {"jumps": [{"start_s": 1.0}]}, "missing"),
@@ -231,6 +243,6 @@ def test_the_config_of_a_recorded_drive_leads_to_plan(tmp_path: Path) -> None:
     path = write_config(tmp_path / "config.yaml")
 
     with pytest.raises(
-        ConfigError, match=r"'caliv-graph plan .*config\.yaml --out scenario\.yaml' makes"
+        ConfigError, match=r"Make one .* by 'caliv-graph plan .*config\.yaml --out scenario\.yaml'"
     ):
         load_scenario(path)

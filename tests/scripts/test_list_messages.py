@@ -15,6 +15,10 @@ def test_the_remedy_begins_with_an_imperative() -> None:
     cause, remedy = parted("lidar 'rear': stamps are 0.1 s late: 7 sigma. Check its clock, or wait")
     assert cause == "lidar 'rear': stamps are 0.1 s late: 7 sigma"
     assert remedy == "Check its clock, or wait"
+    assert (
+        parted("off: pitch: imu.T_vehicle_imu rpy_deg about (0, 2, 0) would fit")[0] == "off: pitch"
+    )
+    assert parted("'duration_s' (9 s) must be below 5 s")[1] == "must be below 5 s"
     assert parted("a.yaml: is a pipe") == ("a.yaml: is a pipe", "")
 
 

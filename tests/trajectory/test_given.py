@@ -40,7 +40,10 @@ def test_one_pose_is_no_drive(stamps: tuple[int, ...]) -> None:
     with pytest.raises(TrajectoryError) as caught:
         given_trajectory(recorded(*stamps))
 
-    assert str(caught.value) == f"drive/: {len(stamps)} vehicle pose(s), needs at least 2"
+    assert str(caught.value) == (
+        f"drive/: {len(stamps)} vehicle pose(s), needs at least 2. Choose another topics.pose or "
+        "data.poses"
+    )
 
 
 def test_a_drive_without_poses_is_an_error() -> None:

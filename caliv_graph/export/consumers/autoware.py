@@ -70,7 +70,8 @@ def _changed(request: Request, base: Base) -> Export:
         if frame not in children:
             if frame is not None:
                 raise ExportError(
-                    f"{base.path}: has no frame '{frame}' (--frame), but {', '.join(children)}"
+                    f"{base.path}: has no frame '{frame}'. Give --frame one of "
+                    f"{', '.join(children)}"
                 )
             missing.append(name)
             continue

@@ -77,7 +77,9 @@ def _changed(base: Base, value: str, note: str) -> str:
     try:
         json.loads(_without_comments(edited).removeprefix("\ufeff"))
     except ValueError as e:
-        raise ExportError(f"{base.path}: is not valid JSON: {e}") from None
+        raise ExportError(
+            f"{base.path}: is not valid JSON: {e}. Correct it there, or give another --base"
+        ) from None
     return edited
 
 

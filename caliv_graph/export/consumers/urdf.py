@@ -115,10 +115,14 @@ class _Robot:
         try:
             self._parser.Parse(self._bytes, True)
         except (expat.ExpatError, ValueError) as e:
-            raise ExportError(f"{self._path}: is not valid XML: {e}") from None
+            raise ExportError(
+                f"{self._path}: is not valid XML: {e}. Correct it there, or give another --base"
+            ) from None
         if self._root is None or self._root[0] != "robot":
             found = self._root[0] if self._root else ""
-            raise ExportError(f"{self._path}: its root is <{found}>, but a URDF has <robot>")
+            raise ExportError(
+                f"{self._path}: its root is <{found}>, expected <robot>: give the URDF as --base"
+            )
         # Transmissions and ros2_control have joint elements, too, without parent and child.
         self._joints = [joint for joint in self._joints if joint.parent and joint.child]
 
@@ -207,8 +211,8 @@ class _Robot:
         if request.vehicle_frame:
             if request.vehicle_frame not in frames:
                 raise ExportError(
-                    f"{self._path}: has no link '{request.vehicle_frame}' (--vehicle-frame), but "
-                    f"{_listed(frames)}"
+                    f"{self._path}: has no link '{request.vehicle_frame}'. Give --vehicle-frame "
+                    f"one of {_listed(frames)}"
                 )
             return request.vehicle_frame, ()
         known = [frame for frame in VEHICLE_FRAMES if frame in frames]

@@ -60,7 +60,7 @@ def extract_targets(
     if config.target is None and not searched:
         searched = find_target(recordings, trajectories, config, progress)
     if config.target is False:
-        raise TargetError("target: false: no target is looked for")
+        raise TargetError("target: false: no target is looked for", "Remove target: false")
     regions: list[tuple[TargetRegion, ...]] = (
         [tuple(f.region for f in (found, *found.others)) for found in searched]
         if config.target is None

@@ -72,6 +72,8 @@ class Place:
         T_vehicle_lidar: the guesses with their errors removed.
         late_s: LiDAR -> lateness of its stamps, of those that were free.
         velocity_map: (3,) m/s of the object; zero if it was not free.
+        cov: LiDAR -> (6, 6) covariance of what is left of its guess's error, right perturbation,
+            rad and m; the guess's own where nothing was seen that tells it.
     """
 
     place_map: Array
@@ -79,6 +81,7 @@ class Place:
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
     late_s: Mapping[str, float]
     velocity_map: Array
+    cov: Mapping[str, Array]
 
 
 def fit_place(
@@ -108,7 +111,7 @@ def fit_place(
     for k, name in enumerate(names):
         prior[3 + 6 * k : 9 + 6 * k] = 1.0 / guesses[name][1]
     prior[3 + 6 * m : 3 + 7 * m] = 1.0 / LATE_SIGMA_S
-    error, rest = np.zeros(columns), np.zeros((n, 3))
+    error, rest, A = np.zeros(columns), np.zeros((n, 3)), np.zeros((0, columns))
     weights = np.ones(n)
     for _ in range(ITERATIONS):
         p, J = _places(seen, index, [T[name] for name in names], error[3 + 6 * m : 3 + 7 * m])
@@ -128,12 +131,16 @@ def fit_place(
         length = np.linalg.norm(rest, axis=1)
         weights = np.minimum(1.0, HUBER * max(float(np.median(length)), SEEN_SIGMA_M) / length)
     late_s = error[3 + 6 * m : 3 + 7 * m]
+    cov = np.zeros((columns, columns))
+    cov[np.ix_(free, free)] = np.linalg.inv(A.T @ A)
+    parts = [slice(3 + 6 * k, 9 + 6 * k) for k in range(m)]
     return Place(
         place_map=error[:3],
         scatter_m=float(np.quantile(np.linalg.norm(rest, axis=1), QUARTILE)),
         T_vehicle_lidar={**{name: T for name, (T, _) in guesses.items()}, **T},
         late_s={name: float(late_s[k]) for k, name in enumerate(names) if name in late},
         velocity_map=error[3 + 7 * m :],
+        cov={name: cov[part, part] for name, part in zip(names, parts, strict=True)},
     )
 
 

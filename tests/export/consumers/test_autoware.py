@@ -198,6 +198,6 @@ def test_what_is_wrong_with_a_base(text: str, message: str) -> None:
 
 def test_a_frame_that_is_not_there() -> None:
     with pytest.raises(
-        ExportError, match=r"has no frame 'top' \(--frame\), but camera0/camera_link"
+        ExportError, match=r"has no frame 'top'. Give --frame one of camera0/camera_link"
     ):
         export(request(base=base(KIT), lidars=("front",), frames={"front": "top"}))

@@ -237,7 +237,7 @@ def test_looking_straight_up_or_down(tmp_path: Path, pitch: float) -> None:
     ("text", "message"),
     [
         ("<robot", "old: is not valid XML"),
-        ("<sdf/>", r"old: its root is <sdf>, but a URDF has <robot>"),
+        ("<sdf/>", r"old: its root is <sdf>, expected <robot>"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><robot name="r"/>', "old: has a DOCTYPE"),
         (
             one_joint("camera_front"),

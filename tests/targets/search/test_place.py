@@ -88,6 +88,17 @@ def test_what_walks_has_a_velocity() -> None:
     assert found.velocity_map == pytest.approx(velocity, abs=0.002)
 
 
+def test_what_the_place_tells_of_a_guess_is_right_within_its_covariance() -> None:
+    """A figure-eight tells yaw, x and y of a guess; a point tells no roll about the line to it."""
+    off = {"front": np.array([0.0, 0.0, 0.2, 0.5, -0.4, 0.0]), "rear": np.zeros(6)}
+    found = fit_place(sightings(), guesses(off))
+    for name, T in TRUE.items():
+        error = T.logmap(found.T_vehicle_lidar[name])
+        spread = np.sqrt(np.diag(found.cov[name]))
+        assert (spread <= 1.0001 * SIGMAS).all()
+        assert (np.abs(error)[[2, 3, 4]] < 3.0 * spread[[2, 3, 4]]).all()
+
+
 def test_one_cloud_of_something_else_does_not_move_the_place() -> None:
     seen = sightings()
     seen.centres_lidar[7] += [3.0, 2.0, 0.0]

@@ -183,7 +183,7 @@ def recording_of(task: Task, beams: Path) -> SimulatedRecording:
     """
     scenario = scenario_of(task)
     if task.whole:
-        return simulate_drive(scenario, task.seed)
+        return simulate_drive(GroundWaves().on(scenario, task.seed), task.seed)
     selection = replace(
         selection_of(task.drive, task.lidar, beams), digest=scenario_digest(scenario)
     )

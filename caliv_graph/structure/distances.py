@@ -19,6 +19,7 @@ import scipy.sparse
 
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, solved
+from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
 from caliv_graph.structure.problem import (
     Problem,
@@ -30,20 +31,11 @@ from caliv_graph.structure.problem import (
     placed_sightings,
     with_guesses,
 )
+from caliv_graph.structure.residuals import Geometry
+from caliv_graph.structure.rows import PLACE_PRIOR_M, TILT_PRIOR_RAD, Rows, whitened
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
-from caliv_graph.structure.system import (
-    PLACE_PRIOR_M,
-    TILT_PRIOR_RAD,
-    Geometry,
-    Layout,
-    Nuisances,
-    Rows,
-    State,
-    stepped,
-    whitened,
-)
 from caliv_graph.structure.thickness import thickness_m, weighted_alike
 
 OWN_SIGHTINGS = 3

@@ -11,8 +11,8 @@ import numpy as np
 
 from caliv_graph.products import Array
 from caliv_graph.structure.elimination import factor_of, half_solved
+from caliv_graph.structure.layout import Layout
 from caliv_graph.structure.noise import LEAST_JITTER_S, MOST_JITTER_S
-from caliv_graph.structure.system import Layout
 
 EVIDENCE = 3.0
 """Gain of the log-likelihood from which stamps are taken to jitter: chance gains as much in one of

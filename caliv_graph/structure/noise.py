@@ -11,9 +11,10 @@ from scipy.optimize import nnls
 
 from caliv_graph.config.range_errors import RangeErrors, size_weights
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import BEAM_RAD, Sightings
-from caliv_graph.structure.system import BIASES, Geometry, Layout, Nuisances
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01

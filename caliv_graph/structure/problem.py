@@ -11,12 +11,14 @@ import numpy as np
 from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.layout import Layout, State
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.residuals import Geometry, geometry_of, lidar_poses
 from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import Strips
-from caliv_graph.structure.system import Geometry, Layout, State, System, geometry_of, lidar_poses
+from caliv_graph.structure.system import System
 from caliv_graph.structure.views import Views
 from caliv_graph.trajectory.select import VehicleTrajectory
 

@@ -14,6 +14,7 @@ from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s
+from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
     fitted_noise,
@@ -32,19 +33,12 @@ from caliv_graph.structure.problem import (
     placed_sightings,
     with_guesses,
 )
+from caliv_graph.structure.residuals import Geometry
+from caliv_graph.structure.rows import whitened
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.standing import Stands, stands_of
 from caliv_graph.structure.strips import Strips, find_strips
-from caliv_graph.structure.system import (
-    Geometry,
-    Layout,
-    Nuisances,
-    State,
-    System,
-    stepped,
-    system_of,
-    whitened,
-)
+from caliv_graph.structure.system import System, system_of
 from caliv_graph.structure.thinning import (
     on_all_coordinates,
     on_all_poses,

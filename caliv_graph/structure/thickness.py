@@ -10,9 +10,9 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.problem import geometry_at, placed_patches, placed_sightings
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import Solved
-from caliv_graph.structure.system import PLANE_ROWS, Geometry
 
 RIDGE = 1e-6
 """Prior of a fitted plane, in sightings: what one LiDAR sees from afar determines no tilt."""

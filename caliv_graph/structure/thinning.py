@@ -15,10 +15,10 @@ import numpy as np
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.elimination import factor_of, half_solved, solved
+from caliv_graph.structure.layout import State
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem
-from caliv_graph.structure.system import State
 from caliv_graph.structure.views import Views
 
 FEW_SCANS = 50

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.structure.jitter import jitter_sigma_s
-from caliv_graph.structure.system import Layout
+from caliv_graph.structure.layout import Layout
 
 LAYOUT = Layout(poses=2, parameters=0, offsets=(), lidars=1, surface_of=(), jitters=150)
 

@@ -8,17 +8,11 @@ import scipy.sparse
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.structure.elimination import eliminated, factor_of, solved
+from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
+from caliv_graph.structure.residuals import Geometry, geometry_of
+from caliv_graph.structure.rows import whitened
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.standing import Standing, Stands, standing_rows, stands_of
-from caliv_graph.structure.system import (
-    Geometry,
-    Layout,
-    Nuisances,
-    State,
-    geometry_of,
-    stepped,
-    whitened,
-)
 
 LAYOUT = Layout(
     poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2, rates=6

@@ -1,0 +1,213 @@
+"""The variables of structure: where each stands, an estimate of them, and a step from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from caliv_graph.geometry.se3 import stack, tangent_axes
+from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.imu import exp_so3
+
+BIASES = 3
+"""Biases of a LiDAR that hold for the whole drive: bias, growth with incidence, on the ground."""
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """1 sigma of errors of the LiDARs that are estimated beside all else, metres.
+
+    Attributes:
+        bias: bias of the ranges of a LiDAR.
+        incidence: growth of that bias with 1 / cos(incidence).
+        ground: bias of a LiDAR on all level strips: asphalt is darker than walls are.
+        surface: bias of a LiDAR on a surface: colour, gloss.
+        strip: (K,) how far a LiDAR sees each strip from where others do: bumps, other beams.
+        sighting: (K,) offset of each strip from scan to scan.
+        shared: offset of a surface from scan to scan, which its strips share: incidence, and how
+            the beams fall, change along a wall slowly.
+        repeated: share of the variances of `sighting` and `shared` that is the same in all scans
+            from one place, beyond what `strip` has of it.
+        jitter_s: of the stamp of each scan, s; 0: no such variables.
+    """
+
+    bias: float
+    incidence: float
+    ground: float
+    surface: float
+    strip: Array
+    sighting: Array
+    shared: float
+    repeated: float
+    jitter_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class State:
+    """An estimate; M poses, n LiDARs, K strips.
+
+    Attributes:
+        R_map_vehicle: (M, 3, 3).
+        t_map_vehicle: (M, 3) metres.
+        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior; with
+            the errors of the rates, 6 more.
+        T_vehicle_lidar: n poses.
+        offsets_s: (n,) time offsets; zero where they are not free.
+        centres_map: (K, 3) points of the planes.
+        normals_map: (K, 3).
+        errors: (D,) errors of LiDARs, height and tilt at their coordinates; else zero.
+    """
+
+    R_map_vehicle: Array
+    t_map_vehicle: Array
+    moved: Array
+    T_vehicle_lidar: tuple[gtsam.Pose3, ...]
+    offsets_s: Array
+    centres_map: Array
+    normals_map: Array
+    errors: Array
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each variable is among the D coordinates of the system.
+
+    In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
+    were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
+    incidence, and that on the ground (3), error of the vehicle's height and tilt above the ground
+    (3), jitter of the stamp of each scan, if there is any; and what belongs to one surface each:
+    planes (two tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each
+    strip.
+    """
+
+    poses: int
+    parameters: int
+    offsets: tuple[int, ...]
+    lidars: int
+    surface_of: tuple[int, ...]
+    jitters: int = 0
+    rates: int = 0
+
+    @property
+    def strips(self) -> int:
+        """K."""
+        return len(self.surface_of)
+
+    @property
+    def surfaces(self) -> int:
+        """Number of surfaces."""
+        return max(self.surface_of, default=-1) + 1
+
+    @property
+    def rate(self) -> int:
+        """First error of the rates."""
+        return 6 * self.poses + self.parameters
+
+    @property
+    def offset(self) -> int:
+        """First time offset; before it is what the pose prior is on."""
+        return self.rate + self.rates
+
+    @property
+    def extrinsic(self) -> int:
+        """First coordinate of the extrinsics."""
+        return self.offset + len(self.offsets)
+
+    @property
+    def error(self) -> int:
+        """First coordinate of the biases of the LiDARs."""
+        return self.extrinsic + 6 * self.lidars
+
+    @property
+    def plane(self) -> int:
+        """First coordinate of the planes, and of all that belongs to one surface."""
+        return self.jitter + self.jitters
+
+    @property
+    def jitter(self) -> int:
+        """First jitter of a stamp."""
+        return self.standing + 3
+
+    @property
+    def standing(self) -> int:
+        """Error of the vehicle's height above ground, and the two of its tilt."""
+        return self.error + BIASES * self.lidars
+
+    @property
+    def surface_error(self) -> int:
+        """First bias of a LiDAR on a surface."""
+        return self.plane + 3 * self.strips
+
+    @property
+    def strip_error(self) -> int:
+        """First offset of a LiDAR on a strip."""
+        return self.surface_error + self.lidars * self.surfaces
+
+    @property
+    def size(self) -> int:
+        """D."""
+        return self.strip_error + self.lidars * self.strips
+
+    def error_columns(self) -> IntArray:
+        """Coordinates of all errors of the LiDARs, in the order of `error_sigmas`."""
+        return np.concatenate(
+            [np.arange(self.error, self.standing), np.arange(self.surface_error, self.size)]
+        )
+
+    def error_sigmas(self, nuisances: Nuisances) -> Array:
+        """1 sigma of each error of the LiDARs."""
+        of_lidar = np.array([nuisances.bias, nuisances.incidence, nuisances.ground])
+        return np.concatenate(
+            [
+                np.tile(of_lidar, self.lidars),
+                np.full(self.lidars * self.surfaces, nuisances.surface),
+                np.tile(nuisances.strip, self.lidars),
+            ]
+        )
+
+    def of_surfaces(self) -> list[IntArray]:
+        """Coordinates that belong to each surface."""
+        surface = np.array(self.surface_of, dtype=np.int64)
+        strips = np.arange(self.strips)
+        where = [self.plane + 3 * strips + i for i in range(3)]
+        where += [self.strip_error + self.strips * i + strips for i in range(self.lidars)]
+        own = [np.arange(self.surfaces)] * self.lidars
+        of = np.concatenate([surface] * len(where) + own)
+        where += [self.surface_error + self.surfaces * i + own[0] for i in range(self.lidars)]
+        columns = np.concatenate(where)
+        order = np.argsort(of, kind="stable")
+        ends = np.cumsum(np.bincount(of, minlength=self.surfaces))[:-1]
+        return [np.sort(part) for part in np.split(columns[order], ends)]
+
+
+def stepped(state: State, layout: Layout, d: Array) -> State:
+    """The estimate after a step (D,)."""
+    m = layout.poses
+    xi = d[: 6 * m].reshape(m, 6)
+    moved = [gtsam.Pose3.Expmap(v) for v in xi]
+    R_d, t_d = stack(moved)
+    tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
+    planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
+    errors = np.concatenate([layout.error_columns(), np.arange(layout.standing, layout.plane)])
+    all_errors = state.errors.copy()
+    all_errors[errors] += d[errors]
+    B = tangent_axes(state.normals_map)
+    turn = np.cross(state.normals_map, np.einsum("kj,kji->ki", planes[:, :2], B))
+    normals = np.einsum("kij,kj->ki", exp_so3(turn), state.normals_map)
+    offsets = state.offsets_s.copy()
+    offsets[list(layout.offsets)] += d[layout.offset : layout.extrinsic]
+    return replace(
+        state,
+        R_map_vehicle=state.R_map_vehicle @ R_d,
+        t_map_vehicle=state.t_map_vehicle + np.einsum("mij,mj->mi", state.R_map_vehicle, t_d),
+        moved=state.moved + d[: layout.offset],
+        T_vehicle_lidar=tuple(
+            T.retract(v) for T, v in zip(state.T_vehicle_lidar, tangents, strict=True)
+        ),
+        offsets_s=offsets,
+        centres_map=state.centres_map + planes[:, 2:] * state.normals_map,
+        normals_map=normals,
+        errors=all_errors,
+    )

@@ -1,0 +1,247 @@
+"""Distances of points from their strips, and their derivatives by all variables."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import scipy.sparse
+
+from caliv_graph.geometry.se3 import skew, stack, tangent_axes
+from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.layout import BIASES, Layout, State
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.strips import LEVEL
+
+DENT_RAD = 0.05
+"""Largest angle of a strip to its tile that is a dent of the ground. What is steeper, such as a
+bonnet, is a surface of its own."""
+
+
+PLANE_ROWS = slice(12, 15)
+"""Where the derivatives by the plane are in `Geometry.by`: after pose and extrinsic."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Residuals of all sightings as linear functions of h = (p, 1), and their derivatives.
+
+    Attributes:
+        plain: (Q, 4) the residual, metres.
+        by: (Q, C, 4) its derivatives.
+        columns: (Q, C) coordinates of these.
+        normals_lidar: (Q, 3) normals of the strips in the lidar frame at the scan's stamp.
+    """
+
+    plain: Array
+    by: Array
+    columns: IntArray
+    normals_lidar: Array
+
+    def offsets_m(self, sightings: Sightings) -> Array:
+        """(Q,) distance of the middle of each sighting from its plane."""
+        return np.asarray(np.einsum("qi,qi->q", self.plain, _middles(sightings)))
+
+    def offset_rows(self, sightings: Sightings, size: int) -> scipy.sparse.csr_array:
+        """(Q, `size`) derivatives of `offsets_m`."""
+        data = np.einsum("qci,qi->qc", self.by, _middles(sightings))
+        return rows_of(data[:, None], self.columns, size)
+
+
+def _middles(sightings: Sightings) -> Array:
+    centroid = sightings.centroids_lidar
+    return np.concatenate([centroid, np.ones((len(centroid), 1))], axis=1)
+
+
+def rows_of(data: Array, columns: IntArray, size: int) -> scipy.sparse.csr_array:
+    """A sparse matrix (r q, `size`) of r rows (q, r, C) each with the same columns (q, C)."""
+    q, r, c = data.shape
+    column = np.repeat(columns.astype(np.int32), r, axis=0).ravel()
+    ends = np.arange(0, q * r * c + 1, c, dtype=np.int32)
+    return scipy.sparse.csr_array((data.ravel(), column, ends), shape=(q * r, size))
+
+
+def lidar_poses(
+    state: State, lidar: IntArray, pose: IntArray, twists: Array | None
+) -> tuple[Array, Array]:
+    """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included."""
+    R_e, t_e = stack(state.T_vehicle_lidar)
+    R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
+    if twists is not None and state.offsets_s.any():
+        late = [gtsam.Pose3.Expmap(v) for v in -state.offsets_s[lidar][:, None] * twists[pose]]
+        R_d, t_d = stack(late)
+        R_v, t_v = R_v @ R_d, t_v + np.einsum("qij,qj->qi", R_v, t_d)
+    return R_v @ R_e[lidar], t_v + np.einsum("qij,qj->qi", R_v, t_e[lidar])
+
+
+def geometry_of(
+    state: State,
+    sightings: Sightings,
+    layout: Layout,
+    lidar: IntArray,
+    pose: IntArray,
+    twists: Array | None,
+    dents: bool = True,
+) -> Geometry:
+    """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
+
+    Args:
+        state: where they are linearised.
+        sightings: Q of them.
+        layout: the coordinates.
+        lidar: (Q,) index of the LiDAR of each.
+        pose: (Q,) index of the pose of each.
+        twists: (M, 6) velocity at each pose, right perturbation per second; None: no offset is
+            free.
+        dents: whether dents of the ground tell where a LiDAR is (`smooth_normals`).
+    """
+    q = sightings.count
+    strip = sightings.strip
+    surface = np.array(layout.surface_of, dtype=np.int64)[strip]
+    R, t = lidar_poses(state, lidar, pose, twists)
+    centre, normal = state.centres_map[strip], state.normals_map[strip]
+    m = np.einsum("qji,qj->qi", R, normal)
+    error_columns = _error_columns(layout, lidar, surface, strip)
+    by_error = _by_error(sightings, m, normal[:, 2] > LEVEL)
+
+    plain = np.zeros((q, 4))
+    plain[:, :3] = m
+    plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre)
+    plain += np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
+
+    normals = state.normals_map if dents else smooth_normals(state.normals_map, layout)
+    smooth = np.einsum("qji,qj->qi", R, normals[strip])
+    by_extrinsic = np.zeros((q, 6, 4))
+    by_extrinsic[:, :3, :3] = -skew(smooth)
+    by_extrinsic[:, 3:, 3] = smooth
+    back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
+    by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
+    if twists is not None and layout.rates:
+        by_extrinsic = by_extrinsic + _by_compensation(
+            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
+        )
+    B = tangent_axes(normal)
+    by_plane = np.zeros((q, 3, 4))
+    by_plane[:, :2, :3] = B @ R
+    by_plane[:, :2, 3] = np.einsum("qki,qi->qk", B, t - centre)
+    by_plane[:, 2, 3] = -1.0
+    parts = [by_pose, by_extrinsic, by_plane, by_error]
+    columns = [
+        6 * pose[:, None] + np.arange(6),
+        layout.extrinsic + 6 * lidar[:, None] + np.arange(6),
+        layout.plane + 3 * strip[:, None] + np.arange(3),
+        error_columns,
+    ]
+    if twists is not None and layout.rates:
+        # Points move with the velocity in the map, whatever way the vehicle is turned.
+        by_turn = sightings.time_s[:, None, None] * (
+            np.swapaxes(skew(twists[pose, 3:]), 1, 2) @ by_pose[:, 3:]
+        )
+        turned = state.moved[6 * pose[:, None] + np.arange(3)]
+        plain += np.einsum("qc,qci->qi", turned, by_turn)
+        parts[0] = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
+    moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
+    for by, own, value in moved:
+        plain += np.einsum("qc,qci->qi", value, by)
+        parts.append(by)
+        columns.append(own)
+    return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:
+    """(Q, 6, 4) further derivatives by the extrinsic: points were moved in time with it.
+
+    A point taken tau later is at `X Exp(tau xi) E p`: a right perturbation of E there is one by
+    `Ad(Exp(tau xi_lidar))` at the stamp. With it, a turn of the LiDAR on the vehicle that the
+    vehicle's poses make up for is told by nothing, the rates following the poses.
+    """
+    turn, shift = skew(twists_lidar[:, :3]), skew(twists_lidar[:, 3:])
+    ad = np.zeros((len(time_s), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = turn
+    ad[:, 3:, :3] = shift
+    return np.asarray(time_s[:, None, None] * (np.swapaxes(ad, 1, 2) @ by_extrinsic))
+
+
+def _by_motion(
+    state: State,
+    sightings: Sightings,
+    layout: Layout,
+    lidar: IntArray,
+    pose: IntArray,
+    twists: Array | None,
+    by_pose: Array,
+) -> list[tuple[Array, IntArray, Array]]:
+    """What moves a whole scan, or its points by their times, as errors of its pose do.
+
+    Each with its derivatives (Q, c, 4), their coordinates (Q, c), and the values (Q, c) that are
+    not in the poses of `state` yet.
+    """
+    q = sightings.count
+    out = []
+    if layout.rates:
+        # Points taken tau later: X Exp(tau e) in the place of X.
+        own = np.broadcast_to(layout.rate + np.arange(layout.rates), (q, layout.rates))
+        by_rates = sightings.time_s[:, None, None] * by_pose
+        out.append((by_rates, own, state.moved[own]))
+    if twists is None or not (layout.offsets or layout.jitters):
+        return out
+    by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+    if layout.jitters:
+        own = layout.jitter + sightings.scan[:, None]
+        out.append((by_time, own, state.errors[own]))
+    if layout.offsets:
+        by_offset = by_time.copy()
+        place = np.full(layout.lidars, -1)
+        place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
+        by_offset[place[lidar] < 0] = 0.0
+        out.append((by_offset, np.maximum(place[lidar], 0)[:, None], np.zeros((q, 1))))
+    return out
+
+
+def smooth_normals(normals_map: Array, layout: Layout) -> Array:
+    """(K, 3) normals by which a motion of a LiDAR changes the distances from the strips.
+
+    Of level strips that of their tile: dents of the ground are no flat pieces, and which of them a
+    beam meets depends on where it falls. They tell height and tilt, a ramp tells more.
+    """
+    surface = np.array(layout.surface_of, dtype=np.int64)
+    level = normals_map[:, 2] > LEVEL
+    total = np.stack([np.bincount(surface, n, layout.surfaces) for n in normals_map.T], axis=1)
+    mean = total / np.linalg.norm(total, axis=1)[:, None]
+    dent = level & (np.einsum("ki,ki->k", mean[surface], normals_map) > math.cos(DENT_RAD))
+    return np.where(dent[:, None], mean[surface], normals_map)
+
+
+def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: IntArray) -> IntArray:
+    """(Q, 5) columns of the errors of each sighting, in the order of `_by_error`."""
+    of_surface = layout.surface_error + layout.surfaces * lidar + surface
+    of_strip = layout.strip_error + layout.strips * lidar + strip
+    first = layout.error + BIASES * lidar
+    return np.stack([first, first + 1, first + 2, of_surface, of_strip], axis=1)
+
+
+def _by_error(sightings: Sightings, normals_lidar: Array, level: BoolArray) -> Array:
+    """(Q, 5, 4) what each error of a LiDAR adds to the residual, linear in h = (p, 1).
+
+    A range that is too long by b moves a point by `-b cos(incidence)` along the normal; the cosine
+    changes over a strip: on ground that looks like a tilt. Errors: bias, its growth with
+    1 / cos(incidence), bias on the ground (`level` strips), bias on the surface, offset on the
+    strip.
+    """
+    centroid = sightings.centroids_lidar
+    distance = np.linalg.norm(centroid, axis=1)[:, None]
+    u = centroid / distance
+    cos = -np.einsum("qi,qi->q", normals_lidar, u)
+    # Along the plane only: a change along the normal would scale the points' scatter away.
+    slope = -cos[:, None] * (u + cos[:, None] * normals_lidar) / distance
+    out = np.zeros((len(u), 5, 4))
+    out[:, 0, :3] = slope
+    out[:, 0, 3] = cos - np.einsum("qi,qi->q", slope, centroid)
+    out[:, 1] = -out[:, 0]
+    out[:, 1, 3] += 1.0
+    out[:, 2] = np.where(level[:, None], out[:, 0], 0.0)
+    out[:, 3] = out[:, 0]
+    out[:, 4, 3] = 1.0
+    return out

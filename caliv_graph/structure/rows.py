@@ -1,0 +1,126 @@
+"""Residuals of sightings in units of their noise: what goes into the normal equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.layout import Nuisances
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry, rows_of
+from caliv_graph.structure.sightings import Sightings, without_own_error
+
+MOST_NOISE = 0.5
+"""Largest part of a strip's information on its tilt that may be noise of the points."""
+
+
+TILT_PRIOR_RAD = 5.0
+
+
+PLACE_PRIOR_M = 1000.0
+"""Prior of a plane: a single ring of beams does not determine its tilt. A thousand planes together
+must say next to nothing of what turns and shifts all of them, such as the roll of all LiDARs on a
+straight drive: 5 rad / sqrt(1000) is five times the guess's 30 mrad."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened residuals of all sightings.
+
+    Attributes:
+        J: (4 Q, D).
+        r: (4 Q,).
+        shared: (4 Q, G) derivatives by the offset of each surface in each scan, 1 sigma each.
+        of_noise: (D,) what the noise of the points adds to `J^T r` in the mean.
+        shared_noise: (G,) the same of `shared^T r`.
+    """
+
+    J: scipy.sparse.csr_array
+    r: Array
+    shared: scipy.sparse.csr_array
+    of_noise: Array
+    shared_noise: Array
+
+    def normal_equations(
+        self,
+    ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array, Array]:
+        """H and V with H - V V^T of the system, (D, D) and (D, G), and its b (D,).
+
+        The shared offsets are eliminated; V has their couplings. The product would couple all
+        strips of a surface with each other: most of the memory of the solve.
+        """
+        B = self.shared
+        J_t = self.J.T.tocsr()
+        inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
+        V = (J_t @ (B @ scipy.sparse.diags_array(np.sqrt(inner)))).tocsr()
+        b = self.of_noise - J_t @ self.r
+        b += V @ (np.sqrt(inner) * (B.T @ self.r - self.shared_noise))
+        return (J_t @ self.J).tocsr(), V, np.asarray(b)
+
+
+def whitened(
+    geometry: Geometry,
+    sightings: Sightings,
+    group: IntArray,
+    repeated: IntArray,
+    alike: IntArray,
+    nuisances: Nuisances,
+    weights: Array,
+    size: int,
+) -> Rows:
+    """Residuals by the noise of points and sightings, the latter eliminated.
+
+    `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
+    view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
+    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
+    """
+    more = repetition(nuisances, repeated)
+    own = nuisances.sighting[sightings.strip] * more
+    # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
+    # scans: bumps within it. As often as it is seen, so often the error counts.
+    tilt = np.sqrt(own**2 + (alike - 1.0) * nuisances.strip[sightings.strip] ** 2)
+    S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
+    S, noise = S * weights[:, None, None], noise * weights[:, None, None]
+    values, vectors = np.linalg.eigh(S)
+    C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    data = np.swapaxes(geometry.by @ C, 1, 2)
+    q = sightings.count
+    J = rows_of(data, geometry.columns, size)
+    groups, number = np.unique(group, return_inverse=True)
+    by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
+    own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
+    shared = scipy.sparse.csr_array(
+        (by_offset.ravel(), (np.arange(4 * q), own_group.ravel())), shape=(4 * q, len(groups))
+    )
+    noise *= _bearable(geometry, S, noise, sightings.strip)[:, None, None]
+    of_plane = np.einsum("qij,qj->qi", noise, geometry.plain)
+    pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
+    of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
+    of_offset = nuisances.shared * more * of_plane[:, 3]
+    of_groups = np.bincount(number.ravel(), of_offset, len(groups))
+    r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
+    return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups))
+
+
+def repetition(nuisances: Nuisances, repeated: IntArray) -> Array:
+    """(Q,) factor on sigmas of sightings whose views have `repeated` (Q,) scans."""
+    return np.asarray(np.sqrt(1.0 + (repeated - 1.0) * nuisances.repeated))
+
+
+def _bearable(geometry: Geometry, S: Array, noise: Array, strip: IntArray) -> Array:
+    """(Q,) factors on the noise: less than MOST_NOISE of what a strip's moments say of its tilt.
+
+    Where a single ring of beams meets a wall all that is known of its tilt is noise.
+    """
+    by = geometry.by[:, PLANE_ROWS][:, :2]
+    count = int(strip.max(initial=-1)) + 1
+    both = []
+    for of in (S, noise):
+        blocks = by @ of @ np.swapaxes(by, 1, 2)
+        total = [np.bincount(strip, blocks[:, i, j], count) for i, j in ((0, 0), (0, 1), (1, 1))]
+        both.append(np.stack([total[0], total[1], total[1], total[2]], axis=1).reshape(-1, 2, 2))
+    known = both[0] + TILT_PRIOR_RAD**-2.0 * np.eye(2)
+    largest = np.abs(np.linalg.eigvals(np.linalg.solve(known, both[1]))).max(axis=1, initial=0.0)
+    return np.asarray(np.minimum(1.0, MOST_NOISE / np.maximum(largest, 1e-9))[strip])

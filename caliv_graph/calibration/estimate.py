@@ -165,9 +165,7 @@ def _estimate(
     terms: tuple[StructureTerm, ...] = ()
     if structure.patches:
         with progress.stage("solving walls and other surfaces", None):
-            terms = structure.terms_beside(
-                rough.state, problem, trajectories, noise.heave_m, grounds
-            )
+            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m)
         times["structure"] = time.perf_counter() - begun
 
     begun = time.perf_counter()

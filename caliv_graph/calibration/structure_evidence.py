@@ -72,12 +72,8 @@ class StructureEvidence:
         heave_m: float,
         noise: PoseNoise,
         config: Config,
-        grounds: Sequence[GroundObservation] = (),
     ) -> tuple[StructureTerm, ...]:
         """The term of each drive that has structure.
-
-        Where the strips have the ground of some LiDARs only, those terms are without it that have
-        other strips: planes tie the ground of all LiDARs, and of one it counts once.
 
         Args:
             trajectories: one per drive, with nodes at the stamps of the patches.
@@ -86,7 +82,6 @@ class StructureEvidence:
             heave_m: 1 sigma of the heave.
             noise: of given poses.
             config: guesses and noise.
-            grounds: the ground planes that the LiDARs saw.
 
         Raises:
             SolveError: it could not be solved.
@@ -99,25 +94,16 @@ class StructureEvidence:
             of.drive: np.unique(np.concatenate([kept[of.drive], of.stamps_ns])) for of in patches
         }
         priors = pose_priors(trajectories, stamps, heave_m, noise, config)
-
-        def solved(some: Sequence[DrivePatches], config: Config) -> tuple[StructureTerm, ...]:
-            return self.solve(
-                some,
-                [priors[of.drive] for of in some],
-                [kept[of.drive] for of in some],
-                [trajectories[of.drive] for of in some],
-                start,
-                config,
-                frozenset(config.lidars) if config.solve.time_offset else frozenset(),
-                heave_m,
-            )
-
-        terms = solved(patches, config)
-        twice = drives_with_ground_twice(grounds, terms)
-        again = [of for of in patches if of.drive in twice]
-        without = solved(again, _without_ground(config)) if again else ()
-        others = [term for term in terms if term.drive not in twice]
-        return tuple(sorted([*others, *without], key=lambda term: term.drive))
+        return self.solve(
+            patches,
+            [priors[of.drive] for of in patches],
+            [kept[of.drive] for of in patches],
+            [trajectories[of.drive] for of in patches],
+            start,
+            config,
+            frozenset(config.lidars) if config.solve.time_offset else frozenset(),
+            heave_m,
+        )
 
     def terms_beside(
         self,
@@ -125,7 +111,6 @@ class StructureEvidence:
         problem: Problem,
         trajectories: Sequence[VehicleTrajectory],
         heave_m: float,
-        grounds: Sequence[GroundObservation],
     ) -> tuple[StructureTerm, ...]:
         """`terms` on the poses of a problem, from where a rough solve put its LiDARs."""
         kept: dict[int, list[int]] = {}
@@ -137,33 +122,19 @@ class StructureEvidence:
             else lidar.guess()
             for name, lidar in state.config.lidars.items()
         }
-        return self.terms(trajectories, kept, start, heave_m, state.noise, state.config, grounds)
-
-
-def _without_ground(config: Config) -> Config:
-    return config.model_copy(update={"ground": config.ground.model_copy(update={"use": False})})
+        return self.terms(trajectories, kept, start, heave_m, state.noise, state.config)
 
 
 def other_grounds(
     grounds: tuple[GroundObservation, ...], terms: Sequence[StructureTerm]
 ) -> tuple[GroundObservation, ...]:
-    """The ground planes of drives whose terms do not have the ground: it counts once.
+    """The ground planes of LiDARs whose ground the terms do not have: it counts once.
 
-    In the terms it is cell by cell, under a range bias of each LiDAR that tilts and lifts all its
-    planes alike.
+    In the terms it is cell by cell. The planes of all LiDARs in its place claim too much: they take
+    what scans from other places share of the ground, such as bumps, as independent.
     """
     within = {(term.drive, name) for term in terms for name in term.ground}
     return tuple(o for o in grounds if (o.drive, o.lidar) not in within)
-
-
-def drives_with_ground_twice(
-    grounds: Sequence[GroundObservation], terms: Sequence[StructureTerm]
-) -> frozenset[int]:
-    """Drives whose terms have the ground of some LiDARs, but not of all with ground planes."""
-    seen = {(o.drive, o.lidar) for o in grounds}
-    within = {(term.drive, name) for term in terms for name in term.ground}
-    some = {drive for drive, _ in within}
-    return frozenset(drive for drive, name in seen - within if drive in some)
 
 
 NO_STRUCTURE = StructureEvidence()

@@ -270,6 +270,7 @@ def add_ground(
     stamps_ns: IntArray,
     columns: Columns,
     assumptions: Assumptions,
+    only: frozenset[str] | None = None,
 ) -> None:
     """Adds the ground: the plane that each LiDAR measures, and the plane under the wheels.
 
@@ -281,6 +282,7 @@ def add_ground(
         stamps_ns: times at which the ground is measured.
         columns: the shared coordinates.
         assumptions: sigmas of the ground, and its use.
+        only: LiDARs that measure planes; None: all that see the ground.
     """
     level = _level(motion, scenario, drive)
     nodes = motion.nodes_of(stamps_ns)
@@ -292,7 +294,7 @@ def add_ground(
     stood = np.zeros(len(level), dtype=np.bool_)
     for name in columns.lidars:
         model = scenario.lidars[name]
-        if not sees_ground(model):
+        if not sees_ground(model) or (only is not None and name not in only):
             continue
         scans = scan_stamps(scenario, name, drive.duration_s)
         if not len(scans):

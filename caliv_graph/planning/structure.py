@@ -7,7 +7,7 @@ Clouds of targets are added on the same poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,27 +92,7 @@ class PlannedStructure:
 def plan_structure(
     scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
 ) -> PlannedStructure | None:
-    """The structure of a drive; None if it passes no walls, or if none is to be used.
-
-    Without the ground where some LiDARs see it as planes only, at scans of targets: it counts once.
-    """
-    planned = _planned(scenario, drive, sightings, assumptions)
-    planes = assumptions.ground != "none" and any(len(s.used) for s in sightings)
-    if planned is None or not planes or _has_all_ground(scenario, planned.found):
-        return planned
-    return _planned(scenario, drive, sightings, replace(assumptions, ground="none"))
-
-
-def _has_all_ground(scenario: Scenario, found: Solved) -> bool:
-    """Whether the strips have the ground of all LiDARs that see it."""
-    seeing = {name for name, model in scenario.lidars.items() if sees_ground(model)}
-    return seeing <= lidars_with_ground(found)
-
-
-def _planned(
-    scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
-) -> PlannedStructure | None:
-    """`plan_structure`, with the ground wherever strips have it."""
+    """The structure of a drive; None if it passes no walls, or if none is to be used."""
     faces = faces_of(scenario)
     if not assumptions.structure or not faces.flat.any():
         return None
@@ -195,7 +175,11 @@ def information_with_structure(
     used = [s for s in sightings if len(s.used)]
     layout, nodes = structure.found.layout, structure.nodes
     names = list(scenario.lidars)
-    with_planes = assumptions.ground != "none" and not _has_all_ground(scenario, structure.found)
+    # The ground of a LiDAR counts once, as in `calibrate`.
+    with_planes: frozenset[str] = frozenset()
+    if assumptions.ground != "none":
+        seeing = {name for name, model in scenario.lidars.items() if sees_ground(model)}
+        with_planes = frozenset(seeing) - lidars_with_ground(structure.found)
     columns = Columns(
         names,
         assumptions.time_offset,
@@ -210,7 +194,7 @@ def information_with_structure(
         add_clouds(H, structure.motion, scenario, sighting, placement, columns)
     if with_planes and used:
         stamps = np.unique(np.concatenate([s.stamps_ns[s.used] for s in used]))
-        add_ground(H, structure.motion, scenario, drive, stamps, columns, assumptions)
+        add_ground(H, structure.motion, scenario, drive, stamps, columns, assumptions, with_planes)
     H = H[nodes]
     # Coordinates: those of `columns`, then poses, then errors of LiDARs and of the vehicle's stand.
     errors = layout.plane - layout.error

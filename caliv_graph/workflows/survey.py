@@ -136,7 +136,7 @@ def survey_observations(
         problem, used, tuple(grounds), config, progress, limit, look_for_symmetries=True
     )
     state = rough.state
-    terms = structure.terms_beside(state, problem, trajectories, problem.heave_m, grounds)
+    terms = structure.terms_beside(state, problem, trajectories, problem.heave_m)
     if terms:
         others = lidars_with_structure(terms)
         problem = pose_problem(used, trajectories, config, None, others)

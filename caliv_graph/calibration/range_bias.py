@@ -20,9 +20,9 @@ import scipy.linalg
 from caliv_graph.calibration.linear import cloud_rows
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.config.range_errors import (
-    INCIDENCES_M,
     OFFSETS_M,
     flat,
+    incidence_prior,
     log_normal,
     offset_prior,
     size_weights,
@@ -243,8 +243,7 @@ def fit_bias_sizes(
         offset_m: 1 sigma of the offsets, if the user knows it.
     """
     offsets = offset_prior(offset_m)
-    # Who knows that all ranges are right to a millimetre knows it of those at a slant, too.
-    incidences = flat(INCIDENCES_M if offset_m is None else np.minimum(INCIDENCES_M, offset_m))
+    incidences = incidence_prior(offset_m)
     unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
     information, pull = _information(reduced, unit, prior)
     smooths = log_normal(SMOOTHS, TYPICAL_SMOOTH) if biases.smooth.shape[1] else flat(np.zeros(1))

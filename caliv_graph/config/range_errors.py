@@ -127,6 +127,11 @@ def offset_prior(stated_m: float | None) -> SizePrior:
     return log_normal(OFFSETS_M, TYPICAL_OFFSET_M)
 
 
+def incidence_prior(stated_m: float | None) -> SizePrior:
+    """The prior of the sigma of the growth; at most what is stated of all ranges."""
+    return flat(INCIDENCES_M if stated_m is None else np.minimum(INCIDENCES_M, stated_m))
+
+
 def size_weights(
     information: Array, pull: Array, kinds: IntArray, priors: Sequence[SizePrior]
 ) -> Array:

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.calibration.choose import choose_static, displaced
-from caliv_graph.calibration.structure_evidence import (
-    kept_stamps,
-)
+from caliv_graph.calibration.structure_evidence import kept_stamps
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config

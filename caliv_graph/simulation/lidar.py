@@ -15,7 +15,7 @@ from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.scenario.beams import channel_elevations_deg, unit_vectors
 from caliv_graph.scenario.model import CropModel
 from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel
-from caliv_graph.scenario.world import GROUND, World
+from caliv_graph.scenario.world import World
 from caliv_graph.simulation.rays import NO_OBJECT, RayCaster
 
 SingleArray = npt.NDArray[np.float32]
@@ -123,7 +123,6 @@ class SimulatedLidar:
         self.channels, self.columns = directions.shape[:2]
         self.column_times_s = column_times(model, self.columns)
         self._directions_lidar = directions.reshape(-1, 3)
-        self._ground_index = world.names.index(GROUND)
         self._spheres_map: list[tuple[Array, float]] = []
         always = np.full(directions.shape[:2], crop is None)
         if crop is not None:

@@ -218,6 +218,19 @@ def half_solved(factor: tuple[Array, Array], right: Array) -> Array:
     )
 
 
+def marginal(H: Array, b: Array, keep: IntArray, rest: IntArray) -> tuple[Array, Array]:
+    """Information and gradient of coordinates `keep` of a Gaussian, those of `rest` eliminated.
+
+    Raises:
+        SolveError: `rest` is singular.
+    """
+    half = half_solved(
+        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(keep, rest)].T, b[rest]])
+    )
+    known = half.T @ half
+    return H[np.ix_(keep, keep)] - known[:-1, :-1], b[keep] - known[:-1, -1]
+
+
 def covariance_of(factor: tuple[Array, Array], own: IntArray) -> Array:
     """(n, n) block of H^-1 of n coordinates, from `factor_of(H)`."""
     unit = np.zeros((len(factor[0]), len(own)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.products import Array
-from caliv_graph.structure.elimination import factor_of, half_solved
+from caliv_graph.structure.elimination import marginal
 from caliv_graph.structure.layout import Layout
 from caliv_graph.structure.noise import LEAST_JITTER_S, MOST_JITTER_S
 
@@ -35,12 +35,7 @@ def jitter_sigma_s(H: Array, b: Array, layout: Layout) -> float:
     """
     own = np.arange(layout.jitter, layout.plane)
     rest = np.arange(layout.jitter)
-    half = half_solved(
-        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(own, rest)].T, b[rest]])
-    )
-    known = half.T @ half
-    A = H[np.ix_(own, own)] - known[:-1, :-1]
-    u = b[own] - known[:-1, -1]
+    A, u = marginal(H, b, own, rest)
     values, vectors = np.linalg.eigh(A)
     seen = values > 1e-9 * max(float(values.max(initial=0.0)), MOST_JITTER_S**-2.0)
     told, square = values[seen], (vectors[:, seen].T @ u) ** 2

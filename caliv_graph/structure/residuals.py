@@ -118,30 +118,30 @@ def geometry_of(
     by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
+    by_own_pose = by_pose
     if twists is not None and layout.rates:
         by_extrinsic = by_extrinsic + _by_compensation(
             sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
         )
-    B = tangent_axes(normal)
-    by_plane = np.zeros((q, 3, 4))
-    by_plane[:, :2, :3] = B @ R
-    by_plane[:, :2, 3] = np.einsum("qki,qi->qk", B, t - centre)
-    by_plane[:, 2, 3] = -1.0
-    parts = [by_pose, by_extrinsic, by_plane, by_error]
-    columns = [
-        6 * pose[:, None] + np.arange(6),
-        layout.extrinsic + 6 * lidar[:, None] + np.arange(6),
-        layout.plane + 3 * strip[:, None] + np.arange(3),
-        error_columns,
-    ]
-    if twists is not None and layout.rates:
         # Points move with the velocity in the map, whatever way the vehicle is turned.
         by_turn = sightings.time_s[:, None, None] * (
             np.swapaxes(skew(twists[pose, 3:]), 1, 2) @ by_pose[:, 3:]
         )
         turned = state.moved[6 * pose[:, None] + np.arange(3)]
         plain += np.einsum("qc,qci->qi", turned, by_turn)
-        parts[0] = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
+        by_own_pose = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
+    B = tangent_axes(normal)
+    by_plane = np.zeros((q, 3, 4))
+    by_plane[:, :2, :3] = B @ R
+    by_plane[:, :2, 3] = np.einsum("qki,qi->qk", B, t - centre)
+    by_plane[:, 2, 3] = -1.0
+    parts = [by_own_pose, by_extrinsic, by_plane, by_error]
+    columns = [
+        6 * pose[:, None] + np.arange(6),
+        layout.extrinsic + 6 * lidar[:, None] + np.arange(6),
+        layout.plane + 3 * strip[:, None] + np.arange(3),
+        error_columns,
+    ]
     moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
     for by, own, value in moved:
         plain += np.einsum("qc,qci->qi", value, by)

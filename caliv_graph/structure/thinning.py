@@ -14,7 +14,7 @@ import numpy as np
 
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.elimination import factor_of, half_solved, solved
+from caliv_graph.structure.elimination import factor_of, marginal, solved
 from caliv_graph.structure.layout import State
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
@@ -67,18 +67,13 @@ def _on(prior: PosePrior, poses: IntArray) -> PosePrior:
     """The Gaussian of some of the poses (p,), and of the parameters."""
     if len(poses) == len(prior.stamps_ns):
         return prior
-    keep, rest = _coordinates(prior, poses)
-    H, b = prior.information, prior.gradient
-    half = half_solved(
-        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(keep, rest)].T, b[rest]])
-    )
-    known = half.T @ half
+    information, gradient = marginal(prior.information, prior.gradient, *_coordinates(prior, poses))
     return replace(
         prior,
         stamps_ns=prior.stamps_ns[poses],
         T_map_vehicle=tuple(prior.T_map_vehicle[i] for i in poses),
-        information=H[np.ix_(keep, keep)] - known[:-1, :-1],
-        gradient=b[keep] - known[:-1, -1],
+        information=information,
+        gradient=gradient,
     )
 
 

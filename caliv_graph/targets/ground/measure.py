@@ -13,6 +13,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -137,7 +138,7 @@ def by_rates(points_lidar: Array, times_s: Array, T_vehicle_lidar: gtsam.Pose3) 
     R_vehicle_lidar = T_vehicle_lidar.rotation().matrix()
     # In lidar axes: arms from the vehicle's origin, and the vehicle's axes.
     arms = points_lidar - T_vehicle_lidar.inverse().translation()
-    by_turn = [times_s[:, None] * np.cross(axis, arms) for axis in R_vehicle_lidar]
+    by_turn = [times_s[:, None] * cross(axis, arms) for axis in R_vehicle_lidar]
     return by_turn + [times_s[:, None] * axis for axis in R_vehicle_lidar]
 
 

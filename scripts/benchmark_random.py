@@ -33,17 +33,13 @@ sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script fr
 from caliv_graph.common.exits import DEFECT, DONE, INCONSISTENT, UNMET, USAGE, exit_code
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
-from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
-from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, Calibration
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.model import dump_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.uncertainty.evaluation import evaluate
-from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined
+from scripts._judged import judged, sigmas_off
 from scripts._random_drives import RandomDrive, random_drive
 from scripts._runs import add_line, code_digest, json_lines, performed
 
@@ -113,7 +109,7 @@ def perform(task: tuple[int, bool | None]) -> dict[str, Any]:
     except Exception:  # a defect on one drive must not end the others
         line |= {"exit": DEFECT, "said": [traceback.format_exc()]}
     else:
-        line |= judged(run, recording)
+        line |= outcome_of(run, recording)
     return {**line, "cpu_s": time.process_time() - begun}
 
 
@@ -130,46 +126,15 @@ def calibrated(recording: SimulatedRecording, drive: RandomDrive) -> Calibration
     return calibrate([recording], parse_config(raw, drive.text, REPOSITORY), SilentProgress())
 
 
-def judged(run: CalibrationRun, recording: SimulatedRecording) -> dict[str, Any]:
+def outcome_of(run: CalibrationRun, recording: SimulatedRecording) -> dict[str, Any]:
     """Exit code, messages and errors of a run, as part of its line."""
     calibration = run.calibration
-    found = evaluate(calibration, recording.truth.T_vehicle_lidar)
-    errors = {}
-    for name, of in found["lidars"].items():
-        lidar = calibration.lidars[name]
-        errors[f"S2V {name}"] = _judged(of["s2v"], name, lidar.cov, lidar.determined, calibration)
-    for of in found["pairs"]:
-        a, b = of["from"], of["to"]
-        cov, determined = pair_covariance(calibration, a, b), pair_determined(calibration, a, b)
-        errors[f"S2S {a} to {b}"] = _judged(of, a, cov, determined, calibration)
     return {
         "exit": exit_code(calibration),
         "said": [*calibration.contradictions, *calibration.unmet],
         "warnings": list(run.warnings),
         "undetermined": [direction.text for direction in calibration.undetermined],
-        "errors": errors,
-    }
-
-
-def _judged(
-    of: Mapping[str, Any],
-    lidar: str,
-    cov: Array,
-    determined: Mapping[str, bool],
-    calibration: Calibration,
-) -> dict[str, Any]:
-    """Errors (rad, m), sigmas and NEES of the determined axes; None: an undetermined axis."""
-    told = np.array([determined[axis] for axis in AXES])
-    error = np.array([*of["rotation_rad"], *of["translation_m"]])
-    cov = parent_axes_covariance(calibration.lidars[lidar].T_vehicle_lidar, cov)
-    sigma = np.sqrt(np.diag(cov))
-    part = cov[np.ix_(told, told)] / np.outer(sigma[told], sigma[told])
-    whitened = error[told] / sigma[told]
-    return {
-        "error": [float(e) if t else None for e, t in zip(error, told, strict=True)],
-        "sigma": sigma.tolist(),
-        "nees": float(whitened @ np.linalg.solve(part, whitened)) if told.any() else None,
-        "axes": int(told.sum()),
+        "errors": judged(calibration, recording.truth.T_vehicle_lidar),
     }
 
 
@@ -181,12 +146,6 @@ def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
     lines = (x for x in json_lines(path) if any_version or x["code"] == code_digest())
     last = {(line["seed"], line["forced"]): line for line in lines}
     return sorted(last.values(), key=lambda line: int(line["seed"]))
-
-
-def sigmas_off(of: Mapping[str, Any]) -> list[float]:
-    """Errors of the determined axes of a quantity over their sigmas, absolute."""
-    pairs = zip(of["error"], of["sigma"], strict=True)
-    return [abs(error) / sigma for error, sigma in pairs if error is not None]
 
 
 def worst_sigmas(line: Mapping[str, Any]) -> float:

@@ -1,0 +1,59 @@
+"""A calibration against known extrinsics: errors, sigmas and NEES of the axes it determines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from caliv_graph.conventions import AXES
+from caliv_graph.geometry.covariance import parent_axes_covariance
+from caliv_graph.products import Array, Calibration
+from caliv_graph.uncertainty.evaluation import evaluate
+from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined
+
+
+def judged(
+    calibration: Calibration, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> dict[str, dict[str, Any]]:
+    """Quantity (`S2V a`, `S2S a to b`) -> errors and sigmas (rad, m, vehicle axes), NEES."""
+    found = evaluate(calibration, T_vehicle_lidar)
+    errors = {}
+    for name, of in found["lidars"].items():
+        lidar = calibration.lidars[name]
+        errors[f"S2V {name}"] = _judged(of["s2v"], name, lidar.cov, lidar.determined, calibration)
+    for of in found["pairs"]:
+        a, b = of["from"], of["to"]
+        cov, determined = pair_covariance(calibration, a, b), pair_determined(calibration, a, b)
+        errors[f"S2S {a} to {b}"] = _judged(of, a, cov, determined, calibration)
+    return errors
+
+
+def sigmas_off(of: Mapping[str, Any]) -> list[float]:
+    """Errors of the determined axes of a quantity over their sigmas, absolute."""
+    pairs = zip(of["error"], of["sigma"], strict=True)
+    return [abs(error) / sigma for error, sigma in pairs if error is not None]
+
+
+def _judged(
+    of: Mapping[str, Any],
+    lidar: str,
+    cov: Array,
+    determined: Mapping[str, bool],
+    calibration: Calibration,
+) -> dict[str, Any]:
+    """Errors (rad, m), sigmas and NEES of the determined axes; None: an undetermined axis."""
+    told = np.array([determined[axis] for axis in AXES])
+    error = np.array([*of["rotation_rad"], *of["translation_m"]])
+    cov = parent_axes_covariance(calibration.lidars[lidar].T_vehicle_lidar, cov)
+    sigma = np.sqrt(np.diag(cov))
+    part = cov[np.ix_(told, told)] / np.outer(sigma[told], sigma[told])
+    whitened = error[told] / sigma[told]
+    return {
+        "error": [float(e) if t else None for e, t in zip(error, told, strict=True)],
+        "sigma": sigma.tolist(),
+        "nees": float(whitened @ np.linalg.solve(part, whitened)) if told.any() else None,
+        "axes": int(told.sum()),
+    }

@@ -37,6 +37,7 @@ from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
     other_grounds,
+    rough_extrinsics,
     solved_with_structure,
 )
 from caliv_graph.common.progress import Progress
@@ -93,10 +94,12 @@ def estimate_with_noise(
     if not used and structure.patches:
         with threadpool_limits(limits=1):
             with progress.stage("estimating the noise of the sensors", None):
-                noise = noise_of_motion(trajectories, config.noise)
+                guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
+                told = structure.slow_errors(trajectories, guesses, config)
+                noise = noise_of_motion(trajectories, config.noise, told.of_drives)
                 trajectories = with_noise(noise, trajectories)
             solved = solve_structure_and_ground(
-                trajectories, config, progress, tuple(grounds), structure, noise
+                trajectories, config, progress, tuple(grounds), structure, noise, told
             )
             return solution_without_target(solved), tuple(trajectories)
     problem = pose_problem(used, trajectories, config)
@@ -123,7 +126,8 @@ def _estimate(
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
-        noise = estimated_noise(rough.state, rough.registrations, trajectories)
+        told = structure.slow_errors(trajectories, rough_extrinsics(rough.state), config)
+        noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
         grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
         grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
@@ -165,7 +169,7 @@ def _estimate(
     terms: tuple[StructureTerm, ...] = ()
     if structure.patches:
         with progress.stage("solving walls and other surfaces", None):
-            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m)
+            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m, told)
         times["structure"] = time.perf_counter() - begun
 
     begun = time.perf_counter()

@@ -38,7 +38,6 @@ from caliv_graph.config.range_errors import RangeErrors, range_errors
 from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
 from caliv_graph.targets.ground.planes import ground_floors
-from caliv_graph.trajectory.correlated import MOVES
 from caliv_graph.trajectory.effects import ErrorEffects, error_effects, smoothed_in_time
 from caliv_graph.trajectory.error_likelihood import (
     ErrorLikelihood,
@@ -47,6 +46,12 @@ from caliv_graph.trajectory.error_likelihood import (
 )
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+
+ErrorsByStructure = Mapping[int, tuple[Array, Array]]
+"""Drive -> information and gradient of what its structure says of the errors of its sensors, as
+those of `ErrorLikelihood`."""
+
+NOTHING: ErrorsByStructure = {}
 
 FEWEST_CLOUDS = 16
 """Fewer clouds do not tell noise levels: the usual ones hold."""
@@ -71,7 +76,7 @@ class Evidence:
         by_pose: (N, 6 p) derivatives by right perturbations of p poses.
         white: name of `LEVELS` -> (N, N) covariance at sigma 1.
         effects: per drive, the columns of its poses in `by_pose`, and what errors do to them.
-        motion: per drive, what its motion data say of these errors.
+        motion: per drive, what its motion data and its structure say of these errors.
         sensor_sigmas: kind of sensor -> (3,) white 1 sigma of one measurement, map axes.
     """
 
@@ -101,13 +106,23 @@ class Evidence:
         return out
 
 
-def motion_evidence(trajectories: Sequence[VehicleTrajectory]) -> Evidence:
-    """What the motion data of smoothed drives say of their sensors, without any LiDAR."""
-    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
-    motion = [error_likelihood(t, kinds) for t in smoothed for kinds in [_kinds(t)] if kinds]
+def motion_evidence(
+    trajectories: Sequence[VehicleTrajectory], structure: ErrorsByStructure = NOTHING
+) -> Evidence:
+    """What motion data and structure say of the sensors of smoothed drives, without a target."""
+    drives = {n: t for n, t in enumerate(trajectories) if isinstance(t, SmoothedTrajectory)}
+    motion = [_of_errors(t, structure.get(n)) for n, t in drives.items() if t.open_kinds]
     nothing = Observed(np.zeros(1), np.ones((1, 1)), np.ones(1), np.eye(1))
-    sigmas = _sensor_sigmas(smoothed)
+    sigmas = _sensor_sigmas(list(drives.values()))
     return Evidence(nothing, np.zeros((1, 6)), {}, motion=motion, sensor_sigmas=sigmas)
+
+
+def _of_errors(
+    trajectory: SmoothedTrajectory, structure: tuple[Array, Array] | None
+) -> ErrorLikelihood:
+    """What the motion data of a drive say of errors of its sensors, and its structure."""
+    found = error_likelihood(trajectory, trajectory.open_kinds)
+    return found if structure is None else found.told(*structure)
 
 
 @dataclass
@@ -131,6 +146,7 @@ def linearised_evidence(
     state: SolveState,
     registrations: Sequence[Registration],
     trajectories: Sequence[VehicleTrajectory],
+    structure: ErrorsByStructure = NOTHING,
 ) -> Evidence | None:
     """The residuals of smoothed drives at the smoothed poses; None: too few clouds."""
     # Rates err by what does not matter for noise levels.
@@ -182,11 +198,11 @@ def linearised_evidence(
         information = of.trajectory.joint_information(of.stamps_ns)[0]
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
-        kinds = _kinds(of.trajectory)
+        kinds = of.trajectory.open_kinds
         found = error_effects(of.trajectory, of.stamps_ns, kinds)
         effects.append((of.columns, {effect.kind: effect for effect in found}))
         if kinds:
-            motion.append(error_likelihood(of.trajectory, kinds))
+            motion.append(_of_errors(of.trajectory, structure.get(drive)))
     weak = partial(_weak, problem, range_errors(state.config.noise))
     ridge = np.concatenate([*(weak(key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
@@ -219,18 +235,11 @@ def _of_drives(
     return out
 
 
-def _kinds(trajectory: SmoothedTrajectory) -> list[str]:
-    """Sensors that a drive has and whose errors may be correlated; none if some are in use."""
-    if trajectory.correlated:
-        return []
-    return [kind for kind in MOVES if kind in trajectory.factor_kinds]
-
-
 def _sensor_sigmas(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Array]:
     """Sensor -> (3,) white 1 sigma of one measurement: the median of the drives."""
     found: dict[str, list[Array]] = {}
     for trajectory in trajectories:
-        for kind in _kinds(trajectory):
+        for kind in trajectory.open_kinds:
             found.setdefault(kind, []).append(white_sigmas(trajectory.data, kind))
     return {kind: np.median(sigmas, axis=0) for kind, sigmas in found.items()}
 

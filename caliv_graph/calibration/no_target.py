@@ -39,7 +39,9 @@ from caliv_graph.calibration.structure import (
     structure_graph,
 )
 from caliv_graph.calibration.structure_evidence import (
+    NOTHING_TOLD,
     StructureEvidence,
+    ToldErrors,
     kept_stamps,
     other_grounds,
 )
@@ -94,6 +96,7 @@ def solve_structure_and_ground(
     grounds: tuple[GroundObservation, ...],
     structure: StructureEvidence,
     noise: SensorNoise | None = None,
+    told: ToldErrors = NOTHING_TOLD,
 ) -> StructureSolve:
     """Solves for the extrinsics by structure and ground.
 
@@ -104,6 +107,7 @@ def solve_structure_and_ground(
         grounds: the ground at the poses of `kept_stamps`.
         structure: the patches.
         noise: of the drives; None: the usual figures.
+        told: what a rough solve of the structure said of the sensors' errors.
 
     Raises:
         TargetError: structure says nothing, or the mode is the paper's, which needs a target.
@@ -117,7 +121,13 @@ def solve_structure_and_ground(
     begun = time.perf_counter()
     with progress.stage("solving walls and other surfaces", None):
         terms = structure.terms(
-            trajectories, kept, guesses, noise.heave_m, first_pose_noise(config.noise), config
+            trajectories,
+            kept,
+            told.T_vehicle_lidar or guesses,
+            noise.heave_m,
+            first_pose_noise(config.noise),
+            config,
+            aligned=told.T_vehicle_lidar is not None,
         )
     others = lidars_with_structure(terms)
     if not others:

@@ -33,8 +33,8 @@ SURELY_NONE = 0.95
 
 
 RATHER_NONE = 0.5
-"""The same where motion data alone tell. On a sound drive they leave it at 0.6 to 0.8, and sigmas
-by walls and ground would grow by a quarter to two thirds."""
+"""The same where motion data alone tell, without a target or structure. On a sound drive they leave
+it at 0.6 to 0.8."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
+from caliv_graph.calibration.heave import with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     ParameterPrior,
     ParameterValue,
@@ -25,7 +26,7 @@ from caliv_graph.structure.prior import PosePrior
 from caliv_graph.trajectory.chain import inverse_of
 from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 
 WALK_RAD, WALK_M = 1e-3, 0.02
 """Random walk of the odometry of a LiDAR over 0.1 s, 1 sigma per axis: several times what a scan
@@ -93,6 +94,26 @@ def _smoothed(
     )
 
 
+def plain_prior(joint: JointInformation, stamps_ns: IntArray, heave_m: float) -> PosePrior:
+    """The prior of poses alone, from their Gaussian; the other arguments as in `pose_priors`."""
+    H, b = with_heave(joint.information, joint.gradient, len(stamps_ns), heave_m)
+    return _on_poses(np.asarray(stamps_ns, np.int64), joint.T_map_vehicle, H, b)
+
+
+def _on_poses(
+    stamps: IntArray, poses: Sequence[gtsam.Pose3], information: Array, gradient: Array
+) -> PosePrior:
+    return PosePrior(
+        stamps_ns=stamps,
+        T_map_vehicle=tuple(poses),
+        parameters={},
+        information=information,
+        gradient=gradient,
+        parameter_information=np.zeros((0, 0)),
+        parameter_offset=np.zeros(0),
+    )
+
+
 def _offset(prior: ParameterPrior, value: ParameterValue) -> Array:
     """(3,) the value less the mean of its prior."""
     mean = prior.mean
@@ -132,15 +153,8 @@ def _given(
     # A right perturbation moves the position by R dt.
     information[:, 3:] = np.einsum("iba,ibjk->iajk", R, information[:, 3:])
     information[..., 3:] = np.einsum("jba,ikjb->ikja", R, information[..., 3:])
-    return PosePrior(
-        stamps_ns=stamps,
-        T_map_vehicle=unstack(R, t),
-        parameters={},
-        information=information.reshape(6 * m, 6 * m),
-        gradient=np.zeros(6 * m),
-        parameter_information=np.zeros((0, 0)),
-        parameter_offset=np.zeros(0),
-    )
+    flat = information.reshape(6 * m, 6 * m)
+    return _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
 
 
 def odometry_prior(trajectory: GivenTrajectory, stamps_ns: IntArray) -> PosePrior:
@@ -164,12 +178,4 @@ def odometry_prior(trajectory: GivenTrajectory, stamps_ns: IntArray) -> PosePrio
         J = np.hstack([-poses[i + 1].between(poses[i]).AdjointMap(), np.eye(6)])
         both = slice(6 * i, 6 * i + 12)
         information[both, both] += J.T @ weight @ J
-    return PosePrior(
-        stamps_ns=stamps,
-        T_map_vehicle=poses,
-        parameters={},
-        information=information,
-        gradient=np.zeros(6 * m),
-        parameter_information=np.zeros((0, 0)),
-        parameter_offset=np.zeros(0),
-    )
+    return _on_poses(stamps, poses, information, np.zeros(6 * m))

@@ -13,9 +13,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.calibration.evidence import Evidence, linearised_evidence, motion_evidence
+from caliv_graph.calibration.evidence import (
+    NOTHING,
+    ErrorsByStructure,
+    Evidence,
+    linearised_evidence,
+    motion_evidence,
+)
 from caliv_graph.calibration.noise import LOG_SPREAD
-from caliv_graph.calibration.open_errors import RATHER_NONE, SIZES, of_expected_size, open_errors
+from caliv_graph.calibration.open_errors import (
+    RATHER_NONE,
+    SIZES,
+    SURELY_NONE,
+    of_expected_size,
+    open_errors,
+)
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
@@ -98,28 +110,41 @@ def estimated_noise(
     state: SolveState,
     registrations: Sequence[Registration],
     trajectories: Sequence[VehicleTrajectory],
+    structure: ErrorsByStructure = NOTHING,
 ) -> SensorNoise:
     """Noise levels that the config leaves open, from a rough solve.
 
-    Of drives with given poses, whose noise is fitted elsewhere, nothing is used.
+    Of drives with given poses, whose noise is fitted elsewhere, nothing is used. `structure` is
+    what that of each drive says of slow errors of its sensors.
     """
     noise = state.config.noise
-    evidence = linearised_evidence(state, registrations, trajectories)
+    evidence = linearised_evidence(state, registrations, trajectories, structure)
     if evidence is None:
-        return noise_of_motion(trajectories, noise)
+        return noise_of_motion(trajectories, noise, structure)
     found = estimated(evidence, noise)
     if again := _with_other_levels(found, evidence, trajectories):
-        evidence = replace(evidence, motion=motion_evidence(again).motion)
+        evidence = replace(evidence, motion=motion_evidence(again, structure).motion)
         found = estimated(evidence, noise)
     return found
 
 
-def noise_of_motion(trajectories: Sequence[VehicleTrajectory], noise: NoiseConfig) -> SensorNoise:
-    """`usual_noise`, and the correlated errors that the motion data alone rather have than not."""
-    evidence = motion_evidence(trajectories)
-    found = _rather_errors(evidence, noise)
+def noise_of_motion(
+    trajectories: Sequence[VehicleTrajectory],
+    noise: NoiseConfig,
+    structure: ErrorsByStructure = NOTHING,
+) -> SensorNoise:
+    """`usual_noise`, and the correlated errors that motion data and structure leave open.
+
+    Motion data alone rather see such errors on a sound drive than not: there they count from a
+    higher probability on.
+    """
+    none_from = SURELY_NONE if structure else RATHER_NONE
+    evidence = motion_evidence(trajectories, structure)
+    found = _open_errors(evidence, noise, none_from)
     again = _with_other_levels(found, evidence, trajectories)
-    return _rather_errors(motion_evidence(again), noise) if again else found
+    if not again:
+        return found
+    return _open_errors(motion_evidence(again, structure), noise, none_from)
 
 
 def _with_other_levels(
@@ -150,9 +175,10 @@ def _differ(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
     return any(max(ratio, 1.0 / ratio) > LARGEST_RIGHT for ratio in ratios)
 
 
-def _rather_errors(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
+def _open_errors(evidence: Evidence, noise: NoiseConfig, none_from: float) -> SensorNoise:
+    """The usual noise, and errors that may be there, unless none is as probable."""
     kinds = _looked_for(noise, evidence)
-    errors = open_errors(evidence, (), np.zeros(0), (), kinds, RATHER_NONE)
+    errors = open_errors(evidence, (), np.zeros(0), (), kinds, none_from)
     opened = tuple(error.kind for error in errors)
     found = replace(_usual(noise), correlated=errors, opened=opened)
     return replace(found, levels=_levels(found, noise, ()))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.pose_priors import pose_priors
-from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.pose_priors import plain_prior, pose_priors
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
 from caliv_graph.calibration.solve import SolveState, solve_registered, with_determined_offsets
 from caliv_graph.calibration.structure import nearest_extrinsics
 from caliv_graph.config.model import Config
 from caliv_graph.products import (
+    Array,
     GroundObservation,
     IntArray,
     PoseNoise,
@@ -23,7 +24,11 @@ from caliv_graph.products import (
 from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.slow_errors import scans_for_errors
+from caliv_graph.trajectory.effects import poses_and_gain
+from caliv_graph.trajectory.error_likelihood import likelihood_end_ns
 from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 KEPT_POSES = 40
 """Poses of a drive without a target that the calibration keeps, for the ground: spread over the
@@ -39,17 +44,52 @@ StructureTerms = Callable[
         Config,
         frozenset[str],
         float,
+        bool,
     ],
     tuple[StructureTerm, ...],
 ]
 """Patches, priors of the poses, stamps of the poses to keep and trajectory of each drive; rough
-extrinsics, config, names of the LiDARs with a free time offset, 1
-sigma of the heave -> a term per drive."""
+extrinsics, config, names of the LiDARs with a free time offset, 1 sigma of the heave, whether the
+strips lie on each other at these extrinsics -> a term per drive."""
+
+
+SlowErrors = Callable[
+    [
+        Sequence[DrivePatches],
+        Sequence[PosePrior],
+        Sequence[Array],
+        Sequence[VehicleTrajectory],
+        Mapping[str, gtsam.Pose3],
+        Config,
+        float,
+    ],
+    tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]],
+]
+"""Patches, priors of their poses, gains of these on errors of sensors and trajectory of each drive;
+rough extrinsics, config, 1 sigma of the heave -> per drive information and gradient on the errors,
+and better extrinsics."""
+
+
+@dataclass(frozen=True)
+class ToldErrors:
+    """What structure says of slow errors of the vehicle's sensors.
+
+    Attributes:
+        of_drives: drive -> information and gradient, as those of `ErrorLikelihood`.
+        T_vehicle_lidar: of every LiDAR, where the strips of these drives lie on each other; None:
+            no drive has any.
+    """
+
+    of_drives: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3] | None = None
 
 
 def no_terms(*_: object) -> tuple[StructureTerm, ...]:
     """Structure that says nothing."""
     return ()
+
+
+NOTHING_TOLD = ToldErrors()
 
 
 @dataclass(frozen=True)
@@ -59,10 +99,45 @@ class StructureEvidence:
     Attributes:
         patches: per drive.
         solve: how they become terms.
+        errors: what they say of slow errors of the vehicle's sensors.
     """
 
     patches: tuple[DrivePatches, ...] = ()
     solve: StructureTerms = no_terms
+    errors: SlowErrors | None = None
+
+    def slow_errors(
+        self,
+        trajectories: Sequence[VehicleTrajectory],
+        start: Mapping[str, gtsam.Pose3],
+        config: Config,
+    ) -> ToldErrors:
+        """What the structure of smoothed drives says of slow errors of their sensors.
+
+        `start` are rough T_vehicle_lidar of every LiDAR.
+
+        Raises:
+            SolveError: it could not be solved.
+        """
+        heave_m = config.noise.heave_m or HEAVE_SIGMA_M
+        of_drives: list[tuple[DrivePatches, PosePrior, Array, SmoothedTrajectory]] = []
+        for patches in self.patches:
+            trajectory = trajectories[patches.drive]
+            if not isinstance(trajectory, SmoothedTrajectory) or not trajectory.open_kinds:
+                continue
+            used = scans_for_errors(patches, likelihood_end_ns(trajectory))
+            if not len(used.scan):
+                continue
+            stamps = np.unique(used.stamps_ns)
+            joint, gain = poses_and_gain(trajectory, stamps, trajectory.open_kinds)
+            of_drives.append((used, plain_prior(joint, stamps, heave_m), gain, trajectory))
+        if not of_drives or self.errors is None:
+            return NOTHING_TOLD
+        drives, priors, gains, own = zip(*of_drives, strict=True)
+        told, T_vehicle_lidar = self.errors(drives, priors, gains, own, start, config, heave_m)
+        pairs = zip(drives, told, strict=True)
+        by_drive = {patches.drive: of for patches, of in pairs if of is not None}
+        return ToldErrors(by_drive, T_vehicle_lidar) if by_drive else NOTHING_TOLD
 
     def terms(
         self,
@@ -72,6 +147,8 @@ class StructureEvidence:
         heave_m: float,
         noise: PoseNoise,
         config: Config,
+        *,
+        aligned: bool = False,
     ) -> tuple[StructureTerm, ...]:
         """The term of each drive that has structure.
 
@@ -82,6 +159,7 @@ class StructureEvidence:
             heave_m: 1 sigma of the heave.
             noise: of given poses.
             config: guesses and noise.
+            aligned: `start` is from `slow_errors`.
 
         Raises:
             SolveError: it could not be solved.
@@ -103,6 +181,7 @@ class StructureEvidence:
             config,
             frozenset(config.lidars) if config.solve.time_offset else frozenset(),
             heave_m,
+            aligned,
         )
 
     def terms_beside(
@@ -111,18 +190,27 @@ class StructureEvidence:
         problem: Problem,
         trajectories: Sequence[VehicleTrajectory],
         heave_m: float,
+        told: ToldErrors = NOTHING_TOLD,
     ) -> tuple[StructureTerm, ...]:
-        """`terms` on the poses of a problem, from where a rough solve put its LiDARs."""
+        """`terms` on the poses of a problem, from where the rough solves put its LiDARs."""
         kept: dict[int, list[int]] = {}
         for drive, stamp in problem.poses:
             kept.setdefault(drive, []).append(stamp)
-        start = {
-            name: state.problem.extrinsic(state.values, name)
-            if name in state.problem.lidars
-            else lidar.guess()
-            for name, lidar in state.config.lidars.items()
-        }
-        return self.terms(trajectories, kept, start, heave_m, state.noise, state.config)
+        start = told.T_vehicle_lidar or rough_extrinsics(state)
+        aligned = told.T_vehicle_lidar is not None
+        return self.terms(
+            trajectories, kept, start, heave_m, state.noise, state.config, aligned=aligned
+        )
+
+
+def rough_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:
+    """T_vehicle_lidar of every LiDAR: of a solve, and the guess of those that it is without."""
+    return {
+        name: state.problem.extrinsic(state.values, name)
+        if name in state.problem.lidars
+        else lidar.guess()
+        for name, lidar in state.config.lidars.items()
+    }
 
 
 def other_grounds(

@@ -32,6 +32,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
+from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
 from caliv_graph.wording.structure import nothing_sentence
 
@@ -115,7 +116,7 @@ def _calibrate(
 
 def structure_evidence(prepared: Prepared) -> StructureEvidence:
     """The structure of prepared drives, for the solve."""
-    return StructureEvidence(prepared.patches, structure_terms)
+    return StructureEvidence(prepared.patches, structure_terms, slow_errors)
 
 
 def without_anything(prepared: Prepared, error: TargetError) -> TargetError:

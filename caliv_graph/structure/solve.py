@@ -169,6 +169,22 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     return _on_all_poses(found, problem, poses)
 
 
+def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
+    """`solve_structure` with the fewest steps that find the strips: for what is not the result.
+
+    Raises:
+        SolveError: the system is singular.
+    """
+    range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
+    state, levels = _rough(problem, start, range_sigma)
+    found = _round(problem, state, range_sigma, GATES_M[0], levels)
+    if found is None:
+        return None
+    return _on_all_poses(
+        _settled(found, STEPS[0]), problem, np.arange(len(problem.prior.stamps_ns))
+    )
+
+
 def _rough(
     problem: Problem, start: Mapping[str, gtsam.Pose3], range_sigma: Array
 ) -> tuple[State, Levels]:

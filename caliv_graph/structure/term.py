@@ -49,6 +49,7 @@ def structure_terms(
     config: Config,
     free_offsets: frozenset[str],
     heave_m: float,
+    aligned: bool,
 ) -> tuple[StructureTerm, ...]:
     """The term of each drive that has structure.
 
@@ -62,6 +63,7 @@ def structure_terms(
         config: guesses and noise.
         free_offsets: LiDARs whose time offset is estimated.
         heave_m: 1 sigma of the heave.
+        aligned: the strips lie on each other at `start` already.
 
     Raises:
         SolveError: a system is singular.
@@ -69,16 +71,17 @@ def structure_terms(
     odometry = odometry_of(trajectories)
     if odometry is not None:
         start = start_about(odometry, start, config)
-    aligned = aligned_start(patches, trajectories, start, config)
+    if not aligned:
+        start = aligned_start(patches, trajectories, start, config)
     out = []
     for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
-        used = usable(own, trajectory, aligned, config)
+        used = usable(own, trajectory, start, config)
         if not len(used.scan):
             continue
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
         if odometry is not None:
-            problem = relative_problem(problem, odometry, aligned, config)
-        found = solve_structure(problem, aligned)
+            problem = relative_problem(problem, odometry, start, config)
+        found = solve_structure(problem, start)
         if found is None:
             continue
         places = np.searchsorted(prior.stamps_ns, kept)

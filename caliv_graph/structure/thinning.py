@@ -35,6 +35,18 @@ def some_scans(patches: DrivePatches) -> BoolArray:
     return keep
 
 
+def patches_of_scans(patches: DrivePatches, keep: BoolArray) -> DrivePatches:
+    """The patches of some of the scans (S,)."""
+    number = np.cumsum(keep) - 1
+    fewer = patches.part(keep[patches.scan])
+    return replace(
+        fewer,
+        stamps_ns=patches.stamps_ns[keep],
+        scan_lidar=patches.scan_lidar[keep],
+        scan=number[fewer.scan],
+    )
+
+
 def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     """The drive with the scans of a mask (S,) and their poses only.
 
@@ -51,14 +63,7 @@ def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         return own, poses
     patches = problem.patches
     seen = keep[patches.scan]
-    number = np.cumsum(keep) - 1
-    fewer = patches.part(seen)
-    fewer = replace(
-        fewer,
-        stamps_ns=patches.stamps_ns[keep],
-        scan_lidar=patches.scan_lidar[keep],
-        scan=number[fewer.scan],
-    )
+    fewer = patches_of_scans(patches, keep)
     views = Views.numbered(problem.views.of_scan[keep])
     return replace(own, patches=fewer, relative=problem.relative[seen], views=views), poses
 

@@ -8,16 +8,20 @@ covariance; Schmidt 1966), and its level can be estimated from what the LiDARs s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.chain import POSE, STATE, Chain
-from caliv_graph.trajectory.chain_solution import inverse_columns
+from caliv_graph.trajectory.build import TrajectoryGraph
+from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
+from caliv_graph.trajectory.chain_solution import inverse_columns, solved_columns
+from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, linearised
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.parameters import UncertainParameter
+from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
+from caliv_graph.trajectory.suspects import suspect_parameters
 
 STEP_NS = 500_000_000
 """The error is taken to be constant over this: a quarter of the shortest correlation time that is
@@ -73,6 +77,86 @@ def error_effects(
         first, middle = error_steps(trajectory.nodes_ns)
         out.append(ErrorEffects(kind, middle, np.add.reduceat(turned.reshape(shape), first, 2)))
     return tuple(out)
+
+
+def poses_and_gain(
+    smoothed: SmoothedTrajectory, stamps_ns: Sequence[int] | IntArray, kinds: Sequence[str]
+) -> tuple[JointInformation, Array]:
+    """The Gaussian of m vehicle poses, and their gain (6 m, 3 k s) on errors of k kinds in s steps.
+
+    The poses that the data mean are at minus the gain per unit of an error. Columns are by kind,
+    then by axis of the map, then by step, as in `ErrorLikelihood`. Inputs that could be wrong are
+    eliminated, as there: a lever arm that was typed wrong is no error of the fixes. `smoothed` is
+    without errors that are correlated over time.
+
+    Raises:
+        KeyError: a stamp has no node.
+    """
+    parameters = _with_free_suspects(smoothed)
+    i, of = smoothed.node_indices(stamps_ns), [p.parameter for p in parameters]
+    n, width = len(smoothed.nodes_ns), STATE + AXES * len(kinds)
+    common = [] if smoothed.yaw_bias is None else [key_yaw_bias()]
+    linear = smoothed.graph.linearize(smoothed.values)
+    graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
+    J, r = linearised(linear, graph.kinds, kinds, smoothed.states.R_map_imu, common)
+    columns = parameter_columns(
+        smoothed.data,
+        smoothed.nodes_ns,
+        smoothed.states,
+        graph,
+        smoothed.values,
+        smoothed.gnss_dropped,
+        of,
+    )
+    with_right = Chain.zero(n, width, len(common) + columns.shape[1] + 1)
+    with_right.add(beside(beside(J, columns), -r[:, None]))
+    chain = with_right.leading(STATE)
+    joint = replace(smoothed, chain=chain, parameters=parameters).joint(stamps_ns)
+    own = np.arange(len(common) + columns.shape[1])
+    both = replace(
+        with_right,
+        border=with_right.border[:, :, own],
+        corner=with_right.corner[np.ix_(own, own)],
+    )
+    free = own[len(common) :]
+    both.corner[free, free] += np.concatenate(
+        [np.zeros(0), *(np.square(1.0 / np.asarray(p.sigmas)) for p in parameters)]
+    )
+    first, _ = error_steps(smoothed.nodes_ns)
+    solution = solved_columns(both.leading(STATE), by_steps(both, first))
+    of_imu = solution[: n * STATE].reshape(n, STATE, -1)[i, :POSE]
+    # A parameter that moves T_vehicle_imu moves the vehicle, the IMU being where it is.
+    moves = np.hstack([np.zeros((POSE, 0)), *(p.imu_moves(smoothed.data) for p in of)])
+    of_imu = of_imu - moves @ solution[n * STATE + len(common) :]
+    Ad = np.asarray(smoothed.T_vehicle_imu.AdjointMap())
+    return joint, np.asarray((Ad @ of_imu).reshape(POSE * len(i), -1))
+
+
+def _with_free_suspects(smoothed: SmoothedTrajectory) -> tuple[UncertainParameter, ...]:
+    """Parameters under priors: the suspects under those that hold nothing, about their values."""
+    free = [UncertainParameter(s.parameter, s.scale) for s in suspect_parameters(smoothed)]
+    names = {p.parameter.name for p in free}
+    known = (p for p in smoothed.parameters if p.parameter.name not in names)
+    return (*free, *(p for p in known if p.sigmas is not None))
+
+
+def by_steps(both: Chain, first: IntArray) -> Array:
+    """(n STATE + k, e s) between states with common coordinates and errors by step.
+
+    `both` has e coordinates of errors after each state; `first` (s,) are the first nodes of the
+    steps. An error of a sensor acts at its own node: the coupling of neighbours has none.
+    """
+    n, width = both.diagonal.shape[:2]
+    k, e, m = len(both.corner), width - STATE, len(first)
+    of_state, of_error = slice(0, STATE), slice(STATE, width)
+    out = np.zeros((n * STATE + k, e * m))
+    step = np.searchsorted(first, np.arange(n), "right") - 1
+    columns = step[:, None] + m * np.arange(e)
+    by_state = out[: n * STATE].reshape(n, STATE, -1)
+    by_state[np.arange(n)[:, None], :, columns] = both.diagonal[:, of_error, of_state]
+    border = np.add.reduceat(both.border[:, of_error], first, 0)
+    out[n * STATE :] = border.transpose(2, 1, 0).reshape(k, e * m)
+    return out
 
 
 def error_steps(nodes_ns: IntArray) -> tuple[IntArray, IntArray]:

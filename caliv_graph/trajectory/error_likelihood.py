@@ -20,7 +20,7 @@ from caliv_graph.trajectory.chain import STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import solved_columns
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, linearised
-from caliv_graph.trajectory.effects import error_steps
+from caliv_graph.trajectory.effects import by_steps, error_steps
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.noise import orientation_covariances
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, first_nodes
@@ -61,6 +61,21 @@ class ErrorLikelihood:
             self,
             information=self.information - across @ taken,
             gradient=self.gradient - taken.T @ (L.T @ self.gradient[at]),
+        )
+
+    def told(self, information: Array, gradient: Array) -> ErrorLikelihood:
+        """With what else is known of the errors, on their first steps as here or on more.
+
+        `information` (3 k s, 3 k s) and `gradient` (3 k s,) are as those of the class, in s steps.
+        Errors beyond the steps of here are taken for none.
+        """
+        k = AXES * len(self.kinds)
+        m, s = len(self.stamps_ns), len(gradient) // k
+        own = (s * np.arange(k)[:, None] + np.arange(m)).ravel()
+        return replace(
+            self,
+            information=self.information + information[np.ix_(own, own)],
+            gradient=self.gradient + gradient[own],
         )
 
     def gains(self, error: CorrelatedError, sizes: Array) -> Array:
@@ -113,6 +128,11 @@ def error_likelihood(smoothed: SmoothedTrajectory, kinds: Sequence[str]) -> Erro
     )
 
 
+def likelihood_end_ns(smoothed: SmoothedTrajectory) -> int:
+    """Last stamp of which `error_likelihood` uses the data."""
+    return int(smoothed.nodes_ns[:NODES][-1])
+
+
 def eliminated(
     graph: gtsam.GaussianFactorGraph,
     factor_kinds: Sequence[str],
@@ -150,7 +170,7 @@ def eliminated(
     by_node = slope[: n * width].reshape(n, width)
     first, middles = error_steps(nodes_ns)
     m = len(first)
-    shared = _shared(both, first)
+    shared = by_steps(both, first)
     right = np.column_stack([shared, np.append(by_node[:, of_state], slope[n * width :])])
     solution = solved_columns(both.leading(STATE), right)
     # A dense product would take ten times as long: a step touches the states of few nodes.
@@ -167,24 +187,6 @@ def eliminated(
     return ErrorLikelihood(
         tuple(kinds), middles, np.asarray(0.5 * (information + information.T)), -pull
     )
-
-
-def _shared(both: Chain, first: IntArray) -> Array:
-    """(n STATE + k, e m) between states with common coordinates and errors by step.
-
-    An error of a sensor acts at its own node: the coupling of neighbours has none.
-    """
-    n, width = both.diagonal.shape[:2]
-    k, e, m = len(both.corner), width - STATE, len(first)
-    of_state, of_error = slice(0, STATE), slice(STATE, width)
-    out = np.zeros((n * STATE + k, e * m))
-    step = np.searchsorted(first, np.arange(n), "right") - 1
-    columns = step[:, None] + m * np.arange(e)
-    by_state = out[: n * STATE].reshape(n, STATE, -1)
-    by_state[np.arange(n)[:, None], :, columns] = both.diagonal[:, of_error, of_state]
-    border = np.add.reduceat(both.border[:, of_error], first, 0)
-    out[n * STATE :] = border.transpose(2, 1, 0).reshape(k, e * m)
-    return out
 
 
 def white_sigmas(data: SmootherInput, kind: str) -> Array:

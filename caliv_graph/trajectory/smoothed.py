@@ -16,7 +16,7 @@ from caliv_graph.geometry.se3 import cross, stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.readers.common_stamps import MERGE_NS
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
-from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
@@ -174,6 +174,11 @@ class SmoothedTrajectory:
     def span_ns(self) -> tuple[int, int]:
         """First and last stamp at which there is a pose."""
         return int(self.nodes_ns[0]), int(self.nodes_ns[-1])
+
+    @property
+    def open_kinds(self) -> list[str]:
+        """Sensors whose errors may be correlated over time; none where such errors are in use."""
+        return [] if self.correlated else [kind for kind in MOVES if kind in self.factor_kinds]
 
     @cached_property
     def _dead(self) -> DeadReckoning:

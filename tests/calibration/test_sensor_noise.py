@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.evidence import Evidence
+from caliv_graph.calibration.evidence import Evidence, motion_evidence
 from caliv_graph.calibration.sensor_noise import (
     LEVELS,
     OPEN,
@@ -22,7 +22,7 @@ from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
-from tests.trajectory.test_variances import recorded, shifted, smoothed
+from tests.trajectory.test_variances import base, recorded, shifted, smoothed
 
 POSES = 16
 STEPS = 48
@@ -209,3 +209,21 @@ def test_without_lidars_the_motion_data_must_rather_have_an_error(
     assert noise_of_motion([], NoiseConfig()).correlated == ()
     monkeypatch.setattr("caliv_graph.calibration.sensor_noise.RATHER_NONE", 0.0)
     assert noise_of_motion([wave], NoiseConfig()).correlated == ()
+
+
+def test_structure_tells_whether_there_is_an_error() -> None:
+    """Structure that knows the errors of the fixes to a millimetre, and says what they are."""
+    trajectory = base()
+    (motion,) = motion_evidence([trajectory]).motion
+    steps, size = len(motion.stamps_ns), len(motion.gradient)
+    swing = np.zeros(size)
+    own = size // len(motion.kinds) * motion.kinds.index("gnss")
+    swing[own : own + steps] = 0.03 * np.sin(1e-9 * (motion.stamps_ns - motion.stamps_ns[0]))
+    sure = np.eye(size) * 1e-3**-2.0
+
+    none = noise_of_motion([trajectory], NoiseConfig(), {0: (sure, np.zeros(size))})
+    some = noise_of_motion([trajectory], NoiseConfig(), {0: (sure, sure @ swing)})
+
+    assert not any((np.array(e.sigmas) > 2e-3).any() for e in none.correlated if e.kind == "gnss")
+    found = next(e for e in some.correlated if e.kind == "gnss")
+    assert 0.01 < found.sigmas[0] < 0.04

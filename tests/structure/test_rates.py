@@ -10,7 +10,8 @@ from caliv_graph.geometry.se3 import stack, vehicle_axes_difference
 from caliv_graph.products import Array
 from caliv_graph.structure.problem import Problem
 from caliv_graph.structure.sightings import moved_moments
-from caliv_graph.structure.solve import Solved
+from caliv_graph.structure.slow_errors import told_of_errors
+from caliv_graph.structure.solve import Solved, solve_roughly
 from caliv_graph.structure.term import term_of
 from caliv_graph.trajectory.rates import rate_rows
 from tests.structure.test_solve import GUESS_SIGMAS, between, information_of, problem_of, solve
@@ -77,3 +78,18 @@ def test_wrong_rates_are_no_error_of_the_extrinsics(swept: Problem) -> None:
     assert nees(solve(swept), motion) > 30.0
     found = nees(solve(replace(swept, prior=swept.prior.with_rates())), motion)
     assert found < 15.1  # 5 degrees of freedom, one of 100
+
+
+def test_slow_errors_are_told_where_sweeps_are_put_together(swept: Problem) -> None:
+    gain = np.random.default_rng(0).normal(size=(6 * POSES, 3))
+    guesses = dict(zip(swept.patches.lidars, swept.guesses, strict=True))
+    found = solve_roughly(replace(swept, prior=swept.prior.with_rates()), guesses)
+    assert found is not None
+
+    information, gradient = told_of_errors(found, swept.prior, gain)
+
+    # No more than if the poses were known exactly, and not nothing.
+    known = gain.T @ swept.prior.information @ gain
+    part = np.linalg.eigvals(np.linalg.solve(known, information)).real
+    assert 0.01 < part.min() <= part.max() < 1.0 + 1e-6
+    assert gradient.shape == (3,)

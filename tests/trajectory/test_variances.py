@@ -14,7 +14,12 @@ from caliv_graph.trajectory.build import build_graph
 from caliv_graph.trajectory.chain import STATE
 from caliv_graph.trajectory.chain_solution import inverse_columns, solved
 from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
-from caliv_graph.trajectory.effects import STEP_NS, error_effects, smoothed_in_time
+from caliv_graph.trajectory.effects import (
+    STEP_NS,
+    error_effects,
+    poses_and_gain,
+    smoothed_in_time,
+)
 from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -191,6 +196,53 @@ def test_poses_follow_an_error_of_the_fixes_by_the_gain() -> None:
 
     assert np.abs(expected).max() > 1e-3
     assert change.ravel() == pytest.approx(expected, abs=5e-5)
+
+
+def test_poses_and_inputs_follow_an_error_by_the_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    motion = recorded()
+    assert motion.gnss is not None
+    at = motion.gnss.stamps_ns
+    error = 2e-3 * (1e-9 * (at - at[0]) // (STEP_NS * 1e-9)) / 14.0
+    typed = {"gnss": {"lever_arm": [1.2, 0.3, 0.85], "lever_arm_sigma": 0.01}}
+    config = config_for(Sensors(), **typed)
+    trajectory, moved = (
+        smooth_trajectory(of, config, WANTED) for of in (motion, shifted(motion, error))
+    )
+    held = error_effects(trajectory, WANTED.tolist(), ["gnss"])[0]
+    by_step = 2e-3 * ((held.stamps_ns - trajectory.nodes_ns[0]) // STEP_NS) / 14.0
+
+    # The arm alone is free, and as far as in the smoother.
+    monkeypatch.setattr("caliv_graph.trajectory.effects.suspect_parameters", lambda _: ())
+    joint, gain = poses_and_gain(trajectory, WANTED, ["orientation", "gnss"])
+
+    expected = trajectory.joint(WANTED)
+    assert joint.information == pytest.approx(expected.information, rel=1e-6, abs=1e-2)
+    both = (t.joint_information(WANTED)[1] for t in (trajectory, moved))
+    change = np.concatenate([a.localCoordinates(b) for a, b in zip(*both, strict=True)])
+    of_gnss = gain.reshape(len(gain), 2, 3, -1)[:, 1, 1]
+    assert change == pytest.approx(of_gnss @ by_step, abs=1e-5)
+    assert np.abs(change - held.gain[:, 1] @ by_step).max() > 3e-5
+    assert np.abs(change).max() > 1e-3
+
+
+def test_an_input_that_may_be_wrong_explains_what_it_could() -> None:
+    """A constant error of the fixes in the vehicle is a lever arm: nobody sees it by the poses."""
+    heading = np.array([T.rotation().matrix() for T in base().joint(WANTED).T_map_vehicle])
+    joint, _ = poses_and_gain(base(), WANTED, ["gnss"])
+
+    information = joint.information.reshape(len(WANTED), 6, len(WANTED), 6)
+    for axis in range(2):
+        # The fixes shift by an arm: the poses move back along the vehicle's axis.
+        arm = np.zeros((len(WANTED), 6))
+        arm[:, 3 + axis] = 0.01
+        told = np.einsum("ia,iajb,jb->", arm, information, arm)
+        assert told < 0.5 * np.einsum(
+            "ia,iajb,jb->",
+            arm,
+            base().joint(WANTED).information.reshape(information.shape),
+            arm,
+        )
+    assert len(heading) == len(WANTED)
 
 
 def test_a_correlated_error_widens_the_covariance_as_far_as_the_gain_says() -> None:

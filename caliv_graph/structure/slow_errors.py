@@ -1,0 +1,108 @@
+"""What structure says of slow errors of fixes and orientations (`README.md`, section 11b).
+
+An error that wanders over seconds moves the smoothed poses as slowly, and the walls with them: they
+do not lie on each other. Motion data alone take most of it for motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from caliv_graph.config.model import Config
+from caliv_graph.products import Array
+from caliv_graph.structure.elimination import factor_of, half_solved
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.problem import with_guesses
+from caliv_graph.structure.solve import Solved, solve_roughly
+from caliv_graph.structure.term import aligned_start, problem_of, usable
+from caliv_graph.structure.thinning import patches_of_scans, some_scans
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+
+def scans_for_errors(patches: DrivePatches, until_ns: int) -> DrivePatches:
+    """The patches of some scans of a drive, before a time: slow errors show in few."""
+    within = patches_of_scans(patches, patches.stamps_ns <= until_ns)
+    return patches_of_scans(within, some_scans(within))
+
+
+def slow_errors(
+    patches: Sequence[DrivePatches],
+    priors: Sequence[PosePrior],
+    gains: Sequence[Array],
+    trajectories: Sequence[VehicleTrajectory],
+    start: Mapping[str, gtsam.Pose3],
+    config: Config,
+    heave_m: float,
+) -> tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]]:
+    """What the structure of each drive says of errors of its sensors, beside its motion data.
+
+    Args:
+        patches: of each drive, of the scans that are to be used.
+        priors: what the motion data of each drive say of the poses at the stamps of these scans,
+            and of nothing else: parameters are eliminated.
+        gains: (6 m, c) of each drive: the poses that its motion data mean are at minus this per
+            unit of an error.
+        trajectories: of each drive.
+        start: rough T_vehicle_lidar.
+        config: guesses and noise.
+        heave_m: 1 sigma of the heave.
+
+    Returns:
+        Per drive information (c, c) and gradient (c,): minus its log-likelihood is
+        `b^T information b / 2 - gradient^T b`. None: it has no structure. And T_vehicle_lidar at
+        which the strips lie on each other.
+
+    Raises:
+        SolveError: a system is singular.
+    """
+    aligned = aligned_start(patches, trajectories, start, config)
+    out = []
+    for own, prior, gain, trajectory in zip(patches, priors, gains, trajectories, strict=True):
+        used = usable(own, trajectory, aligned, config)
+        found = None
+        if len(used.scan):
+            found = solve_roughly(problem_of(used, prior, trajectory, config, heave_m), aligned)
+        out.append(None if found is None else told_of_errors(found, prior, gain))
+        if found is not None:
+            aligned = {
+                **aligned,
+                **dict(zip(used.lidars, found.state.T_vehicle_lidar, strict=True)),
+            }
+    return tuple(out), aligned
+
+
+def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array, Array]:
+    """Information (c, c) and gradient (c,) on errors with a gain (6 m, c), from a solved drive.
+
+    `prior` (m poses) is that of the drive, without rates.
+    """
+    H, b = with_guesses(found.problem, found.state, found.system)
+    moved = found.state.moved[: len(gain)]
+    pull = prior.gradient - prior.information @ moved
+    return of_moved_prior(H, b, prior.information, pull, gain)
+
+
+def of_moved_prior(
+    H: Array, b: Array, information: Array, pull: Array, gain: Array
+) -> tuple[Array, Array]:
+    """A Gaussian on what moves the mean of a prior, by a quadratic that contains this prior.
+
+    Args:
+        H: (R, R) of the quadratic `d^T H d / 2 - b^T d`.
+        b: (R,).
+        information: (P, P) of the prior, on the first P coordinates.
+        pull: (P,) of the prior where d is zero.
+        gain: (P, c): the mean of the prior is at minus this per unit.
+    """
+    across: Array = information @ gain
+    coupling = np.zeros((len(H), gain.shape[1] + 1))
+    coupling[: len(across), :-1] = across
+    coupling[:, -1] = b
+    half = half_solved(factor_of(H), coupling)
+    known = half[:, :-1].T @ half
+    told = gain.T @ across - known[:, :-1]
+    return np.asarray(0.5 * (told + told.T)), np.asarray(gain.T @ pull - known[:, -1])

@@ -1,0 +1,91 @@
+"""What walls say of slow errors of the vehicle's sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array
+from caliv_graph.structure.slow_errors import of_moved_prior, scans_for_errors, told_of_errors
+from caliv_graph.structure.thinning import FEW_SCANS
+from tests.structure.test_solve import problem_of, solve
+from tests.structure.yards import STEP_NS, figure_eight, yard
+
+POSES = 150
+
+
+def test_a_moved_prior_is_eliminated_as_from_the_joint_quadratic() -> None:
+    rng = np.random.default_rng(3)
+    rows, of_prior, prior_rows = rng.normal(size=(20, 7)), np.zeros((9, 7)), rng.normal(size=(9, 4))
+    of_prior[:, :4] = prior_rows
+    gain, residual, prior_residual = (
+        rng.normal(size=(4, 3)),
+        rng.normal(size=20),
+        rng.normal(size=9),
+    )
+    # Residuals rows d - residual of all else, prior_rows (d + gain b) - residual of the prior.
+    J = np.block([[rows, np.zeros((20, 3))], [of_prior, prior_rows @ gain]])
+    right = J.T @ np.concatenate([residual, prior_residual])
+    whole = J.T @ J
+    own, rest = slice(7, 10), slice(0, 7)
+    across = whole[own, rest] @ np.linalg.inv(whole[rest, rest])
+
+    information, gradient = of_moved_prior(
+        whole[rest, rest],
+        right[rest],
+        prior_rows.T @ prior_rows,
+        prior_rows.T @ prior_residual,
+        gain,
+    )
+
+    assert information == pytest.approx(whole[own, own] - across @ whole[rest, own])
+    assert gradient == pytest.approx(right[own] - across @ right[rest])
+
+
+def swinging(period_s: float) -> tuple[Array, Array]:
+    """(6 m, 2) gain of an error along map x and y that swings once in a period, and its sine."""
+    _, yaw = figure_eight(POSES)
+    at = 1e-9 * STEP_NS * np.arange(POSES)
+    wave = np.sin(2.0 * np.pi * at / period_s)
+    R = np.array([[[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]] for a in yaw])
+    gain = np.zeros((POSES, 6, 2))
+    gain[:, 3:5] = wave[:, None, None] * R
+    return gain.reshape(6 * POSES, 2), wave
+
+
+@pytest.mark.parametrize("north_m", [0.0, 0.03])
+def test_walls_tell_how_far_the_poses_swing(north_m: float) -> None:
+    """Poses that swing by 30 mm beside their own slow errors of 20 mm."""
+    gain, wave = swinging(period_s=6.0)
+    problem = problem_of(yard(), figure_eight(POSES), seed=5)
+    R, _ = stack(problem.prior.T_map_vehicle)
+    off = np.zeros((POSES, 6))
+    off[:, 3:] = np.einsum("nji,j->ni", R, [0.0, north_m, 0.0]) * wave[:, None]
+    means = [T.retract(d) for T, d in zip(problem.prior.T_map_vehicle, off, strict=True)]
+    problem = replace(problem, prior=replace(problem.prior, T_map_vehicle=tuple(means)))
+
+    information, gradient = told_of_errors(solve(problem), problem.prior, gain)
+
+    found = np.linalg.solve(information, gradient)
+    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert (sigma < 6e-3).all()
+    assert (np.abs(found - [0.0, north_m]) < 3.0 * sigma).all()
+
+
+def test_few_scans_of_the_first_part_are_used() -> None:
+    patches = problem_of(yard(), figure_eight(POSES), seed=5).patches
+
+    used = scans_for_errors(patches, 120 * STEP_NS)
+
+    assert used.stamps_ns.max() <= 120 * STEP_NS
+    for lidar in range(2):
+        count = np.count_nonzero(used.scan_lidar == lidar)
+        assert FEW_SCANS <= count <= FEW_SCANS + 11
+    every = set(
+        zip(patches.stamps_ns[patches.scan].tolist(), patches.scatter_m.tolist(), strict=True)
+    )
+    own = zip(used.stamps_ns[used.scan].tolist(), used.scatter_m.tolist(), strict=True)
+    assert set(own) <= every

@@ -254,11 +254,12 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "broken.yaml").write_text("a: 1\nb: [1\nc: 2\n")
     (tmp_path / "empty.yaml").write_text("")
+    (tmp_path / "folder").mkdir()
 
     for name, part in {
         "nowhere.yaml": "no such file. Write it for a drive by 'caliv-graph init DRIVE --out",
         "x" * 300: "File name too long",
-        ".": "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph",
+        "folder": "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",
         "empty.yaml": "holds no configuration",

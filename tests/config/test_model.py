@@ -259,7 +259,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     for name, part in {
         "nowhere.yaml": "no such file. Write it for a drive by 'caliv-graph init DRIVE --out",
         "x" * 300: "File name too long",
-        "folder": "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph",
+        "folder": "is a folder, expected a YAML file. If this is a drive, write one by",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",
         "empty.yaml": "holds no configuration",

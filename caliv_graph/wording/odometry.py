@@ -33,5 +33,5 @@ def unseen_words(lidar: str) -> str:
     return (
         f"No motion data: the clouds lie along the odometry of lidar '{lidar}', so that S2S alone "
         "is seen here. An error that all LiDARs share is not: all six axes of S2V, and a clock "
-        "that is off for all. A drive with motion data shows the clock, and S2V's errors against it"
+        "that is off for all. Validate on a drive with motion data to see these"
     )

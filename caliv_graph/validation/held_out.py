@@ -58,7 +58,8 @@ class HeldOutOutcome:
     Attributes:
         found: what the LiDARs differ by on it; None: there is none.
         sentences: why there is none.
-        used: the solve without it; None: there is none.
+        used: the solve without it, of a drive without motion data: its poses are the best there
+            are. Else None.
     """
 
     found: HeldOutStructure | None
@@ -128,7 +129,8 @@ def measure_held_out(
             ),
             WITHOUT: at_the_solve(other),
         }
-    return HeldOutOutcome(_found(other, drive.held, measured), (), other.used)
+    found = _found(other, drive.held, measured)
+    return HeldOutOutcome(found, (), other.used if own else None)
 
 
 def _nothing(why: str) -> HeldOutOutcome:

@@ -89,8 +89,14 @@ class RecordedDrive:
         """Whether there is anything to predict with."""
         return self.sees_target or self.walls is not None
 
-    def with_mountings(self, others: Mapping[str, LidarModel]) -> dict[str, LidarModel]:
-        """Its LiDARs, mounted as others of the same names."""
+    def mounted_as(self, others: Mapping[str, LidarModel]) -> dict[str, LidarModel]:
+        """Its LiDARs, mounted as others of the same names: those of the same vehicle.
+
+        What is found of their places differs a bit from drive to drive. Pieces of walls join only
+        at the mountings that their own drive has.
+        """
+        if self.walls is not None:
+            return dict(self.scenario.lidars)
         return {
             name: model.model_copy(update={"mounting": others[name].mounting})
             for name, model in self.scenario.lidars.items()
@@ -348,10 +354,9 @@ def next_drive(
     first = drives[0]
     lidars = first.scenario.lidars
     seeing = [d for d in drives if d.tells]
-    # One vehicle: what a LiDAR shows of its beams and what is found of its place may differ a bit.
     recorded = [
         SeenDrive.of(
-            d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}),
+            d.scenario.model_copy(update={"lidars": d.mounted_as(lidars)}),
             d.route,
             assumptions,
             d.walls,

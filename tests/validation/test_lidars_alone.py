@@ -18,7 +18,7 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import dump_config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError, TrajectoryError
-from caliv_graph.products import Calibration, LidarResult
+from caliv_graph.products import Array, Calibration, LidarResult
 from caliv_graph.results.calibration_file import write_calibration
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.validation.findings import AFTER, BEFORE, WITHOUT, Validation
@@ -47,7 +47,7 @@ def calibration(b_turned_rad: float = 0.0) -> Calibration:
         )
         for name, T in TRUTH.items()
     }
-    both = np.kron(np.eye(2), cov)
+    both: Array = np.asarray(np.kron(np.eye(2), cov), np.float64)
     return replace(
         make_calibration(),
         lidars=lidars,

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 from rich.console import Console
 
 from caliv_graph.common.progress import SilentProgress
@@ -136,6 +137,10 @@ def test_a_plan_of_the_recorded_drive_counts_its_walls() -> None:
         ratio = sigma / observed.covariance.sigma_s2v[lidar]
         assert (np.abs(np.log(ratio)) < np.log(1.35)).all()
     assert any("it is predicted by walls and ground" in note for note in planned.notes)
+    # At the mountings of this drive its walls join, whatever those of another drive are.
+    assert drive.mounted_as({}) == drive.scenario.lidars
+    for lidar, model in drive.scenario.lidars.items():
+        assert model.mounting.xyz != pytest.approx(config.lidars[lidar].given.xyz, abs=1e-3)
 
 
 def test_walls_that_are_not_to_be_used_predict_nothing() -> None:

@@ -11,8 +11,15 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     turning      as plain, with LiDARs that turn once in a sweep
     packets      the same, stamps at the end, times that start anew with every packet
     inspvax      poses as novatel_oem7_msgs/INSPVAX instead of IMU, GNSS and velocity
+    novatel      the same as novatel_msgs/INSPVAX, which is stamped by the recording
     tum          poses as a TUM file beside the bag
+    csv          poses as a CSV file with nanoseconds beside the bag
     navpvt       fixes as ublox_msgs/NavPVT
+    pvt          fixes as septentrio_gnss_driver/PVTGeodetic
+    station      positions of a total station, in its own axes, as geometry_msgs/PoseStamped
+    kitti        folders of .bin files, times.txt and poses of a camera, as of KITTI odometry
+    nuscenes     folders of .pcd.bin files with the time in their names, and ego_pose.json
+    pcd          a CaLiV folder whose files say WIDTH 0, HEIGHT 0, POINTS n
     odometry     no IMU: fixes, and wheel odometry (speed and yaw rate) as nav_msgs/Odometry
     speed        no IMU: fixes, and speeds as geometry_msgs/TwistStamped
     heading      IMU without orientation, fixes, heading of two antennas as QuaternionStamped
@@ -27,6 +34,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import math
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,6 +60,7 @@ from caliv_graph.readers.pose_file import read_poses
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._dialects_folders import poses_of_clouds, write_kitti, write_nuscenes, write_pcds
 from scripts._dialects_motion import (
     ARM_M,
     BASELINE_DEG,
@@ -68,6 +77,7 @@ from scripts._dialects_motion import (
 SCENARIO = ROOT / "configs" / "scenarios" / "distorted.yaml"
 PACKET_S = 24 * 55.296e-6
 SWEEPS: dict[str, dict[str, Any]] = {
+    "still": {},
     "plain": {"time_field": "t"},
     "turning": {"time_field": "t"},
     "end": {"time_field": "t", "stamp_at": "end", "times_from": "start"},
@@ -79,12 +89,23 @@ SWEEPS: dict[str, dict[str, Any]] = {
     },
 }
 MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels", "scale")
+POSES = {"inspvax": "novatel_oem7_msgs/msg/INSPVAX", "novatel": "novatel_msgs/msg/INSPVAX"}
+FIXES = {
+    "navpvt": "ublox_msgs/msg/NavPVT",
+    "pvt": "septentrio_gnss_driver/msg/PVTGeodetic",
+    "station": "geometry_msgs/msg/PoseStamped",
+}
+FOLDERS = {"kitti": write_kitti, "nuscenes": write_nuscenes, "pcd": write_pcds}
+"""Clouds of these are taken at one instant: the formats have no times of points."""
+
 WRITTEN = {
     "as start": "end",
-    **dict.fromkeys(("inspvax", "tum", "navpvt", *MORE), "plain"),
+    **dict.fromkeys((*POSES, *FIXES, "tum", "csv", *MORE), "plain"),
+    **dict.fromkeys(FOLDERS, "still"),
 }
 ROWS = (
-    *("plain", "end", "as start", "inspvax", "tum", "navpvt", "turning", "packets"),
+    *("plain", "end", "as start", *POSES, "tum", "csv", *FIXES, "turning", "packets"),
+    *FOLDERS,
     *MORE,
 )
 NO_IMU = ("odometry", "speed", "wheels")
@@ -142,6 +163,8 @@ def described(kind: str) -> dict[str, Any]:
     raw: dict[str, Any] = load_scenario(SCENARIO).model_dump(mode="json", exclude_none=True)
     for lidar in raw["lidars"].values():
         lidar["sweep"] = dict(SWEEPS[kind])
+        if kind == "still":
+            del lidar["sweep"]
         if kind in ("turning", "packets"):
             lidar["horizontal_fov_deg"] = [-180.0, 180.0]
     raw["bag"]["transport_s"] = 0.004
@@ -164,15 +187,27 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
         (folder / "noisy.tum").write_text("\n".join(lines))
         raw["data"]["poses"] = "noisy.tum"
         raw["topics"] = {}
-    elif row in ("inspvax", "navpvt"):
+    elif row == "csv":
+        stamps, R, t = noisy_poses(folder, seed)
+        q = [r.toQuaternion() for r in R]
+        lines = ["timestamp_nsec,x,y,z,qx,qy,qz,qw"] + [
+            f"{s},{p[0]:.6f},{p[1]:.6f},{p[2]:.6f},{v.x():.9f},{v.y():.9f},{v.z():.9f},{v.w():.9f}"
+            for s, p, v in zip(stamps, t, q, strict=True)
+        ]
+        (folder / "noisy.csv").write_text("\n".join(lines))
+        raw["data"]["poses"] = "noisy.csv"
+        raw["topics"] = {}
+    elif row in POSES or row in FIXES:
         path = folder / row
         if not path.exists():
-            rewritten(folder / "drive", path, inspvax(folder, seed) if row == "inspvax" else None)
+            rewritten(folder / "drive", path, row, seed)
         raw["data"]["path"] = row
-        if row == "inspvax":
-            raw["topics"] = {"pose": "/inspvax"}
+        if row in POSES:
+            raw["topics"] = {"pose": f"/{row}"}
         else:
-            raw["topics"]["gnss"] = "/navpvt"
+            raw["topics"]["gnss"] = f"/{row}"
+    elif row in FOLDERS:
+        in_folders(row, raw, folder, seed)
     elif row in MORE:
         path = folder / row.replace(" ", "_")
         if not path.exists():
@@ -226,8 +261,25 @@ def noisy_poses(folder: Path, seed: int) -> tuple[list[int], list[Any], Any]:
     return stamps, R, np.array(t)
 
 
-def inspvax(folder: Path, seed: int) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """The noisy poses as messages: stamp, topic and fields."""
+def in_folders(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
+    """The clouds in folders, with poses for each, and the config for them."""
+    recording = open_recording(parse_config(raw, "config.yaml", folder))
+    target = folder / row
+    if target.exists():
+        shutil.rmtree(target)
+    target.mkdir()
+    folders = FOLDERS[row](
+        target, recording, poses_of_clouds(recording, *noisy_poses(folder, seed))
+    )
+    raw["data"] = {"format": "caliv" if row == "pcd" else "clouds", "path": row}
+    raw["topics"] = {}
+    for name, topic in folders.items():
+        raw["lidars"][name]["topic"] = topic
+
+
+def inspvax(folder: Path, seed: int, row: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The noisy poses as messages: stamp and fields."""
+    above, std = ("altitude", "std") if row == "novatel" else ("height", "stdev")
     gnss = load_scenario(SCENARIO).gnss
     stamps, R, t = noisy_poses(folder, seed)
     east, north, up = t.T
@@ -236,16 +288,15 @@ def inspvax(folder: Path, seed: int) -> Iterator[tuple[int, str, dict[str, Any]]
     )
     for i, stamp in enumerate(stamps):
         roll, pitch, yaw = (math.degrees(v) for v in rpy(R[i].matrix()))
-        sigmas = {f"{n}_stdev": POSITION_M for n in ("latitude", "longitude", "height")}
+        sigmas = {f"{n}_{std}": POSITION_M for n in ("latitude", "longitude", above)}
         deg = math.degrees(ROTATION_RAD)
-        sigmas |= {f"{n}_stdev": deg for n in ("roll", "pitch", "azimuth")}
+        sigmas |= {f"{n}_{std}": deg for n in ("roll", "pitch", "azimuth")}
         yield (
             stamp,
-            "/inspvax",
             {
                 "latitude": float(places[0][i]),
                 "longitude": float(places[1][i]),
-                "height": float(places[2][i]) - 45.0,
+                above: float(places[2][i]) - 45.0,
                 "undulation": 45.0,
                 **{"roll": roll, "pitch": -pitch, "azimuth": (90.0 - yaw) % 360.0},
                 **sigmas,
@@ -253,8 +304,8 @@ def inspvax(folder: Path, seed: int) -> Iterator[tuple[int, str, dict[str, Any]]
         )
 
 
-def rewritten(source: Path, target: Path, more: Any) -> None:
-    """Copies a bag; adds INSPVAX messages, or replaces its NavSatFix messages by NavPVT."""
+def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
+    """Copies a bag; adds messages of poses, or replaces its fixes by those of another receiver."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -265,14 +316,15 @@ def rewritten(source: Path, target: Path, more: Any) -> None:
         to = {
             c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections
         }
-        kind = "novatel_oem7_msgs/msg/INSPVAX" if more else "ublox_msgs/msg/NavPVT"
-        own = w.add_connection("/inspvax" if more else "/navpvt", kind, typestore=store)
-        for stamp, _, fields in more or ():
+        kind = {**POSES, **FIXES}[row]
+        own = w.add_connection(f"/{row}", kind, typestore=store)
+        for stamp, fields in inspvax(source.parent, seed, row) if row in POSES else ():
             w.write(own, stamp, serialised(store, kind, stamp, fields))
         for connection, stamp, data in reader.messages():
-            if connection.msgtype.endswith("NavSatFix") and not more:
-                fix = store.deserialize_cdr(data, connection.msgtype)
-                w.write(own, stamp, serialised(store, kind, stamp, navpvt(fix, stamp)))
+            if connection.msgtype.endswith("NavSatFix") and row in FIXES:
+                fix: Any = store.deserialize_cdr(data, connection.msgtype)
+                at = fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec
+                w.write(own, stamp, serialised(store, kind, at, RECEIVERS[row](fix, at)))
             else:
                 w.write(to[connection.id], stamp, data)
 
@@ -318,6 +370,31 @@ def navpvt(fix: Any, stamp: int) -> dict[str, Any]:
     }
 
 
+def pvt(fix: Any, stamp: int) -> dict[str, Any]:
+    """A NavSatFix as a Septentrio reports it: radians; 2DRMS and two sigma in centimetres."""
+    cov = fix.position_covariance
+    return {
+        "mode": 4,
+        "latitude": math.radians(fix.latitude),
+        "longitude": math.radians(fix.longitude),
+        "height": fix.altitude,
+        "h_accuracy": round(1e2 * 2.0 * math.sqrt(2.0 * cov[0])),
+        "v_accuracy": round(1e2 * 2.0 * math.sqrt(cov[8])),
+    }
+
+
+def station(fix: Any, stamp: int) -> dict[str, Any]:
+    """A NavSatFix as a total station 360 m away reports a prism: axes of the map, no rotation."""
+    gnss = load_scenario(SCENARIO).gnss
+    origin = (gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m)
+    east, north, up = pymap3d.geodetic2enu(fix.latitude, fix.longitude, fix.altitude, *origin)
+    place = {"x": float(east) + 300.0, "y": float(north) - 200.0, "z": float(up) + 5.0}
+    return {"pose": {"position": place, "orientation": {"w": 1.0}}}
+
+
+RECEIVERS = {"navpvt": navpvt, "pvt": pvt, "station": station}
+
+
 def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> bytes:
     """A message whose other fields are zero; the status of an INS is good."""
 
@@ -332,9 +409,13 @@ def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> byt
                 values[field] = given.get(field, np.zeros(detail[1], detail[0][1][0]))
         return store.types[name](**values)
 
-    if kind.endswith("INSPVAX"):
-        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
+    header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
+    if kind == POSES["novatel"]:
+        fields = {**fields, "ins_status": 3}
+    elif kind == POSES["inspvax"]:
         fields = {**fields, "header": header, "ins_status": {"status": 3}}
+    elif kind in (FIXES["pvt"], FIXES["station"]):
+        fields = {**fields, "header": header}
     return bytes(store.serialize_cdr(built(kind, fields), kind))
 
 

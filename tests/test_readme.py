@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shlex
 import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin
 
+import click
 import gtsam
 import numpy as np
 import pytest
@@ -278,6 +280,42 @@ def test_commands_and_their_options_exist(page: Path) -> None:
                 options = {word for word in words if word.startswith("--")}
                 code = (ROOT / scripts[0]).read_text(encoding="utf-8")
                 assert [option for option in options if f'"{option}"' not in code] == [], line
+
+
+def lines_of_configs() -> Iterator[tuple[str, str]]:
+    """Command lines in comments of configs: on a line of their own, or quoted."""
+    for path in sorted((ROOT / "configs").rglob("*.yaml")):
+        text = text_of(path)
+        for line in re.findall(r"^# (caliv-graph .+)$|'(caliv-graph [a-z]+ [^']+)'", text, re.M):
+            yield name_of(path), line[0] or line[1]
+
+
+def test_lines_in_comments_of_configs_are_whole() -> None:
+    """They are parsed as the program does, required arguments included."""
+    found = list(lines_of_configs())
+
+    assert {path for path, _ in found} >= {"configs/batch.yaml", "configs/caliv_released.yaml"}
+    for path, line in found:
+        words = shlex.split(line)[1:]
+        try:
+            commands()[words[0]].make_context(words[0], words[1:])
+        except click.ClickException as problem:
+            pytest.fail(f"{path}: {line}: {problem.format_message()}")
+
+
+def test_commands_that_messages_name_exist() -> None:
+    """Remedies quote command lines, with placeholders: their commands and options are real."""
+    named = 0
+    for path in sorted((ROOT / "caliv_graph").rglob("*.py")):
+        # Strings that go on in the next line are one.
+        text = re.sub(r"\"\s*\n\s*f?\"", "", text_of(path))
+        for command, rest in re.findall(r"'caliv-graph ([a-z]+)([^'\n]*)'", text):
+            named += 1
+            known = {
+                name for p in commands()[command].params for name in (*p.opts, *p.secondary_opts)
+            } | {"--help"}
+            assert set(re.findall(r"--[a-z-]+", rest)) <= known, f"{path.name}: {command}{rest}"
+    assert named > 20
 
 
 def test_every_command_has_an_example() -> None:

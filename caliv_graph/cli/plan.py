@@ -81,10 +81,10 @@ def plan(
     one that keeps all limits in the least space.
 
     With the config of a recorded drive, vehicle, sensors, noise and target are read off the
-    recording, and its own sigmas are predicted, without its walls. The suggestion is a drive of
-    that vehicle to be solved together with the recorded one, unless that alone suffices. --out
-    writes it as a scenario; with the config and this scenario the command tells what both drives
-    give together. Limits are those of the config unless --sigma names others.
+    recording, and its own sigmas are predicted, with the walls that it passes. The suggestion is a
+    drive of that vehicle to be solved together with the recorded one, unless that alone suffices.
+    --out writes it as a scenario; with the config and this scenario the command tells what both
+    drives give together. Limits are those of the config unless --sigma names others.
 
     Exit code 3: the drive does not keep a limit, or a LiDAR never sees the target or a wall.
 
@@ -184,17 +184,19 @@ def _of_recording(
     `options` are the ground (None: as the config says), time offsets, structure.
     """
     from caliv_graph.batch.job import open_recordings
+    from caliv_graph.config.model import StructureConfig
     from caliv_graph.scenario.model import load_scenario
     from caliv_graph.workflows.next_drive import next_drive, recorded_drive
 
     planned = [load_scenario(scenario) for scenario in scenarios]
-    drives = [recorded_drive(r, config, progress) for r in open_recordings(config, data)]
     ground, time_offset, structure = options
+    if not structure:
+        config = config.model_copy(update={"structure": StructureConfig(use=False)})
+    drives = [recorded_drive(r, config, progress) for r in open_recordings(config, data)]
     assumptions = drives[0].assumptions
     assumptions = replace(
         assumptions,
         ground=ground or assumptions.ground,
         time_offset=time_offset or assumptions.time_offset,
-        structure=structure and assumptions.structure,
     )
     return next_drive(drives, planned, assumptions)

@@ -55,6 +55,9 @@ def validate(
     without it, and both calibrations are measured on it. DIR contains validation.json and
     validation.html.
 
+    Without motion data the poses are those of the odometry of one LiDAR, as in 'calibrate': only
+    the places of the LiDARs to each other are validated then, not those on the vehicle.
+
     Exit code 3: there is no structure to validate on. Exit code 4: distances or thicknesses exceed
     the expected values by more than 5 sigma.
 

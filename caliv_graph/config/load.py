@@ -21,6 +21,12 @@ _MOST_BYTES = 200_000_000
 """Of a YAML file: ten times the poses of a drive of hours. A recording that is given by mistake is
 larger, and is not read to its end."""
 
+_OF_A_BAG = "metadata.yaml"
+"""YAML that a person never gives: that of a rosbag2 folder."""
+
+_MOST_NAMED = 4
+"""Files of a folder that a message names at most."""
+
 
 def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
     """Reads a YAML file with the safe loader.
@@ -33,7 +39,7 @@ def read_yaml(path: Path, error: type[Exception] = ConfigError) -> Any:
     except FileNotFoundError:
         raise error(f"{path}: no such file. Check the path") from None
     except IsADirectoryError:
-        raise error(f"{path}: is a folder, expected a YAML file") from None
+        raise error(f"{path}: {_instead_of_folder(path)}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: is not text in UTF-8. Give a YAML file") from None
     except OSError as e:
@@ -96,13 +102,27 @@ def _no_config(path: Path) -> str:
     if path.is_dir() and inside.is_file():
         return f"is a folder. Give {inside}"
     if path.is_dir():
-        return (
-            "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph init "
-            f"{path} --out config.yaml'"
-        )
+        return _instead_of_folder(path)
     if not path.exists():
         return f"no such file. Write it for a drive by 'caliv-graph init DRIVE --out {path}'"
     return ""
+
+
+def _instead_of_folder(path: Path) -> str:
+    """What to give instead of a folder: the YAML files in it, or a config of the drive it is."""
+    try:
+        inside = sorted(p for p in path.glob("*.yaml") if p.name != _OF_A_BAG)
+    except OSError:
+        inside = []
+    if inside:
+        named = ", ".join(map(str, inside[:_MOST_NAMED]))
+        more = ", ..." if len(inside) > _MOST_NAMED else ""
+        which = "one of its files" if len(inside) > 1 else "its file"
+        return f"is a folder. Give {which}: {named}{more}"
+    return (
+        "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph init "
+        f"{path} --out config.yaml'"
+    )
 
 
 def dump_config(config: Config) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -39,6 +41,23 @@ def relative_covariance(
     J = relative_jacobian(T_vehicle_a, T_vehicle_b)
     cov = J @ cov_joint @ J.T
     return np.asarray((cov + cov.T) / 2.0)
+
+
+def about_one_jacobian(T_vehicle_lidar: Sequence[gtsam.Pose3], index: int) -> Array:
+    """Derivative of n extrinsics about one of them, with respect to all.
+
+    That one is held, the others keep their places to it: `relative_jacobian` for each, at its own
+    six coordinates.
+
+    Returns:
+        (6 n, 6 n) right perturbations; the rows of the one that is held are zero.
+    """
+    out = np.eye(6 * len(T_vehicle_lidar))
+    own = slice(6 * index, 6 * index + 6)
+    for i, T in enumerate(T_vehicle_lidar):
+        out[6 * i : 6 * i + 6, own] = -T.between(T_vehicle_lidar[index]).AdjointMap()
+    out[own] = 0.0
+    return out
 
 
 def parent_axes_covariance(T_parent_child: gtsam.Pose3, cov: Array) -> Array:

@@ -22,6 +22,7 @@ from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError, ConfigError, TargetError
 from caliv_graph.planning.assumptions import Assumptions
 from caliv_graph.planning.information import drive_information, eliminated
+from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.planning.sightings import Sighting, placements, sight, thinned
 from caliv_graph.planning.structure import (
     PlannedStructure,
@@ -136,14 +137,20 @@ class SeenDrive:
     _known: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, scenario: Scenario, drive: Route, assumptions: Assumptions) -> SeenDrive:
-        """Finds out what the LiDARs see.
+    def of(
+        cls,
+        scenario: Scenario,
+        drive: Route,
+        assumptions: Assumptions,
+        recorded: RecordedWalls | None = None,
+    ) -> SeenDrive:
+        """Finds out what the LiDARs see; `recorded` walls replace those of the scenario.
 
         Raises:
             ConfigError: the drive ends before the first sample of a sensor.
         """
         sightings = _sightings(scenario, drive, assumptions)
-        structure = plan_structure(scenario, drive, sightings, assumptions)
+        structure = plan_structure(scenario, drive, sightings, assumptions, recorded)
         return cls(scenario, drive, assumptions, sightings, structure)
 
     def information(self, lidars: tuple[str, ...]) -> Array:

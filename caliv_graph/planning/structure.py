@@ -7,7 +7,7 @@ Clouds of targets are added on the same poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from caliv_graph.planning.information import (
 )
 from caliv_graph.planning.motion import PlannedMotion, plan_motion
 from caliv_graph.planning.patches import planned_patches
+from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.planning.sightings import Sighting, placements, sees_ground
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Route
@@ -48,6 +49,9 @@ walls have joints, paint and gloss: a fifth of the range noise of a usual LiDAR.
 
 GROUND = -1
 """Number of the ground among the objects."""
+
+RECORDED_WALLS = "walls of the drive"
+"""Name of all walls of a recorded drive, which does not tell where one ends."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +94,30 @@ class PlannedStructure:
 
 
 def plan_structure(
-    scenario: Scenario, drive: Route, sightings: Sequence[Sighting], assumptions: Assumptions
+    scenario: Scenario,
+    drive: Route,
+    sightings: Sequence[Sighting],
+    assumptions: Assumptions,
+    recorded: RecordedWalls | None = None,
 ) -> PlannedStructure | None:
-    """The structure of a drive; None if it passes no walls, or if none is to be used."""
-    faces = faces_of(scenario)
-    if not assumptions.structure or not faces.flat.any():
+    """The structure of a drive; None if it passes no walls, or if none is to be used.
+
+    `recorded` walls replace those of the scenario.
+    """
+    if not assumptions.structure:
         return None
-    patches, face = planned_patches(scenario, drive, faces, assumptions.ground != "none")
+    names: tuple[str, ...] = (RECORDED_WALLS,)
+    if recorded is not None:
+        if assumptions.ground == "none":
+            recorded = recorded.part(~recorded.level)
+        patches, relative = recorded.patches, recorded.relative
+        face = np.where(recorded.level, GROUND, 0)
+    else:
+        faces = faces_of(scenario)
+        if not faces.flat.any():
+            return None
+        patches, face = planned_patches(scenario, drive, faces, assumptions.ground != "none")
+        relative, names = np.broadcast_to(np.eye(4), (len(face), 4, 4)), faces.names
     if not (face != GROUND).any():
         return None
     stamps = np.unique(
@@ -106,12 +127,15 @@ def plan_structure(
     nodes = np.unique(motion.nodes_of(stamps))
     n = len(scenario.lidars)
     prior = _pose_prior(motion, nodes, assumptions.heave_sigma_m)
+    if recorded is not None:
+        poses = recorded.poses(prior.stamps_ns, prior.T_map_vehicle)
+        prior = replace(prior, T_map_vehicle=poses)
     pose_of_scan = np.searchsorted(nodes, motion.nodes_of(patches.stamps_ns))
     problem = Problem(
         patches=patches,
         prior=prior,
         pose_of_scan=pose_of_scan,
-        relative=np.broadcast_to(np.eye(4), (len(face), 4, 4)),
+        relative=relative,
         twists=motion.twist[nodes] if assumptions.time_offset else None,
         offsets=tuple(range(n)) if assumptions.time_offset else (),
         guesses=tuple(m.mounting.pose() for m in scenario.lidars.values()),
@@ -130,12 +154,16 @@ def plan_structure(
     found = linearised(
         problem,
         {name: model.mounting.pose() for name, model in scenario.lidars.items()},
-        np.array([model.range_sigma_m for model in scenario.lidars.values()]),
-        Levels.first(SIGHTING_M, STRIP_M, SHARED_M, assumptions.ranges),
+        np.array([model.range_sigma_m for model in scenario.lidars.values()])
+        if recorded is None
+        else recorded.range_sigma_m,
+        Levels.first(SIGHTING_M, STRIP_M, SHARED_M, assumptions.ranges)
+        if recorded is None
+        else recorded.levels,
     )
     if found is None:
         return None
-    return PlannedStructure(found, motion, nodes, _seen_walls(found, face, faces.names))
+    return PlannedStructure(found, motion, nodes, _seen_walls(found, face, names))
 
 
 def _pose_prior(motion: PlannedMotion, nodes: IntArray, heave_m: float) -> PosePrior:

@@ -29,7 +29,6 @@ from caliv_graph.validation.findings import (
     Validation,
 )
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
-from caliv_graph.validation.verdict import UNSEEN
 from caliv_graph.workflows.repeatability import Repeatability
 
 MOST_SHOWN = 12
@@ -57,7 +56,7 @@ def validation_table(found: Validation, repeated: Repeatability | None, p_value:
 
 def first_line(found: Validation) -> str:
     """The verdict in a word, and what it does not cover."""
-    return f"Verdict: {found.verdict.word}. {UNSEEN}."
+    return f"Verdict: {found.verdict.word}. {found.unseen}."
 
 
 def validation_status(found: Validation) -> str:
@@ -191,7 +190,7 @@ def validation_document(
         "drive": found.drive,
         "structure": found.has_structure,
         "verdict": verdict.word,
-        "unseen": UNSEEN,
+        "unseen": found.unseen,
         "test": {
             "text": " ".join(verdict.sentences),
             "better": verdict.better,
@@ -362,7 +361,7 @@ def render_validation(found: Validation, repeated: Repeatability | None, p_value
     return template.render(
         found=found,
         status=validation_status(found),
-        unseen=UNSEEN,
+        unseen=found.unseen,
         tables=tables(found),
         repeated=[] if repeated is None else repeatability_sentences(repeated, p_value),
         held_out_heads=HELD_OUT_HEADS,

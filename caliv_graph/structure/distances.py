@@ -225,11 +225,45 @@ def at_extrinsics(
 
     rng = np.random.default_rng(0)
     draws = np.zeros((layout.plane, DRAWS))
-    values, vectors = np.linalg.eigh(cov)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws[given] = root @ rng.standard_normal((len(given), DRAWS))
+    draws[given] = _drawn(cov, rng)
     draws[rest] = _draws(factor, rng.standard_normal((len(rest), DRAWS))) - follow @ draws[given]
     return _measured(other, _moved(other, state, d), propagated, draws, rng)
+
+
+def at_extrinsics_on_the_poses(
+    other: OtherStrips,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    offsets_s: Mapping[str, float],
+    cov: Array,
+) -> Measured:
+    """At given extrinsics, on the poses and biases of the solve; see `at_extrinsics`.
+
+    For poses that hang on the extrinsics alone: those that the given ones ask for would hide that
+    these are wrong. The errors of the solve and of the given extrinsics are taken as independent.
+    """
+    layout, used = other.layout, other.used
+    H, _ = with_guesses(used.problem, used.state, used.system)
+    factor = factor_of(H)
+    given = np.arange(layout.offset, layout.error)
+    rest = np.setdiff1d(np.arange(layout.plane), given)
+
+    def propagated(D: Array) -> Array:
+        by_rest = D.copy()
+        by_rest[:, given] = 0.0
+        return np.asarray(D[:, given] @ cov @ D[:, given].T + by_rest @ solved(factor, by_rest.T))
+
+    rng = np.random.default_rng(0)
+    draws = np.zeros((layout.plane, DRAWS))
+    draws[given] = _drawn(cov, rng)
+    draws[rest] = _draws(factor, rng.standard_normal((layout.plane, DRAWS)))[rest]
+    names = other.problem.patches.lidars
+    offsets = np.array([offsets_s.get(name, 0.0) for name in names])
+    state = replace(
+        used.state,
+        T_vehicle_lidar=tuple(T_vehicle_lidar[name] for name in names),
+        offsets_s=offsets,
+    )
+    return _measured(other, state, propagated, draws, rng)
 
 
 def at_guesses(other: OtherStrips) -> Measured:
@@ -245,6 +279,13 @@ def _draws(factor: tuple[Array, Array], white: Array) -> Array:
     scale, L = factor
     turned = scipy.linalg.solve_triangular(L, white, lower=True, trans=1, check_finite=False)
     return np.asarray(turned / scale[:, None])
+
+
+def _drawn(cov: Array, rng: np.random.Generator) -> Array:
+    """(k, DRAWS) errors with a covariance (k, k), which may be singular."""
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(root @ rng.standard_normal((len(cov), DRAWS)))
 
 
 def _moved(other: OtherStrips, state: State, d: Array) -> State:

@@ -16,6 +16,7 @@ import numpy as np
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.lidars import FoundLidarConfig
 from caliv_graph.config.model import Config
+from caliv_graph.geometry.covariance import about_one_jacobian
 from caliv_graph.products import Array
 from caliv_graph.structure.problem import Problem
 from caliv_graph.trajectory.odometry import OdometryPoses
@@ -83,14 +84,6 @@ def relative_quadratic(
         Information and gradient on the same coordinates. A common motion of all LiDARs changes
         nothing.
     """
-    T, n = T_vehicle_lidar, len(T_vehicle_lidar)
-    own = 6 * tracked + np.arange(6)
-    others = np.setdiff1d(np.arange(6 * n), own)
-    # d of S_a = E^-1 T_a follows those of E and T_a: d_a - Ad(S_a^-1) d_E.
-    B = np.eye(6 * n)
-    for i in range(n):
-        if i != tracked:
-            B[6 * i : 6 * i + 6, own] = -T[i].between(T[tracked]).AdjointMap()
-    B = B[others]
-    out = B.T @ information[np.ix_(others, others)] @ B
-    return 0.5 * (out + out.T), B.T @ gradient[others]
+    B = about_one_jacobian(T_vehicle_lidar, tracked)
+    out = B.T @ information @ B
+    return 0.5 * (out + out.T), B.T @ gradient

@@ -13,6 +13,7 @@ from caliv_graph.products import Array
 from caliv_graph.validation.clouds import Clouds
 from caliv_graph.validation.measure import Apart, Expected, Thickness
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
+from caliv_graph.wording.held_out import UNSEEN
 
 BEFORE, AFTER, BEST = "before", "after", "best"
 """The initial guesses, the calibration, and the extrinsics with the best alignment."""
@@ -219,6 +220,7 @@ class Validation:
         best: extrinsics with the best alignment, in the order of `lidars`; no calibration.
         held_out: the third of the strips that is held out; None: not measured.
         before: what "before" is: the initial guesses, or what was found where none was given.
+        unseen: what it does not see, a sentence without its full stop.
     """
 
     drive: str
@@ -237,6 +239,7 @@ class Validation:
     warnings: tuple[str, ...]
     held_out: HeldOutStructure | None = None
     before: str = "the initial guesses"
+    unseen: str = UNSEEN
 
     @property
     def has_structure(self) -> bool:

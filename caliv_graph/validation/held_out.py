@@ -23,6 +23,7 @@ from caliv_graph.structure.distances import (
     Measured,
     OtherStrips,
     at_extrinsics,
+    at_extrinsics_on_the_poses,
     at_guesses,
     at_the_solve,
     other_strips,
@@ -31,9 +32,10 @@ from caliv_graph.structure.held_out import HeldOut, hold_out
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.problem import Problem, first_state, part_of, placed_patches
 from caliv_graph.structure.read import read_patches
-from caliv_graph.structure.solve import solve_structure
+from caliv_graph.structure.relative import relative_problem
+from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.strips import TILE_M
-from caliv_graph.structure.term import aligned_start, problem_of, usable
+from caliv_graph.structure.term import aligned_start, odometry_of, problem_of, usable
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.validation.clouds import Extrinsics
 from caliv_graph.validation.covariances import pose_noise
@@ -47,6 +49,22 @@ from caliv_graph.validation.findings import (
     Pair,
 )
 from caliv_graph.wording.held_out import no_held_out_sentence
+
+
+@dataclass(frozen=True)
+class HeldOutOutcome:
+    """What came of holding out a third of the structure.
+
+    Attributes:
+        found: what the LiDARs differ by on it; None: there is none.
+        sentences: why there is none.
+        used: the solve without it, of a drive without motion data: its poses are the best there
+            are. Else None.
+    """
+
+    found: HeldOutStructure | None
+    sentences: tuple[str, ...] = ()
+    used: Solved | None = None
 
 
 @dataclass(frozen=True)
@@ -65,8 +83,8 @@ def measure_held_out(
     extrinsics: Extrinsics,
     config: Config,
     progress: Progress,
-) -> tuple[HeldOutStructure | None, tuple[str, ...]]:
-    """What the LiDARs differ by on the held-out structure; None and why not, if there is none.
+) -> HeldOutOutcome:
+    """What the LiDARs differ by on the held-out structure, and the solve without it.
 
     Args:
         recording: the drive.
@@ -82,12 +100,12 @@ def measure_held_out(
         TrajectoryError: the motion data are unusable.
     """
     if not config.structure.use:
-        return None, ()
+        return HeldOutOutcome(None)
     names = list(extrinsics.T_vehicle_lidar)
     config = config.model_copy(update={"lidars": {n: config.lidars[n] for n in names}})
     (patches,) = read_patches([recording], [rough], config, progress, keep_level=True)
     if not len(patches.scan):
-        return None, (no_held_out_sentence("no LiDAR sees flat surfaces"),)
+        return _nothing("no LiDAR sees flat surfaces")
     with progress.stage("calibrating without a third of the structure", None):
         stamps = np.unique(patches.stamps_ns)
         (trajectory,) = smooth_trajectories([recording], config, [stamps], motions)
@@ -95,12 +113,15 @@ def measure_held_out(
         try:
             other = _without(drive, trajectory, config)
         except SolveError as error:
-            return None, (no_held_out_sentence(error.what),)
+            return _nothing(error.what)
         if other is None:
-            return None, (no_held_out_sentence("too little of it stands still"),)
+            return _nothing("too little of it stands still")
+        # Poses by the LiDARs' own odometry hang on the extrinsics alone.
+        own = odometry_of([trajectory]) is not None
+        measure = at_extrinsics_on_the_poses if own else at_extrinsics
         measured = {
             BEFORE: at_guesses(other),
-            AFTER: at_extrinsics(
+            AFTER: measure(
                 other,
                 extrinsics.T_vehicle_lidar,
                 extrinsics.time_offset_s,
@@ -108,7 +129,12 @@ def measure_held_out(
             ),
             WITHOUT: at_the_solve(other),
         }
-    return _found(other, drive.held, measured), ()
+    found = _found(other, drive.held, measured)
+    return HeldOutOutcome(found, (), other.used if own else None)
+
+
+def _nothing(why: str) -> HeldOutOutcome:
+    return HeldOutOutcome(None, (no_held_out_sentence(why),))
 
 
 def _drive(
@@ -144,6 +170,9 @@ def _without(drive: _Drive, trajectory: VehicleTrajectory, config: Config) -> Ot
         return None
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
     start = aligned_start([rest.patches], [trajectory], guesses, config)
+    odometry = odometry_of([trajectory])
+    if odometry is not None:
+        rest = relative_problem(rest, odometry, start, config)
     used = solve_structure(rest, start)
     return None if used is None else other_strips(used, part_of(problem, held))
 

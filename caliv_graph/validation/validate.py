@@ -14,11 +14,11 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_guess
 from caliv_graph.config.lidars import FoundLidarConfig
 from caliv_graph.config.model import Config
-from caliv_graph.errors import ConfigError, TrajectoryError
+from caliv_graph.errors import ConfigError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
-from caliv_graph.trajectory.select import noise_scales, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
@@ -41,6 +41,7 @@ from caliv_graph.validation.findings import (
     Validation,
 )
 from caliv_graph.validation.held_out import measure_held_out
+from caliv_graph.validation.lidars_alone import Way, about_tracked, way_of
 from caliv_graph.validation.measure import (
     Errors,
     SurfaceMeter,
@@ -52,7 +53,7 @@ from caliv_graph.validation.refine import align, sharper
 from caliv_graph.validation.surfaces import Structure, Thing, Wall
 from caliv_graph.validation.verdict import is_shared, judge, with_held_out
 from caliv_graph.wording.guesses import before_words
-from caliv_graph.wording.odometry import unvalidated_sentence
+from caliv_graph.wording.odometry import unseen_words
 
 Stages = Mapping[str, tuple[Placed, Sequence[gtsam.Pose3] | None]]
 
@@ -71,8 +72,11 @@ def validate(
     one or another one of the same vehicle, and the config is as for `calibrate`. Motion data that
     have been read already are not read again.
 
+    A drive without motion data is measured on the poses by the odometry of a LiDAR, S2S alone.
+
     Raises:
-        ConfigError: calibration and config have no LiDAR in common.
+        ConfigError: calibration and config have no LiDAR in common, or the config asks for what
+            cannot be had without motion data.
         RecordingError: the recording could not be read.
         TrajectoryError: the recording does not determine the vehicle's motion.
     """
@@ -81,30 +85,33 @@ def validate(
         names, notes = _common_lidars(recording, calibration, config)
         config = _with_guesses(names, calibration, config)
         before = before_words(names, [n for n in names if _is_found(config, n)])
-        extrinsics = _extrinsics(names, calibration, config)
         motions = {0: recording.motion() if motion is None else motion}
+        tracked: str | None = None
         if needs_odometry(motions[0], config):
-            raise TrajectoryError(unvalidated_sentence(recording.name))
+            alone = about_tracked(recording, names, calibration, config, motions, progress)
+            tracked, motions = alone.lidar, {0: alone.motion}
+            config, calibration = alone.config, alone.calibration
+        extrinsics = _extrinsics(names, calibration, config)
         with progress.stage("smoothing the trajectory", None):
             (rough,) = smooth_trajectories([recording], config, [[]], motions)
         regions, no_target = target_regions(recording, rough, config, progress)
-        chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
-        nodes = _nodes(chosen, extrinsics[AFTER], rough.span_ns)
-        with progress.stage("smoothing the trajectory at the scans", None):
-            scales = noise_scales([rough])
-            (trajectory,) = smooth_trajectories([recording], config, [nodes], motions, scales)
+        held = measure_held_out(
+            recording, rough, motions, calibration, extrinsics[AFTER], config, progress
+        )
+        if tracked is None:
+            way = _way(recording, rough, motions, calibration, extrinsics[AFTER], config, progress)
+        else:
+            way = way_of(recording.name, names, rough, held)
+        trajectory = way.trajectory
         # The calibration comes first: it decides which points are target and ground.
         clouds = read_clouds(
-            recording, trajectory, chosen, extrinsics, regions, not config.ground.use, progress
+            recording, trajectory, way.chosen, extrinsics, regions, not config.ground.use, progress
         )
         errors = Errors(
             extrinsic_covariance(names, calibration),
-            pose_covariance(clouds.placed[AFTER].taken_ns, nodes, trajectory, calibration, config),
+            way.covariance(clouds.placed[AFTER].taken_ns),
             config.noise.lidar_range_m,
             HEAVE_SIGMA_M if isinstance(trajectory, SmoothedTrajectory) else 0.0,
-        )
-        held, no_held = measure_held_out(
-            recording, rough, motions, calibration, extrinsics[AFTER], config, progress
         )
         sigmas = np.array([config.lidars[n].sigma.sigmas() for n in names])
         with progress.stage("measuring the alignment", None):
@@ -118,10 +125,36 @@ def validate(
                 (*notes, *recording.warnings(), *trajectory.warnings, *no_target),
                 before,
             )
-    if held is None:
-        sentences = (*found.verdict.sentences, *no_held)
+    if tracked is not None:
+        found = replace(found, unseen=unseen_words(tracked))
+    if held.found is None:
+        sentences = (*found.verdict.sentences, *held.sentences)
         return replace(found, verdict=replace(found.verdict, sentences=sentences))
-    return replace(found, held_out=held, verdict=with_held_out(found.verdict, held, before))
+    verdict = with_held_out(found.verdict, held.found, before)
+    return replace(found, held_out=held.found, verdict=verdict)
+
+
+def _way(
+    recording: Recording,
+    rough: VehicleTrajectory,
+    motions: Mapping[int, MotionData],
+    calibration: Calibration,
+    extrinsics: Extrinsics,
+    config: Config,
+    progress: Progress,
+) -> Way:
+    """The vehicle's poses at the scans to measure, by the motion data."""
+    names = extrinsics.T_vehicle_lidar
+    chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
+    nodes = _nodes(chosen, extrinsics, rough.span_ns)
+    with progress.stage("smoothing the trajectory at the scans", None):
+        scales = noise_scales([rough])
+        (trajectory,) = smooth_trajectories([recording], config, [nodes], motions, scales)
+    return Way(
+        trajectory,
+        chosen,
+        lambda taken_ns: pose_covariance(taken_ns, nodes, trajectory, calibration, config),
+    )
 
 
 def _common_lidars(

@@ -34,13 +34,6 @@ from caliv_graph.wording.held_out import (
     stage_sentence,
 )
 
-UNSEEN = (
-    "Errors that all LiDARs share with the trajectory are not seen here: S2V, by a wrong "
-    "imu.T_vehicle_imu, gnss.lever_arm or ground.vehicle_height"
-)
-"""What no validation by structure sees: trajectory and S2V are off by opposite motions, and every
-cloud lies where it should."""
-
 POOR = 0.01
 """Probability below which noise explains the offsets poorly."""
 

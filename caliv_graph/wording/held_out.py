@@ -1,6 +1,13 @@
-"""Sentences about the third of the structure that a validation holds out."""
+"""Sentences about a validation: what it does not see, and the structure that it holds out."""
 
 from __future__ import annotations
+
+UNSEEN = (
+    "Errors that all LiDARs share with the trajectory are not seen here: S2V, by a wrong "
+    "imu.T_vehicle_imu, gnss.lever_arm or ground.vehicle_height"
+)
+"""What no validation by structure sees: trajectory and S2V are off by opposite motions, and every
+cloud lies where it should."""
 
 
 def held_out_sentence(strips: int, before_mm: float, after_mm: float, before: str) -> str:

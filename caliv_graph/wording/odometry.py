@@ -28,10 +28,10 @@ def odometry_sentence(lidar: str, statement: VehicleStatement, config: Config) -
     )
 
 
-def unvalidated_sentence(name: str) -> str:
-    """Why a drive without motion data validates nothing, and what does."""
+def unseen_words(lidar: str) -> str:
+    """What a validation along the odometry of a LiDAR does not see, for the end of a verdict."""
     return (
-        f"{name}: no motion data: validation puts the clouds of all LiDARs into one map by poses "
-        "that no LiDAR made. Name IMU, GNSS, velocities or poses in topics (or data.poses) if they "
-        "were recorded, or give --data a drive of this vehicle that has them"
+        f"No motion data: the clouds lie along the odometry of lidar '{lidar}', so that S2S alone "
+        "is seen here. An error that all LiDARs share is not: all six axes of S2V, and a clock "
+        "that is off for all. Validate on a drive with motion data to see these"
     )

@@ -34,21 +34,24 @@ def heading_sentence() -> str:
     return "the heading of two antennas is not in the prediction: its sigmas are then too large"
 
 
-def no_target_sentence(why: str) -> str:
-    """The recorded drive shows no target."""
+def no_target_sentence(why: str, walls: bool | None) -> str:
+    """The recorded drive shows no target; whether it has walls, None: they are not to be used."""
     because = f" ({why})" if why else ""
+    instead = "it is predicted by walls and ground"
+    if not walls:
+        none = "walls are not used" if walls is None else "it passes no walls"
+        instead = f"and {none}: there are no sigmas of it here"
     return (
-        f"no target is known in the recorded drive{because}, and walls of a recorded drive are not "
-        "predicted: there are no sigmas of it here. 'caliv-graph observability' tells what it "
-        "determines. Next drives are planned past a chair"
+        f"no target is known in the recorded drive{because}, {instead}. Next drives are planned "
+        "past a chair"
     )
 
 
 def walls_sentence() -> str:
-    """The config uses structure, the prediction does not."""
+    """The config uses structure, and the drive has none."""
     return (
-        "walls of the recorded drive are not predicted: its sigmas are those of target and ground "
-        "alone. 'caliv-graph observability' counts the walls too"
+        "the recorded drive shows no walls: its sigmas are those of target and ground alone "
+        "(structure.use)"
     )
 
 

@@ -97,8 +97,6 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
     original = find_original(drive_folder(data))
     extrinsics = original.extrinsics if original else {}
     target = original.target if original else None
-    unknown = [] if target else ["target"]
-    unknown.append(_HEIGHT)
     source = original.source if original else ""
     lidars = "\n".join(
         lidar_text(
@@ -121,10 +119,11 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
             ground=ground_text(None),
         )
     )
-    taken = f"Initial guesses and target taken from {original.path}" if original else ""
+    what = "Initial guesses and target" if target else "Initial guesses"
+    taken = f"{what} taken from {original.path}" if original else ""
     if original and original.radians:
         taken += ", whose angles are radians by their size"
-    return Draft(text, sensors, tuple(unknown), taken)
+    return Draft(text, sensors, (_HEIGHT,), taken)
 
 
 def _draft_of_clouds(data: Path, config: Path, folders: Sequence[str]) -> Draft:

@@ -62,7 +62,7 @@ def lidar_text(
 def target_text(target: tuple[Sequence[float], Sequence[float]] | None, source: str) -> str:
     """The section of the target, or a comment in its place."""
     if target is None:
-        return NO_TARGET_TEMPLATE
+        return SEARCHED_TARGET_TEMPLATE
     return TARGET_TEMPLATE.format(source=source, min=yaml_list(target[0]), max=yaml_list(target[1]))
 
 
@@ -119,14 +119,6 @@ target:\t# a box around the target, with nothing else above the ground in it
   min: {min}\t# metres, taken from {source}
   max: {max}\t# metres
   frame: map\t# map (the frame of the poses) or start (the vehicle's first pose)"""
-
-NO_TARGET_TEMPLATE = """\
-# TODO: a box around the target, with nothing else above the ground in it: metres, in the frame of
-# the poses (map) or of the vehicle's first pose (start). Without it the target is searched for.
-# target:
-#   min: [10.0, -14.0, -1.0]
-#   max: [20.0, -4.0, 3.0]
-#   frame: map"""
 
 SEARCHED_TARGET_TEMPLATE = """\
 # The target is searched for. If that fails, or other objects are near it, give a box around it,

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
+import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
@@ -23,6 +24,7 @@ from caliv_graph.planning.recorded_lidar import SeenBeams, lidar_model
 from caliv_graph.planning.recorded_motion import RecordedMotion, lifted, recorded_motion
 from caliv_graph.planning.recorded_route import RecordedRoute
 from caliv_graph.planning.recorded_target import nearest_object, silhouettes
+from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.planning.suggest import DEFAULT_RADIUS_M, DEFAULT_SPEED_M_S, Planned
 from caliv_graph.products import IntArray, Recording
 from caliv_graph.scenario.drive_models import ArcDrive
@@ -46,6 +48,7 @@ from caliv_graph.wording.recorded import (
     unknown_height_sentence,
     walls_sentence,
 )
+from caliv_graph.workflows.recorded_walls import SolvedWalls, solved_walls, uses_walls
 
 SCANS = 12
 """Clouds of a LiDAR from which its beams are read: half of them of those that see a target."""
@@ -69,6 +72,7 @@ class RecordedDrive:
         assumptions: how the config calibrates it.
         vehicle: the same on level ground, with a chair if no target was found: for suggestions.
         sees_target: whether there is a target to predict with.
+        walls: those that it passes; None: none, or they are not used.
         notes: for the user, a line each.
     """
 
@@ -78,9 +82,21 @@ class RecordedDrive:
     vehicle: Scenario
     sees_target: bool
     notes: tuple[str, ...]
+    walls: RecordedWalls | None = None
 
-    def with_mountings(self, others: Mapping[str, LidarModel]) -> dict[str, LidarModel]:
-        """Its LiDARs, mounted as others of the same names."""
+    @property
+    def tells(self) -> bool:
+        """Whether there is anything to predict with."""
+        return self.sees_target or self.walls is not None
+
+    def mounted_as(self, others: Mapping[str, LidarModel]) -> dict[str, LidarModel]:
+        """Its LiDARs, mounted as others of the same names: those of the same vehicle.
+
+        What is found of their places differs a bit from drive to drive. Pieces of walls join only
+        at the mountings that their own drive has.
+        """
+        if self.walls is not None:
+            return dict(self.scenario.lidars)
         return {
             name: model.model_copy(update={"mounting": others[name].mounting})
             for name, model in self.scenario.lidars.items()
@@ -125,9 +141,14 @@ def recorded_drive(recording: Recording, config: Config, progress: Progress) -> 
     height_m, said_height = _height(recording, seen.trajectory, config, progress)
     motion = recorded_motion(seen.trajectory, config, begin_ns, height_m)
     route = RecordedRoute(seen.trajectory, begin_ns, end_ns, height_m)
-    objects, said_targets = _targets(seen, seen.trajectory, config, route)
-    lidars = _lidars(recording, seen, config, route, progress)
-    said_walls = (walls_sentence(),) if objects and config.structure.use else ()
+    solved = solved_walls(recording, seen.trajectory, config, begin_ns, height_m, progress)
+    walls_seen = _walls_seen(config, solved)
+    objects, said_targets = _targets(seen, seen.trajectory, config, route, walls_seen)
+    mountings = {name: lidar.guess() for name, lidar in config.lidars.items()}
+    mountings |= {} if solved is None else dict(solved.T_vehicle_lidar)
+    lidars = _lidars(recording, seen, config, route, mountings, progress)
+    without = objects and walls_seen is False
+    said_walls = (walls_sentence(),) if without else ()
     scenario = _scenario(recording, config, motion, route, lidars, objects)
     elsewhere = objects or {"chair": ChairModel(xy_m=(0.0, 0.0))}
     vehicle = scenario.model_copy(
@@ -140,6 +161,7 @@ def recorded_drive(recording: Recording, config: Config, progress: Progress) -> 
         vehicle,
         bool(objects),
         (*seen.notes, *motion.notes, *said_height, *said_targets, *said_walls),
+        None if solved is None else solved.walls,
     )
 
 
@@ -184,12 +206,21 @@ def _height(
     return height_m, (height_sentence(height_m),)
 
 
+def _walls_seen(config: Config, solved: SolvedWalls | None) -> bool | None:
+    """Whether a drive has walls; None: they are not to be used."""
+    return solved is not None if uses_walls(config) else None
+
+
 def _targets(
-    seen: Look, trajectory: VehicleTrajectory, config: Config, route: RecordedRoute
+    seen: Look,
+    trajectory: VehicleTrajectory,
+    config: Config,
+    route: RecordedRoute,
+    walls: bool | None,
 ) -> tuple[dict[str, ObjectModel], tuple[str, ...]]:
     """The objects that stand for the targets, by name, and what to say of them."""
     if not seen.observations:
-        return {}, (no_target_sentence(seen.problems[-1] if seen.problems else ""),)
+        return {}, (no_target_sentence(seen.problems[-1] if seen.problems else "", walls),)
     mounts = {name: lidar.guess() for name, lidar in config.lidars.items()}
     objects: dict[str, ObjectModel] = {}
     said = []
@@ -207,9 +238,14 @@ def _targets(
 
 
 def _lidars(
-    recording: Recording, seen: Look, config: Config, route: RecordedRoute, progress: Progress
+    recording: Recording,
+    seen: Look,
+    config: Config,
+    route: RecordedRoute,
+    mountings: Mapping[str, gtsam.Pose3],
+    progress: Progress,
 ) -> dict[str, LidarModel]:
-    """The LiDARs, read off some of their clouds."""
+    """The LiDARs, read off some of their clouds, with their T_vehicle_lidar."""
     out = {}
     with progress.stage("looking at the beams", len(recording.lidars)) as advance:
         for name in recording.lidars:
@@ -225,7 +261,7 @@ def _lidars(
             out[name] = lidar_model(
                 SeenBeams.of(clouds, f"{recording.name}: LiDAR '{name}'"),
                 config.lidars[name],
-                lifted(config.lidars[name].guess(), route.height_m),
+                lifted(mountings[name], route.height_m),
                 config.noise.lidar_range_m,
                 stamps - route.begin_ns,
             )
@@ -317,11 +353,13 @@ def next_drive(
     """
     first = drives[0]
     lidars = first.scenario.lidars
-    seeing = [d for d in drives if d.sees_target]
-    # One vehicle: what a LiDAR shows of its beams and what is found of its place may differ a bit.
+    seeing = [d for d in drives if d.tells]
     recorded = [
         SeenDrive.of(
-            d.scenario.model_copy(update={"lidars": d.with_mountings(lidars)}), d.route, assumptions
+            d.scenario.model_copy(update={"lidars": d.mounted_as(lidars)}),
+            d.route,
+            assumptions,
+            d.walls,
         )
         for d in seeing
     ]

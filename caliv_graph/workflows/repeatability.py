@@ -18,6 +18,7 @@ from caliv_graph.config.model import Config, StructureConfig
 from caliv_graph.errors import RegistrationError, SolveError, TargetError
 from caliv_graph.fusion.compare import Comparison, compare
 from caliv_graph.fusion.terms import drive_digest
+from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.pipeline import Prepared, prepare
 from caliv_graph.products import (
     Calibration,
@@ -29,6 +30,12 @@ from caliv_graph.products import (
 
 PASS_GAP_NS = 5_000_000_000
 """Gap between two clouds of the target after which a new pass begins."""
+
+WITHOUT_TARGET = "without a target the drive is not halved: both halves would see the same walls"
+WITHOUT_MOTION = (
+    "without motion data no target is used, and the drive is not halved: both halves would see the "
+    "same walls"
+)
 
 
 @dataclass(frozen=True)
@@ -110,6 +117,8 @@ def split_halves(
         RecordingError, TrajectoryError: the recording could not be read.
     """
     motion = recording.motion() if motion is None else motion
+    if needs_odometry(motion, config):
+        return Repeatability(("", ""), None, reason=WITHOUT_MOTION)
     # Both halves would have the same structure, and agree by it.
     config = config.model_copy(update={"structure": StructureConfig(use=False)})
     try:
@@ -118,8 +127,7 @@ def split_halves(
         return Repeatability(("", ""), None, reason=str(e))
     observations, config = prepared.observations, prepared.config
     if not observations:
-        reason = "without a target the drive is not halved: both halves would see the same walls"
-        return Repeatability(("", ""), None, reason=reason)
+        return Repeatability(("", ""), None, reason=WITHOUT_TARGET)
     fewest = config.extraction.min_scans
     names, halves = ("first passes", "later passes"), [split(o, fewest) for o in observations]
     by_passes = None not in halves

@@ -47,6 +47,24 @@ def test_an_arc_as_json(arc: Path) -> None:
     assert found["status"] == "partial"
 
 
+@pytest.mark.parametrize("command", ["observability", "plan"])
+def test_zeros_of_a_draft_are_no_guesses(
+    command: str, arc: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = yaml.safe_load((arc / "config.yaml").read_text())
+    for lidar in raw["lidars"].values():
+        lidar["initial"] = {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 0]}
+    raw["data"]["path"] = str(arc / "drive")
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(raw))
+
+    assert run([command, str(config)]) == 2
+
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {config}: lidars.front.initial and lidars.rear.initial are all")
+    assert "or 'initial: null': then they are found from the drive" in told
+
+
 def test_in_words_and_with_exit_3_where_the_config_wants_more(arc: Path, tmp_path: Path) -> None:
     raw = yaml.safe_load((arc / "config.yaml").read_text())
     raw |= {"require": ["s2s", "s2v_rotation"], "data": {"path": str(arc / "drive")}}

@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from caliv_graph.config.lidars import PoseSigmaConfig
-from caliv_graph.config.load import dump_config, load_config, parse_config
+from caliv_graph.config.load import dump_config, load_config, parse_config, read_yaml
 from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.errors import ConfigError
@@ -254,11 +254,12 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "broken.yaml").write_text("a: 1\nb: [1\nc: 2\n")
     (tmp_path / "empty.yaml").write_text("")
+    (tmp_path / "folder").mkdir()
 
     for name, part in {
         "nowhere.yaml": "no such file. Write it for a drive by 'caliv-graph init DRIVE --out",
         "x" * 300: "File name too long",
-        ".": "is a folder, expected a YAML file. If this is a drive, write one by 'caliv-graph",
+        "folder": "is a folder, expected a YAML file. If this is a drive, write one by",
         "binary.yaml": "is not text in UTF-8",
         "broken.yaml": "not valid YAML in line 3",
         "empty.yaml": "holds no configuration",
@@ -274,6 +275,22 @@ def test_the_folder_of_a_config_leads_to_it(tmp_path: Path) -> None:
 
     with pytest.raises(ConfigError, match=r"is a folder\. Give .*config\.yaml"):
         load_config(tmp_path)
+
+
+def test_the_folder_of_a_result_names_what_to_give(tmp_path: Path) -> None:
+    for name in ("calibration.yaml", "config.yaml", "metadata.yaml", "report.html"):
+        (tmp_path / name).write_text("a: 1")
+
+    with pytest.raises(ConfigError) as caught:
+        read_yaml(tmp_path)
+
+    files = f"{tmp_path / 'calibration.yaml'}, {tmp_path / 'config.yaml'}"
+    assert str(caught.value) == f"{tmp_path}: is a folder. Give one of its files: {files}"
+    # That of a bag is none: a drive needs a config.
+    (tmp_path / "calibration.yaml").unlink()
+    (tmp_path / "config.yaml").unlink()
+    with pytest.raises(ConfigError, match=r"If this is a drive, write one by 'caliv-graph init"):
+        read_yaml(tmp_path)
 
 
 def test_names_of_digits_are_text(tmp_path: Path) -> None:

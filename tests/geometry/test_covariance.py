@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.geometry.covariance import (
+    about_one_jacobian,
     parent_axes_covariance,
     relative_covariance,
     relative_jacobian,
@@ -46,6 +47,24 @@ def test_the_covariance_is_that_of_samples() -> None:
     # 20000 samples know a correlation to 1 / sqrt(20000) = 0.7 percent.
     difference = (errors.T @ errors / len(errors) - cov) / np.outer(sigma, sigma)
     assert np.abs(difference).max() < 0.03
+
+
+def test_about_one_lidar_only_the_places_of_the_others_to_it_are_uncertain() -> None:
+    T = [FRONT, LEFT, pose(*MOUNTINGS["rear"])]
+    cov_joint = make_covariance(3)
+
+    J = about_one_jacobian(T, 1)
+    cov = J @ cov_joint @ J.T
+
+    assert cov[6:12] == pytest.approx(np.zeros((6, 18)), abs=1e-12)
+    for i in (0, 2):
+        own, held = 6 * i + np.arange(6), 6 + np.arange(6)
+        both = np.concatenate([own, held])
+        pair = relative_covariance(T[i], T[1], cov_joint[np.ix_(both, both)])
+        assert cov[np.ix_(own, own)] == pytest.approx(pair, abs=1e-12)
+    # What all share is no uncertainty at all.
+    together = np.vstack([t.inverse().AdjointMap() for t in T])
+    assert J @ together == pytest.approx(np.zeros((18, 6)), abs=1e-12)
 
 
 def test_what_both_lidars_share_is_no_uncertainty_of_the_pair() -> None:

@@ -11,6 +11,7 @@ from caliv_graph.structure.distances import (
     Measured,
     OtherStrips,
     at_extrinsics,
+    at_extrinsics_on_the_poses,
     at_guesses,
     at_the_solve,
     other_strips,
@@ -110,6 +111,23 @@ def test_a_right_calibration_is_explained_and_a_wrong_one_is_not(others: OtherSt
     vague = COV.copy()
     vague[2, 2] = 0.003**2
     assert p_value(at_extrinsics(others, wrong, {}, vague)) > 1e-3
+
+
+def test_on_the_poses_of_the_solve_it_is_the_same(others: OtherStrips) -> None:
+    rng = np.random.default_rng(2)
+    right = {name: T.retract(FILE_SIGMAS * rng.standard_normal(6)) for name, T in TRUE.items()}
+    turned = np.array([0.0, 0.0, 0.003, 0.0, 0.0, 0.0])
+    wrong = {**right, "front": right["front"].retract(turned)}
+
+    found = at_extrinsics_on_the_poses(others, right, {}, COV)
+    assert p_value(found) > 1e-3
+    assert found.expected_m is not None
+    assert np.median(found.thickness_m / found.expected_m) == pytest.approx(0.85, abs=0.35)
+    assert p_value(at_extrinsics_on_the_poses(others, wrong, {}, COV)) < 1e-9
+    # The extrinsics of the solve itself are where the solve is.
+    names, poses = tuple(TRUE), others.used.state.T_vehicle_lidar
+    own = at_extrinsics_on_the_poses(others, dict(zip(names, poses, strict=True)), {}, COV)
+    assert own.distances_m == pytest.approx(at_the_solve(others).distances_m, abs=1e-9)
 
 
 def test_a_lidar_that_is_moved_is_apart_by_that_along_the_normal(others: OtherStrips) -> None:

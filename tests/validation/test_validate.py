@@ -8,8 +8,8 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config, TargetRegion
-from caliv_graph.errors import ConfigError, TrajectoryError
-from caliv_graph.products import Calibration, MotionData, PoseNoise
+from caliv_graph.errors import ConfigError
+from caliv_graph.products import Calibration, PoseNoise
 from caliv_graph.validation.covariances import given_pose_covariance
 from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation
 from caliv_graph.validation.surfaces import Pole, Wall
@@ -52,16 +52,6 @@ def right() -> Validation:
 @pytest.fixture(scope="module")
 def wrong() -> Validation:
     return validated(calibration_of(WRONG))
-
-
-def test_a_drive_without_motion_data_is_refused_with_what_validates() -> None:
-    class Bare(Memory):
-        def motion(self) -> MotionData:
-            return MotionData(self.name)
-
-    recording = make_recording()
-    with pytest.raises(TrajectoryError, match=r"memory: no motion data.*give --data a drive"):
-        validated(recording=Bare(recording.clouds, recording.poses))
 
 
 def test_what_stands_around_is_found(right: Validation) -> None:

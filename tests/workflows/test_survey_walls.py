@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+from functools import cache
 from pathlib import Path
 
+import numpy as np
+import pytest
 from rich.console import Console
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import Config, GroundConfig
+from caliv_graph.config.model import Config, GroundConfig, StructureConfig
 from caliv_graph.pipeline import calibrate, prepare, structure_evidence
 from caliv_graph.report.predicted import survey_document, survey_table
 from caliv_graph.scenario.drive_models import StraightDrive
@@ -18,6 +21,7 @@ from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.world_models import WallModel, WorldModel
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.workflows.next_drive import next_drive, recorded_drive
 from caliv_graph.workflows.survey import Survey, survey_observations
 from tests.drives_with_chair import paper_lidar, paper_scenario
 from tests.kept import KeptDrive
@@ -59,12 +63,14 @@ CASES = {
 }
 
 
+@cache
 def driven(name: str) -> tuple[KeptDrive, Config]:
     recording = KeptDrive(scenario_of(*CASES[name]), 1)
     config = parse_config(config_of(recording, has_bag=True), name, Path())
     return recording, config.model_copy(update={"target": False, "ground": GroundConfig(use=True)})
 
 
+@cache
 def surveyed(name: str) -> Survey:
     recording, config = driven(name)
     found = prepare([recording], config, {0: recording.motion()}, SilentProgress())
@@ -110,3 +116,39 @@ def test_walls_that_are_not_shared_are_named() -> None:
     assert "see no piece of a wall that the other sees" in text
     assert "Scans that see the target" not in text
     assert survey_document(found)["shared_walls"] == [{"lidars": ["front", "rear"], "strips": 0}]
+
+
+def test_a_plan_of_the_recorded_drive_counts_its_walls() -> None:
+    recording, config = driven("not shared")
+    observed = surveyed("not shared")
+
+    drive = recorded_drive(recording, config, SilentProgress())
+    planned = next_drive([drive], [], drive.assumptions)
+
+    found = planned.prediction
+    assert found is not None
+    (walls,) = found.walls
+    assert walls is not None
+    assert walls.strips == {("front", "rear"): 0}
+    assert walls.scans.keys() == {("walls of the drive", name) for name in ASIDE}
+    lost = {d.text for d in observed.covariance.undetermined}
+    assert {d.text for d in found.undetermined} == lost
+    for lidar, sigma in found.sigma_s2v.items():
+        ratio = sigma / observed.covariance.sigma_s2v[lidar]
+        assert (np.abs(np.log(ratio)) < np.log(1.35)).all()
+    assert any("it is predicted by walls and ground" in note for note in planned.notes)
+    # At the mountings of this drive its walls join, whatever those of another drive are.
+    assert drive.mounted_as({}) == drive.scenario.lidars
+    for lidar, model in drive.scenario.lidars.items():
+        assert model.mounting.xyz != pytest.approx(config.lidars[lidar].given.xyz, abs=1e-3)
+
+
+def test_walls_that_are_not_to_be_used_predict_nothing() -> None:
+    recording, config = driven("parallel")
+    without = config.model_copy(update={"structure": StructureConfig(use=False)})
+
+    drive = recorded_drive(recording, without, SilentProgress())
+    planned = next_drive([drive], [], drive.assumptions)
+
+    assert planned.prediction is None
+    assert any("walls are not used: there are no sigmas" in note for note in planned.notes)

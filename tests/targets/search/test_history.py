@@ -12,7 +12,7 @@ import pytest
 from caliv_graph.products import IntArray
 from caliv_graph.targets.search import align
 from caliv_graph.targets.search.history import Alignment, LidarHistory
-from caliv_graph.targets.search.objects import ScanObject, ScanObjects
+from caliv_graph.targets.search.objects import WIDE_M, ScanObject, ScanObjects
 
 
 def object_at(azimuth_deg: float) -> ScanObject:
@@ -66,7 +66,7 @@ def test_objects_at_one_place_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     # one is too wide for a target.
     along_m = (0.0, 0.2, 0.4501, 3.0, 0.1)
     objects = [replace(object_at(0.0), base=np.array([9.0, y, 0.0])) for y in along_m]
-    objects[-1] = replace(objects[-1], extent_m=2.0 * align.WIDE_M)
+    objects[-1] = replace(objects[-1], extent_m=2.0 * WIDE_M)
     scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), 0.2, True)
     poses = np.eye(3)[None], np.zeros((1, 3))
     history = LidarHistory("front", gtsam.Pose3(), [scan], poses, 1.0)

@@ -38,6 +38,10 @@ COMPONENTS = 100
 ITERATIONS = 25
 """Size of the registration that decides: centimetres are enough."""
 
+TOLERANCE = (5e-3, 3e-3)
+"""Median step of a cloud, rad and m, at which it ends. Clouds of so few points never come to rest
+to a millimetre."""
+
 AGREE_M = 0.05
 """Scatter of the centres that poses and registrations explain: a candidate with less is static."""
 
@@ -343,6 +347,7 @@ def _sightings(
         state = JointRegistration(
             observation, config.model_copy(update={"registration": small}), rough=True
         )
+        state.tolerance = TOLERANCE
         registered = register_jointly(state, poses, ITERATIONS, other_starts=False)
     except RegistrationError:
         return None

@@ -166,16 +166,18 @@ def given_pose_factor(
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     if cov is not None:
         noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+    by_error = -np.eye(6)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T = values.atPose3(key_pose)
-        w = gtsam.Rot3.Logmap(R_given.between(T.rotation()))
+        rotation = T.rotation()
+        w = gtsam.Rot3.Logmap(R_given.between(rotation))
         if jacobians is not None:
             J = np.zeros((6, 6))
             J[:3, :3] = gtsam.Rot3.LogmapDerivative(w)
-            J[3:, 3:] = T.rotation().matrix()
+            J[3:, 3:] = rotation.matrix()
             jacobians[0] = J
-            jacobians[1] = -np.eye(6)
+            jacobians[1] = by_error
         return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
 
     return gtsam.CustomFactor(noise, [key_pose, key_pose_error], error)

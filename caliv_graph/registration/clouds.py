@@ -89,13 +89,14 @@ class CloudStack:
     sigma_range_m: float
 
     def only(self, which: IntArray) -> CloudStack:
-        """The clouds at these indices, ascending."""
-        kept = np.isin(self.cloud, which)
+        """The clouds at these indices; one that is named twice is there twice."""
         sizes = self.sizes[which]
+        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        kept = np.arange(int(sizes.sum())) + np.repeat(self.starts[which] - starts, sizes)
         return CloudStack(
             points=self.points[kept],
             cloud=np.repeat(np.arange(len(which)), sizes),
-            starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+            starts=starts,
             lidar=self.lidar[which],
             beams=self.beams[kept],
             normals=self.normals[kept],

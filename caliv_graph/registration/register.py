@@ -322,9 +322,10 @@ def register_jointly(
     if coarse:
         t = centre_clouds(state.clouds, R, t, [c.cut for c in state.observation.clouds])
     state.seed(R, t, COARSE_SIGMA_M if coarse else FINE_SIGMA_M)
-    run = _alternated(state, R, t, max_iterations)
     if coarse and other_starts:
-        run = _from_other_starts(state, run, max_iterations)
+        run = _from_other_starts(state, R, t, max_iterations)
+    else:
+        run = _alternated(state, R, t, max_iterations)
     quadratic = state.expect(run.R, run.t)
     joint = quadratic.joint()
     return state.result(
@@ -343,11 +344,13 @@ class _Run:
     last_step: tuple[float, float]
 
 
-def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: int) -> _Run:
-    """E-step and M-step in turn, from a seeded mixture until the poses stay."""
+def _alternated(
+    state: JointRegistration, R: Array, t: Array, max_iterations: int, to_finest: bool = False
+) -> _Run:
+    """E-step and M-step in turn until the poses stay, or `to_finest`: until annealing has ended."""
     converged, step = False, (np.inf, np.inf)
     iteration = 0
-    while iteration < max_iterations and not converged:
+    while iteration < max_iterations and not (converged or (to_finest and state.finest)):
         iteration += 1
         quadratic = state.expect(R, t)
         d = free_step(quadratic)
@@ -368,23 +371,30 @@ def _alternated(state: JointRegistration, R: Array, t: Array, max_iterations: in
     return _Run(R, t, iteration, converged, step)
 
 
-def _from_other_starts(state: JointRegistration, run: _Run, max_iterations: int) -> _Run:
-    """The same run, or one in which clouds that show less of the target have better places."""
-    found = suspicious(state.clouds, run.R, run.t)
-    if not len(found.clouds):
-        return run
-    trial = copy(state)
-    trial.weights = state.weights.copy()
-    trial.weights[found.clouds] *= LEFT_OUT
-    trial.seed(run.R, run.t, COARSE_SIGMA_M)
-    others = _alternated(trial, run.R, run.t, max_iterations)
-    R, t, moved = best_starts(
-        trial.clouds, trial.mixture, trial.noise, others.R, others.t, found, left_step
-    )
-    if not moved.any():
-        return run
-    R_all, t_all = others.R.copy(), others.t.copy()
-    R_all[found.clouds], t_all[found.clouds] = R, t
-    state.seed(R_all, t_all, FINE_SIGMA_M)
-    again = _alternated(state, R_all, t_all, max_iterations)
-    return replace(again, iterations=run.iterations + others.iterations + again.iterations)
+def _from_other_starts(state: JointRegistration, R: Array, t: Array, max_iterations: int) -> _Run:
+    """`_alternated`, with better places for clouds that show less of the target than the rest."""
+    # Whether a cloud is lower or narrower shows before sparse clouds have come to rest.
+    annealed = _alternated(state, R, t, max_iterations, to_finest=True)
+    found = suspicious(state.clouds, annealed.R, annealed.t)
+    if len(found.clouds):
+        trial = copy(state)
+        trial.weights = state.weights.copy()
+        trial.weights[found.clouds] *= LEFT_OUT
+        trial.seed(annealed.R, annealed.t, COARSE_SIGMA_M)
+        others = _alternated(trial, annealed.R, annealed.t, max_iterations)
+        R, t, moved = best_starts(
+            trial.clouds, trial.mixture, trial.noise, others.R, others.t, found, left_step
+        )
+        if moved.any():
+            R_all, t_all = others.R.copy(), others.t.copy()
+            R_all[found.clouds], t_all[found.clouds] = R, t
+            state.seed(R_all, t_all, FINE_SIGMA_M)
+            again = _alternated(state, R_all, t_all, max_iterations)
+            before = annealed.iterations + others.iterations
+            return replace(again, iterations=before + again.iterations)
+    if annealed.converged:
+        return annealed
+    rest = _alternated(state, annealed.R, annealed.t, max_iterations - annealed.iterations)
+    if not rest.iterations:
+        return annealed
+    return replace(rest, iterations=annealed.iterations + rest.iterations)

@@ -7,11 +7,13 @@ a cloud is tried at several places on the shape of the others; the best explanat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.common.cores import parts
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import HeightNoise
@@ -35,6 +37,9 @@ MOST_SUSPICIOUS = 0.5
 
 START_STEP_M = 0.1
 """Distance between starts: a cloud is drawn in from half of it, one sigma of the first width."""
+
+TRIED_TOGETHER = 64
+"""Starts that are fitted in one batch: their sums over points and surfels stay small."""
 
 START_SIGMA_M = 0.05
 """Roughness and width of the surfels at a start. It falls by `NARROWER` per iteration."""
@@ -154,40 +159,44 @@ def best_starts(
     Returns:
         R (S, 3, 3) and t (S, 3) of them, and (S,) whether that is another place than before.
     """
-    part = clouds.only(found.clouds)
     mixture = _shown_by_others(mixture)
     R_now, t_now = R[found.clouds], t[found.clouds]
-    best_R, best_t, best = R_now, t_now, np.full(part.count, -np.inf)
-    for shift in _shifts(found):
-        R_end, t_end = _fitted(part, mixture, noise, R_now, t_now + shift, move)
+    best_R, best_t, best = R_now.copy(), t_now.copy(), np.full(len(R_now), -np.inf)
+    tried, shifts = _shifts(found)
+    for some in parts(len(tried), -(-len(tried) // TRIED_TOGETHER)):
+        of = tried[some]
+        part = clouds.only(found.clouds[of])
+        R_end, t_end = _fitted(part, mixture, noise, R_now[of], t_now[of] + shifts[some], move)
         score = _log_likelihood(part, *_widened(mixture, noise, COMPARED_SIGMA_M), R_end, t_end)
         score -= MISSING_NATS * _missing(part, mixture, R_end, t_end)
-        better = score > best
-        best_R = np.where(better[:, None, None], R_end, best_R)
-        best_t = np.where(better[:, None], t_end, best_t)
-        best = np.maximum(best, score)
-    middle = part.centres
+        for i, s in enumerate(of.tolist()):
+            if score[i] > best[s]:
+                best_R[s], best_t[s], best[s] = R_end[i], t_end[i], score[i]
+    middle = clouds.centres[found.clouds]
     moved = np.einsum("sab,sb->sa", best_R - R_now, middle) + best_t - t_now
     return best_R, best_t, np.linalg.norm(moved, axis=1) > SAME_PLACE_M
 
 
-def _shifts(found: Suspicion) -> list[Array]:
-    """(S, 3) displacements of the clouds, metres, target frame; the first is none."""
-    up = _steps(found.up_m)
-    across = _steps(found.across_m)
-    shifts = [
-        (0.5 * u * found.up_m)[:, None] * np.array([0.0, 0.0, 1.0])
-        + (0.5 * a * found.across_m)[:, None] * found.across
-        for u in up
-        for a in across
-    ]
-    return sorted(shifts, key=lambda shift: float(np.abs(shift).max(initial=0.0)))
+def _shifts(found: Suspicion) -> tuple[IntArray, Array]:
+    """Where each cloud is tried: over what it lacks itself, and no closer than need be.
+
+    (P,) index of the cloud among the suspicious ones, ascending; (P, 3) displacements, metres,
+    target frame, those of a cloud by size: the first is none.
+    """
+    tried, shifts = [], []
+    up = np.array([0.0, 0.0, 1.0])
+    lacks = zip(found.up_m.tolist(), found.across_m.tolist(), found.across, strict=True)
+    for s, (up_m, across_m, across) in enumerate(lacks):
+        own = [u * up + a * across for u in _steps(up_m) for a in _steps(across_m)]
+        shifts += sorted(own, key=lambda shift: float(np.abs(shift).max()))
+        tried += [s] * len(own)
+    return np.array(tried), np.array(shifts)
 
 
-def _steps(lacks_m: Array) -> Array:
-    """From -1 to 1 with 0: from one end of what clouds lack (S,) to the other, in small steps."""
-    half = int(np.ceil(0.5 * lacks_m.max(initial=0.0) / START_STEP_M))
-    return np.linspace(-1.0, 1.0, 2 * half + 1) if half else np.zeros(1)
+def _steps(lacks_m: float) -> list[float]:
+    """From one end of what a cloud lacks to the other, metres from its middle; with 0."""
+    half = math.ceil(0.5 * lacks_m / START_STEP_M)
+    return np.linspace(-0.5 * lacks_m, 0.5 * lacks_m, 2 * half + 1).tolist() if half else [0.0]
 
 
 def _shown_by_others(mixture: Mixture) -> Mixture:

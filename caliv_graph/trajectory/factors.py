@@ -83,9 +83,10 @@ def velocity_factor(
         back = values.atPose3(key_imu).rotation().matrix().T
         predicted = scale * (back @ (values.atVector(key_velocity) + gained_map))
         if jacobians is not None:
-            J = np.zeros((3, 6))
-            J[:, :3] = skew(predicted)
-            jacobians[0] = J
+            # `skew`, written out: there is one such factor per message of the wheels.
+            x, y, z = predicted.tolist()
+            rows = ((0.0, -z, y, 0.0, 0.0, 0.0), (z, 0.0, -x, 0.0, 0.0, 0.0))
+            jacobians[0] = np.array((*rows, (-y, x, 0.0, 0.0, 0.0, 0.0)))
             jacobians[1] = scale * back
         return np.asarray(predicted - velocity_imu)
 

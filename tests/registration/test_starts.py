@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, Side
+from caliv_graph.registration import register
 from caliv_graph.registration.centring import centre_clouds
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.register import (
     JointRegistration,
     register_jointly,
 )
-from caliv_graph.registration.starts import suspicious
+from caliv_graph.registration.starts import Suspicion, _shifts, suspicious
 from tests.registration.scenes import (
     Scene,
     chair_scene,
@@ -75,11 +76,26 @@ def test_where_no_cloud_is_suspicious_nothing_changes(monkeypatch: pytest.Monkey
     for _ in range(2):
         state = JointRegistration(scene.observation, config, rough=True)
         results.append(register_jointly(state, guesses(scene.T_target_lidar, 1), 40))
-        monkeypatch.setattr(
-            "caliv_graph.registration.register._from_other_starts", lambda _, run, __: run
-        )
+        monkeypatch.setattr(register, "_from_other_starts", register._alternated)
+    assert results[0].iterations == results[1].iterations
     for a, b in zip(results[0].T_target_lidar, results[1].T_target_lidar, strict=True):
         assert np.array_equal(a.matrix(), b.matrix())
+
+
+def test_a_cloud_is_tried_over_what_it_lacks_itself() -> None:
+    # 0.35 m of height: every 8.75 cm from end to end. 0.15 m of width, across the view: three.
+    view = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
+    found = Suspicion(
+        np.array([2, 5, 7]), np.array([0.35, 0.0, 0.1]), np.array([0, 0.15, 0.1]), view
+    )
+    tried, shifts = _shifts(found)
+    assert np.bincount(tried).tolist() == [5, 3, 9]
+    first = shifts[tried == 0]
+    assert sorted(first[:, 2]) == pytest.approx([-0.175, -0.0875, 0.0, 0.0875, 0.175])
+    assert np.abs(first[:, :2]).max() == 0.0
+    np.testing.assert_allclose(np.sort(shifts[tried == 1][:, 0]), [-0.075, 0.0, 0.075])
+    # The first is where the cloud is: of two places that are as good it stays.
+    assert [np.abs(shifts[tried == s][0]).max() for s in range(3)] == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("part", ["top", "bottom", "left", "right"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -71,6 +72,10 @@ class GroundSurface:
     nodes: Array
     cells: Array
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.cells)
+
     def height_at(self, xy: Array) -> Array:
         """(k,) metres at places (k, 2); beyond the rim, the height of the rim."""
         node, part = _node_and_part(xy)
@@ -82,7 +87,7 @@ class GroundSurface:
 
     def is_seen_at(self, xy: Array) -> BoolArray:
         """(k,) whether ground was seen within `SUPPORT_M` of places (k, 2)."""
-        distance, _ = cKDTree(self.cells).query(xy, distance_upper_bound=SUPPORT_M)
+        distance, _ = self._tree.query(xy, distance_upper_bound=SUPPORT_M)
         seen: BoolArray = np.isfinite(distance)
         return seen
 

@@ -104,9 +104,11 @@ class LidarHistory:
         shift = np.array([*alignment.shift_m, 0.0])
         return gtsam.Pose3(R_yaw.compose(self.guess.rotation()), self.t_vehicle_lidar + shift)
 
-    def bases(self, alignment: Alignment) -> Array:
-        """(n, 3) metres in the map, the foot of each object."""
-        return self.places(alignment, self._base, self.scan_of)
+    def bases(self, alignment: Alignment, which: BoolArray | None = None) -> Array:
+        """(n, 3) metres in the map, the foot of each object, or of those that `which` (n,) has."""
+        if which is None:
+            return self.places(alignment, self._base, self.scan_of)
+        return self.places(alignment, self._base[which], self.scan_of[which])
 
     def outlines(self, which: BoolArray, alignment: Alignment) -> tuple[Array, IntArray]:
         """Points (m, 3) of these objects in the map, and the scan of each."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -199,7 +200,7 @@ def _clusters(stands: _Standing, spacing: Array) -> IntArray:
     if len(sparse):
         found = tree.query_ball_point(points[sparse], link[sparse])
         counts = np.array([len(f) for f in found])
-        to = np.concatenate([np.asarray(f, dtype=np.intp) for f in found])
+        to = np.fromiter(itertools.chain.from_iterable(found), np.intp, int(counts.sum()))
         pairs.append(np.column_stack([np.repeat(sparse, counts), to]))
     of_point: IntArray = connected(np.vstack(pairs), len(points))[member.ravel()]
     return of_point

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.products import IntArray
-from caliv_graph.targets.search.history import LidarHistory
-from caliv_graph.targets.search.objects import ScanObject, ScanObjects
+from caliv_graph.targets.search import align
+from caliv_graph.targets.search.history import Alignment, LidarHistory
+from caliv_graph.targets.search.objects import WIDE_M, ScanObject, ScanObjects
 
 
 def object_at(azimuth_deg: float) -> ScanObject:
@@ -57,3 +59,19 @@ def test_a_lidar_that_looks_all_around_has_no_edge(azimuth_deg: float) -> None:
 
 def test_a_scan_without_returns_has_no_field_of_view() -> None:
     assert not whole(0.0, np.zeros(0, np.int64))
+
+
+def test_objects_at_one_place_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    # One pair within 0.25 m (0 and 0.2), three within 0.5 m, each counted from both sides. The last
+    # one is too wide for a target.
+    along_m = (0.0, 0.2, 0.4501, 3.0, 0.1)
+    objects = [replace(object_at(0.0), base=np.array([9.0, y, 0.0])) for y in along_m]
+    objects[-1] = replace(objects[-1], extent_m=2.0 * WIDE_M)
+    scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), 0.2, True)
+    poses = np.eye(3)[None], np.zeros((1, 3))
+    history = LidarHistory("front", gtsam.Pose3(), [scan], poses, 1.0)
+    moved = Alignment(0.3, np.array([1.0, -2.0]))
+    assert align.concentration(history, moved) == 2 * (1 + 3)
+    # The same with a tree, where there are many.
+    monkeypatch.setattr(align, "FEW", 0)
+    assert align.concentration(history, moved) == 2 * (1 + 3)

@@ -34,10 +34,10 @@ from caliv_graph.conventions import (
 )
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
-from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
+from caliv_graph.products import Array, BoolArray, IntArray, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.rates import rate_rows_of_drives
+from caliv_graph.trajectory.rates import rate_rows_of_drives, turn_densities
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -88,6 +88,8 @@ class Problem:
             (`trajectory.rates`); none where an odometry gave them.
         cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
             were moved with the rates of the trajectory, seconds; None: zero.
+        cloud_turn_rad: (J, 3) 1 sigma of what the gyroscope turned from the stamp of each cloud to
+            `cloud_apart_s`, vehicle axes; None: zero.
         moved_with: T_vehicle_lidar with which they were moved; the guess, of one that it has not.
     """
 
@@ -113,6 +115,7 @@ class Problem:
     heave_m: float = field(default_factory=usual_heave_m)
     rate_rows: Mapping[int, Array] = field(default_factory=dict)
     cloud_apart_s: Array | None = None
+    cloud_turn_rad: Array | None = None
     moved_with: Mapping[str, gtsam.Pose3] = field(default_factory=dict)
 
     @property
@@ -355,7 +358,18 @@ def pose_problem(
         heave_m=heave_m,
         rate_rows=rate_rows_of_drives(trajectories, of_pose),
         cloud_apart_s=apart_s,
+        cloud_turn_rad=_turns(clouds, smoothed) if apart_s.any() else None,
     )
+
+
+def _turns(
+    clouds: Sequence[tuple[int, TargetCloud]], smoothed: Mapping[int, SmoothedTrajectory]
+) -> Array:
+    """`Problem.cloud_turn_rad`: a gyroscope's angle walks at random."""
+    density = {drive: turn_densities(trajectory) for drive, trajectory in smoothed.items()}
+    nothing = np.zeros(3)
+    variance = [abs(c.apart_s) * density.get(c.drive, nothing) for _, c in clouds]
+    return np.sqrt(np.array(variance).reshape(-1, 3))
 
 
 def _views(

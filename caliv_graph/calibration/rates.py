@@ -13,6 +13,7 @@ import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.ground_factors import moved
+from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND, key_rates, key_vehicle
 from caliv_graph.geometry.se3 import unstack
@@ -84,3 +85,19 @@ def rates_factor(
 
     noise = gtsam.noiseModel.Diagonal.Sigmas(RATE_SIGMAS)
     return gtsam.CustomFactor(noise, [*T_map_vehicle, key], error)
+
+
+def turned_clouds(problem: Problem, lines: CloudLinearisation) -> Array:
+    """(6 J, 3 K) how the K clouds that were moved in time turn by 1 sigma of the gyroscope's noise.
+
+    Left perturbations of the predicted poses, as a turn of the vehicle between the stamp and the
+    points makes them. Each cloud has errors of its own.
+    """
+    sigmas = problem.cloud_turn_rad
+    own = [] if sigmas is None else np.flatnonzero(sigmas.any(axis=1)).tolist()
+    out = np.zeros((problem.clouds, 6, len(own), 3))
+    for k, j in enumerate(own):
+        assert sigmas is not None
+        at = lines.keys[j].index(key_vehicle(int(problem.cloud_pose[j])))
+        out[j, :, k] = lines.jacobians[j][at][:, :3] * sigmas[j]
+    return out.reshape(6 * problem.clouds, -1)

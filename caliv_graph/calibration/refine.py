@@ -29,6 +29,7 @@ from caliv_graph.calibration.range_bias import (
     range_biases,
     without_bias,
 )
+from caliv_graph.calibration.rates import turned_clouds
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import explained_part
 from caliv_graph.calibration.solve import (
@@ -186,8 +187,8 @@ class _Loop:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """The graph with the clouds' quadratic, the biases of the ranges eliminated."""
-        joint, directions = shapes.joint(self.state.scale), self._directions(shapes)
+        """The graph with the clouds' quadratic; biases of ranges and turns eliminated."""
+        joint, directions = shapes.joint(self.state.scale), self._directions(shapes, lines)
         return self._reduced(without_bias(*joint, directions, self._applied(directions)), lines)
 
     def _sizes(self) -> BiasSizes:
@@ -196,8 +197,10 @@ class _Loop:
         most_m = max(RANGE_BIAS_LIMIT_M, stated_m or 0.0)
         return replace(sizes, offset_m=min(sizes.offset_m, most_m))
 
-    def _directions(self, shapes: _Shapes) -> Array:
-        return shapes.biases.directions(self._sizes())
+    def _directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
+        """(6 J, B) by biases of the ranges, and by what the gyroscope turned since the stamps."""
+        biases = shapes.biases.directions(self._sizes())
+        return np.hstack([biases, turned_clouds(self.state.problem, lines)])
 
     def _applied(self, directions: Array) -> Array:
         """(B,) the offsets in sigmas, of all biases along `directions`."""
@@ -207,7 +210,7 @@ class _Loop:
 
     def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array) -> None:
         """Moves the offsets to their most likely values after a step."""
-        directions = self._directions(shapes)
+        directions = self._directions(shapes, reduced.lines)
         joint, applied = shapes.joint(self.state.scale), self._applied(directions)
         found = most_likely_biases(*joint, directions, applied, reduced.moved_clouds(step))
         self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]

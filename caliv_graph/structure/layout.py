@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -31,6 +31,7 @@ class Nuisances:
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
+        turn_rad_s: (P, 3) of the angular velocity within scans (`Problem.turn_rad_s`); not metres.
     """
 
     bias: float
@@ -42,6 +43,7 @@ class Nuisances:
     shared: float
     repeated: float
     jitter_s: float = 0.0
+    turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class Layout:
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
     incidence, and that on the ground (3), error of the vehicle's height and tilt above the ground
-    (3), jitter of the stamp of each scan, if there is any; and what belongs to one surface each:
+    (3), errors of the angular velocity within the scans at each pose, if there are any (3),
+    jitter of the stamp of each scan, if there is any; and what belongs to one surface each:
     planes (two tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each
     strip.
     """
@@ -89,6 +92,7 @@ class Layout:
     surface_of: tuple[int, ...]
     jitters: int = 0
     rates: int = 0
+    turns: int = 0
 
     @property
     def strips(self) -> int:
@@ -126,9 +130,14 @@ class Layout:
         return self.jitter + self.jitters
 
     @property
+    def turn(self) -> int:
+        """First error of the angular velocity within the scans at a pose."""
+        return self.standing + 3
+
+    @property
     def jitter(self) -> int:
         """First jitter of a stamp."""
-        return self.standing + 3
+        return self.turn + self.turns
 
     @property
     def standing(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -47,6 +47,8 @@ class Problem:
         standing: what is known of how the vehicle stands on the ground.
         views: which scans are from one place.
         range_errors: what is stated of the errors of the ranges.
+        turn_rad_s: (P, 3) 1 sigma of the errors of the angular velocity within the scans at each of
+            the P poses with a scan, vehicle axes (`turns.py`); empty: points are taken at once.
     """
 
     patches: DrivePatches
@@ -61,6 +63,12 @@ class Problem:
     standing: Standing
     views: Views
     range_errors: RangeErrors = UNSTATED
+    turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def turn_of_scan(self) -> IntArray:
+        """(S,) which of the poses with a scan each has."""
+        return np.unique(self.pose_of_scan, return_inverse=True)[1].ravel()
 
 
 def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
@@ -159,6 +167,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
         offsets=problem.offsets,
         lidars=len(problem.patches.lidars),
         surface_of=tuple(strips.surface.tolist()),
+        turns=problem.turn_rad_s.size,
     )
 
 
@@ -201,6 +210,7 @@ def geometry_at(
         problem.pose_of_scan[scan],
         problem.twists,
         dents,
+        problem.turn_of_scan[scan],
     )
 
 

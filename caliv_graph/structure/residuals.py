@@ -84,6 +84,7 @@ def geometry_of(
     pose: IntArray,
     twists: Array | None,
     dents: bool = True,
+    turn: IntArray | None = None,
 ) -> Geometry:
     """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
 
@@ -96,6 +97,7 @@ def geometry_of(
         twists: (M, 6) velocity at each pose, right perturbation per second; None: no offset is
             free.
         dents: whether dents of the ground tell where a LiDAR is (`smooth_normals`).
+        turn: (Q,) which error of the angular velocity each has, where the layout has any.
     """
     q = sightings.count
     strip = sightings.strip
@@ -143,6 +145,11 @@ def geometry_of(
         error_columns,
     ]
     moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
+    if layout.turns and turn is not None:
+        # What the gyroscope erred since the stamp: X Exp(tau w) in the place of X.
+        own = layout.turn + 3 * turn[:, None] + np.arange(3)
+        by_turn_rate = sightings.time_s[:, None, None] * by_pose[:, :3]
+        moved.append((by_turn_rate, own, state.errors[own]))
     for by, own, value in moved:
         plain += np.einsum("qc,qci->qi", value, by)
         parts.append(by)

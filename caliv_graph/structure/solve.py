@@ -283,7 +283,7 @@ def _round(
     layout = layout_of(problem, strips)
     errors = np.zeros(layout.size)
     # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.
-    of_lidars = slice(layout.error, layout.plane)  # and of the vehicle's stand
+    of_lidars = slice(layout.error, layout.turn)  # and of the vehicle's stand
     errors[of_lidars] = state.errors[of_lidars] if len(state.errors) else 0.0
     state = replace(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
@@ -297,6 +297,7 @@ def _round(
         sighting=np.full(strips.count, levels.sighting_m),
         shared=levels.shared_m,
         repeated=0.0,
+        turn_rad_s=problem.turn_rad_s,
     )
     weights = np.ones(sightings.count)
     geometry = geometry_at(problem, state, sightings, layout)

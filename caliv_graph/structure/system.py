@@ -48,7 +48,7 @@ def system_of(
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
     sparse, less, right = rows.normal_equations()
-    own_errors = slice(layout.standing, layout.jitter)
+    own_errors = slice(layout.standing, layout.turn)
     J, r = standing_rows(
         standing,
         stands,
@@ -70,6 +70,7 @@ def system_of(
     weight[errors] = layout.error_sigmas(nuisances) ** -2.0
     tilt = standing.tilt_sigma_rad or 1.0
     weight[own_errors] = np.array([standing.height_sigma_m, tilt, tilt]) ** -2.0
+    weight[layout.turn : layout.jitter] = nuisances.turn_rad_s.ravel() ** -2.0
     if nuisances.jitter_s > 0.0:
         weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors

@@ -35,6 +35,7 @@ from caliv_graph.structure.thickness import (
     thickness_at_estimate,
     thickness_at_guesses,
 )
+from caliv_graph.structure.turns import turn_sigmas
 from caliv_graph.structure.views import views_of
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
@@ -160,6 +161,7 @@ def problem_of(
         standing=standing_of(config, heave_m),
         views=views_of(patches, pose_of_scan, prior),
         range_errors=range_errors(config.noise),
+        turn_rad_s=turn_sigmas(patches, pose_of_scan, trajectory),
     )
 
 

@@ -53,11 +53,15 @@ def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     Also returns the indices of these poses among those of `problem`.
     """
     poses = np.unique(problem.pose_of_scan[keep])
+    turns = problem.turn_rad_s
+    if len(turns):
+        turns = turns[np.searchsorted(np.unique(problem.pose_of_scan), poses)]
     own = replace(
         problem,
         prior=_on(problem.prior, poses),
         pose_of_scan=np.searchsorted(poses, problem.pose_of_scan[keep]),
         twists=None if problem.twists is None else problem.twists[poses],
+        turn_rad_s=turns,
     )
     if keep.all():
         return own, poses

@@ -17,6 +17,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 RATES = 6
 """Angular velocity (rad/s) and velocity in the map (m/s), both along the vehicle's axes."""
@@ -103,3 +104,9 @@ def with_rates(information: Array, gradient: Array, rows: Array) -> tuple[Array,
     out = tie.T @ tie
     out[:n, :n] += information
     return out, np.concatenate([gradient, np.zeros(RATES)])
+
+
+def turn_densities(trajectory: SmoothedTrajectory) -> Array:
+    """(3,) rad^2/s, vehicle axes: variance per second of what the gyroscope errs over a sweep."""
+    R = trajectory.T_vehicle_imu.rotation().matrix()
+    return np.asarray(np.diag(R @ trajectory.data.noise.gyro_density @ R.T))

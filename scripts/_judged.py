@@ -8,6 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.common.exits import exit_code
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.covariance import parent_axes_covariance
 from caliv_graph.products import Array, Calibration
@@ -29,6 +30,23 @@ def judged(
         cov, determined = pair_covariance(calibration, a, b), pair_determined(calibration, a, b)
         errors[f"S2S {a} to {b}"] = _judged(of, a, cov, determined, calibration)
     return errors
+
+
+def outcome_of(
+    calibration: Calibration, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> dict[str, Any]:
+    """Exit code, messages and errors of a calibration, as part of a run's line."""
+    return {
+        "exit": exit_code(calibration),
+        "said": [*calibration.contradictions, *calibration.unmet],
+        "undetermined": [direction.text for direction in calibration.undetermined],
+        "errors": judged(calibration, T_vehicle_lidar),
+    }
+
+
+def worst(errors: Mapping[str, Mapping[str, Any]]) -> float:
+    """Largest error of some quantities over its sigma; 0 if nothing is determined."""
+    return max((s for of in errors.values() for s in sigmas_off(of)), default=0.0)
 
 
 def sigmas_off(of: Mapping[str, Any]) -> list[float]:

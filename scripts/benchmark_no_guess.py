@@ -27,7 +27,7 @@ import gtsam
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
-from caliv_graph.common.exits import DONE, UNMET, USAGE, exit_code
+from caliv_graph.common.exits import DONE, UNMET, USAGE
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
@@ -36,7 +36,8 @@ from caliv_graph.products import Calibration
 from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
-from scripts._judged import judged, sigmas_off
+from scripts._guesses import drop_guesses
+from scripts._judged import judged, outcome_of, worst
 from scripts._runs import add_line, code_digest, json_lines, performed
 
 OUT = REPOSITORY / "out" / "no_guess"
@@ -96,12 +97,7 @@ def perform(task: tuple[str, int]) -> dict[str, Any]:
         except CalivError as e:
             line[name]["said"] = [f"{type(e).__name__}: {e}"]
         else:
-            line[name] |= {
-                "exit": exit_code(calibration),
-                "said": [*calibration.contradictions, *calibration.unmet],
-                "undetermined": [direction.text for direction in calibration.undetermined],
-                "errors": judged(calibration, recording.truth.T_vehicle_lidar),
-            }
+            line[name] |= outcome_of(calibration, recording.truth.T_vehicle_lidar)
         line[name]["cpu_s"] = time.process_time() - begun
     if len(found) == 2:
         other = {name: lidar.T_vehicle_lidar for name, lidar in found["with"].lidars.items()}
@@ -117,8 +113,7 @@ def calibrated(recording: SimulatedRecording, *, guess: bool) -> Calibration:
     """
     raw = config_of(recording, has_bag=True)
     if not guess:
-        for lidar in raw["lidars"].values():
-            del lidar["initial"], lidar["sigma"]
+        drop_guesses(raw)
     return calibrate(
         [recording], parse_config(raw, "simulated", REPOSITORY), SilentProgress()
     ).calibration
@@ -147,11 +142,6 @@ def is_same(line: Mapping[str, Any]) -> bool:
         and all(of["axes"] == 6 for of in line["apart"].values())
         and worst(line["apart"]) < SAME_SIGMAS
     )
-
-
-def worst(errors: Mapping[str, Mapping[str, Any]]) -> float:
-    """Largest difference in sigmas; 0 if nothing is determined."""
-    return max((s for of in errors.values() for s in sigmas_off(of)), default=0.0)
 
 
 def largest(line: Mapping[str, Any], own: slice) -> float:

@@ -30,7 +30,7 @@ from scipy.stats import chi2
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
-from caliv_graph.common.exits import DEFECT, DONE, INCONSISTENT, UNMET, USAGE, exit_code
+from caliv_graph.common.exits import DEFECT, DONE, INCONSISTENT, UNMET, USAGE
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
@@ -39,7 +39,8 @@ from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.model import dump_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
-from scripts._judged import judged, sigmas_off
+from scripts._guesses import drop_guesses
+from scripts._judged import outcome_of, sigmas_off, worst
 from scripts._random_drives import RandomDrive, random_drive
 from scripts._runs import add_line, code_digest, json_lines, performed
 
@@ -109,7 +110,8 @@ def perform(task: tuple[int, bool | None]) -> dict[str, Any]:
     except Exception:  # a defect on one drive must not end the others
         line |= {"exit": DEFECT, "said": [traceback.format_exc()]}
     else:
-        line |= outcome_of(run, recording)
+        line |= outcome_of(run.calibration, recording.truth.T_vehicle_lidar)
+        line["warnings"] = list(run.warnings)
     return {**line, "cpu_s": time.process_time() - begun}
 
 
@@ -121,21 +123,8 @@ def calibrated(recording: SimulatedRecording, drive: RandomDrive) -> Calibration
     """
     raw = config_of(recording, has_bag=True)
     if not drive.guess:
-        for lidar in raw["lidars"].values():
-            del lidar["initial"], lidar["sigma"]
+        drop_guesses(raw)
     return calibrate([recording], parse_config(raw, drive.text, REPOSITORY), SilentProgress())
-
-
-def outcome_of(run: CalibrationRun, recording: SimulatedRecording) -> dict[str, Any]:
-    """Exit code, messages and errors of a run, as part of its line."""
-    calibration = run.calibration
-    return {
-        "exit": exit_code(calibration),
-        "said": [*calibration.contradictions, *calibration.unmet],
-        "warnings": list(run.warnings),
-        "undetermined": [direction.text for direction in calibration.undetermined],
-        "errors": judged(calibration, recording.truth.T_vehicle_lidar),
-    }
 
 
 # ------------------------------------------------------------------ lines
@@ -150,7 +139,7 @@ def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
 
 def worst_sigmas(line: Mapping[str, Any]) -> float:
     """Largest error of a run over its sigma; 0 if nothing is determined."""
-    return max((s for of in line["errors"].values() for s in sigmas_off(of)), default=0.0)
+    return worst(line["errors"])
 
 
 def is_wrong(line: Mapping[str, Any]) -> bool:

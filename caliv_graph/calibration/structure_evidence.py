@@ -119,6 +119,8 @@ class StructureEvidence:
         Raises:
             SolveError: it could not be solved.
         """
+        if self.errors is None:
+            return NOTHING_TOLD
         heave_m = config.noise.heave_m or HEAVE_SIGMA_M
         of_drives: list[tuple[DrivePatches, PosePrior, Array, SmoothedTrajectory]] = []
         for patches in self.patches:
@@ -131,7 +133,7 @@ class StructureEvidence:
             stamps = np.unique(used.stamps_ns)
             joint, gain = poses_and_gain(trajectory, stamps, trajectory.open_kinds)
             of_drives.append((used, plain_prior(joint, stamps, heave_m), gain, trajectory))
-        if not of_drives or self.errors is None:
+        if not of_drives:
             return NOTHING_TOLD
         drives, priors, gains, own = zip(*of_drives, strict=True)
         told, T_vehicle_lidar = self.errors(drives, priors, gains, own, start, config, heave_m)

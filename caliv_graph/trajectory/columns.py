@@ -18,7 +18,7 @@ from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
-from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, without_bias
 
 
 def parameter_columns(
@@ -67,6 +67,19 @@ def parameter_columns(
                     out[white.rows, column] = np.einsum("mij,mj->mi", white.roots, change)
             column += 1
     return out
+
+
+def columns_of(smoothed: SmoothedTrajectory, parameters: Sequence[InputParameter]) -> Array:
+    """`parameter_columns` of a smoothed trajectory, at its estimate."""
+    return parameter_columns(
+        smoothed.data,
+        smoothed.nodes_ns,
+        smoothed.states,
+        TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds)),
+        smoothed.values,
+        smoothed.gnss_dropped,
+        parameters,
+    )
 
 
 @dataclass(frozen=True)

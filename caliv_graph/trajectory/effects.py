@@ -14,10 +14,9 @@ import numpy as np
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import TrajectoryGraph
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import inverse_columns, solved_columns
-from caliv_graph.trajectory.columns import parameter_columns
+from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.correlated import AXES, linearised
 from caliv_graph.trajectory.parameters import UncertainParameter
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
@@ -97,17 +96,9 @@ def poses_and_gain(
     n, width = len(smoothed.nodes_ns), STATE + AXES * len(kinds)
     common = [] if smoothed.yaw_bias is None else [key_yaw_bias()]
     linear = smoothed.graph.linearize(smoothed.values)
-    graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
-    J, r = linearised(linear, graph.kinds, kinds, smoothed.states.R_map_imu, common)
-    columns = parameter_columns(
-        smoothed.data,
-        smoothed.nodes_ns,
-        smoothed.states,
-        graph,
-        smoothed.values,
-        smoothed.gnss_dropped,
-        of,
-    )
+    R = smoothed.states.R_map_imu
+    J, r = linearised(linear, smoothed.factor_kinds, kinds, R, common)
+    columns = columns_of(smoothed, of)
     with_right = Chain.zero(n, width, len(common) + columns.shape[1] + 1)
     with_right.add(beside(beside(J, columns), -r[:, None]))
     chain = with_right.leading(STATE)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from caliv_graph.trajectory.build import TrajectoryGraph
-from caliv_graph.trajectory.columns import parameter_columns
+from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.correlated_step import chain_with_errors
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -27,18 +27,10 @@ def with_parameters(
     if not more:
         return smoothed
     every = (*smoothed.parameters, *more)
-    graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
-    columns = parameter_columns(
-        smoothed.data,
-        smoothed.nodes_ns,
-        smoothed.states,
-        graph,
-        smoothed.values,
-        smoothed.gnss_dropped,
-        [p.parameter for p in every],
-    )
+    columns = columns_of(smoothed, [p.parameter for p in every])
     linear = smoothed.graph.linearize(smoothed.values)
     if smoothed.correlated:
+        graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
         estimate = Estimate(smoothed.states, graph, smoothed.values)
         settled = Settled(smoothed.data, estimate, every, columns)
         chain = chain_with_errors(

@@ -10,6 +10,7 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
     as start     the same bag with `stamp: start`: what a wrong stamp costs
     turning      as plain, with LiDARs that turn once in a sweep
     packets      the same, stamps at the end, times that start anew with every packet
+    velodyne     VLP-16 LiDARs in place of the drive's, as velodyne_msgs/VelodyneScan
     inspvax      poses as novatel_oem7_msgs/INSPVAX instead of IMU, GNSS and velocity
     novatel      the same as novatel_msgs/INSPVAX, which is stamped by the recording
     tum          poses as a TUM file beside the bag
@@ -32,7 +33,6 @@ NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3
 from __future__ import annotations
 
 import argparse
-import datetime
 import math
 import shutil
 import sys
@@ -61,6 +61,7 @@ from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
 from scripts._dialects_folders import poses_of_clouds, write_kitti, write_nuscenes, write_pcds
+from scripts._dialects_messages import FIXES, POSES, RECEIVERS, serialised
 from scripts._dialects_motion import (
     ARM_M,
     BASELINE_DEG,
@@ -73,6 +74,7 @@ from scripts._dialects_motion import (
     second_fixes,
     turned,
 )
+from scripts._dialects_packets import velodyne_scans
 
 SCENARIO = ROOT / "configs" / "scenarios" / "distorted.yaml"
 PACKET_S = 24 * 55.296e-6
@@ -89,22 +91,17 @@ SWEEPS: dict[str, dict[str, Any]] = {
     },
 }
 MORE = ("odometry", "speed", "heading", "imu heading", "two fixes", "wheels", "scale")
-POSES = {"inspvax": "novatel_oem7_msgs/msg/INSPVAX", "novatel": "novatel_msgs/msg/INSPVAX"}
-FIXES = {
-    "navpvt": "ublox_msgs/msg/NavPVT",
-    "pvt": "septentrio_gnss_driver/msg/PVTGeodetic",
-    "station": "geometry_msgs/msg/PoseStamped",
-}
 FOLDERS = {"kitti": write_kitti, "nuscenes": write_nuscenes, "pcd": write_pcds}
 """Clouds of these are taken at one instant: the formats have no times of points."""
 
 WRITTEN = {
     "as start": "end",
+    "velodyne": "plain",
     **dict.fromkeys((*POSES, *FIXES, "tum", "csv", *MORE), "plain"),
     **dict.fromkeys(FOLDERS, "still"),
 }
 ROWS = (
-    *("plain", "end", "as start", *POSES, "tum", "csv", *FIXES, "turning", "packets"),
+    *("plain", "end", "as start", *POSES, "tum", "csv", *FIXES, "turning", "packets", "velodyne"),
     *FOLDERS,
     *MORE,
 )
@@ -206,6 +203,13 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
             raw["topics"] = {"pose": f"/{row}"}
         else:
             raw["topics"]["gnss"] = f"/{row}"
+    elif row == "velodyne":
+        topics = {name: f"/{name}/velodyne_packets" for name in raw["lidars"]}
+        if not (folder / row).exists():
+            with_packets(folder / "drive", folder / row, seed, topics)
+        raw["data"]["path"] = row
+        for name, topic in topics.items():
+            raw["lidars"][name]["topic"] = topic
     elif row in FOLDERS:
         in_folders(row, raw, folder, seed)
     elif row in MORE:
@@ -317,6 +321,7 @@ def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
             c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections
         }
         kind = {**POSES, **FIXES}[row]
+        gnss = load_scenario(SCENARIO).gnss
         own = w.add_connection(f"/{row}", kind, typestore=store)
         for stamp, fields in inspvax(source.parent, seed, row) if row in POSES else ():
             w.write(own, stamp, serialised(store, kind, stamp, fields))
@@ -324,7 +329,7 @@ def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
             if connection.msgtype.endswith("NavSatFix") and row in FIXES:
                 fix: Any = store.deserialize_cdr(data, connection.msgtype)
                 at = fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec
-                w.write(own, stamp, serialised(store, kind, at, RECEIVERS[row](fix, at)))
+                w.write(own, stamp, serialised(store, kind, at, RECEIVERS[row](fix, at, gnss)))
             else:
                 w.write(to[connection.id], stamp, data)
 
@@ -355,68 +360,25 @@ def with_messages(
                 w.write(to[connection.id], stamp, data)
 
 
-def navpvt(fix: Any, stamp: int) -> dict[str, Any]:
-    """A NavSatFix as the receiver would report it."""
-    t = datetime.datetime.fromtimestamp(stamp // 10**9, tz=datetime.UTC)
-    horizontal, vertical = math.sqrt(2 * fix.position_covariance[0]), fix.position_covariance[8]
-    return {
-        **{"year": t.year, "month": t.month, "day": t.day, "hour": t.hour, "min": t.minute},
-        **{"sec": t.second, "nano": stamp % 10**9, "valid": 7, "fix_type": 3, "flags": 1},
-        "lat": round(fix.latitude * 1e7),
-        "lon": round(fix.longitude * 1e7),
-        "height": round(fix.altitude * 1e3),
-        "h_acc": round(1e3 * horizontal),
-        "v_acc": round(1e3 * math.sqrt(vertical)),
-    }
-
-
-def pvt(fix: Any, stamp: int) -> dict[str, Any]:
-    """A NavSatFix as a Septentrio reports it: radians; 2DRMS and two sigma in centimetres."""
-    cov = fix.position_covariance
-    return {
-        "mode": 4,
-        "latitude": math.radians(fix.latitude),
-        "longitude": math.radians(fix.longitude),
-        "height": fix.altitude,
-        "h_accuracy": round(1e2 * 2.0 * math.sqrt(2.0 * cov[0])),
-        "v_accuracy": round(1e2 * 2.0 * math.sqrt(cov[8])),
-    }
-
-
-def station(fix: Any, stamp: int) -> dict[str, Any]:
-    """A NavSatFix as a total station 360 m away reports a prism: axes of the map, no rotation."""
-    gnss = load_scenario(SCENARIO).gnss
-    origin = (gnss.latitude_deg, gnss.longitude_deg, gnss.altitude_m)
-    east, north, up = pymap3d.geodetic2enu(fix.latitude, fix.longitude, fix.altitude, *origin)
-    place = {"x": float(east) + 300.0, "y": float(north) - 200.0, "z": float(up) + 5.0}
-    return {"pose": {"position": place, "orientation": {"w": 1.0}}}
-
-
-RECEIVERS = {"navpvt": navpvt, "pvt": pvt, "station": station}
-
-
-def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> bytes:
-    """A message whose other fields are zero; the status of an INS is good."""
-
-    def built(name: str, given: dict[str, Any]) -> Any:
-        values = {}
-        for field, (node, detail) in store.fielddefs[name][1]:
-            if int(node) == 2:
-                values[field] = built(detail, given.get(field, {}))
-            elif int(node) == 1:
-                values[field] = given.get(field, "" if detail[0] == "string" else 0)
-            else:
-                values[field] = given.get(field, np.zeros(detail[1], detail[0][1][0]))
-        return store.types[name](**values)
-
-    header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
-    if kind == POSES["novatel"]:
-        fields = {**fields, "ins_status": 3}
-    elif kind == POSES["inspvax"]:
-        fields = {**fields, "header": header, "ins_status": {"status": 3}}
-    elif kind in (FIXES["pvt"], FIXES["station"]):
-        fields = {**fields, "header": header}
-    return bytes(store.serialize_cdr(built(kind, fields), kind))
+def with_packets(source: Path, target: Path, seed: int, topics: dict[str, str]) -> None:
+    """Copies a bag with packets in place of its clouds."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    scenario = parse_scenario(described("plain"), "plain.yaml")
+    with (
+        Reader(source) as reader,
+        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
+    ):
+        kept = [c for c in reader.connections if not c.msgtype.endswith("PointCloud2")]
+        to = {c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in kept}
+        for connection, stamp, data in reader.messages(connections=kept):
+            w.write(to[connection.id], stamp, data)
+        own: dict[str, Any] = {}
+        for at, topic, kind, fields in velodyne_scans(scenario, seed, topics):
+            if topic not in own:
+                own[topic] = w.add_connection(topic, kind, typestore=store)
+            w.write(own[topic], at, serialised(store, kind, at, fields))
 
 
 if __name__ == "__main__":

@@ -121,7 +121,7 @@ def static_objects(
     for track in tracks[1:]:
         if all(_is_another(track, other, flat, candidate_set, fewest) for other in kept):
             kept.append(track)
-    whole = [track for track in kept if not _reaches_rim(extractor, track, flat)]
+    whole = [track for track in kept if not _is_cut_off(track, flat)]
     kept = (whole or kept)[:MOST_OBJECTS]
     if not kept:
         return None
@@ -130,10 +130,10 @@ def static_objects(
     return LidarObjects(lidar, len(scans), candidates, places, cov)
 
 
-def _reaches_rim(extractor: RegionExtractor, track: IntArray, flat: Sequence[Candidate]) -> bool:
+def _is_cut_off(track: IntArray, flat: Sequence[Candidate]) -> bool:
     """Whether the widened region cuts an object off in most scans."""
     some = track[np.linspace(0, len(track) - 1, COMPARED_SCANS).round().astype(int)]
-    return bool(np.median([extractor.reaches_rim(flat[n]) for n in some.tolist()]) > 0.5)
+    return bool(np.median([flat[n].is_cut_off for n in some.tolist()]) > 0.5)
 
 
 def _is_another(

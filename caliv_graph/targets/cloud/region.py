@@ -83,6 +83,7 @@ class Candidate:
         measured_lidar: (n, 3) metres, its points without motion compensation.
         row_rad: spacing of the rows of beams about it.
         top_m: height of its highest point above the ground; inf without ground in the region.
+        is_cut_off: whether the points near the region end within it: it goes on outside.
     """
 
     cloud: TargetCloud
@@ -92,6 +93,7 @@ class Candidate:
     measured_lidar: Array
     row_rad: float
     top_m: float
+    is_cut_off: bool = False
 
     @property
     def points_region(self) -> Array:
@@ -147,6 +149,77 @@ def _connected(pairs: IntArray, count: int) -> list[IntArray]:
     """Indices of the points of each connected component, given linked pairs (p, 2)."""
     labels = connected(pairs, count)
     return [np.flatnonzero(labels == label) for label in np.unique(labels)]
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """What stands on the ground near a region.
+
+    Points (n, 3), region frame, metres; their ascending indices `near` in the scan; heights above
+    the ground in metres.
+    """
+
+    points: Array
+    near: IntArray
+    height_m: Array
+
+    @classmethod
+    def of(
+        cls,
+        scan: LidarScan,
+        points: Array,
+        near: IntArray,
+        plane: Array | None,
+        extraction: ExtractionConfig,
+    ) -> _Standing:
+        """Of points near a region; without ground all points stand."""
+        height_m = np.full(len(near), extraction.ground_distance * 2.0)
+        if plane is not None:
+            height_m = height_above(plane, points)
+        above = (height_m > extraction.ground_distance) & (height_m < MAX_HEIGHT_M)
+        return cls(points[above], near[above], height_m[above])
+
+
+def _completed(
+    standing: _Standing,
+    groups: Sequence[IntArray],
+    cut_off: Sequence[bool],
+    beyond: _Standing,
+    linking: Linking,
+) -> tuple[list[IntArray], list[bool]]:
+    """Groups of points with what of them is outside the region, and which of them stay cut off.
+
+    A guess that is far off, or unknown along an arc, moves a target over the rim of its region, and
+    that cut through it. What would be too wide as a whole, such as a wall, stays as it was.
+
+    Args:
+        standing: what stands near the region.
+        groups: indices of `standing` of each.
+        cut_off: which of them reach the rim.
+        beyond: what stands in a wider region, that near it included.
+        linking: of the points of `beyond`.
+
+    Returns:
+        Indices of `beyond` of each group, and which are cut off.
+    """
+    wider = _groups(beyond.points, linking)
+    group_of = np.zeros(len(beyond.near), np.int64)
+    for number, member in enumerate(wider):
+        group_of[member] = number
+    out: list[IntArray] = []
+    still: list[bool] = []
+    taken: set[int] = set()
+    for chosen, reaches in zip(groups, cut_off, strict=True):
+        own = np.searchsorted(beyond.near, standing.near[chosen])
+        whole = int(np.bincount(group_of[own]).argmax())
+        completed = reaches and _extent_m(beyond.points[wider[whole]]) <= MAX_EXTENT_M
+        if completed and whole in taken:
+            continue
+        if completed:
+            taken.add(whole)
+        out.append(wider[whole] if completed else own)
+        still.append(reaches and not completed)
+    return out, still
 
 
 class RegionExtractor:
@@ -208,22 +281,28 @@ class RegionExtractor:
         if rings_m > NEAR_RINGS_M:
             around, _ = self._near_region(scan.points_lidar, R, t, margin + rings_m, tally)
         plane = fit_ground(around, extraction.ground_distance)
-        if plane is None:
-            # No ground inside the region: all points are candidates.
-            height = np.full(len(near), extraction.ground_distance * 2.0)
-        else:
-            height = height_above(plane, points)
-        above = (height > extraction.ground_distance) & (height < MAX_HEIGHT_M)
-        points, near, height = points[above], near[above], height[above]
-        linking = Linking.of(scan.points_lidar[near], spacing, range_m)
-        objects = self._objects(points, linking)
+        standing = _Standing.of(scan, points, near, plane, extraction)
+        linking = Linking.of(scan.points_lidar[standing.near], spacing, range_m)
+        groups = _groups(standing.points, linking) if len(standing.near) >= FEWEST_NEAR else []
+        cut_off = [self._reaches_rim(standing.points[g], margin, linking.link_m) for g in groups]
+        # By a trusted extrinsic a target is where the region was drawn.
+        if any(cut_off) and not self._config.lidars[scan.lidar].fixed:
+            wide = self._near_region(scan.points_lidar, R, t, margin + MAX_EXTENT_M, tally)
+            if plane is None:
+                plane = fit_ground(wide[0], extraction.ground_distance)
+            beyond = _Standing.of(scan, *wide, plane, extraction)
+            linking = Linking.of(scan.points_lidar[beyond.near], spacing, range_m)
+            groups, cut_off = _completed(standing, groups, cut_off, beyond, linking)
+            standing = beyond
+        objects = self._objects(standing.points, groups, cut_off)
         if not objects:
             tally.rejected[NOTHING] += 1
             return []
-        if len(objects[0]) <= MOST_OF_A_SCAN * len(scan.points_lidar):
+        points, near, height = standing.points, standing.near, standing.height_m
+        if len(objects[0][0]) <= MOST_OF_A_SCAN * len(scan.points_lidar):
             self._edges[scan.lidar].add(scan.points_lidar, scan_elevations)
         out, sizes = [], []
-        for chosen in objects:
+        for chosen, is_cut_off in objects:
             kept = near[chosen][_filtered(points[chosen], linking.places[chosen], extraction)]
             sizes.append(len(kept))
             if len(kept) < extraction.min_points:
@@ -236,7 +315,7 @@ class RegionExtractor:
             cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
             centre, measured = 0.5 * (low + high), compact.points_lidar
             top_m = math.inf if plane is None else float(height[chosen].max())
-            out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m))
+            out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m, is_cut_off))
         tally.most_points = max(tally.most_points, *sizes)
         if not out:
             tally.rejected[f"under {extraction.min_points} points"] += 1
@@ -281,24 +360,25 @@ class RegionExtractor:
         inside = distance <= margin
         return points[inside], near[inside]
 
-    def _objects(self, points: Array, linking: Linking) -> list[IntArray]:
-        """Indices of the objects of the right size, the best inside the region first.
+    def _objects(
+        self, points: Array, groups: Sequence[IntArray], cut_off: Sequence[bool]
+    ) -> list[tuple[IntArray, bool]]:
+        """The groups of the right size, the best inside the region first, and whether cut off.
 
-        Points (n, 3), region frame, are of one object if they are linked. What is too wide that way
+        Points (n, 3), region frame, are of one group if they are linked. What is too wide that way
         is taken apart by plain distance: a sparse LiDAR's target that stands near something else.
         """
-        if len(points) < 3:
-            return []
         scored = []
-        for member in _groups(points, linking):
+        for member, is_cut_off in zip(groups, cut_off, strict=True):
             extent = _extent_m(points[member])
             if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
                 continue
             centre = points[member].mean(axis=0)
             off = np.maximum(np.maximum(self._low - centre, centre - self._high), 0.0)
-            scored.append((len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M), member))
-        scored.sort(key=lambda pair: -pair[0])
-        return [member for _, member in scored[:MOST_CANDIDATES]]
+            score = len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M)
+            scored.append((score, member, is_cut_off))
+        scored.sort(key=lambda found: -found[0])
+        return [(member, is_cut_off) for _, member, is_cut_off in scored[:MOST_CANDIDATES]]
 
     def choose(self, found: Sequence[Sequence[Candidate]], lidar: str) -> list[TargetCloud]:
         """The clouds of the static object among the candidates of a LiDAR's scans, best first.
@@ -354,12 +434,15 @@ class RegionExtractor:
         off = np.maximum(np.maximum(self._low - places, places - self._high), 0.0)
         return np.asarray(np.linalg.norm(off, axis=1))
 
-    def reaches_rim(self, candidate: Candidate) -> bool:
-        """Whether a candidate may go on where the points near the region end."""
-        range_m = float(np.linalg.norm(self.centre - candidate.t_region_lidar))
-        margin = widened_margin_m(self._config, candidate.cloud.lidar, range_m)
-        rim_m = min(RIM_M, 0.5 * margin)
-        return float(self.outside_m(candidate.points_region).max()) > margin - rim_m
+    def _reaches_rim(self, points: Array, margin: float, link_m: float) -> bool:
+        """Whether an object (n, 3), region frame, may go on where the points near the region end.
+
+        What it would go on with is within `link_m`, the distance of linked points.
+        """
+        if _extent_m(points) > MAX_EXTENT_M:
+            return False
+        rim_m = min(max(RIM_M, link_m), 0.5 * margin)
+        return float(self.outside_m(points).max()) > margin - rim_m
 
     def in_map(self, place: Array) -> Array:
         """(3,) metres, a place (3,) of the region frame in the map."""

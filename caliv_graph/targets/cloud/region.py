@@ -210,7 +210,9 @@ def _completed(
     still: list[bool] = []
     taken: set[int] = set()
     for chosen, reaches in zip(groups, cut_off, strict=True):
-        own = np.searchsorted(beyond.near, standing.near[chosen])
+        own = np.flatnonzero(np.isin(beyond.near, standing.near[chosen], assume_unique=True))
+        if not len(own):
+            continue  # it was ground, which only the wider region shows
         whole = int(np.bincount(group_of[own]).argmax())
         completed = reaches and _extent_m(beyond.points[wider[whole]]) <= MAX_EXTENT_M
         if completed and whole in taken:
@@ -288,7 +290,7 @@ class RegionExtractor:
         # By a trusted extrinsic a target is where the region was drawn.
         if any(cut_off) and not self._config.lidars[scan.lidar].fixed:
             wide = self._near_region(scan.points_lidar, R, t, margin + MAX_EXTENT_M, tally)
-            if plane is None:
+            if plane is None:  # little of it is near the region
                 plane = fit_ground(wide[0], extraction.ground_distance)
             beyond = _Standing.of(scan, *wide, plane, extraction)
             linking = Linking.of(scan.points_lidar[beyond.near], spacing, range_m)

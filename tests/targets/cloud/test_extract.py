@@ -242,6 +242,48 @@ def test_a_trusted_lidar_does_not_look_beyond_the_region() -> None:
     assert sum(rejected.values()) == 1
 
 
+@pytest.mark.parametrize(("axis", "part"), [(0, 0.3), (0, 0.6), (1, 0.4), (1, 0.7)])
+def test_a_target_over_the_rim_of_its_region_is_taken_whole(axis: int, part: float) -> None:
+    # The rim of the widened region runs through the chair.
+    scene = chair_at_10()
+    low, high = scene.world.bounds("chair")
+    config = config_of(TargetRegion(min=(0, 0, 0), max=(1, 1, 1)))
+    margin = widened_margin_m(config, "front", float(np.linalg.norm(high)))
+    least, most = low - 1.0, high + 1.0
+    most[axis] = low[axis] + part * (high - low)[axis] - margin
+    least[axis] = most[axis] - 1.0
+
+    region = TargetRegion(min=least.tolist(), max=most.tolist())
+    cloud, _ = extracted(scene.points_lidar, config_of(region))
+
+    inside, _ = extracted(scene.points_lidar, config_of(tight_region(scene.world, margin_m=1.0)))
+    whole, _ = recall_and_strangers(inside, scene, "chair")
+    recall, strangers = recall_and_strangers(cloud, scene, "chair")
+    assert recall > whole - 0.03  # feet: what is ground depends on the points around
+    assert strangers == 0
+
+
+def test_a_wall_over_the_rim_stays_cut_off() -> None:
+    # 1.5 m of a wall of 6 m are in the widened region: as wide as a target.
+    wall = BoxModel(xy_m=(16.0, 6.0), size_m=(0.2, 6.0, 2.0))
+    scene = scene_with_chair(wall=wall)
+    region = TargetRegion(min=(9, -2, -1), max=(18, 3.5, 3))
+    config = config_of(region)
+    extractor = RegionExtractor(region, config, standing())
+
+    found = extractor.candidates(LidarScan("front", 0, scene.points_lidar, "0.pcd"), 0)
+
+    of_wall, of_chair = scene.of("wall"), scene.of("chair")
+    told = {}
+    for candidate in found:
+        points = {tuple(p) for p in candidate.cloud.points_lidar.tolist()}
+        told["wall" if len(points & of_wall) > len(points & of_chair) else "chair"] = candidate
+    assert told["wall"].is_cut_off
+    assert not told["chair"].is_cut_off
+    width = np.ptp(told["wall"].points_region[:, 1])
+    assert 0.5 < width < 2.0
+
+
 # ------------------------------------------------------------------ what stands around the target
 
 

@@ -58,9 +58,15 @@ def _surface_row(drive: str, strips: Sequence[Strip]) -> list[str]:
         place_text(np.mean([strip.centre_map for strip in strips], axis=0)),
         str(len(strips)),
         ", ".join(f"{name} ({count})" for name, count in seen.items()),
-        f"{1e3 * np.median([strip.before_m for strip in strips]):.1f}",
-        f"{1e3 * np.median([strip.scatter_m for strip in strips]):.1f}",
+        _median_mm([strip.before_m for strip in strips]),
+        _median_mm([strip.scatter_m for strip in strips]),
     ]
+
+
+def _median_mm(values_m: Sequence[float]) -> str:
+    """Of the strips of which it is known: one scan alone has no thickness."""
+    known = [value for value in values_m if np.isfinite(value)]
+    return f"{1e3 * np.median(known):.1f}" if known else "-"
 
 
 def kind_of(normal: Array) -> str:

@@ -141,5 +141,21 @@ def _two(
             figure.y_axes(scaleanchor="x3", panel=3)
         figure.x_axes(constrain="domain")
         figure.y_axes(constrain="domain")
+        # Stated: of linked axes plotly.js 3 makes a range of their own with nothing in it.
+        both = np.concatenate([views[stage] for stage in (BEFORE, AFTER)])
+        for panel, shown in enumerate((both, both, views[AFTER])[: len(stages)], start=1):
+            x, y = _ranges(shown)
+            figure.x_axes(range=x, panel=panel)
+            figure.y_axes(range=y, panel=panel)
     finish(figure, height)
     return figure
+
+
+def _ranges(points: Array) -> tuple[list[float], list[float]]:
+    """Ranges of x and y that show all points (n, 2), with a rim of 5 percent."""
+    if not len(points):
+        return [-1.0, 1.0], [-1.0, 1.0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    rim = 0.05 * max(float((high - low).max()), 1e-3)
+    x, y = zip((low - rim).tolist(), (high + rim).tolist(), strict=True)
+    return list(x), list(y)

@@ -23,6 +23,10 @@
     for (const [from, to] of Object.entries(darkened)) { text = text.split('"' + from + '"').join('"' + to + '"'); }
     return text;
   }
+  // plotly.js draws the button that is pressed nearly white, with the figure's letters on it.
+  function legible(layout) {
+    for (const menu of dark && layout.updatemenus || []) { Object.assign(menu, { bgcolor: "#aab2bb", font: { color: "#1a1a1a" } }); }
+  }
   // On a narrow screen, panels that are side by side go one below another.
   function fit(layout, plot) {
     const width = plot.clientWidth, count = Number(plot.parentNode.dataset.across);
@@ -46,6 +50,7 @@
     const name = plot.dataset.figure;
     const figure = JSON.parse(coloured(document.getElementById("data-" + name).textContent));
     fit(figure.layout, plot);
+    legible(figure.layout);
     plot.textContent = "";
     // The bar of buttons would cover the legend of a narrow figure.
     const bar = figure.layout.width < 640 ? { displayModeBar: false } : {};

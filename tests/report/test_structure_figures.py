@@ -15,8 +15,7 @@ import pytest
 from caliv_graph.products import Array
 from caliv_graph.report.figures.structure import _two
 from caliv_graph.report.surfaces import _median_mm
-from caliv_graph.validation.findings import AFTER, BEFORE
-from caliv_graph.validation.validate import Validation
+from caliv_graph.validation.findings import AFTER, BEFORE, Validation
 from tests.report.test_html import chromium, shown
 
 RNG = np.random.default_rng(0)

@@ -21,10 +21,16 @@ from caliv_graph.targets.cloud.beams import (
     elevations,
 )
 from caliv_graph.targets.cloud.field_of_view import MOST_OF_A_SCAN, SeenEdges
+from caliv_graph.targets.cloud.groups import (
+    MAX_EXTENT_M,
+    Standing,
+    completed_groups,
+    extent_m,
+    groups_of,
+)
 from caliv_graph.targets.cloud.tally import EMPTY, MOVED, NOTHING, OUTSIDE, Tally
 from caliv_graph.targets.cloud.track import CandidateSet
-from caliv_graph.targets.ground.fit import fit_ground, height_above
-from caliv_graph.targets.search.objects import connected
+from caliv_graph.targets.ground.fit import fit_ground
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
@@ -35,14 +41,9 @@ GUESS_SIGMAS = 2.0
 TRUSTED_MARGIN_M = 0.1
 """Margin for an extrinsic that is fixed: the error of the vehicle's poses."""
 
-MAX_HEIGHT_M = 2.5
-"""Maximum height of a candidate: targets are at most 2 m high, and a ground plane has errors at the
-rim."""
-
 MIN_EXTENT_M = 0.2
-MAX_EXTENT_M = 2.0
-"""Bounds of the largest horizontal extent of a candidate. Targets are 0.3 to 1.5 m wide; partial
-views are smaller, tilt errors of the ground and noise make them larger."""
+"""Least largest horizontal extent of a candidate; at most it has `groups.MAX_EXTENT_M`. Targets are
+0.3 to 1.5 m wide; partial views are smaller."""
 
 OUTSIDE_M = 0.2
 """Decay length of the score of an object outside the region: at this distance a factor of 1/e."""
@@ -128,102 +129,6 @@ def _filtered(points: Array, places: Array, extraction: ExtractionConfig) -> Int
     return keep
 
 
-def _extent_m(points: Array) -> float:
-    """Largest horizontal extent of points (n, 3), z up."""
-    return float(np.ptp(points[:, :2], axis=0).max())
-
-
-def _groups(points: Array, linking: Linking) -> list[IntArray]:
-    """Indices of the points (n, 3) of each object; see `RegionExtractor._objects`."""
-    out = []
-    for member in _connected(linking.pairs(), len(points)):
-        if linking.row_m and _extent_m(points[member]) > MAX_EXTENT_M:
-            near = cKDTree(points[member]).query_pairs(linking.link_m, output_type="ndarray")
-            out += [member[part] for part in _connected(near, len(member))]
-        else:
-            out.append(member)
-    return out
-
-
-def _connected(pairs: IntArray, count: int) -> list[IntArray]:
-    """Indices of the points of each connected component, given linked pairs (p, 2)."""
-    labels = connected(pairs, count)
-    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
-
-
-@dataclass(frozen=True)
-class _Standing:
-    """What stands on the ground near a region.
-
-    Points (n, 3), region frame, metres; their ascending indices `near` in the scan; heights above
-    the ground in metres.
-    """
-
-    points: Array
-    near: IntArray
-    height_m: Array
-
-    @classmethod
-    def of(
-        cls,
-        scan: LidarScan,
-        points: Array,
-        near: IntArray,
-        plane: Array | None,
-        extraction: ExtractionConfig,
-    ) -> _Standing:
-        """Of points near a region; without ground all points stand."""
-        height_m = np.full(len(near), extraction.ground_distance * 2.0)
-        if plane is not None:
-            height_m = height_above(plane, points)
-        above = (height_m > extraction.ground_distance) & (height_m < MAX_HEIGHT_M)
-        return cls(points[above], near[above], height_m[above])
-
-
-def _completed(
-    standing: _Standing,
-    groups: Sequence[IntArray],
-    cut_off: Sequence[bool],
-    beyond: _Standing,
-    linking: Linking,
-) -> tuple[list[IntArray], list[bool]]:
-    """Groups of points with what of them is outside the region, and which of them stay cut off.
-
-    A guess that is far off, or unknown along an arc, moves a target over the rim of its region, and
-    that cut through it. What would be too wide as a whole, such as a wall, stays as it was.
-
-    Args:
-        standing: what stands near the region.
-        groups: indices of `standing` of each.
-        cut_off: which of them reach the rim.
-        beyond: what stands in a wider region, that near it included.
-        linking: of the points of `beyond`.
-
-    Returns:
-        Indices of `beyond` of each group, and which are cut off.
-    """
-    wider = _groups(beyond.points, linking)
-    group_of = np.zeros(len(beyond.near), np.int64)
-    for number, member in enumerate(wider):
-        group_of[member] = number
-    out: list[IntArray] = []
-    still: list[bool] = []
-    taken: set[int] = set()
-    for chosen, reaches in zip(groups, cut_off, strict=True):
-        own = np.flatnonzero(np.isin(beyond.near, standing.near[chosen], assume_unique=True))
-        if not len(own):
-            continue  # it was ground, which only the wider region shows
-        whole = int(np.bincount(group_of[own]).argmax())
-        completed = reaches and _extent_m(beyond.points[wider[whole]]) <= MAX_EXTENT_M
-        if completed and whole in taken:
-            continue
-        if completed:
-            taken.add(whole)
-        out.append(wider[whole] if completed else own)
-        still.append(reaches and not completed)
-    return out, still
-
-
 class RegionExtractor:
     """Finds the target of one region in the scans of a drive.
 
@@ -283,18 +188,18 @@ class RegionExtractor:
         if rings_m > NEAR_RINGS_M:
             around, _ = self._near_region(scan.points_lidar, R, t, margin + rings_m, tally)
         plane = fit_ground(around, extraction.ground_distance)
-        standing = _Standing.of(scan, points, near, plane, extraction)
+        standing = Standing.of(scan, points, near, plane, extraction)
         linking = Linking.of(scan.points_lidar[standing.near], spacing, range_m)
-        groups = _groups(standing.points, linking) if len(standing.near) >= FEWEST_NEAR else []
+        groups = groups_of(standing.points, linking) if len(standing.near) >= FEWEST_NEAR else []
         cut_off = [self._reaches_rim(standing.points[g], margin, linking.link_m) for g in groups]
         # By a trusted extrinsic a target is where the region was drawn.
         if any(cut_off) and not self._config.lidars[scan.lidar].fixed:
             wide = self._near_region(scan.points_lidar, R, t, margin + MAX_EXTENT_M, tally)
             if plane is None:  # little of it is near the region
                 plane = fit_ground(wide[0], extraction.ground_distance)
-            beyond = _Standing.of(scan, *wide, plane, extraction)
+            beyond = Standing.of(scan, *wide, plane, extraction)
             linking = Linking.of(scan.points_lidar[beyond.near], spacing, range_m)
-            groups, cut_off = _completed(standing, groups, cut_off, beyond, linking)
+            groups, cut_off = completed_groups(standing, groups, cut_off, beyond, linking)
             standing = beyond
         objects = self._objects(standing.points, groups, cut_off)
         if not objects:
@@ -365,14 +270,13 @@ class RegionExtractor:
     def _objects(
         self, points: Array, groups: Sequence[IntArray], cut_off: Sequence[bool]
     ) -> list[tuple[IntArray, bool]]:
-        """The groups of the right size, the best inside the region first, and whether cut off.
+        """The groups of points (n, 3), region frame, that have the size of a target.
 
-        Points (n, 3), region frame, are of one group if they are linked. What is too wide that way
-        is taken apart by plain distance: a sparse LiDAR's target that stands near something else.
+        The best inside the region first; and whether they are cut off.
         """
         scored = []
         for member, is_cut_off in zip(groups, cut_off, strict=True):
-            extent = _extent_m(points[member])
+            extent = extent_m(points[member])
             if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
                 continue
             centre = points[member].mean(axis=0)
@@ -441,7 +345,7 @@ class RegionExtractor:
 
         What it would go on with is within `link_m`, the distance of linked points.
         """
-        if _extent_m(points) > MAX_EXTENT_M:
+        if extent_m(points) > MAX_EXTENT_M:
             return False
         rim_m = min(max(RIM_M, link_m), 0.5 * margin)
         return float(self.outside_m(points).max()) > margin - rim_m

@@ -95,14 +95,28 @@ def _determined(
     """Whether the data determine each axis.
 
     Where nobody gave a guess, an undetermined direction may be off so far that the other axes take
-    part in it: y, after half a turn about the centre of an arc.
+    part in it: y, after half a turn about the centre of an arc. Where the tangent of that arc is
+    along x the sigma of y knows nothing of it, so what a turn adds in second order counts as well.
     """
     if not guess.found:
         return dict(found)
     axes = right_to_vehicle_axes(T_vehicle_lidar)
-    sigmas = np.sqrt(np.diag(axes @ cov @ axes.T))
+    in_vehicle = axes @ cov @ axes.T
+    sigmas = np.sqrt(np.diag(in_vehicle) + second_order(in_vehicle))
     known = sigmas <= UNDETERMINED_RATIO * guess.sigmas
     return {axis: found[axis] and bool(k) for axis, k in zip(AXES, known, strict=True)}
+
+
+def second_order(cov: Array) -> Array:
+    """(6,) mean squares of what turns add to the place of a LiDAR in second order, rad^2 and m^2.
+
+    A turn w moves a place by v, and by w x v / 2 beyond it. For normal errors along one direction
+    with variance s^2 that has a mean square of 3 s^4 |w x v|^2 / 4, and s^2 w x v is in the
+    covariance (6, 6) of turn and place, vehicle axes.
+    """
+    crossed = cov[:3, 3:] - cov[:3, 3:].T
+    mean = 0.5 * np.array([crossed[1, 2], crossed[2, 0], crossed[0, 1]])
+    return np.concatenate([np.zeros(3), 3.0 * mean**2])
 
 
 def _to_right(names: Sequence[str], solved: Mapping[str, gtsam.Pose3]) -> Array:

@@ -299,13 +299,11 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         for command in commands
     ]
     yield address
+    # Asked to end, they would wait for each other for half a minute.
     for process in processes:
-        process.terminate()
+        process.kill()
     for process in processes:
-        try:
-            process.wait(timeout=20)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        process.wait()
 
 
 def test_on_an_existing_scheduler(

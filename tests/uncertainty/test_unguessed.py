@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Guess, Uncertainty
-from caliv_graph.uncertainty.assemble import assemble_matrices
+from caliv_graph.uncertainty.assemble import assemble_matrices, second_order
 from caliv_graph.uncertainty.observability import UNKNOWN_SIGMAS, unguessed
 
 SIGMAS = np.array([0.03] * 3 + [0.2] * 3)
@@ -49,3 +49,41 @@ def test_an_axis_that_takes_part_in_what_is_open_is_not_determined() -> None:
         assert found.determined["y"] is determined
         assert found.determined["roll"]
         assert not found.determined["x"]
+
+
+def test_an_axis_that_an_arc_leaves_only_in_second_order_is_not_determined() -> None:
+    """On an arc about (0, -9), a LiDAR at x = 0: a turn moves it along x, and y by its square."""
+    yes = dict.fromkeys(("roll", "pitch", "yaw", "x", "y", "z"), True)
+    T = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([0.0, 0.3, 1.8]))
+    open_direction = np.array([0.0, 0.0, 1.0, -9.3, 0.0, 0.0])  # turn and place, vehicle axes
+    known = 1e-4 * np.eye(6)
+    uncertainty = Uncertainty((), (), {"front": yes | {"x": False, "yaw": False}}, np.zeros(6))
+    for turn_rad, determined in ((0.7, False), (0.01, True)):
+        in_vehicle = turn_rad**2 * np.outer(open_direction, open_direction) + known
+        found = assemble_matrices(
+            {"front": T},
+            {"front": FOUND},
+            in_vehicle,
+            1e8 * np.eye(6),  # nothing of the prior that is to be taken out
+            uncertainty,
+            "front",
+            {"front": 9},
+        ).lidars["front"]
+        assert found.determined["y"] is determined
+        assert found.determined["z"]
+
+
+def test_what_a_turn_adds_in_second_order_is_that_of_draws() -> None:
+    direction = np.array([0.0, 0.0, 1.0, -9.3, 2.0, 0.0])
+    turns = 0.05 * np.random.default_rng(1).standard_normal(200_000)
+    # About (0, -9): the place (2, 0.3) on its circle, less where it is in first order.
+    arm = np.array([2.0, 9.3])
+    moved = np.column_stack(
+        [
+            np.cos(turns) * arm[0] - np.sin(turns) * arm[1] - arm[0] + turns * arm[1],
+            np.sin(turns) * arm[0] + np.cos(turns) * arm[1] - arm[1] - turns * arm[0],
+        ]
+    )
+    expected = second_order(0.05**2 * np.outer(direction, direction))
+    np.testing.assert_allclose(expected[3:5], (moved**2).mean(axis=0), rtol=0.1)
+    assert not expected[[0, 1, 2, 5]].any()

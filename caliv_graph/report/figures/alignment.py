@@ -183,7 +183,8 @@ def _pair_of_scenes(
                 y=y,
                 z=z,
                 mode="markers",
-                marker={"color": colour[name], "size": size},
+                # Of all symbols the one with the fewest triangles: half the time without a GPU.
+                marker={"color": colour[name], "size": size, "symbol": "square"},
                 name=shown[name],
                 legendgroup=shown[name],
                 showlegend=panel == 1,

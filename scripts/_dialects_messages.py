@@ -10,6 +10,7 @@ import numpy as np
 import pymap3d
 
 from caliv_graph.scenario.sensor_models import GnssModel
+from scripts._dialects_motion import time_message
 
 POSES = {"inspvax": "novatel_oem7_msgs/msg/INSPVAX", "novatel": "novatel_msgs/msg/INSPVAX"}
 FIXES = {
@@ -74,7 +75,7 @@ def serialised(store: Any, kind: str, stamp: int, fields: dict[str, Any]) -> byt
                 values[field] = given.get(field, np.zeros(detail[1], detail[0][1][0]))
         return store.types[name](**values)
 
-    header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
+    header = {"stamp": time_message(stamp)}
     if kind == POSES["novatel"]:
         fields = {**fields, "ins_status": 3}
     elif kind == POSES["inspvax"]:

@@ -46,6 +46,11 @@ Message = tuple[int, str, str, dict[str, Any]]
 """Stamp, topic, type and fields of a message."""
 
 
+def time_message(at_ns: int) -> dict[str, int]:
+    """The fields of a builtin_interfaces/Time."""
+    return {"sec": at_ns // 10**9, "nanosec": at_ns % 10**9}
+
+
 @dataclass(frozen=True)
 class Drawn:
     """Errors of one drive.
@@ -97,7 +102,7 @@ def odometry(folder: Path, seed: int, yaw_rate: bool = True) -> Iterator[Message
         yaw += rate / RATE_HZ
         stamp = int(truth.stamps_ns[i])
         twist = {"linear": {"x": speed}, "angular": {"z": rate if yaw_rate else 0.0}}
-        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
+        header = {"stamp": time_message(stamp)}
         if not yaw_rate:
             fields = {"header": {**header, "frame_id": "base_link"}, "twist": twist}
             yield stamp, "/vehicle/speed", "geometry_msgs/msg/TwistStamped", fields
@@ -135,7 +140,7 @@ def headings(folder: Path, seed: int, as_imu: bool = False) -> Iterator[Message]
         yaw = azimuth if as_imu else 0.5 * math.pi - azimuth
         q = {"z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}
         stamp = int(truth.stamps_ns[i])
-        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "gnss"}
+        header = {"stamp": time_message(stamp), "frame_id": "gnss"}
         if not as_imu:
             fields = {"header": header, "quaternion": q}
             yield stamp, "/heading", "geometry_msgs/msg/QuaternionStamped", fields
@@ -160,7 +165,7 @@ def second_fixes(folder: Path, seed: int, origin: tuple[float, float, float]) ->
         east, north, up = place
         latitude, longitude, altitude = pymap3d.enu2geodetic(east, north, up, *origin)
         stamp = int(truth.stamps_ns[i])
-        header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "gnss_2"}
+        header = {"stamp": time_message(stamp), "frame_id": "gnss_2"}
         fields = {
             **{"header": header, "status": {"status": 2, "service": 1}},
             **{"latitude": float(latitude), "longitude": float(longitude)},

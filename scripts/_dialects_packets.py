@@ -16,7 +16,7 @@ from caliv_graph.readers.velodyne_packets import BLOCKS, MODELS, PACKET_BYTES, S
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS, SimulatedRecording
-from scripts._dialects_motion import Message
+from scripts._dialects_motion import Message, time_message
 
 NUMBER, STRONGEST = 0x22, 0x37
 """Factory bytes: VLP-16, the strongest return."""
@@ -41,19 +41,19 @@ def velodyne_scans(scenario: Scenario, seed: int, topics: Mapping[str, str]) -> 
     drive = SimulatedRecording(scenario, seed)
     caster = RayCaster(drive.world)
     packet_ns = round(BLOCKS * LIDAR.block_us * 1000)
+    scan_ns = packet_ns * SCAN_PACKETS
+    shots_us = LIDAR.block_us * np.arange(BLOCKS)[:, None] + LIDAR.shot_times_us()
+    shots_ns = np.rint(1000 * shots_us).astype(np.int64)
     for index, (name, topic) in enumerate(topics.items()):
         model = scenario.lidars[name]
         rng = np.random.default_rng([seed, 2, index])
         T_vehicle_lidar = model.mounting.pose()
         # The LiDARs are not synchronised: each begins at a time of its own.
-        first_ns = drive.truth.start_ns + int(rng.integers(packet_ns * SCAN_PACKETS))
-        scan_ns = packet_ns * SCAN_PACKETS
+        first_ns = drive.truth.start_ns + int(rng.integers(scan_ns))
         for begin_ns in range(first_ns, drive.truth.end_ns - scan_ns, scan_ns):
             packets = begin_ns + packet_ns * np.arange(SCAN_PACKETS)
-            azimuth_deg = _block_azimuths(packets)
             heave_m = drive.truth.heave_m[(begin_ns - drive.truth.start_ns) // HEAVE_PERIOD_NS]
-            shots_us = LIDAR.block_us * np.arange(BLOCKS)[:, None] + LIDAR.shot_times_us()
-            at_ns = (packets[:, None, None] + np.rint(1000 * shots_us).astype(np.int64)).ravel()
+            at_ns = (packets[:, None, None] + shots_ns).ravel()
             states = drive.truth.drive.states(
                 at_ns - drive.truth.start_ns, drive.truth.level_z_map + heave_m
             )
@@ -69,9 +69,9 @@ def velodyne_scans(scenario: Scenario, seed: int, topics: Mapping[str, str]) -> 
             ranges_m = true_m + noise_m + drive.truth.range_bias_m[name]
             seen = (ranges_m > RANGE_M[0]) & (ranges_m < RANGE_M[1])
             counts = np.where(seen, np.rint(np.where(seen, ranges_m, 0.0) / LIDAR.range_m), 0.0)
-            fields = _scan(packets, packet_ns, azimuth_deg, counts.astype(np.uint16))
-            done_ns = int(packets[-1]) + packet_ns + DRIVER_NS
-            yield (done_ns, topic, "velodyne_msgs/msg/VelodyneScan", fields)
+            stamps = packets + packet_ns + DRIVER_NS
+            fields = _scan(packets, stamps, counts.astype(np.uint16))
+            yield (int(stamps[-1]), topic, "velodyne_msgs/msg/VelodyneScan", fields)
 
 
 def _block_azimuths(packets_ns: Any) -> Any:
@@ -100,8 +100,12 @@ def _beams(at_ns: Any) -> tuple[Array, Array]:
     return origins, directions
 
 
-def _scan(packets_ns: Any, packet_ns: int, azimuth: Any, counts: Any) -> dict[str, Any]:
-    """The fields of a message; counts (n,) are in the order of the shots."""
+def _scan(packets_ns: Any, stamps_ns: Any, counts: Any) -> dict[str, Any]:
+    """The fields of a message.
+
+    Packets begin and are stamped at (P,) times; counts (n,) are in the order of the shots.
+    """
+    azimuth = _block_azimuths(packets_ns)
     data = np.zeros((len(packets_ns), PACKET_BYTES), np.uint8)
     blocks = data[:, : BLOCKS * 100].reshape(-1, BLOCKS, 100)
     blocks[..., :2] = (0xFF, 0xEE)
@@ -113,15 +117,10 @@ def _scan(packets_ns: Any, packet_ns: int, azimuth: Any, counts: Any) -> dict[st
     own_us = (packets_ns // 1000 % _HOUR_US).astype("<u4")
     data[:, 1200:1204] = own_us.view(np.uint8).reshape(-1, 4)
     data[:, 1204:] = (STRONGEST, NUMBER)
-    stamps = packets_ns + packet_ns + DRIVER_NS
     return {
-        "header": {"stamp": _stamp(int(stamps[-1])), "frame_id": "velodyne"},
+        "header": {"stamp": time_message(int(stamps_ns[-1])), "frame_id": "velodyne"},
         "packets": [
-            {"stamp": _stamp(int(stamp)), "data": body}
-            for stamp, body in zip(stamps, data, strict=True)
+            {"stamp": time_message(int(stamp)), "data": body}
+            for stamp, body in zip(stamps_ns, data, strict=True)
         ],
     }
-
-
-def _stamp(at_ns: int) -> dict[str, int]:
-    return {"sec": at_ns // 10**9, "nanosec": at_ns % 10**9}

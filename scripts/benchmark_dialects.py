@@ -36,7 +36,7 @@ import argparse
 import math
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -206,7 +206,9 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
     elif row == "velodyne":
         topics = {name: f"/{name}/velodyne_packets" for name in raw["lidars"]}
         if not (folder / row).exists():
-            with_packets(folder / "drive", folder / row, seed, topics)
+            clouds = [lidar["topic"] for lidar in raw["lidars"].values()]
+            scans = velodyne_scans(parse_scenario(described("plain"), "plain.yaml"), seed, topics)
+            with_messages(folder / "drive", folder / row, scans, clouds, oriented=True)
         raw["data"]["path"] = row
         for name, topic in topics.items():
             raw["lidars"][name]["topic"] = topic
@@ -215,7 +217,9 @@ def changed(row: str, raw: dict[str, Any], folder: Path, seed: int) -> None:
     elif row in MORE:
         path = folder / row.replace(" ", "_")
         if not path.exists():
-            with_messages(folder / "drive", path, more_messages(row, folder, seed), row in NO_IMU)
+            without = ("/vehicle/twist", *(("/imu/data",) if row in NO_IMU else ()))
+            more = more_messages(row, folder, seed)
+            with_messages(folder / "drive", path, more, without, oriented=False)
         raw["data"]["path"] = path.name
         raw["topics"] = {"gnss": "/gnss/fix"} | TOPICS[row]
         if row in ("heading", "wheels"):
@@ -310,9 +314,7 @@ def inspvax(folder: Path, seed: int, row: str) -> Iterator[tuple[int, dict[str, 
 
 def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
     """Copies a bag; adds messages of poses, or replaces its fixes by those of another receiver."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
+    store = _store()
     with (
         Reader(source) as reader,
         Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
@@ -334,12 +336,24 @@ def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
                 w.write(to[connection.id], stamp, data)
 
 
-def with_messages(
-    source: Path, target: Path, messages: Iterator[Message], without_imu: bool
-) -> None:
-    """Copies a bag without its velocities and orientations, or IMU, and with more messages."""
+def _store() -> Any:
+    """The types of ROS 2 and those that our readers know."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    without = ("/vehicle/twist", *(("/imu/data",) if without_imu else ()))
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def with_messages(
+    source: Path,
+    target: Path,
+    messages: Iterator[Message],
+    without: Collection[str],
+    *,
+    oriented: bool,
+) -> None:
+    """Copies a bag without some topics and with more messages; its IMU is `oriented` or not."""
+    store = _store()
     with (
         Reader(source) as reader,
         Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
@@ -352,33 +366,12 @@ def with_messages(
                 own[topic] = w.add_connection(topic, kind, typestore=store)
             w.write(own[topic], stamp, serialised(store, kind, stamp, fields))
         for connection, stamp, data in reader.messages(connections=kept):
-            if connection.topic == "/imu/data":
+            if connection.topic == "/imu/data" and not oriented:
                 message: Any = store.deserialize_cdr(data, connection.msgtype)
                 message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
                 w.write(to[connection.id], stamp, store.serialize_cdr(message, connection.msgtype))
             else:
                 w.write(to[connection.id], stamp, data)
-
-
-def with_packets(source: Path, target: Path, seed: int, topics: dict[str, str]) -> None:
-    """Copies a bag with packets in place of its clouds."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
-    scenario = parse_scenario(described("plain"), "plain.yaml")
-    with (
-        Reader(source) as reader,
-        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
-    ):
-        kept = [c for c in reader.connections if not c.msgtype.endswith("PointCloud2")]
-        to = {c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in kept}
-        for connection, stamp, data in reader.messages(connections=kept):
-            w.write(to[connection.id], stamp, data)
-        own: dict[str, Any] = {}
-        for at, topic, kind, fields in velodyne_scans(scenario, seed, topics):
-            if topic not in own:
-                own[topic] = w.add_connection(topic, kind, typestore=store)
-            w.write(own[topic], at, serialised(store, kind, at, fields))
 
 
 if __name__ == "__main__":

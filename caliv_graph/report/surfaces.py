@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caliv_graph.products import Array, Solution, Strip
+from caliv_graph.report.layout import millimetres
 from caliv_graph.structure.strips import LEVEL
 
 MOST_ROWS = 40
@@ -66,7 +67,7 @@ def _surface_row(drive: str, strips: Sequence[Strip]) -> list[str]:
 def _median_mm(values_m: Sequence[float]) -> str:
     """Of the strips of which it is known: one scan alone has no thickness."""
     known = [value for value in values_m if np.isfinite(value)]
-    return f"{1e3 * np.median(known):.1f}" if known else "-"
+    return millimetres(float(np.median(known)) if known else None)
 
 
 def kind_of(normal: Array) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from caliv_graph.config.model import ExtractionConfig
-from caliv_graph.products import Array, IntArray, LidarScan
+from caliv_graph.products import Array, IntArray
 from caliv_graph.targets.cloud.beams import Linking
 from caliv_graph.targets.ground.fit import height_above
 from caliv_graph.targets.search.objects import connected
@@ -65,7 +65,6 @@ class Standing:
     @classmethod
     def of(
         cls,
-        scan: LidarScan,
         points: Array,
         near: IntArray,
         plane: Array | None,
@@ -113,11 +112,11 @@ def completed_groups(
         if not len(own):
             continue  # it was ground, which only the wider region shows
         whole = int(np.bincount(group_of[own]).argmax())
-        completed = reaches and extent_m(beyond.points[wider[whole]]) <= MAX_EXTENT_M
-        if completed and whole in taken:
-            continue
-        if completed:
+        if not reaches or extent_m(beyond.points[wider[whole]]) > MAX_EXTENT_M:
+            out.append(own)
+            still.append(reaches)
+        elif whole not in taken:
             taken.add(whole)
-        out.append(wider[whole] if completed else own)
-        still.append(reaches and not completed)
+            out.append(wider[whole])
+            still.append(False)
     return out, still

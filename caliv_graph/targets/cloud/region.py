@@ -94,7 +94,7 @@ class Candidate:
     measured_lidar: Array
     row_rad: float
     top_m: float
-    is_cut_off: bool = False
+    is_cut_off: bool
 
     @property
     def points_region(self) -> Array:
@@ -188,7 +188,7 @@ class RegionExtractor:
         if rings_m > NEAR_RINGS_M:
             around, _ = self._near_region(scan.points_lidar, R, t, margin + rings_m, tally)
         plane = fit_ground(around, extraction.ground_distance)
-        standing = Standing.of(scan, points, near, plane, extraction)
+        standing = Standing.of(points, near, plane, extraction)
         linking = Linking.of(scan.points_lidar[standing.near], spacing, range_m)
         groups = groups_of(standing.points, linking) if len(standing.near) >= FEWEST_NEAR else []
         cut_off = [self._reaches_rim(standing.points[g], margin, linking.link_m) for g in groups]
@@ -197,7 +197,7 @@ class RegionExtractor:
             wide = self._near_region(scan.points_lidar, R, t, margin + MAX_EXTENT_M, tally)
             if plane is None:  # little of it is near the region
                 plane = fit_ground(wide[0], extraction.ground_distance)
-            beyond = Standing.of(scan, *wide, plane, extraction)
+            beyond = Standing.of(*wide, plane, extraction)
             linking = Linking.of(scan.points_lidar[beyond.near], spacing, range_m)
             groups, cut_off = completed_groups(standing, groups, cut_off, beyond, linking)
             standing = beyond
@@ -280,8 +280,7 @@ class RegionExtractor:
             if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
                 continue
             centre = points[member].mean(axis=0)
-            off = np.maximum(np.maximum(self._low - centre, centre - self._high), 0.0)
-            score = len(member) * math.exp(-float(np.linalg.norm(off)) / OUTSIDE_M)
+            score = len(member) * math.exp(-float(self.outside_m(centre[None])[0]) / OUTSIDE_M)
             scored.append((score, member, is_cut_off))
         scored.sort(key=lambda found: -found[0])
         return [(member, is_cut_off) for _, member, is_cut_off in scored[:MOST_CANDIDATES]]

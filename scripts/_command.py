@@ -53,6 +53,18 @@ class Usage:
     stages_s: Mapping[str, float]
 
 
+def run_command(*arguments: object) -> str:
+    """Runs `caliv-graph` in its own process; returns what it prints.
+
+    Raises:
+        CalivError: it ended with an exit code other than 0.
+    """
+    done = subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise _failed(str(arguments[0]), done.returncode, done.stderr)
+    return done.stdout
+
+
 def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
     """Runs `caliv-graph calibrate` in its own process.
 
@@ -69,13 +81,17 @@ def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
     launched = subprocess.run(launch, check=True, capture_output=True, text=True)
     usage = json.loads(launched.stdout)
     if usage["code"] not in (0, 3, 4):
-        why = "; ".join(launched.stderr.strip().splitlines()[-2:])
-        raise CalivError(f"caliv-graph calibrate, exit code {usage['code']}: {why}")
+        raise _failed("calibrate", usage["code"], launched.stderr)
     stages: dict[str, float] = {}
     for line in map(json.loads, (result / "log.jsonl").read_text(encoding="utf-8").splitlines()):
         if "stage" in line and line["depth"] == 0:
             stages[line["stage"]] = stages.get(line["stage"], 0.0) + line["seconds"]
     return Usage(stages_s=stages, **usage)
+
+
+def _failed(command: str, code: int, stderr: str) -> CalivError:
+    why = "; ".join(stderr.strip().splitlines()[-2:])
+    return CalivError(f"caliv-graph {command}, exit code {code}: {why}")
 
 
 def exit_code_of(work: Callable[[], int], interrupted: str = "interrupted") -> int:

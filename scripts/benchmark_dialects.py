@@ -2,7 +2,7 @@
 
     .venv/bin/python scripts/benchmark_dialects.py --seeds 2 --out out/dialects
 
-The drive is `distorted`, a figure-eight with sweeps of 0.1 s.
+The drive is `distorted`, a figure-eight with sweeps of 0.1 s. The installed command calibrates.
 NEES is 6 on average if the covariance is right, and beyond 20 in 0.3 percent (3 sigma). The rows:
 
     plain        stamps at the start of the sweep
@@ -49,17 +49,17 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # imports the module beside this one from any folder
 
-from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
 from caliv_graph.geometry.se3 import rpy
-from caliv_graph.pipeline import calibrate
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.definitions import DEFINITIONS
 from caliv_graph.readers.pose_file import read_poses
+from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._command import calibrate_measured
 from scripts._dialects_folders import poses_of_clouds, write_kitti, write_nuscenes, write_pcds
 from scripts._dialects_messages import FIXES, POSES, RECEIVERS, serialised
 from scripts._dialects_motion import (
@@ -132,12 +132,13 @@ def result(row: str, seed: int, out: Path) -> str:
         write_drive(scenario, folder, seed, threads=1)
     raw = yaml.safe_load((folder / "config.yaml").read_text())
     changed(row, raw, folder, seed)
+    config = folder / f"config_{row.replace(' ', '_')}.yaml"
+    config.write_text(yaml.safe_dump(raw), encoding="utf-8")
     try:
-        config = parse_config(raw, "config.yaml", folder)
-        recording = open_recording(config)
-        calibration = calibrate([recording], config, SilentProgress()).calibration
+        calibrate_measured(config, config.with_suffix(""))
     except CalivError as e:
         return str(e)
+    calibration = read_calibration(config.with_suffix("") / "calibration.yaml")
     truth = {name: model.mounting.pose() for name, model in scenario.lidars.items()}
     if row in NO_IMU:
         truth = {name: turned(T, seed) for name, T in truth.items()}

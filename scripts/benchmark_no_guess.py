@@ -3,39 +3,35 @@
     .venv/bin/python scripts/benchmark_no_guess.py
     .venv/bin/python scripts/benchmark_no_guess.py --scenarios paper_arc --seeds 2 --summary
 
-Raw sensors of a scenario, the config that `simulate` writes, and the same without `initial`
-and `sigma` of every LiDAR. Printed per drive: exit codes, how far S2S of the two are apart (mm,
-mrad, sigmas of the one without), the largest error against the truth in sigmas, which S2V is
-determined, processor time over that with guesses. A run is a line in out/no_guess/runs.jsonl; a
-second start runs the missing ones.
+By the installed command: `simulate` writes a bag and its config, `calibrate` runs with that config,
+and with the same without `initial` and `sigma` of every LiDAR. Printed per drive: exit codes, how
+far S2S of the two are apart (mm, mrad, sigmas of the one without), the largest error against the
+truth in sigmas, which S2V is determined, processor time over that with guesses. A drive is a line
+in out/no_guess/runs.jsonl; a second start runs the missing ones.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
+import math
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
-
 import gtsam
+import yaml
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 from caliv_graph.common.exits import DONE, UNMET, USAGE
-from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
-from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Calibration
-from caliv_graph.scenario.model import load_scenario
-from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
-from caliv_graph.simulation.writer import config_of
+from caliv_graph.results.calibration_file import read_calibration
+from caliv_graph.results.truth_file import read_truth
+from scripts._command import calibrate_measured, run_command
 from scripts._guesses import drop_guesses
 from scripts._judged import judged, outcome_of, worst
 from scripts._runs import add_line, code_digest, json_lines, performed
@@ -84,39 +80,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def perform(task: tuple[str, int]) -> dict[str, Any]:
-    """Simulates one drive and calibrates it with and without guesses; returns the line to write."""
+    """Simulates one drive and calibrates it with and without guesses; returns the line to write.
+
+    Raises:
+        CalivError: the drive could not be simulated.
+    """
     scenario, seed = task
-    recording = simulate_drive(load_scenario(FOLDER / f"{scenario}.yaml"), seed)
     line: dict[str, Any] = {"scenario": scenario, "seed": seed, "code": code_digest()}
     found: dict[str, Calibration] = {}
-    for name in ("with", "without"):
-        begun = time.process_time()
-        line[name] = {"exit": USAGE, "said": [], "undetermined": []}
-        try:
-            found[name] = calibration = calibrated(recording, guess=name == "with")
-        except CalivError as e:
-            line[name]["said"] = [f"{type(e).__name__}: {e}"]
-        else:
-            line[name] |= outcome_of(calibration, recording.truth.T_vehicle_lidar)
-        line[name]["cpu_s"] = time.process_time() - begun
+    with TemporaryDirectory(prefix="no_guess_") as name:
+        folder = Path(name)
+        run_command(
+            *("simulate", FOLDER / f"{scenario}.yaml", "--out", folder / "drive", "--seed", seed)
+        )
+        truth = read_truth(folder / "drive" / "truth.yaml")
+        for way in ("with", "without"):
+            config, result = folder / "drive" / f"{way}.yaml", folder / way
+            raw = yaml.safe_load((folder / "drive" / "config.yaml").read_text(encoding="utf-8"))
+            if way == "without":
+                drop_guesses(raw)
+            config.write_text(yaml.safe_dump(raw), encoding="utf-8")
+            line[way] = {"exit": USAGE, "said": [], "undetermined": [], "cpu_s": math.nan}
+            try:
+                usage = calibrate_measured(config, result)
+            except CalivError as e:
+                line[way]["said"] = [str(e)]
+                continue
+            found[way] = calibration = read_calibration(result / "calibration.yaml")
+            line[way] |= outcome_of(calibration, truth) | {"exit": usage.code, "cpu_s": usage.cpu_s}
     if len(found) == 2:
         other = {name: lidar.T_vehicle_lidar for name, lidar in found["with"].lidars.items()}
         line["apart"] = apart(found["without"], other)
     return line
-
-
-def calibrated(recording: SimulatedRecording, *, guess: bool) -> Calibration:
-    """Calibrates with the config that `simulate` writes.
-
-    Raises:
-        CalivError: there is no result.
-    """
-    raw = config_of(recording, has_bag=True)
-    if not guess:
-        drop_guesses(raw)
-    return calibrate(
-        [recording], parse_config(raw, "simulated", REPOSITORY), SilentProgress()
-    ).calibration
 
 
 def apart(

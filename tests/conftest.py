@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
+# Before numpy is imported, as the command line does (`caliv_graph.__main__`): several processes
+# share the cores, and threads of its library would wait for each other at ten times the cost.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from contextlib import ExitStack
 from pathlib import Path
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from threadpoolctl import threadpool_limits
+
 from caliv_graph.calibration.choose import displaced_or_misguessed
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -51,6 +53,13 @@ def look(recording: Recording, config: Config, progress: Progress) -> Look:
 
     Clouds that are read for the first time here may be damaged: that is a problem like the others.
     """
+    # As in `pipeline.run.calibrate`: threads for small matrices cost ten times the time.
+    with threadpool_limits(limits=1):
+        return _look(recording, config, progress)
+
+
+def _look(recording: Recording, config: Config, progress: Progress) -> Look:
+    """See `look`."""
     findings: tuple[Finding, ...] = ()
     problems: list[str] = []
     notes: tuple[str, ...] = ()

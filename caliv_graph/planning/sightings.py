@@ -22,7 +22,7 @@ from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.shapes import object_mesh
 from caliv_graph.scenario.terrain import Terrain, make_terrain
 from caliv_graph.scenario.world_models import ObjectModel
-from caliv_graph.targets.cloud.views import clouds_per_lidar, evenly_spread
+from caliv_graph.targets.cloud.views import chosen, clouds_per_lidar, preference
 from caliv_graph.targets.ground.planes import CELL_M, CELL_POINTS, UNEVENNESS_M
 
 SEEN_PART = 0.87
@@ -265,7 +265,8 @@ def thinned(weights: Array, seeing: int, extraction: ExtractionConfig) -> IntArr
     """
     if len(weights) < extraction.min_scans:
         return np.zeros(0, dtype=np.int64)
-    return evenly_spread(weights, clouds_per_lidar(extraction.max_scans, seeing))
+    preferences = preference(np.arange(len(weights)), len(weights))
+    return chosen(preferences, weights, clouds_per_lidar(extraction.max_scans, seeing))
 
 
 def sees_ground(model: LidarModel) -> bool:

@@ -17,7 +17,7 @@ from caliv_graph.targets.cloud.choice import Choose, TriedCandidate, first_candi
 from caliv_graph.targets.cloud.constellation import match_objects, one_object, static_objects
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
 from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor
-from caliv_graph.targets.cloud.scans import scans_to_decode, thinned
+from caliv_graph.targets.cloud.scans import ScanOrder, scans_to_decode
 from caliv_graph.targets.cloud.tally import Tally
 from caliv_graph.targets.cloud.views import clouds_per_lidar
 from caliv_graph.targets.search import FoundTarget, find_target
@@ -76,14 +76,17 @@ def extract_targets(
         for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
             extractors = [RegionExtractor(r, config, trajectory) for r in regions[drive]]
             seen = _candidates(recording, drive, wanted[drive], extractors, advance)
+            order = ScanOrder.of(recording, config.lidars)
             of_drive = f" of {recording.name}" if len(recordings) > 1 else ""
             if searched:
-                placements = _chosen(searched[drive], extractors, seen, config, of_drive, choose)
+                placements = _chosen(
+                    searched[drive], extractors, seen, config, order, of_drive, choose
+                )
             else:
                 placements = []
                 for index, (extractor, of_lidar) in enumerate(zip(extractors, seen, strict=True)):
                     label = "target" if len(extractors) == 1 else f"target {index + 1}"
-                    placements += _placements(label + of_drive, extractor, of_lidar, config)
+                    placements += _placements(label + of_drive, extractor, of_lidar, config, order)
             observations += [
                 replace(found, placement=len(observations) + n)
                 for n, found in enumerate(placements)
@@ -119,6 +122,7 @@ def _chosen(
     extractors: Sequence[RegionExtractor],
     seen: Sequence[Mapping[str, Sequence[Sequence[Candidate]]]],
     config: Config,
+    order: ScanOrder,
     of_drive: str,
     choose: Choose,
 ) -> list[TargetObservation]:
@@ -127,7 +131,7 @@ def _chosen(
     proposals = (searched, *searched.others)
     for found, extractor, of_lidar in zip(proposals, extractors, seen, strict=True):
         label = _label(found) + of_drive
-        placements = tuple(_placements(label, extractor, of_lidar, config))
+        placements = tuple(_placements(label, extractor, of_lidar, config, order))
         tried.append(TriedCandidate(found, placements))
     choice = choose(tried, extractors[0].trajectory, config)
     first, *rest = tried[choice.index].observations
@@ -146,13 +150,14 @@ def _placements(
     extractor: RegionExtractor,
     seen: Mapping[str, Sequence[Sequence[Candidate]]],
     config: Config,
+    order: ScanOrder,
 ) -> list[TargetObservation]:
     """One observation of a target, or one of each of its places if somebody moved it."""
     flat = {name: [c for scan in scans for c in scan] for name, scans in seen.items()}
     centres = {name: _centres(found) for name, found in flat.items()}
     moved = periods(centres, extractor.trajectory, config.extraction.min_scans)
     if not moved:
-        return _objects(label, extractor, seen, config)
+        return _objects(label, extractor, seen, config, order)
     out = []
     begin_ns, _ = extractor.trajectory.span_ns
     for number, period in enumerate(moved, start=1):
@@ -167,11 +172,11 @@ def _placements(
         most = max(most, SCANS_OF_A_PLACE, config.extraction.min_scans)
         extraction = config.extraction.model_copy(update={"max_scans": most})
         fewer = config.model_copy(update={"extraction": extraction})
-        observation = _observation(name, own, clouds, fewer)
+        observation = _observation(name, own, clouds, fewer, order)
         if observation.clouds:
             out.append(observation)
     if not out:
-        return [_observation(label, extractor, [], config)]
+        return [_observation(label, extractor, [], config, order)]
     warnings = [*_warnings_of_moves(label, extractor, out, len(moved), config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
@@ -182,6 +187,7 @@ def _objects(
     extractor: RegionExtractor,
     seen: Mapping[str, Sequence[Sequence[Candidate]]],
     config: Config,
+    order: ScanOrder,
 ) -> list[TargetObservation]:
     """One observation of each object in the region that stands still."""
     fewest = config.extraction.min_scans
@@ -194,7 +200,7 @@ def _objects(
                 clouds += extractor.clouds(lidars[name].candidates[0], lidars[name].scans, name)
             else:
                 clouds += extractor.choose(scans, name)
-        return [_observation(label, extractor, clouds, config)]
+        return [_observation(label, extractor, clouds, config, order)]
     matched = match_objects(tuple(lidars.values()))
     outside_m = extractor.outside_m(np.array([shared.place for shared in matched.objects]))
     # What stands beside the region is not meant; the guesses place all objects wrong together.
@@ -209,13 +215,13 @@ def _objects(
                 objects = lidars[name]
                 clouds += own.clouds(objects.candidates[shared.seen[name]], objects.scans, name)
         if len(meant) == 1:
-            return [_observation(label, own, clouds, config)]
+            return [_observation(label, own, clouds, config, order)]
         name = f"{label}, object {number} of {len(meant)}"
-        observation = _observation(name, own, clouds, config)
+        observation = _observation(name, own, clouds, config, order)
         if observation.clouds:
             out.append(replace(observation, centre_map=extractor.in_map(shared.place)))
     if not out:
-        return [_observation(label, extractor, [], config)]
+        return [_observation(label, extractor, [], config, order)]
     warnings = [*_warnings_of_objects(label, extractor, out, matched.ambiguous, config)]
     out = [replace(o, warnings=()) for o in out]
     return [replace(out[0], warnings=tuple(warnings)), *out[1:]]
@@ -319,6 +325,7 @@ def _observation(
     extractor: RegionExtractor,
     found: list[TargetCloud],
     config: Config,
+    order: ScanOrder,
 ) -> TargetObservation:
     """One observation; LiDARs that saw the target in too few scans are left out with a warning."""
     warnings: list[str] = []
@@ -330,7 +337,7 @@ def _observation(
         if tally.kept >= config.extraction.min_scans:
             of_lidar = [c for c in found if c.lidar == name]
             seen_ns[name] = tuple(sorted(c.stamp_ns for c in of_lidar))
-            kept += thinned(of_lidar, most)
+            kept += order.thinned(of_lidar, most)
         elif not tally.scans:
             warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
         else:

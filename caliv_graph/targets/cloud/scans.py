@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from caliv_graph.config.model import Config, TargetRegion
-from caliv_graph.products import Recording, TargetCloud
+from caliv_graph.products import Array, IntArray, Recording, TargetCloud
 from caliv_graph.targets.cloud.field_of_view import FieldOfView
 from caliv_graph.targets.cloud.region import RegionExtractor, widened_margin_m
-from caliv_graph.targets.cloud.views import evenly_spread, view_weights
+from caliv_graph.targets.cloud.views import (
+    chosen,
+    evenly_spread,
+    preference,
+    view_weights,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 FEW_SCANS = 150
@@ -32,7 +38,10 @@ def scans_to_decode(
 ) -> frozenset[int]:
     """Stamps of the scans of a LiDAR that may see a target; the others are not decoded."""
     begin, end = trajectory.span_ns
-    stamps = np.array([s for s in recording.scan_stamps_ns(lidar) if begin <= s <= end], np.int64)
+    stamps = np.array(recording.scan_stamps_ns(lidar), np.int64)
+    preferences = preference(np.arange(len(stamps)), len(stamps))
+    within = (begin <= stamps) & (stamps <= end)
+    stamps, preferences = stamps[within], preferences[within]
     if len(stamps) <= FEW_SCANS:
         return frozenset(stamps.tolist())
     some = stamps[np.linspace(0, len(stamps) - 1, SAMPLED_SCANS).astype(np.int64)]
@@ -53,15 +62,44 @@ def scans_to_decode(
         sees = field_of_view.may_see(towards, margin_m, config.extraction.min_points)
         weights[sees] = np.maximum(weights[sees], view_weights(towards[sees]))
         possible |= sees
-    stamps, weights = stamps[possible], weights[possible]
     # A long drive passes the target many times: a part of it is enough.
     most = DECODED_PER_SCAN_USED * config.extraction.max_scans
-    return frozenset(stamps[evenly_spread(weights, most)].tolist())
+    some = chosen(preferences[possible], weights[possible], most)
+    return frozenset(stamps[possible][some].tolist())
+
+
+@dataclass(frozen=True)
+class ScanOrder:
+    """In which order the scans of a drive are preferred, whatever they show.
+
+    `of_stamps` are those of all its scans, ascending, by LiDAR.
+    """
+
+    of_stamps: Mapping[str, IntArray]
+
+    @staticmethod
+    def of(recording: Recording, lidars: Iterable[str]) -> ScanOrder:
+        """The order of the scans of these LiDARs."""
+        return ScanOrder(
+            {name: np.array(recording.scan_stamps_ns(name), np.int64) for name in lidars}
+        )
+
+    def thinned(self, clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
+        """At most `most` of a LiDAR's clouds; those of a standing vehicle are left out first."""
+        if len(clouds) <= most:
+            return clouds
+        stamps = self.of_stamps[clouds[0].lidar]
+        numbers = np.searchsorted(stamps, [c.stamp_ns for c in clouds])
+        first = chosen(preference(numbers, len(stamps)), _weights(clouds), most)
+        return [clouds[i] for i in first.tolist()]
 
 
 def thinned(clouds: list[TargetCloud], most: int) -> list[TargetCloud]:
-    """At most `most` of a LiDAR's clouds; those of a standing vehicle are left out first."""
+    """At most `most` of a LiDAR's clouds that have been chosen already, for a first look."""
     if len(clouds) <= most:
         return clouds
-    centres = np.array([c.points_lidar.mean(axis=0) for c in clouds])
-    return [clouds[i] for i in evenly_spread(view_weights(centres), most).tolist()]
+    return [clouds[i] for i in evenly_spread(_weights(clouds), most).tolist()]
+
+
+def _weights(clouds: Sequence[TargetCloud]) -> Array:
+    return view_weights(np.array([c.points_lidar.mean(axis=0) for c in clouds]))

@@ -61,6 +61,29 @@ def evenly_spread(weights: Array, most: int) -> IntArray:
     return np.unique(np.where(nearer, after - 1, after)).astype(np.int64)
 
 
+def preference(numbers: IntArray, count: int) -> Array:
+    """(n,) from 0 to 1, the order in which scans with these `numbers` of `count` are preferred.
+
+    That of van der Corput: the first m are spread evenly over all, for every m.
+    """
+    out, left = np.zeros(len(numbers)), np.asarray(numbers, dtype=np.int64)
+    for bit in range(1, max(int(count) - 1, 1).bit_length() + 1):
+        out += (left & 1) * 0.5**bit
+        left = left >> 1
+    # Not zero: the first scan of all is not to be taken whatever its weight.
+    return np.asarray(out + 0.5 ** (bit + 1))
+
+
+def chosen(preferences: Array, weights: Array, most: int) -> IntArray:
+    """Indices of `most` clouds at most, ascending: as many at each place as the weights (n,) ask.
+
+    One cloud more or less, or another weight, changes a single choice: which clouds are used shall
+    not depend on the initial guess, by which a cloud at the rim of a region is found or not.
+    """
+    first = np.argsort(preferences / weights, kind="stable")[:most]
+    return np.asarray(np.sort(first), dtype=np.int64)
+
+
 def clouds_per_lidar(max_scans: int, seeing: int) -> int:
     """Clouds of one LiDAR that are used at most if so many LiDARs see the target often enough."""
     return min(max_scans, max(round(TOTAL_PER_LIDARS * max_scans / max(seeing, 1)), 10))

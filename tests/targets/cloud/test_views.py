@@ -9,7 +9,9 @@ import pytest
 
 from caliv_graph.targets.cloud.views import (
     TYPICAL_SHARED,
+    chosen,
     evenly_spread,
+    preference,
     view_weights,
     views,
     weights_of_views,
@@ -77,3 +79,35 @@ def test_a_long_stand_does_not_crowd_out_the_drive() -> None:
     assert len(taken) <= 60
     assert (taken >= 600).sum() >= 55
     assert taken[0] < 600
+
+
+def test_a_long_stand_does_not_crowd_out_the_drive_whichever_scans_are_preferred() -> None:
+    standing = np.tile([10.0, 5.0, 0.0], (600, 1))
+    driving = np.column_stack([10.0 - 0.2 * np.arange(1, 81), np.full(80, 5.0), np.zeros(80)])
+    weights = view_weights(np.concatenate([standing, driving]))
+    taken = chosen(preference(np.arange(680), 680), weights, 60)
+    assert len(taken) == 60
+    assert 50 <= (taken >= 600).sum() < 60
+    # Of the drive every part has its share.
+    assert np.diff(taken[taken >= 600]).max() <= 4
+
+
+def test_preferred_scans_are_spread_evenly_however_many_are_taken() -> None:
+    # Bits in reversed order: 0, 4, 2, 6, 1, 5, 3, 7 of eight, each half a step above.
+    order = np.argsort(preference(np.arange(8), 8))
+    assert order.tolist() == [0, 4, 2, 6, 1, 5, 3, 7]
+    assert preference(np.array([0]), 1).tolist() == [0.25]
+    for most in (10, 64, 100, 150):
+        taken = chosen(preference(np.arange(200), 200), np.ones(200), most)
+        assert len(taken) == most
+        assert np.diff(taken).max() <= 2 ** np.ceil(np.log2(200 / most)) + 1e-9
+
+
+def test_a_scan_more_or_less_changes_one_choice() -> None:
+    preferences = preference(np.arange(570), 570)
+    seen = np.arange(100, 400)
+    weights = np.random.default_rng(3).uniform(0.5, 1.0, 570)
+    before = seen[chosen(preferences[seen], weights[seen], 80)]
+    for more in (np.arange(99, 400), np.arange(101, 400)):
+        after = more[chosen(preferences[more], weights[more], 80)]
+        assert len(set(before) - set(after)) <= 1

@@ -53,9 +53,10 @@ MM, MRAD = 1e-3, 1e-3
 
 HEIGHT = "height of all LiDARs together"
 
-QUIET_SEEDS = (1, 2)
+QUIET_SEEDS = (1,)
 
-NOISY_DRAWS = 4
+NOISY_DRAWS = 3
+"""Enough to see that something broke; errors of many drives are in the benchmark's tables."""
 
 MEDIUM = RegistrationConfig(components=400, max_points=320)
 """A registration for a shape that a quick one does not follow."""
@@ -224,7 +225,7 @@ def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(sparse: T
 def test_whatever_the_noise_of_the_range_the_solve_ends_where_it_stays(
     noise_m: float, tmp_path: Path
 ) -> None:
-    scenario = paper_scenario(rate_hz=2.5)
+    scenario = paper_scenario(rate_hz=1.25)
     lidars = {
         name: lidar.model_copy(update={"range_sigma_m": noise_m})
         for name, lidar in scenario.lidars.items()
@@ -293,7 +294,7 @@ def test_joint_agrees_on_sensor_to_sensor(sparse: Tried) -> None:
 
 @pytest.fixture(scope="module")
 def staged(quiet: list[Tried]) -> Tried:
-    return try_out(quiet[0].drive.asked(solve=SolveConfig(mode="staged")))
+    return try_out(quiet[0].drive.asked(solve=SolveConfig(mode="staged"), registration=MEDIUM))
 
 
 def test_staged_is_as_good_as_the_paper_between_sensors(staged: Tried) -> None:
@@ -350,7 +351,7 @@ def test_noisy_poses_cost_no_more_than_their_noise(noisy: list[Tried]) -> None:
 
 @pytest.fixture(scope="module")
 def s_curve(tmp_path_factory: pytest.TempPathFactory) -> ChairDrive:
-    scenario = paper_scenario(S_CURVE, rate_hz=2.5, chair_xy_m=S_CHAIR_XY_M)
+    scenario = paper_scenario(S_CURVE, rate_hz=2.0, chair_xy_m=S_CHAIR_XY_M)
     return simulated(scenario, 1, tmp_path_factory.mktemp("s_curve") / "drive")
 
 
@@ -377,9 +378,9 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> Tried:
     """A third LiDAR that looks left, to the chair, and a fourth that looks right, away from it."""
     others = {
         "left": paper_lidar(0.8, 90.0, y_m=0.6, rate_hz=2.5),
-        "right": paper_lidar(0.8, -90.0, y_m=-0.6, rate_hz=2.5),
+        "right": paper_lidar(0.8, -90.0, y_m=-0.6, rate_hz=1.25),
     }
-    scenario = paper_scenario(rate_hz=2.5, others=others)
+    scenario = paper_scenario(rate_hz=1.25, others=others)
     drive = simulated(scenario, 1, tmp_path_factory.mktemp("four") / "drive")
     return try_out(drive.asked(registration=QUICK))
 
@@ -527,15 +528,15 @@ def test_displaced_clouds_lose_their_say(coarse: Tried, kernel: RobustKernel) ->
 
 
 @dataclass(frozen=True)
-class EverySecond(ForwardingRecording):
-    """A recording with half of its scans."""
+class EveryThird(ForwardingRecording):
+    """A recording with a third of its scans."""
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
-        return super().scan_stamps_ns(lidar)[::2]
+        return super().scan_stamps_ns(lidar)[::3]
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
-        half = self.scan_stamps_ns(lidar)
-        return super().scans(lidar, {s for s in half if wanted is None or s in wanted})
+        third = self.scan_stamps_ns(lidar)
+        return super().scans(lidar, {s for s in third if wanted is None or s in wanted})
 
 
 @pytest.mark.skipif(not RELEASED.is_dir(), reason=f"the authors' drive is not at {RELEASED.name}")
@@ -549,7 +550,7 @@ def test_the_authors_drive() -> None:
         R = gtsam.Rot3.RzRyRx(math.radians(roll), math.radians(pitch), math.radians(yaw))
         truth[name] = gtsam.Pose3(R, np.array(xyz))
 
-    run = calibrate([EverySecond(open_recording(config))], config, SilentProgress())
+    run = calibrate([EveryThird(open_recording(config))], config, SilentProgress())
 
     (pair,) = evaluate(run.calibration, truth)["pairs"]
     rotation, translation = np.abs(pair["rotation_rad"]), np.abs(pair["translation_m"])

@@ -52,8 +52,8 @@ def lidar(x_m: float, y_m: float, yaw_deg: float, phase_s: float) -> LidarModel:
         mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
         rate_hz=2.0,
         phase_s=phase_s,
-        channels=110,
-        horizontal_resolution_deg=0.22,
+        channels=90,
+        horizontal_resolution_deg=0.27,
     )
 
 

@@ -21,7 +21,7 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress, StageRecord
 from caliv_graph.config.load import load_config
-from caliv_graph.config.model import Config, RobustConfig, SolveConfig
+from caliv_graph.config.model import Config, RegistrationConfig, RobustConfig, SolveConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import LidarScan
@@ -50,6 +50,9 @@ EVIL = '<script>alert("x")</script> & <b>up</b>'
 """What somebody may call a LiDAR."""
 
 MOST_BYTES = 10_000_000
+
+REGISTRATION = RegistrationConfig(components=400, max_points=320)
+"""Fine enough for a figure in which the legs of a chair stand on the ground."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,7 +92,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     write_drive(scenario.model_copy(update={"lidars": slow}), folder, 1, threads=1)
     config = without_structure(load_config(folder / "config.yaml"))
     blind = config.lidars["front"].model_copy(update={"min_range": 400.0, "max_range": 450.0})
-    return ran(config.model_copy(update={"lidars": {**config.lidars, EVIL: blind}}))
+    lidars = {**config.lidars, EVIL: blind}
+    return ran(config.model_copy(update={"lidars": lidars, "registration": REGISTRATION}))
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +101,9 @@ def staged(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """Given poses, no ground, and the paper's two stages."""
     scenario = paper_scenario(rate_hz=2.0, position_sigma_m=0.005, rotation_sigma_rad=1e-3)
     drive = simulated(scenario, 1, tmp_path_factory.mktemp("caliv") / "arc")
-    config = drive.config.model_copy(update={"solve": SolveConfig(mode="staged")})
+    config = drive.config.model_copy(
+        update={"solve": SolveConfig(mode="staged"), "registration": REGISTRATION}
+    )
     progress = SilentProgress()
     return Ran(calibrate([drive.recording], config, progress), config, progress.stages)
 

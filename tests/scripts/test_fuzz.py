@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("atheris", reason="has no package for this platform")
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNS = 700
+RUNS = 450
 SCRIPT = ROOT / "scripts" / "fuzz.py"
 
 

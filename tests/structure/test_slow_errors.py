@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array
+from caliv_graph.structure.problem import Problem
 from caliv_graph.structure.slow_errors import of_moved_prior, scans_for_errors, told_of_errors
 from caliv_graph.structure.thinning import FEW_SCANS
 from tests.structure.test_solve import problem_of, solve
@@ -45,6 +47,11 @@ def test_a_moved_prior_is_eliminated_as_from_the_joint_quadratic() -> None:
     assert gradient == pytest.approx(right[own] - across @ right[rest])
 
 
+@cache
+def past_walls() -> Problem:
+    return problem_of(yard(), figure_eight(POSES), seed=5)
+
+
 def swinging(period_s: float) -> tuple[Array, Array]:
     """(6 m, 2) gain of an error along map x and y that swings once in a period, and its sine."""
     _, yaw = figure_eight(POSES)
@@ -60,7 +67,7 @@ def swinging(period_s: float) -> tuple[Array, Array]:
 def test_walls_tell_how_far_the_poses_swing(north_m: float) -> None:
     """Poses that swing by 30 mm beside their own slow errors of 20 mm."""
     gain, wave = swinging(period_s=6.0)
-    problem = problem_of(yard(), figure_eight(POSES), seed=5)
+    problem = past_walls()
     R, _ = stack(problem.prior.T_map_vehicle)
     off = np.zeros((POSES, 6))
     off[:, 3:] = np.einsum("nji,j->ni", R, [0.0, north_m, 0.0]) * wave[:, None]
@@ -76,7 +83,7 @@ def test_walls_tell_how_far_the_poses_swing(north_m: float) -> None:
 
 
 def test_few_scans_of_the_first_part_are_used() -> None:
-    patches = problem_of(yard(), figure_eight(POSES), seed=5).patches
+    patches = past_walls().patches
 
     used = scans_for_errors(patches, 120 * STEP_NS)
 

@@ -46,12 +46,12 @@ def calibrated(*drives: ChairDrive, prior: Calibration | None = None) -> Calibra
 
 @pytest.fixture(scope="module")
 def arcs(tmp_path_factory: pytest.TempPathFactory) -> TwoArcs:
-    """A right and a left arc, seen at 2 Hz, given poses with white errors of 5 mm and 1 mrad."""
+    """A right and a left arc, seen at 1.7 Hz, given poses with white errors of 5 mm and 1 mrad."""
     drives = []
     for model, side in ((ARC, 1.0), (ARC_LEFT, -1.0)):
         scenario = paper_scenario(
             model,
-            rate_hz=2.0,
+            rate_hz=10 / 6,
             position_sigma_m=5e-3,
             rotation_sigma_rad=1e-3,
             chair_xy_m=(CHAIR_XYZ_M[0], side * CHAIR_XYZ_M[1]),

@@ -444,13 +444,13 @@ class TestNothingFound:
             nothing.find()
 
     def test_a_lidar_without_scans(self) -> None:
-        drive = recorded("street")
+        drive = recorded("roundabout")
         clouds = {**drive.recording.clouds, "rear": ()}
         found = replace(drive, recording=replace(drive.recording, clouds=clouds)).find()
         assert found.looked_at["rear"] == found.scans["rear"] == 0
 
     def test_too_few_scans_for_the_extraction(self) -> None:
-        drive = recorded("street")
+        drive = recorded("standing")
         extraction = drive.config.extraction.model_copy(update={"min_scans": 1000})
         config = drive.config.model_copy(update={"extraction": extraction})
         with pytest.raises(TargetError, match="with too few points"):

@@ -17,7 +17,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import scipy.sparse
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, BoolArray, IntArray
@@ -278,14 +278,20 @@ def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
     names = set(likelihood.names)
     scales, best = fit(likelihood, names)
     away = {name for name, s in scales.items() if max(s, 1.0 / s) > LARGEST_RIGHT}
-    kept = {name for name in away if fit(likelihood, names - {name})[1] - best > EVIDENCE}
+    enough = best + EVIDENCE
+    kept = {name for name in away if fit(likelihood, names - {name}, enough)[1] - best > EVIDENCE}
+    if kept == names:
+        return scales
     return fit(likelihood, kept)[0] if kept else {}
 
 
-def fit(likelihood: NoiseLikelihood, free: Set[str]) -> tuple[dict[str, float], float]:
+def fit(
+    likelihood: NoiseLikelihood, free: Set[str], enough: float = -math.inf
+) -> tuple[dict[str, float], float]:
     """Scales of the `free` noise levels at the maximum of likelihood times prior.
 
-    The others are 1. Returns them, and -2 log of likelihood times prior.
+    The others are 1. Returns them, and -2 log of likelihood times prior. The fit ends early where
+    this falls below `enough`: every step descends, so that it would end below as well.
     """
     at = [i for i, name in enumerate(likelihood.names) if name in free]
     logarithms = np.zeros(len(likelihood.names))
@@ -302,12 +308,20 @@ def fit(likelihood: NoiseLikelihood, free: Set[str]) -> tuple[dict[str, float], 
 
     if not at:
         return {}, begin
+    if begin <= enough:
+        return dict.fromkeys(free, 1.0), begin
+
+    def check(intermediate_result: OptimizeResult) -> None:
+        if intermediate_result.fun + begin <= enough:
+            raise StopIteration
+
     found = minimize(
         cost,
         np.zeros(len(at)),
         jac=True,
         method="L-BFGS-B",
         bounds=[tuple(np.log(SCALE_BOUNDS))] * len(at),
+        callback=check,
         options={"ftol": 1e-9, "gtol": 0.5, "maxiter": 30},
     )
     scales = np.exp(np.asarray(found.x)).tolist()

@@ -98,7 +98,8 @@ def provoked(tests: Sequence[str]) -> list[Message]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "messages.jsonl"
         subprocess.run(
-            [sys.executable, "-m", "pytest", "-p", PLUGIN, *tests],
+            # Folders of its own: pytest would first remove those of other sessions.
+            [sys.executable, "-m", "pytest", "-p", PLUGIN, f"--basetemp={folder}/tests", *tests],
             cwd=REPOSITORY,
             env={**os.environ, VARIABLE: str(path)},
             check=False,

@@ -278,9 +278,9 @@ def _noise_rows(solution: Solution, record: RunRecord) -> list[tuple[str, str]]:
                 f"correlation time {noise.drift_time_s:g} s",
             ),
         ]
-    rows.append(
-        ("registration of the target, factor on its sigmas", f"{solution.registration_scale:.2f}")
-    )
+    if solution.registrations:
+        scale = f"{solution.registration_scale:.2f}"
+        rows.append(("registration of the target, factor on its sigmas", scale))
     rows += [_noise_row(level) for level in solution.sensor_noise]
     for name, trajectory in zip(record.drives, record.trajectories, strict=True):
         if isinstance(trajectory, SmoothedTrajectory):

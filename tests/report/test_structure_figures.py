@@ -85,3 +85,29 @@ def test_all_points_of_a_picture_are_in_its_axes(
 def test_thickness_of_strips_that_one_scan_saw_is_left_out() -> None:
     assert _median_mm([np.nan, 0.002, 0.004]) == "3.0"
     assert _median_mm([np.nan]) == "-"
+
+
+def test_buttons_of_a_picture_become_a_list_where_they_would_not_fit(tmp_path: Path) -> None:
+    chromium()
+    script = files("caliv_graph.report").joinpath("templates/draw.js").read_text("utf-8")
+    layout = {
+        "width": 980,
+        "margin": {"t": 90, "b": 20},
+        "updatemenus": [{"type": "buttons", "direction": "right"}],
+    }
+    figure = json.dumps({"data": [], "layout": layout})
+    pictures = "".join(
+        f'<figure data-across="1" style="width: {width}px; margin: 0">'
+        f'<div class="plot" data-figure="{name}" style="height: 400px"></div></figure>'
+        f'<script type="application/json" id="data-{name}">{figure}</script>'
+        for name, width in (("narrow", 390), ("wide", 980))
+    )
+    told = """<script>window.Plotly = { newPlot: function (plot, data, layout) {
+  plot.textContent = layout.updatemenus.map(m => m.type + " " + m.direction).join();
+  return Promise.resolve();
+} };</script>"""
+
+    dom = shown(f'<meta charset="utf-8">{pictures}{told}<script>{script}</script>', tmp_path).dom
+
+    drawn = dict(re.findall(r'data-figure="(\w+)"[^>]*>([^<]*)<', dom))
+    assert drawn == {"narrow": "dropdown down", "wide": "buttons right"}

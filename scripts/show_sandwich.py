@@ -299,7 +299,9 @@ class Estimator:
         self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
         self._floor = FINE_SIGMA_M
         distinct = float((self._stack.sizes / self.clouds.views).sum())
-        return seed_mixture(self._stack, R, t, self._components, FINE_SIGMA_M, distinct)
+        return seed_mixture(
+            self._stack, R, t, self._components, FINE_SIGMA_M, distinct, everywhere=True
+        )
 
     def at(self, T: Sequence[gtsam.Pose3], mixture: Mixture) -> Equation:
         """E-step; at the end of annealing the noise of the heights as well."""
@@ -307,7 +309,8 @@ class Estimator:
         R, t, J = self.poses(T)
         density = GAMMA / (self._depth_m * (GAMMA + 1.0))
         noise = replace(self._noise, floor_m=self._floor)
-        who = expect(self._stack, R, t, mixture, noise, density, self.weights)
+        by_beams = self._floor <= self._floor_end
+        who = expect(self._stack, R, t, mixture, noise, density, self.weights, by_beams=by_beams)
         cells = cell_moments(self._stack, who, len(mixture.weights))
         quadratic = shape_quadratic(self._stack, R, t, mixture, cells, who)
         if self._floor <= self._floor_end:

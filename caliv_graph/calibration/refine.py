@@ -153,6 +153,7 @@ class _Loop:
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
             if normals:
                 shape.refine_normals(R, t)
+            shape.seeds_everywhere = True  # on thin parts, whose normals are not reliable
             shape.seed(R, t, FINE_SIGMA_M)
             shape.held_along = 0.0
 

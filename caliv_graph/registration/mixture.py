@@ -11,13 +11,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations, pairwise
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from caliv_graph.common.cores import parts, share_out
-from caliv_graph.geometry.se3 import cross
+from caliv_graph.geometry.se3 import cross, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, sampling_order
 from caliv_graph.registration.heights import HeightNoise, HeightSums
@@ -37,6 +40,27 @@ density."""
 NORMAL_METRES = 0.1
 """In the search for near surfels, opposite normals count as 2 x 0.1 m apart."""
 
+BEAM_NEIGHBOURS = 12
+"""The same where beams alone tell the surfel: those nearest across the beam."""
+
+ALONG_BEAM = 4.0
+"""A distance along the beam counts less by this factor in the search for these. The noise is along
+it, and surfels about the noisy point itself are on the side that its noise chose."""
+
+AWAY = -0.2
+"""Cosine of incidence at the middle of a cloud below which none of its beams sees a surfel."""
+
+EDGE_M = 0.004
+"""At an edge between two surfels, metres: how much farther one of them is along the beam for it to
+be the one that the beam returns from; and how far one lies behind the plane of the other for there
+to be an edge. Thin parts are known to this."""
+
+EDGE_REACH_M = 0.1
+"""Surfels that are farther apart have no edge in common."""
+
+PAIRED = 4
+"""Of the surfels near a beam, those that edges are looked for between: the most present."""
+
 NORMAL_CONCENTRATION = 4.0
 """Concentration of a reliable normal about that of its surfel (von Mises-Fisher, times flatness):
 0.5 rad. Normals of neighbouring points share their errors at edges."""
@@ -52,11 +76,14 @@ REACH_SIGMAS = 3.0
 """Standard deviations of the noise along the beam that the intersection may be away from the point.
 While poses are wrong by more than that, most points are farther away."""
 
+LEAST_SEEN = 1e-3
+"""What is left of the presence of a surfel that is hidden at edges."""
+
 BESIDE = 1e-4
 """Presence of "no surface here" in the weights of the surfels along a beam: a beam that passes a
 surfel at more than 4.3 of its widths does not return from it."""
 
-LEAST_EXTENT_M = 0.008
+LEAST_EXTENT_M = 0.006
 """Smallest width of a surfel, 1 sigma: half of the thinnest part that is worth one."""
 
 PART_POINTS = 8192
@@ -161,11 +188,80 @@ class _Surfels:
         found[order] = np.reshape(self.tree.query(places, self.neighbours)[1], found.shape)
         return found
 
+    def nearest_to_beams(self, points: Array, beams: Array, cloud: IntArray) -> IntArray:
+        """(n, k) surfels nearest to the beams of points (n, 3) of clouds (n,), ascending."""
+        found = np.empty((len(points), min(BEAM_NEIGHBOURS, self.means.shape[1])), dtype=np.int64)
+        starts = np.append(np.flatnonzero(np.diff(cloud, prepend=-1)), len(cloud)).tolist()
+        for first, end in pairwise(starts):
+            along = beams[first:end].mean(axis=0)
+            along /= np.linalg.norm(along)
+            facing = np.flatnonzero(-(along @ self.normals) > AWAY)
+            if len(facing) < found.shape[1]:
+                facing = np.arange(self.means.shape[1])
+            axes = np.vstack([tangent_axes(along), along / ALONG_BEAM])
+            places = (axes @ self.means[:, facing]).T
+            tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+            near = tree.query(points[first:end] @ axes.T, found.shape[1])[1]
+            found[first:end] = facing[np.reshape(near, (end - first, -1))]
+        return found
+
+    @cached_property
+    def edges(self) -> npt.NDArray[np.float32]:
+        """(K, K) 1 where two surfels meet at an edge that sticks out, -1 at one that is hollow.
+
+        At the first each lies behind the plane of the other, at the second before it.
+        """
+        heights = self.normals.T @ self.means
+        heights -= np.diag(heights)[:, None]  # of surfel l over the plane of surfel k
+        low = np.minimum(heights, heights.T)
+        high = np.maximum(heights, heights.T)
+        bend = np.maximum(-high, 0.0) - np.maximum(low, 0.0)
+        square = np.sum(self.means**2, axis=0)
+        apart2 = square + square[:, None] - 2.0 * self.means.T @ self.means
+        return np.where(apart2 < EDGE_REACH_M**2, np.tanh(bend / EDGE_M), 0.0).astype(np.float32)
+
+    def _hidden_at_edges(self, found: IntArray, there: Array, slide: Array) -> None:
+        """Takes from `there` (k, n) the surfels whose planes the beams meet beyond an edge.
+
+        Two planes that stick out at their edge: a beam returns from the farther, the nearer one it
+        meets in the air. At a hollow edge it returns from the nearer.
+        """
+        if len(there) > PAIRED:
+            kept = np.argpartition(there, -PAIRED, axis=0)[-PAIRED:]
+        else:
+            kept = np.arange(len(there))[:, None]
+        surfel, own, s = (np.take_along_axis(a, kept, axis=0) for a in (found, there, slide))
+        share = own / (own.sum(axis=0) + BESIDE)
+        lost = np.zeros_like(own)
+        for k, other in combinations(range(len(own)), 2):
+            edge = self.edges[surfel[k], surfel[other]]
+            farther = expit((s[k] - s[other]) / EDGE_M)
+            out, hollow = np.maximum(edge, 0.0), np.maximum(-edge, 0.0)
+            lost[k] += share[other] * (out * (1.0 - farther) + hollow * farther)
+            lost[other] += share[k] * (out * farther + hollow * (1.0 - farther))
+        own *= np.clip(1.0 - lost, LEAST_SEEN, 1.0)
+        np.put_along_axis(there, kept, own, axis=0)
+
     def met_by(
-        self, points: Array, normals: Array, beams: Array, flatness: Array, reach_m: float
+        self,
+        points: Array,
+        normals: Array,
+        beams: Array,
+        flatness: Array,
+        reach_m: float,
+        cloud: IntArray | None = None,
     ) -> _Met:
-        """What the beams of points meet; all (n, 3), flatness (n,), target frame."""
-        near = self.nearest(points, normals)
+        """What the beams of points meet; all (n, 3), flatness (n,), target frame.
+
+        With their clouds (n,), ascending, beams alone tell which surfels, and not the normals of
+        the points.
+        """
+        by_beams = cloud is not None
+        near = (
+            self.nearest(points, normals)
+            if cloud is None
+            else self.nearest_to_beams(points, beams, cloud)
+        )
         found = np.ascontiguousarray(near.T)
         height, all2, agreement, facing, depth = (np.zeros(found.shape) for _ in range(5))
         of_points = (np.ascontiguousarray(v.T) for v in (points, normals, beams))
@@ -185,9 +281,12 @@ class _Surfels:
         aside2 = all2 + slide * (2.0 * depth + slide) - (height - facing * slide) ** 2
         visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 0.0, 1.0)
         there = np.exp(self.aside.take(found) * np.maximum(aside2, 0.0)) * visible
+        if by_beams:
+            self._hidden_at_edges(found, there, slide)
         # Where the beam returns from, if it does: surfels share it.
         presence = there / (there.sum(axis=0) + BESIDE)
-        presence *= _agreement(flatness, agreement)
+        if not by_beams:
+            presence *= _agreement(flatness, agreement)
         return _Met(near, presence, height, slide, facing, of_surfels)
 
 
@@ -233,6 +332,7 @@ def expect(
     outlier_density: float,
     cloud_weights: Array,
     held_along: float = 0.0,
+    by_beams: bool = False,
 ) -> Responsibilities:
     """E-step: which surfel each beam returned from, and the weights of the points' heights.
 
@@ -245,8 +345,10 @@ def expect(
         outlier_density: of outliers along a beam, per metre.
         cloud_weights: (J,) weight of each cloud: robust weight times view weight.
         held_along: weight of what holds points along the surface, per square metre; 0: nothing.
+        by_beams: poses and surfels are right to some millimetres, so that the beam tells which
+            surfel it met. Until then the normals of the points do.
     """
-    step = _EStep(stack, mixture, noise, outlier_density, cloud_weights, held_along)
+    step = _EStep(stack, mixture, noise, outlier_density, cloud_weights, held_along, by_beams)
     points = stack.moved(R, t)
     normals, beams = stack.rotated(R, stack.normals), stack.rotated(R, stack.beams)
     pieces = parts(len(points), len(points) // PART_POINTS + 1)
@@ -303,6 +405,7 @@ class _EStep:
     outlier_density: float
     cloud_weights: Array
     held_along: float
+    by_beams: bool
 
     @cached_property
     def _surfels(self) -> _Surfels:
@@ -314,7 +417,14 @@ class _EStep:
         cloud = self.stack.cloud[part]
         lidar, cloud_weight = self.stack.lidar[cloud], self.cloud_weights[cloud]
         reach_m = REACH_SIGMAS * noise.largest_m()
-        met = self._surfels.met_by(points, normals, beams, self.stack.flatness[part], reach_m)
+        met = self._surfels.met_by(
+            points,
+            normals,
+            beams,
+            self.stack.flatness[part],
+            reach_m,
+            cloud if self.by_beams else None,
+        )
         cosine = np.maximum(met.facing, STEEP)
         variance = noise.variance(cosine, lidar)
         # The range is what is measured: a density per metre along the beam.

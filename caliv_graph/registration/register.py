@@ -98,6 +98,7 @@ class JointRegistration:
         held_along: what holds points along surfaces, per square metre; 0 where a graph does.
         weights: (J,) robust weight of each cloud, set from outside.
         noise: of the heights of the points of each LiDAR, estimated at the end of annealing.
+        seeds_everywhere: surfels begin where normals are not reliable, too (`seed_mixture`).
         inlier_ratio: (J,) part of each cloud's points that are inliers, 0 to 1, of the last E-step.
     """
 
@@ -153,7 +154,7 @@ class JointRegistration:
         self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)
         self.weights: Array = np.ones(self.clouds.count)
         self.held_along = HELD_ALONG_M**-2.0
-        self._seeds_everywhere = seeds_everywhere
+        self.seeds_everywhere = seeds_everywhere
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
@@ -198,7 +199,7 @@ class JointRegistration:
             self._floor,
             distinct,
             trusted if trusted.sum() >= 2 else None,
-            self._seeds_everywhere,
+            self.seeds_everywhere,
         )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
@@ -207,7 +208,11 @@ class JointRegistration:
         noise = replace(self.noise, floor_m=0.0 if self.finest else self._floor)
         density = self._gamma / (self._depth_m * (self._gamma + 1.0))
         weights = self.weights * self.view_weights
-        who = expect(self.clouds, R, t, self.mixture, noise, density, weights, self.held_along)
+        # Free registration goes on with normals: nothing holds a cloud of one flat side there.
+        by_beams = self.finest and self.held_along == 0.0
+        who = expect(
+            self.clouds, R, t, self.mixture, noise, density, weights, self.held_along, by_beams
+        )
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)

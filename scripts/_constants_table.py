@@ -120,6 +120,7 @@ class Constant:
 
 
 _MIXTURE = "caliv_graph.registration.mixture"
+_SURFELS = "caliv_graph.registration.surfels"
 _QUADRATIC = "caliv_graph.registration.quadratic"
 _REGISTER = "caliv_graph.registration.register"
 _CLOUDS = "caliv_graph.registration.clouds"
@@ -137,14 +138,14 @@ _CONSISTENCY = "caliv_graph.uncertainty.consistency"
 CONSTANTS: tuple[Constant, ...] = (
     # ---- the shape and the clouds
     Constant(
-        _MIXTURE,
+        _SURFELS,
         "NORMAL_CONCENTRATION",
         "",
         "concentration of a reliable normal about that of its surfel",
         "tried; 60 degrees between normals cost a factor of e^2",
     ),
     Constant(
-        _MIXTURE,
+        _SURFELS,
         "BESIDE",
         "",
         "presence of no surface in the weights of the surfels along a beam",
@@ -174,7 +175,7 @@ CONSTANTS: tuple[Constant, ...] = (
         SHORT,
     ),
     Constant(
-        _MIXTURE,
+        _SURFELS,
         "NEIGHBOURS",
         "",
         "surfels that a beam may return from",
@@ -182,7 +183,7 @@ CONSTANTS: tuple[Constant, ...] = (
         SHORT,
     ),
     Constant(
-        _MIXTURE,
+        _SURFELS,
         "GRAZING",
         "",
         "cosine between beam and surface at which visibility fades",

@@ -50,7 +50,6 @@ from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_cl
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import (
     REACH_SIGMAS,
-    STEEP,
     expect,
     maximise_shape,
     seed_mixture,
@@ -71,6 +70,7 @@ from caliv_graph.registration.quadratic import (
     shape_quadratic,
 )
 from caliv_graph.registration.register import ANNEALING, FINE_SIGMA_M, FLOOR_PER_RANGE_SIGMA
+from caliv_graph.registration.surfels import STEEP
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.scenario.world import make_world

@@ -26,8 +26,8 @@ sys.path.insert(0, str(REPOSITORY))  # for the modules beside this script, run f
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array
-from caliv_graph.registration.mixture import STEEP
 from caliv_graph.registration.quadratic import NORMAL_SIGMA_RAD
+from caliv_graph.registration.surfels import STEEP
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.scenario.world import make_world

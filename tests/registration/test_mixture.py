@@ -18,10 +18,8 @@ from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.heights import HeightNoise, HeightSums
 from caliv_graph.registration.mixture import (
-    BESIDE,
     LEAST_EXTENT_M,
     MAX_TURN_RAD,
-    STEEP,
     expect,
     maximise_shape,
     seed_mixture,
@@ -34,6 +32,7 @@ from caliv_graph.registration.quadratic import (
     shape_quadratic,
 )
 from caliv_graph.registration.register import left_step
+from caliv_graph.registration.surfels import BESIDE, STEEP
 from tests.registration.scenes import (
     looking_at_target,
     matrices,

@@ -198,7 +198,7 @@ def test_a_second_start_does_what_is_missing(
 def test_an_unknown_constant_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         benchmark.main(["--only", "robust.GONE"])
-    assert "no constant robust.GONE; there are mixture." in capsys.readouterr().err
+    assert "no constant robust.GONE; there are surfels." in capsys.readouterr().err
 
 
 def test_a_setting_of_the_config_is_its_default() -> None:

@@ -309,11 +309,11 @@ class Estimator:
         R, t, J = self.poses(T)
         density = GAMMA / (self._depth_m * (GAMMA + 1.0))
         noise = replace(self._noise, floor_m=self._floor)
-        by_beams = self._floor <= self._floor_end
-        who = expect(self._stack, R, t, mixture, noise, density, self.weights, by_beams=by_beams)
+        finest = self._floor <= self._floor_end
+        who = expect(self._stack, R, t, mixture, noise, density, self.weights, by_beams=finest)
         cells = cell_moments(self._stack, who, len(mixture.weights))
         quadratic = shape_quadratic(self._stack, R, t, mixture, cells, who)
-        if self._floor <= self._floor_end:
+        if finest:
             taken_up = quadratic.shape_parameters()
             self._noise = noise.fitted(who.heights, taken_up, self._configured)
             self._shared = self._noise.shared_part(who.heights)

@@ -517,6 +517,7 @@ def test_displaced_clouds_lose_their_say(coarse: Tried, kernel: RobustKernel) ->
     assert weights[is_bad].max() < 0.5, np.round(weights[is_bad], 2).tolist()
     assert np.median(weights[~is_bad]) > 0.9
     # What is left gives the same as without them, but for what these clouds themselves had told.
+    assert np.abs(tried.s2s()[:3]).max() < 3.0 * MRAD, rounded(tried.s2s())
     moved = tried.s2s() - clean.s2s()
     assert np.abs(moved[:3]).max() < 1.0 * MRAD, rounded(moved)
     assert np.abs(moved[3:]).max() < 5.0 * MM, rounded(moved)

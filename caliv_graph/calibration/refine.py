@@ -154,8 +154,8 @@ class _Loop:
             if normals:
                 shape.refine_normals(R, t)
             shape.seeds_everywhere = True  # on thin parts, whose normals are not reliable
-            shape.seed(R, t, FINE_SIGMA_M)
             shape.held_along = 0.0
+            shape.seed(R, t, FINE_SIGMA_M)
 
     def left_out(self, reduced: Reduced) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""

@@ -74,18 +74,26 @@ class Surfels:
     """The surfels for the E-step: means and normals (3, K), and factors (K,) of the exponents.
 
     They lie on surfaces: boxes halved in the middle fit them better than those halved in number,
-    and the search in `tree` is a sixth faster.
+    and the search in trees of them is a sixth faster.
     """
 
     def __init__(self, mixture: Mixture) -> None:
-        places = np.column_stack([mixture.means_target, NORMAL_METRES * mixture.normals_target])
-        self.tree = cKDTree(places, balanced_tree=False)
-        self.neighbours = min(NEIGHBOURS, len(mixture.weights))
         self.low = mixture.means_target.min(axis=0)
         self.extent_m = max(float(np.ptp(mixture.means_target, axis=0).max()), 1e-6)
         self.aside = -0.5 / mixture.var_tangent
         self.means = mixture.means_target.T.copy()
         self.normals = mixture.normals_target.T.copy()
+
+    @property
+    def count(self) -> int:
+        """Number of surfels, K."""
+        return len(self.aside)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """For the search by points and their normals."""
+        places = np.vstack([self.means, NORMAL_METRES * self.normals]).T
+        return cKDTree(places, balanced_tree=False)
 
     def nearest(self, points: Array, normals: Array) -> IntArray:
         """(n, k) surfels nearest to points with normals (n, 3)."""
@@ -98,20 +106,20 @@ class Surfels:
                 along |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
         order = np.argsort(along, kind="stable")
         places = np.column_stack([points, NORMAL_METRES * normals])[order]
-        found = np.empty((len(points), self.neighbours), dtype=np.int64)
-        found[order] = np.reshape(self.tree.query(places, self.neighbours)[1], found.shape)
+        found = np.empty((len(points), min(NEIGHBOURS, self.count)), dtype=np.int64)
+        found[order] = np.reshape(self.tree.query(places, found.shape[1])[1], found.shape)
         return found
 
     def nearest_to_beams(self, points: Array, beams: Array, cloud: IntArray) -> IntArray:
         """(n, k) surfels nearest to the beams of points (n, 3) of clouds (n,), ascending."""
-        found = np.empty((len(points), min(BEAM_NEIGHBOURS, self.means.shape[1])), dtype=np.int64)
+        found = np.empty((len(points), min(BEAM_NEIGHBOURS, self.count)), dtype=np.int64)
         starts = np.append(np.flatnonzero(np.diff(cloud, prepend=-1)), len(cloud)).tolist()
         for first, end in pairwise(starts):
             along = beams[first:end].mean(axis=0)
             along /= np.linalg.norm(along)
             facing = np.flatnonzero(-(along @ self.normals) > AWAY)
             if len(facing) < found.shape[1]:
-                facing = np.arange(self.means.shape[1])
+                facing = np.arange(self.count)
             axes = np.vstack([tangent_axes(along), along / ALONG_BEAM])
             places = (axes @ self.means[:, facing]).T
             tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
@@ -140,10 +148,8 @@ class Surfels:
         Two planes that stick out at their edge: a beam returns from the farther, the nearer one it
         meets in the air. At a hollow edge it returns from the nearer.
         """
-        if len(there) > PAIRED:
-            kept = np.argpartition(there, -PAIRED, axis=0)[-PAIRED:]
-        else:
-            kept = np.arange(len(there))[:, None]
+        paired = min(PAIRED, len(there))
+        kept = np.argpartition(there, -paired, axis=0)[-paired:]
         surfel, own, s = (np.take_along_axis(a, kept, axis=0) for a in (found, there, slide))
         share = own / (own.sum(axis=0) + BESIDE)
         lost = np.zeros_like(own)
@@ -170,12 +176,10 @@ class Surfels:
         With their clouds (n,), ascending, beams alone tell which surfels, and not the normals of
         the points.
         """
-        by_beams = cloud is not None
-        near = (
-            self.nearest(points, normals)
-            if cloud is None
-            else self.nearest_to_beams(points, beams, cloud)
-        )
+        if cloud is None:
+            near = self.nearest(points, normals)
+        else:
+            near = self.nearest_to_beams(points, beams, cloud)
         found = np.ascontiguousarray(near.T)
         height, all2, agreement, facing, depth = (np.zeros(found.shape) for _ in range(5))
         of_points = (np.ascontiguousarray(v.T) for v in (points, normals, beams))
@@ -195,11 +199,11 @@ class Surfels:
         aside2 = all2 + slide * (2.0 * depth + slide) - (height - facing * slide) ** 2
         visible = np.clip((facing + GRAZING) / (2.0 * GRAZING), 0.0, 1.0)
         there = np.exp(self.aside.take(found) * np.maximum(aside2, 0.0)) * visible
-        if by_beams:
+        if cloud is not None:
             self._hidden_at_edges(found, there, slide)
         # Where the beam returns from, if it does: surfels share it.
         presence = there / (there.sum(axis=0) + BESIDE)
-        if not by_beams:
+        if cloud is None:
             presence *= _agreement(flatness, agreement)
         return Met(near, presence, height, slide, facing, of_surfels)
 
@@ -211,7 +215,8 @@ class Met:
     Attributes:
         near: (n, k) indices of the surfels.
         presence: what the likelihood has of a surfel before the range is known: that it is visible,
-            reaches to where the beam meets its plane, and agrees with the point's normal.
+            reaches to where the beam meets its plane, and agrees with the point's normal or, by
+            beams, is not hidden at an edge.
         height: of the point over it, metres.
         slide: along the beam to it, metres.
         facing: cosine of incidence.

@@ -16,6 +16,7 @@ from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, TargetCloud, TargetObservation
+from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.scenario.model import CropModel
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.world import World, make_world
@@ -27,6 +28,9 @@ CENTRE_M = 0.62
 """Height of the chair's middle above the ground: the origin of the target frame."""
 
 STRAIGHT = PoseConfig(xyz=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
+
+IDENTITY = (np.eye(3)[None], np.zeros((1, 3)))
+"""Pose of one cloud, as `expect` takes it."""
 
 
 @dataclass(frozen=True)
@@ -169,3 +173,28 @@ def plates(points: int, sigma_m: float, seed: int, thickness_m: float = 0.025) -
 
 def matrices(poses: Sequence[gtsam.Pose3]) -> tuple[Array, Array]:
     return stack(list(poses))
+
+
+def stack_of(
+    points: Array,
+    normals: Array,
+    *,
+    beams: Array | None = None,
+    flatness: Array | None = None,
+    starts: tuple[int, ...] = (0,),
+    sigma_range_m: float = 0.01,
+) -> CloudStack:
+    """Points with normals as they are given; beams against the normals unless given."""
+    count = len(points)
+    cloud = np.searchsorted(np.array(starts), np.arange(count), side="right") - 1
+    return CloudStack(
+        points=points,
+        cloud=cloud.astype(np.int64),
+        starts=np.array(starts, dtype=np.int64),
+        lidar=np.zeros(len(starts), dtype=np.int64),
+        beams=-normals if beams is None else beams,
+        normals=normals,
+        flatness=np.ones(count) if flatness is None else flatness,
+        whole=(points,),
+        sigma_range_m=sigma_range_m,
+    )

@@ -34,39 +34,14 @@ from caliv_graph.registration.quadratic import (
 from caliv_graph.registration.register import left_step
 from caliv_graph.registration.surfels import BESIDE, STEEP
 from tests.registration.scenes import (
+    IDENTITY,
     looking_at_target,
     matrices,
     observe,
     rectangle_points,
     seen_from,
+    stack_of,
 )
-
-IDENTITY = (np.eye(3)[None], np.zeros((1, 3)))
-
-
-def stack_of(
-    points: Array,
-    normals: Array,
-    *,
-    beams: Array | None = None,
-    flatness: Array | None = None,
-    starts: tuple[int, ...] = (0,),
-    sigma_range_m: float = 0.01,
-) -> CloudStack:
-    """Points with normals as they are given; beams against the normals unless given."""
-    count = len(points)
-    cloud = np.searchsorted(np.array(starts), np.arange(count), side="right") - 1
-    return CloudStack(
-        points=points,
-        cloud=cloud.astype(np.int64),
-        starts=np.array(starts, dtype=np.int64),
-        lidar=np.zeros(len(starts), dtype=np.int64),
-        beams=-normals if beams is None else beams,
-        normals=normals,
-        flatness=np.ones(count) if flatness is None else flatness,
-        whole=(points,),
-        sigma_range_m=sigma_range_m,
-    )
 
 
 def surfel(

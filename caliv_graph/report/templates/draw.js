@@ -36,9 +36,10 @@
     layout.margin = Object.assign({}, layout.margin, { l: 48, r: 8 });
     const inner = layout.height - layout.margin.t - layout.margin.b, gap = 95 / inner;
     if (layout.legend) { layout.legend.y = 1 + 24 / inner; }
+    if (width > 640) { return; }
     // A row of buttons would go beyond the edge.
-    for (const menu of width > 640 ? [] : layout.updatemenus || []) { Object.assign(menu, { type: "dropdown", direction: "down" }); }
-    if (count < 2 || width > 640) { return; }
+    for (const menu of layout.updatemenus || []) { Object.assign(menu, { type: "dropdown", direction: "down" }); }
+    if (count < 2) { return; }
     for (let i = 0; i < count; i += 1) {
       const number = i ? String(i + 1) : "", size = (1 - gap * (count - 1)) / count;
       const top = 1 - i * (size + gap), domain = [Math.max(top - size, 0), top];

@@ -150,9 +150,8 @@ def _estimate(
             config,
             normals=False,
             views=problem.views_of(m),
-            # Surfels that are too wide for legs tilt the clouds of the noisier LiDARs. Elsewhere
-            # the ground corrects that.
-            seeds_everywhere=config.solve.mode == "staged",
+            # In the other modes this is a start for the joint loop.
+            by_beams=config.solve.mode == "staged",
         )
         for m, o in enumerate(observations)
     ]

@@ -153,8 +153,7 @@ class _Loop:
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
             if normals:
                 shape.refine_normals(R, t)
-            shape.seeds_everywhere = True  # on thin parts, whose normals are not reliable
-            shape.held_along = 0.0
+            shape.by_beams, shape.held_along = True, 0.0
             shape.seed(R, t, FINE_SIGMA_M)
 
     def left_out(self, reduced: Reduced) -> float:

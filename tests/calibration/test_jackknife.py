@@ -110,7 +110,7 @@ def seen_chair(count: int = CLOUDS, seed: int = 1, shared_m: float = 0.0) -> Cha
     values.insert(key_extrinsic(), E)
     values.insert(key_target(0), gtsam.Pose3())
     state = JointRegistration(scene.observation, config_of(components=150, max_points=200))
-    state.held_along = 0.0
+    state.by_beams, state.held_along = True, 0.0
     lines = linearise_clouds(problem, values)
     R, t = matrices(lines.predicted)
     state.seed(R, t, 0.02)

@@ -78,9 +78,13 @@ ROUGH_TOLERANCE = (1e-3, 6e-4)
 """Tolerance of the coarse pass."""
 
 STEP_SIGMAS = 0.2
-"""Or else: the median step of a cloud in standard deviations of its own pose, the shape held. Where
-clouds are sparse the steps do not become smaller, since the nearest surfels of points change. The
-graph, which averages over clouds, gains nothing from going on."""
+"""Or else: the median step of a cloud in standard deviations of its own pose, the shape held."""
+
+STEADY_ITERATIONS, STEADY_FALL, STEADY_SIGMAS = 4, 0.8, 1.0
+"""Or else: over this many iterations the median step, in these standard deviations, has a mean that
+is no longer this much smaller than over as many before, and is below this. Where clouds are sparse
+the steps stay at 0.3 to 0.5, since the nearest surfels of points change. The graph, which averages
+over clouds, gains nothing from going on."""
 
 
 def annealing_steps(sigma_m: float, sigma_range_m: float) -> int:
@@ -358,7 +362,7 @@ def _alternated(
 ) -> _Run:
     """E-step and M-step in turn until the poses stay, or `to_finest`: until annealing has ended."""
     converged, step = False, (np.inf, np.inf)
-    iteration = 0
+    iteration, fine_sigmas = 0, list[float]()
     while iteration < max_iterations and not (converged or (to_finest and state.finest)):
         iteration += 1
         quadratic = state.expect(R, t)
@@ -376,8 +380,19 @@ def _alternated(
         step = (turn, shift)
         fine = step[0] < state.tolerance[0] and step[1] < state.tolerance[1]
         sigmas = np.sqrt(np.einsum("ja,jab,jb->j", d, quadratic.blocks, d))
-        converged = state.finest and (fine or bool(np.median(sigmas) < STEP_SIGMAS))
+        if state.finest:
+            fine_sigmas.append(float(np.median(sigmas)))
+            converged = fine or fine_sigmas[-1] < STEP_SIGMAS or _steady(fine_sigmas)
     return _Run(R, t, iteration, converged, step)
+
+
+def _steady(sigmas: Sequence[float]) -> bool:
+    """Whether median steps, in sigmas, an iteration each, no longer become smaller."""
+    n = STEADY_ITERATIONS
+    if len(sigmas) < 2 * n:
+        return False
+    before, now = float(np.mean(sigmas[-2 * n : -n])), float(np.mean(sigmas[-n:]))
+    return STEADY_FALL * before < now < STEADY_SIGMAS
 
 
 def _from_other_starts(state: JointRegistration, R: Array, t: Array, max_iterations: int) -> _Run:

@@ -612,6 +612,21 @@ def test_clouds_whose_steps_stay_below_their_own_sigmas_are_registered() -> None
     assert found.iterations < 60
 
 
+def test_sparse_clouds_whose_steps_no_longer_fall_are_registered() -> None:
+    """Of 20 points the steps stay at half a sigma, since the nearest surfels change."""
+    rng = np.random.default_rng(1)
+    sparse = [cloud[rng.permutation(len(cloud))[:20]] for cloud in clouds_of(chair())]
+    start = guesses(chair().T_target_lidar, 1)
+
+    found = register_jointly(JointRegistration(observe(sparse), CONFIG), start, 100)
+
+    assert found.converged
+    assert found.iterations < 60
+    # A registration that still closes in is not at its end, however long it takes.
+    far = register_jointly(JointRegistration(observe(sparse), CONFIG), start, 8)
+    assert not far.converged
+
+
 def test_turns_about_normals_are_eliminated_apart_with_the_same_result() -> None:
     scene = chair()
     state = JointRegistration(observe(clouds_of(scene)), CONFIG)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray
+from caliv_graph.targets.cloud.groups import MAX_EXTENT_M, extent_m
 from caliv_graph.targets.cloud.region import MIN_EXTENT_M, Candidate, RegionExtractor
 from caliv_graph.targets.cloud.track import PLACE_SIGMA_M, CandidateSet
 
@@ -26,6 +27,12 @@ other: somebody who stops for a while is not."""
 APART_M = 0.2
 """Minimum horizontal gap between two objects, as wide as the thinnest of them: what is nearer, or
 above, is a part of the same object that the clustering split off."""
+
+TOGETHER_M = 0.5
+"""Largest horizontal gap between static objects that are one target, if that is not wider than a
+target: a group of cones, two boxes. Each cone by itself is symmetric, and LiDARs whose guesses are
+off by as much as the gap take one for the other. A scan that shows only a part of them shows a
+part of a target that is hidden."""
 
 COMPARED_SCANS = 5
 """Scans in which the gap between two objects is measured; the median counts."""
@@ -117,6 +124,14 @@ def static_objects(
         return None
     flat, candidate_set = extractor.candidate_set(scans, lidar)
     tracks = candidate_set.tracks(fewest)
+    groups = _standing_together(tracks, flat, candidate_set, fewest)
+    if len(groups) < len(tracks):
+        numbers = [number for number in range(len(scans)) if any(number in g for g in groups)]
+        objects = [[k for k, g in enumerate(groups) if number in g] for number in numbers]
+        joined = [[groups[k][n] for k in of] for n, of in zip(numbers, objects, strict=True)]
+        flat, candidate_set = extractor.candidate_set(joined, lidar)
+        of_group = np.concatenate([np.array(of, np.int64) for of in objects])
+        tracks = [np.flatnonzero(of_group == k) for k in range(len(groups))]
     kept = tracks[:1]
     for track in tracks[1:]:
         if all(_is_another(track, other, flat, candidate_set, fewest) for other in kept):
@@ -128,6 +143,37 @@ def static_objects(
     places, cov = _places(candidate_set, kept, flat)
     candidates = tuple(tuple(flat[n] for n in track.tolist()) for track in kept)
     return LidarObjects(lidar, len(scans), candidates, places, cov)
+
+
+def _standing_together(
+    tracks: Sequence[IntArray], flat: Sequence[Candidate], seen: CandidateSet, fewest: int
+) -> list[dict[int, Candidate]]:
+    """The objects, as a candidate per scan, with those that stand together joined."""
+    groups: list[dict[int, Candidate]] = []
+    for track in tracks:
+        part = {int(seen.scan[n]): flat[n] for n in track.tolist()}
+        for group in groups:
+            if _are_together(group, part, fewest):
+                for scan, candidate in part.items():
+                    group[scan] = group[scan].joined(candidate) if scan in group else candidate
+                break
+        else:
+            groups.append(part)
+    return groups
+
+
+def _are_together(
+    one: Mapping[int, Candidate], other: Mapping[int, Candidate], fewest: int
+) -> bool:
+    """Whether two static objects, a candidate per scan, are parts of one target."""
+    at_once = sorted(one.keys() & other.keys())
+    if len(at_once) < max(fewest, PART_OF_SCANS * len(one)):
+        return False
+    some = np.unique(np.linspace(0, len(at_once) - 1, COMPARED_SCANS).round().astype(int))
+    pairs = [(one[at_once[n]], other[at_once[n]]) for n in some.tolist()]
+    gap_m = np.median([_gap_m(a, b) for a, b in pairs])
+    extent = np.median([extent_m(np.vstack([a.points_region, b.points_region])) for a, b in pairs])
+    return bool(gap_m < TOGETHER_M and extent < MAX_EXTENT_M)
 
 
 def _is_cut_off(track: IntArray, flat: Sequence[Candidate]) -> bool:

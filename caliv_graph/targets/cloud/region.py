@@ -101,6 +101,30 @@ class Candidate:
         """(N, 3) metres, region frame, at the guess."""
         return self.cloud.points_lidar @ self.R_region_lidar.T + self.t_region_lidar
 
+    def joined(self, other: Candidate) -> Candidate:
+        """This one and another one of the same scan as one object."""
+        points = np.vstack([self.cloud.points_lidar, other.cloud.points_lidar])
+        swept, more = self.cloud.swept, other.cloud.swept
+        if swept is not None and more is not None:
+            # Only clouds whose points have times are kept as they were swept.
+            points_s = np.concatenate([swept.point_times_s, more.point_times_s])
+            measured = np.vstack([swept.points_lidar, more.points_lidar])
+            swept = replace(swept, points_lidar=measured, point_times_s=points_s)
+        return replace(
+            self,
+            cloud=replace(self.cloud, points_lidar=points, swept=swept),
+            centre_lidar=_middle(points),
+            measured_lidar=np.vstack([self.measured_lidar, other.measured_lidar]),
+            top_m=max(self.top_m, other.top_m),
+            is_cut_off=self.is_cut_off or other.is_cut_off,
+        )
+
+
+def _middle(points: Array) -> Array:
+    """(3,) middle of the extent of points (n, 3), but for a few at its ends."""
+    low, high = np.percentile(points, [2, 98], axis=0)
+    return np.asarray(0.5 * (low + high))
+
 
 def widened_margin_m(config: Config, lidar: str, range_m: float) -> float:
     """Displacement of a target at `range_m` that the guess of a LiDAR may cause, metres."""
@@ -217,10 +241,9 @@ class RegionExtractor:
             times = None if scan.point_times_s is None else scan.point_times_s[kept]
             compact = replace(scan, points_lidar=scan.points_lidar[kept], point_times_s=times)
             target = deskew(compact, self._guess[scan.lidar], self.trajectory).points_lidar
-            low, high = np.percentile(target, [2, 98], axis=0)
             swept = None if times is None else compact
             cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
-            centre, measured = 0.5 * (low + high), compact.points_lidar
+            centre, measured = _middle(target), compact.points_lidar
             top_m = math.inf if plane is None else float(height[chosen].max())
             out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m, is_cut_off))
         tally.most_points = max(tally.most_points, *sizes)

@@ -17,7 +17,7 @@ from caliv_graph.config.load import load_config, parse_config
 from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, LidarScan, TargetObservation
+from caliv_graph.products import Array, LidarScan, TargetCloud, TargetObservation
 from caliv_graph.readers import open_recording
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.drive_models import FigureEightDrive
@@ -28,7 +28,7 @@ from caliv_graph.scenario.world_models import BoxModel, ChairModel, ObjectModel,
 from caliv_graph.simulation.writer import config_of as written_config
 from caliv_graph.targets import extract_targets
 from caliv_graph.targets.cloud.constellation import LidarObjects, match_objects, one_object
-from caliv_graph.targets.cloud.region import RegionExtractor
+from caliv_graph.targets.cloud.region import Candidate, RegionExtractor
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import sigmas_s2s
@@ -251,6 +251,56 @@ def test_what_walks_by_is_no_placement(places_m: Sequence[float]) -> None:
 
     assert what_is_seen(observation, scenes) == {"left": "chair"}
     assert len(observation.clouds) == len(places_m)
+
+
+@pytest.mark.parametrize(("gap_m", "placements"), [(0.3, 1), (0.7, 2)])
+def test_boxes_that_stand_together_are_one_target(gap_m: float, placements: int) -> None:
+    """From 0.2 m on they are seen apart; guesses that are off by 0.44 m each way exchange them."""
+    y_m = 0.25 + 0.5 * gap_m
+    boxes = {
+        "one": BoxModel(xy_m=(9.8, -y_m), size_m=(0.5, 0.5, 0.5)),
+        "two": BoxModel(xy_m=(9.8, y_m), size_m=(0.5, 0.5, 0.7)),
+    }
+    scenes = {
+        name: [scene(boxes, model, seed=seed) for seed in range(SCANS)]
+        for name, model in MODELS.items()
+    }
+
+    observations = observed(scenes, yaw_deg=2.5 if placements == 1 else 0.0)
+
+    assert len(observations) == placements
+    for observation in observations:
+        assert len(observation.clouds) == 2 * SCANS
+    if placements == 1:
+        assert observations[0].warnings == ()
+        for cloud in observations[0].clouds:
+            shown = scenes[cloud.lidar][cloud.stamp_ns]
+            points = {tuple(p) for p in cloud.points_lidar.tolist()}
+            for name in boxes:
+                assert len(points & shown.of(name)) > 0.8 * len(shown.of(name))
+            assert points <= shown.of("one") | shown.of("two")
+            low, high = np.percentile(cloud.points_lidar, [2, 98], axis=0)
+            assert high[1] - low[1] > 1.2  # 1.3 m from end to end
+
+
+def test_joined_candidates_keep_the_times_of_their_points() -> None:
+    def candidate(x_m: float, time_s: float, top_m: float) -> Candidate:
+        points = np.array([[x_m, 0.0, 0.0], [x_m, 1.0, 0.0]])
+        swept = LidarScan("left", 5, points + 0.1, "scan", np.full(2, time_s))
+        cloud = TargetCloud("left", 0, 5, points, "scan", swept=swept)
+        middle = points.mean(axis=0)
+        return Candidate(cloud, middle, np.eye(3), np.zeros(3), points + 0.1, 0.01, top_m, False)
+
+    one = candidate(4.0, 0.01, 0.4).joined(candidate(6.0, 0.02, 0.9))
+
+    assert one.cloud.points_lidar[:, 0].tolist() == [4.0, 4.0, 6.0, 6.0]
+    assert one.cloud.swept is not None
+    assert one.cloud.swept.point_times_s is not None
+    assert one.cloud.swept.point_times_s.tolist() == [0.01, 0.01, 0.02, 0.02]
+    np.testing.assert_allclose(one.cloud.swept.points_lidar, one.cloud.points_lidar + 0.1)
+    np.testing.assert_allclose(one.measured_lidar, one.cloud.points_lidar + 0.1)
+    np.testing.assert_allclose(one.centre_lidar, [5.0, 0.5, 0.0])
+    assert one.top_m == 0.9
 
 
 # ------------------------------------------------------------------ matchings by hand

@@ -165,9 +165,13 @@ def _standing_together(
 def _are_together(
     one: Mapping[int, Candidate], other: Mapping[int, Candidate], fewest: int
 ) -> bool:
-    """Whether two static objects, a candidate per scan, are parts of one target."""
+    """Whether two static objects, a candidate per scan, are parts of one target.
+
+    Where a LiDAR is farther away it sees them as one, so that it sees them apart in some scans
+    only; but not in a row, as it sees somebody who stops there.
+    """
     at_once = sorted(one.keys() & other.keys())
-    if len(at_once) < max(fewest, PART_OF_SCANS * len(one)):
+    if len(at_once) < max(fewest, 1) or np.ptp(at_once) < PART_OF_SCANS * len(one) - 1:
         return False
     some = np.unique(np.linspace(0, len(at_once) - 1, COMPARED_SCANS).round().astype(int))
     pairs = [(one[at_once[n]], other[at_once[n]]) for n in some.tolist()]

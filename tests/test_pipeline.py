@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from caliv_graph.calibration import refine
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.load import load_config
@@ -483,6 +484,32 @@ def test_the_reference_does_not_matter(sparse: Tried) -> None:
     assert other.run.calibration.reference == "front"
     assert apart(sparse, other) < 0.1
     assert widened(sparse, other) < 0.1
+
+
+def test_an_unsteady_end_is_the_mean_of_several(
+    sparse: Tried, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends: list[list[gtsam.Pose3]] = []
+    mean_of = refine._Loop.move_to_mean
+
+    def kept(loop: refine._Loop, of: Sequence[Sequence[gtsam.Pose3]]) -> None:
+        ends.extend([*one] for one in of)
+        mean_of(loop, of)
+
+    monkeypatch.setattr(refine._Loop, "move_to_mean", kept)
+    monkeypatch.setattr(refine, "UNSTEADY_SIGMAS", 0.0)
+    several = try_out(sparse.drive)
+
+    assert len(ends) == 1 + refine.OTHER_STARTS
+    further = refine.iterations_of_other_starts(sparse.drive.config.noise.lidar_range_m)
+    first = len(several.run.solution.course) - further
+    assert 0 < first <= refine.REFINEMENTS
+    # Each is another, all are of the same data, and the result is where their mean is.
+    for i, name in enumerate(several.poses):
+        steps = [vehicle_axes_difference(end[i], several.poses[name]) for end in ends]
+        assert np.abs(steps).max() > 1e-6
+        assert np.mean(steps, axis=0) == pytest.approx(np.zeros(6), abs=1e-6)
+    assert apart(sparse, several) < 1.0
 
 
 # ------------------------------------------------------------------ outliers

@@ -22,7 +22,12 @@ from caliv_graph.calibration.no_target import (
 )
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
-from caliv_graph.calibration.refine import per_placement, refined, refinements
+from caliv_graph.calibration.refine import (
+    iterations_of_other_starts,
+    per_placement,
+    refined,
+    refinements,
+)
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import (
     estimated_noise,
@@ -189,7 +194,8 @@ def _estimate(
             solution = staged_solution(solve, registrations)
     else:
         most = refinements(config.noise.lidar_range_m)
-        with progress.stage("refining shape and graph together", most) as advance:
+        total = most + iterations_of_other_starts(config.noise.lidar_range_m)
+        with progress.stage("refining shape and graph together", total) as advance:
             solution = refined(solve, states, most, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds

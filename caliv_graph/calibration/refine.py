@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -39,7 +40,7 @@ from caliv_graph.calibration.solve import (
     covariance_of_mode,
     step_of_mode,
 )
-from caliv_graph.geometry.se3 import stack, unstack
+from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, Iteration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
@@ -79,10 +80,24 @@ STEP_SIGMAS = 0.1
 the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
 
+UNSTEADY_SIGMAS = 0.2
+"""Last step, in joint standard deviations of the extrinsics, from which the end is one of many:
+where clouds are sparse the nearest surfels of points change for ever, and another start of the
+shapes ends elsewhere, by 0.2 to 1 standard deviation of S2S (dense clouds: 0.1)."""
+
+OTHER_STARTS = 2
+"""Then the shapes begin so many times more, on other points, and the mean of all ends is taken."""
+
+
 def refinements(sigma_range_m: float) -> int:
-    """How many iterations the joint loop may take, at this noise along the beam (metres)."""
+    """How many iterations a start may take, at this noise along the beam (metres)."""
     annealed = SHAPES_BEGUN_AGAIN + annealing_steps(FINE_SIGMA_M, sigma_range_m)
     return max(REFINEMENTS, annealed + LAST_REFINEMENTS)
+
+
+def iterations_of_other_starts(sigma_range_m: float) -> int:
+    """How many iterations all other starts take."""
+    return OTHER_STARTS * (annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS)
 
 
 def refined(
@@ -91,7 +106,7 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve, `most` iterations at most.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations per start.
 
     `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
     along; `advance` is called after each iteration.
@@ -108,6 +123,16 @@ def refined(
         course.append(loop.iterate(len(course) + 1))
         converged = loop.has_converged(course[-1])
         advance()
+    if course[-1].sigmas > UNSTEADY_SIGMAS:
+        ends = [loop.extrinsics()]
+        each = iterations_of_other_starts(state.config.noise.lidar_range_m) // OTHER_STARTS
+        for draw in range(1, OTHER_STARTS + 1):
+            loop.begin_shapes(normals=False, draw=draw)
+            for _ in range(each):
+                course.append(loop.iterate(len(course) + 1))
+                advance()
+            ends.append(loop.extrinsics())
+        loop.move_to_mean(ends)
     return replace(
         _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
     )
@@ -146,7 +171,25 @@ class _Loop:
         """Poses at which the clouds fit, per placement: the predicted ones, with biased ranges."""
         return moved_back(self.states, per_placement(self.state.problem, lines), self.offsets_m)
 
-    def begin_shapes(self, normals: bool) -> None:
+    def extrinsics(self) -> list[gtsam.Pose3]:
+        """T_vehicle_lidar of every LiDAR."""
+        problem, values = self.state.problem, self.state.values
+        return [problem.extrinsic(values, name) for name in problem.lidars]
+
+    def move_to_mean(self, ends: Sequence[Sequence[gtsam.Pose3]]) -> None:
+        """Takes the extrinsics to the mean of these, the last of which they are; all else follows.
+
+        The ends are a fraction of a sigma apart: the mean of their tangents is the mean.
+        """
+        now = self.extrinsics()
+        steps = [
+            np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in zip(end, now, strict=True)])
+            for end in ends
+        ]
+        _, reduced = self.linearised()
+        self.state.values = reduced.move(np.mean(steps, axis=0))
+
+    def begin_shapes(self, normals: bool, draw: int = 0) -> None:
         """A new mixture, and if asked for new normals, at these: EM ends near its start."""
         _hand_weights(self.state, self.states)
         lines = linearise_clouds(self.state.problem, self.state.values)
@@ -154,15 +197,14 @@ class _Loop:
             if normals:
                 shape.refine_normals(R, t)
             shape.by_beams, shape.held_along = True, 0.0
-            shape.seed(R, t, FINE_SIGMA_M)
+            shape.seed(R, t, FINE_SIGMA_M, draw)
 
     def left_out(self, reduced: Reduced) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
-        problem, values = self.state.problem, self.state.values
-        extrinsics = [problem.extrinsic(values, name) for name in problem.lidars]
+        problem = self.state.problem
         fitting = [T for R, t in self.poses_of_clouds(reduced.lines) for T in unstack(R, t)]
         lines = replace(reduced.lines, predicted=tuple(fitting))
-        return jackknife_scale(problem, extrinsics, self.states, lines)
+        return jackknife_scale(problem, self.extrinsics(), self.states, lines)
 
     def scaled(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
         """Estimates the scale of the registration at a linearisation, and applies it to that."""

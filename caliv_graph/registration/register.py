@@ -194,8 +194,11 @@ class JointRegistration:
         part._expected = None
         return part
 
-    def seed(self, R: Array, t: Array, sigma_m: float) -> None:
-        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
+    def seed(self, R: Array, t: Array, sigma_m: float, draw: int = 0) -> None:
+        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t).
+
+        Another `draw` begins on other points.
+        """
         self._depth_m = depth_of(self.clouds.moved(R, t))
         self._floor = max(sigma_m, self._floor_end)
         distinct = float((self.clouds.sizes * self.view_weights).sum())
@@ -209,6 +212,7 @@ class JointRegistration:
             distinct,
             trusted if trusted.sum() >= 2 else None,
             self.by_beams,
+            draw,
         )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:

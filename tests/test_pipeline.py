@@ -501,8 +501,8 @@ def test_an_unsteady_end_is_the_mean_of_several(
     several = try_out(sparse.drive)
 
     assert len(ends) == 1 + refine.OTHER_STARTS
-    further = refine.iterations_of_other_starts(sparse.drive.config.noise.lidar_range_m)
-    first = len(several.run.solution.course) - further
+    further = refine.further_refinements(sparse.drive.config.noise.lidar_range_m)
+    first = len(several.run.solution.course) - refine.OTHER_STARTS * further
     assert 0 < first <= refine.REFINEMENTS
     # Each is another, all are of the same data, and the result is where their mean is.
     for i, name in enumerate(several.poses):

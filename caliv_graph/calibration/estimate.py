@@ -23,7 +23,8 @@ from caliv_graph.calibration.no_target import (
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import (
-    iterations_of_other_starts,
+    OTHER_STARTS,
+    further_refinements,
     per_placement,
     refined,
     refinements,
@@ -194,7 +195,7 @@ def _estimate(
             solution = staged_solution(solve, registrations)
     else:
         most = refinements(config.noise.lidar_range_m)
-        total = most + iterations_of_other_starts(config.noise.lidar_range_m)
+        total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
         with progress.stage("refining shape and graph together", total) as advance:
             solution = refined(solve, states, most, advance)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds

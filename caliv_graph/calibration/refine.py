@@ -79,7 +79,6 @@ STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
 the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
-
 UNSTEADY_SIGMAS = 0.2
 """Last step, in joint standard deviations of the extrinsics, from which the end is one of many:
 where clouds are sparse the nearest surfels of points change for ever, and another start of the
@@ -95,9 +94,9 @@ def refinements(sigma_range_m: float) -> int:
     return max(REFINEMENTS, annealed + LAST_REFINEMENTS)
 
 
-def iterations_of_other_starts(sigma_range_m: float) -> int:
-    """How many iterations all other starts take."""
-    return OTHER_STARTS * (annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS)
+def further_refinements(sigma_range_m: float) -> int:
+    """How many iterations each other start takes, at this noise along the beam (metres)."""
+    return annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS
 
 
 def refined(
@@ -125,10 +124,10 @@ def refined(
         advance()
     if course[-1].sigmas > UNSTEADY_SIGMAS:
         ends = [loop.extrinsics()]
-        each = iterations_of_other_starts(state.config.noise.lidar_range_m) // OTHER_STARTS
+        further = further_refinements(state.config.noise.lidar_range_m)
         for draw in range(1, OTHER_STARTS + 1):
             loop.begin_shapes(normals=False, draw=draw)
-            for _ in range(each):
+            for _ in range(further):
                 course.append(loop.iterate(len(course) + 1))
                 advance()
             ends.append(loop.extrinsics())

@@ -4,6 +4,7 @@ Needs the environment that scripts/demo makes:
 
     .venv/bin/python scripts/benchmark_targets.py --seeds 20 --jobs 2
     .venv/bin/python scripts/benchmark_targets.py --objects bin --lidars spin16 wide --seeds 3
+    .venv/bin/python scripts/benchmark_targets.py --apart --seeds 3 --jobs 2
     .venv/bin/python scripts/benchmark_targets.py --summary
     .venv/bin/python scripts/benchmark_targets.py --released --edgar
 
@@ -14,7 +15,9 @@ guesses with errors of up to 0.1 m and 3 degrees. Only the relevant beams of a c
 when it ends. A second start runs the missing ones. Runs of another version of the program do not
 count unless --any-version is given. Errors are in vehicle axes, as in `evaluate`; of axes that are
 not determined they are left out. `!` marks what is beyond its limit, from 20 runs of a cell on. The
-motion of the vehicle depends on the seed alone: cells share these errors.
+motion of the vehicle depends on the seed alone: cells share these errors, unless --apart gives each
+cell seeds of its own. Errors over their sigmas are also pooled over all cells of an object, of a
+LiDAR and of a drive: three runs of each cell are 30 of an object, 42 of a LiDAR, 105 of a drive.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +44,15 @@ from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, BoolArray
 from scripts._command import positive
 from scripts._runs import add_line, code_digest, json_lines, performed
-from scripts._tables_statistics import HEADING, Statistics, axis_cells, by_quantity, line_of
+from scripts._tables_statistics import (
+    HEADING,
+    SHOWN,
+    Line,
+    Statistics,
+    axis_cells,
+    by_quantity,
+    line_of,
+)
 from scripts._targets import DRIVES, LIDARS, OBJECTS, RECORDED, Result, Task, run, selection_of
 
 OUT = REPOSITORY / "out" / "targets" / "results.json"
@@ -64,6 +75,9 @@ SCALE_LIMITS = (0.8, 1.5)
 RECORDED_LIMIT = 3.0
 """Limit of the error of a single drive over sigma."""
 
+SEEDS_OF_CELL = 1000
+"""With --apart, the first seeds of two cells are so far apart."""
+
 Cell = tuple[str, str, str]
 """Object, LiDAR, drive."""
 
@@ -75,7 +89,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         defects = [_print_recorded(name) for name in recorded]
         return 1 if any(defects) else 0
     tasks = [
-        Task(thing, lidar, drive, seed, asked.range_sigma, asked.whole)
+        Task(
+            thing,
+            lidar,
+            drive,
+            seed + (SEEDS_OF_CELL * number_of((thing, lidar, drive)) if asked.apart else 0),
+            asked.range_sigma,
+            asked.whole,
+        )
         for seed in range(asked.first_seed, asked.first_seed + asked.seeds)
         for drive in asked.drives
         for lidar in asked.lidars
@@ -96,6 +117,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=list(DRIVES))
     parser.add_argument("--seeds", type=positive, default=20, help="how many (default: 20)")
     parser.add_argument("--first-seed", type=positive, default=1, help="(default: 1)")
+    parser.add_argument("--apart", action="store_true", help="seeds of its own for each cell")
     parser.add_argument("--jobs", type=positive, default=1, help="processes (default: 1)")
     parser.add_argument("--out", type=Path, default=OUT, help="file of the runs, one a line")
     parser.add_argument(
@@ -115,6 +137,13 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     if not 0.0 < asked.range_sigma < 1.0:
         parser.error("--range-sigma must be above 0 and below 1 (metres)")
     return asked
+
+
+def number_of(cell: Cell) -> int:
+    """Number of a cell in the whole matrix."""
+    thing, lidar, drive = cell
+    row = DRIVES.index(drive) * len(LIDARS) + list(LIDARS).index(lidar)
+    return row * len(OBJECTS) + list(OBJECTS).index(thing)
 
 
 # ------------------------------------------------------------------ runs
@@ -168,7 +197,8 @@ def summary(lines: Mapping[Task, Mapping[str, Any]]) -> str:
         by_cell, key=lambda c: (DRIVES.index(c[2]), things.index(c[0]), lidars.index(c[1]))
     )
     out = [text for cell in ordered for text in cell_table(cell, by_cell[cell])]
-    return "\n".join([*out, "", *overview({cell: by_cell[cell] for cell in ordered})])
+    by_cell = {cell: by_cell[cell] for cell in ordered}
+    return "\n".join([*out, "", *pooled(by_cell), "", *overview(by_cell)])
 
 
 def cell_table(cell: Cell, lines: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -281,6 +311,57 @@ def _nees(found: Sequence[Statistics]) -> str:
     judged = min(s.nees_runs for s in found) >= JUDGED_RUNS
     mark = "!" if judged and not NEES_LIMITS[0] <= mean <= NEES_LIMITS[1] else ""
     return f"{mean:.1f}{mark}"
+
+
+def pooled(by_cell: Mapping[Cell, Sequence[Mapping[str, Any]]]) -> Iterator[str]:
+    """Errors over their sigmas, of all cells together, and of those of an object, LiDAR, drive."""
+    axes = "".join(f"{axis:>8}" for axis in SHOWN)
+    yield (
+        "Errors over their own sigmas, pooled over cells. Of n runs, the mean is known to one over "
+        f"the root of n.\n{'':30}{'runs':>5}{axes}{'NEES':>8}"
+    )
+    names = ("all", *dict.fromkeys(name for cell in by_cell for name in cell))
+    for name in sorted(names, key=[*("all",), *OBJECTS, *LIDARS, *DRIVES].index):
+        lines = [
+            line
+            for cell, of_cell in by_cell.items()
+            for line in of_cell
+            if name in ("all", *cell) and not line["failure"]
+        ]
+        found = by_quantity([_in_sigmas(line_of(line)) for line in lines])
+        for quantity, s in found.items():
+            judged = s.determined >= JUDGED_RUNS
+            rows = (
+                ("mean", s.mean, judged & (np.abs(s.mean) > BIAS_LIMIT)),
+                ("RMS", s.rmse, judged & _beyond(s.rmse, RATIO_LIMITS)),
+            )
+            for label, values, marked in rows:
+                cells = "".join(
+                    f"{f'{value:.2f}{mark}' if math.isfinite(value) else '-':>8}"
+                    for value, mark in zip(values, np.where(marked, "!", ""), strict=True)
+                )
+                first = label == "mean"
+                title = f"{name if first else '':13}{quantity[:12] if first else '':12}{label:5}"
+                end = f"{s.runs:5}{cells}{_nees([s]):>8}" if first else f"{'':5}{cells}"
+                yield (title + end).rstrip()
+
+
+def _in_sigmas(line: Line) -> Line:
+    """A run with its errors over their sigmas, as if they were millimetres and milliradians."""
+    return replace(
+        line,
+        quantities={
+            name: replace(
+                of,
+                error=tuple(
+                    1e-3 * e / s if s else math.nan for e, s in zip(of.error, of.sigma, strict=True)
+                ),
+                sigma=(1e-3,) * 6,
+            )
+            for name, of in line.quantities.items()
+            if of.sigma is not None
+        },
+    )
 
 
 # ------------------------------------------------------------------ recorded drives

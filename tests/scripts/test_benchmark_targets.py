@@ -219,6 +219,35 @@ def test_table_of_a_cell_is_as_by_hand() -> None:
     assert last[-3:] == ["70", "55", "12.0"]
 
 
+def test_errors_over_sigmas_are_pooled_over_cells() -> None:
+    # Ten of two LiDARs each, 0 and 2 mm at 1 mm: 20 of the bin, 10 of a LiDAR, which is not judged.
+    lines = {
+        Task("bin", lidar, "s_curve", n): line(n, 0.0 if n % 2 else 2.0)
+        for lidar in ("spin16", "wide")
+        for n in range(10)
+    }
+    text = benchmark.summary(lines)
+    of_bin = text[text.index("pooled over cells") :].split("bin ")[1].splitlines()
+
+    assert " ".join(of_bin[0].split()) == "S2V front mean 20 1.00! 0.50 0.50 0.50 0.50 - 6.0"
+    assert " ".join(of_bin[1].split()) == "RMS 1.41! 0.50! 0.50! 0.50! 0.50! -"
+    assert "S2V front   mean    10    1.00    0.50" in text
+
+
+def test_with_apart_no_two_cells_share_a_seed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ran: list[Task] = []
+    monkeypatch.setattr(benchmark, "run_missing", lambda tasks, *_, **__: ran.extend(tasks))
+    for some in ([], ["--objects", "bin", "--lidars", "wide"]):
+        benchmark.main(["--apart", "--seeds", "3", "--out", str(tmp_path / "none"), *some])
+    seeds = {task.seed for task in ran}
+
+    assert len(seeds) == 3 * len(OBJECTS) * len(LIDARS) * len(DRIVES)
+    # A part of the matrix has the seeds that it has in the whole.
+    assert len(set(ran)) == len(seeds)
+
+
 def test_few_runs_are_not_judged_but_their_scale_is() -> None:
     few = {BIN: line(1, 9.0, scale=5.0)}
     text = benchmark.summary(few)

@@ -11,10 +11,12 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from errno import ENOENT
 from pathlib import Path
 from typing import Any
 
 import caliv_graph
+from caliv_graph.batch.remote import Fetched, ListedFile, RemoteFolder
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
 
@@ -48,40 +50,86 @@ class FileState:
         stat = path.stat()
         return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
 
+    @classmethod
+    def listed(cls, file: ListedFile) -> FileState:
+        """That of a file behind a URL: its mark stands for times and inode."""
+        mark = -1 if file.mark is None else int(file.mark[:15], 16)
+        return cls(file.size, 0, 0, mark)
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """An input file behind a URL.
+
+    Attributes:
+        url: of the file.
+        listed: what its file system says of it.
+        copy: its local copy; None: not fetched.
+    """
+
+    url: str
+    listed: ListedFile
+    copy: Path | None = None
+
+    def __str__(self) -> str:
+        return self.url
+
+
+InputFile = Path | RemoteFile
+"""A file that a result depends on."""
+
+
+def state_of(file: InputFile) -> FileState:
+    """The state of a file: of one on a disk now, of one behind a URL when it was listed.
+
+    Raises:
+        OSError: the file cannot be accessed.
+    """
+    return FileState.of(file) if isinstance(file, Path) else FileState.listed(file.listed)
+
 
 @dataclass
 class DigestCache:
     """Digests of files that were read, so that no file is read twice.
 
     Attributes:
-        entries: per absolute path the state of the file when it was read, and the SHA-256 of its
-            content.
+        entries: per absolute path or URL the state of the file when it was read, and the SHA-256 of
+            its content.
     """
 
     entries: dict[str, tuple[FileState, str]] = field(default_factory=dict)
 
-    def known(self, path: Path) -> str | None:
+    def known(self, file: InputFile) -> str | None:
         """The digest of a file, or None if it was not read or has changed.
 
         Raises:
             OSError: the file does not exist.
         """
-        entry = self.entries.get(str(path))
-        return entry[1] if entry is not None and entry[0] == FileState.of(path) else None
+        entry = self.entries.get(str(file))
+        return entry[1] if entry is not None and entry[0] == state_of(file) else None
 
-    def digest(self, path: Path) -> str:
-        """The digest of a file; reads the file if necessary.
+    def digest(self, file: InputFile) -> str:
+        """The digest of a file; reads the file, or its local copy, if necessary.
 
         Raises:
             OSError: the file cannot be read.
         """
-        known = self.known(path)
+        known = self.known(file)
         if known is not None:
             return known
+        if isinstance(file, RemoteFile):
+            if file.copy is None:
+                raise FileNotFoundError(ENOENT, "was not fetched", file.url)
+            digest = _content(file.copy)
+            if file.listed.mark is not None:
+                self.entries[file.url] = (state_of(file), digest)
+            return digest
+        return self._read(file)
+
+    def _read(self, path: Path) -> str:
         before = FileState.of(path)
         asked_ns = time.time_ns()
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = _content(path)
         settled = asked_ns - max(before.mtime_ns, before.ctime_ns) > _SETTLED_NS
         if settled and FileState.of(path) == before:
             self.entries[str(path)] = (before, digest)
@@ -118,22 +166,22 @@ class Inputs:
         prior: the earlier calibration.
     """
 
-    drives: tuple[Mapping[str, Path], ...]
+    drives: tuple[Mapping[str, InputFile], ...]
     prior: Path | None
 
     @property
-    def files(self) -> tuple[Path, ...]:
+    def files(self) -> tuple[InputFile, ...]:
         """All input files."""
         prior = () if self.prior is None else (self.prior,)
         return (*(path for drive in self.drives for path in drive.values()), *prior)
 
-    def states(self) -> dict[Path, FileState]:
+    def states(self) -> dict[InputFile, FileState]:
         """The current state of each file.
 
         Raises:
             OSError: a file does not exist.
         """
-        return {path: FileState.of(path) for path in self.files}
+        return {file: state_of(file) for file in self.files}
 
     def known(self, cache: DigestCache) -> bool:
         """Whether the digests of all files are known.
@@ -141,28 +189,37 @@ class Inputs:
         Raises:
             OSError: a file does not exist.
         """
-        return all(cache.known(path) is not None for path in self.files)
+        return all(cache.known(file) is not None for file in self.files)
 
 
 def job_inputs(
-    config: Config, data: Sequence[Path], prior: Path | None, out: Path | None = None
+    config: Config,
+    data: Sequence[Path | str],
+    prior: Path | None,
+    out: Path | None = None,
+    fetched: Mapping[str, Fetched] | None = None,
 ) -> Inputs | None:
     """The input files of a job; without `data`, its drive is `data.path` of the config.
 
-    Files in `out`, the folder of the results, are no inputs.
+    Of a URL, all files below, as they were when it was `fetched`, or else are now. Files in `out`,
+    the folder of the results, are no inputs.
 
     Returns:
         None if a drive does not exist or has no files of its format.
 
     Raises:
         OSError: a folder cannot be listed.
+        CalivError: a URL cannot be listed.
     """
     out = None if out is None else out.resolve()
-    drives = []
-    for path in data or ([config.data.path] if config.data.path else []):
-        # Folders of clouds, too: of those, all files below.
-        find = _caliv_files if config.data.format == "caliv" else _bag_files
-        files = dict(find(path, config, out))
+    drives: list[dict[str, InputFile]] = []
+    for drive in data or ([config.data.path] if config.data.path else []):
+        if isinstance(drive, str):
+            files = _remote_files(drive, (fetched or {}).get(drive))
+        else:
+            # Folders of clouds, too: of those, all files below.
+            find = _caliv_files if config.data.format == "caliv" else _bag_files
+            files = dict(find(drive, config, out))
         if not files:
             return None
         if config.data.poses is not None:
@@ -188,7 +245,7 @@ def job_digest(config: Config, inputs: Inputs, cache: DigestCache) -> str:
             "caliv_graph": caliv_graph.__version__,
             "config": dump_config(pathless),
             "drives": [
-                {name: cache.digest(path) for name, path in drive.items()}
+                {name: cache.digest(file) for name, file in drive.items()}
                 for drive in inputs.drives
             ],
             "prior": None if inputs.prior is None else cache.digest(inputs.prior),
@@ -225,6 +282,25 @@ def _caliv_files(path: Path, config: Config, out: Path | None) -> Iterator[tuple
             for cloud in sorted(folder.iterdir()):
                 if cloud.suffix == ".pcd" and cloud.name[0] != "." and cloud.is_file():
                     yield f"{topic}/{cloud.name}", cloud
+
+
+def _remote_files(url: str, fetched: Fetched | None) -> dict[str, InputFile]:
+    """The files of a drive behind a URL, by the names of a local one."""
+    remote = RemoteFolder(url)
+    listed = remote.files() if fetched is None else fetched.listed
+    copy = None if fetched is None else fetched.copy
+    if list(listed) == [remote.name]:
+        # A single file: only its kind is part of the name, as of a bag on a disk.
+        return {Path(remote.name).suffix: RemoteFile(remote.url, listed[remote.name], copy)}
+    return {
+        name: RemoteFile(f"{remote.url}/{name}", of, None if copy is None else copy / name)
+        for name, of in listed.items()
+    }
+
+
+def _content(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _sha256(document: Any) -> str:

@@ -15,7 +15,7 @@ import re
 import secrets
 import shutil
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -33,7 +33,7 @@ SUMMARY_FILES = (SUMMARY_FILE, "summary.csv", "index.html")
 JOB_FILE = "job.json"
 JOB_FILES = (*RESULT_FILES, JOB_FILE)
 
-_CACHE, _LOCK, _WORK = ".digests.json", ".lock", ".work"
+CACHE_FILE, _LOCK, _WORK = ".digests.json", ".lock", ".work"
 
 _LEFT_OVER = re.compile(r"\.(.+)\.[0-9a-f]{12}")
 """Names of the temporary folders of `common.files`."""
@@ -94,8 +94,8 @@ class BatchFolder:
             self._take_lock()
             self._sweep()
             self.work.mkdir(parents=True)
-            if (self.path / _CACHE).is_file():
-                text = (self.path / _CACHE).read_text(encoding="utf-8", errors="replace")
+            if (self.path / CACHE_FILE).is_file():
+                text = (self.path / CACHE_FILE).read_text(encoding="utf-8", errors="replace")
                 self.cache = DigestCache.parse(text)
         except OSError as e:
             self._leave(nothing_done=True)
@@ -124,13 +124,21 @@ class BatchFolder:
                 return None
             document["warnings"] = tuple(document["warnings"])
             record = JobRecord(**document)
-            if {name: (folder / name).stat().st_size for name in record.files} != record.files:
+            if self._sizes(job, record.files) != record.files:
                 return None
             if _sha256(folder / CALIBRATION_FILE) != record.calibration_sha256:
                 return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         return record
+
+    def _sizes(self, job: str, names: Iterable[str]) -> dict[str, int]:
+        """Bytes of files of a job.
+
+        Raises:
+            OSError: one is missing.
+        """
+        return {name: (self.path / job / name).stat().st_size for name in names}
 
     def check_place(self, job: str, force: bool) -> None:
         """Checks before the calibration that the result of a job can be written.
@@ -192,7 +200,7 @@ class BatchFolder:
         Raises:
             OutputError: the file cannot be written.
         """
-        atomic_write(self._given / _CACHE, self.cache.dump(), force=True)
+        atomic_write(self._given / CACHE_FILE, self.cache.dump(), force=True)
 
     def _check_ours(self) -> None:
         if not self.path.exists():
@@ -200,7 +208,7 @@ class BatchFolder:
         if not self.path.is_dir():
             raise OutputError(f"{self._given}: is a file. Give --out the name of a folder")
         names = {entry.name for entry in self.path.iterdir()}
-        if names <= {_CACHE, _LOCK, _WORK}:
+        if names <= {CACHE_FILE, _LOCK, _WORK}:
             return
         if not _is_summary(self.path / SUMMARY_FILE):
             raise OutputError(
@@ -242,7 +250,7 @@ class BatchFolder:
             shutil.rmtree(self.path / _WORK, ignore_errors=True)
             made = self._made if nothing_done and not self._has_results() else []
             if self.path in made:
-                for name in (*SUMMARY_FILES, _CACHE, _LOCK):
+                for name in (*SUMMARY_FILES, CACHE_FILE, _LOCK):
                     (self.path / name).unlink(missing_ok=True)
             os.close(self._lock)
             self._lock = None

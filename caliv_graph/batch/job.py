@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +42,11 @@ class FinishedJob:
     def calibration(self) -> Calibration:
         """The result."""
         return self.run.calibration
+
+    def without_path(self) -> FinishedJob:
+        """The same with a config that names no drive, because its drive was a copy."""
+        nowhere = self.config.data.model_copy(update={"path": None})
+        return replace(self, config=self.config.model_copy(update={"data": nowhere}))
 
     def write(self, folder: Path) -> None:
         """Writes all files of the result into an empty folder.

@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
+from caliv_graph.batch.remote import is_url
 from caliv_graph.config.load import parse_config, read_yaml, validated
 from caliv_graph.config.model import (
     Config,
@@ -18,7 +19,7 @@ from caliv_graph.config.model import (
     SolveMode,
     check_limit_keys,
 )
-from caliv_graph.config.sections import FilePath, Positive, Section, as_written
+from caliv_graph.config.sections import FilePath, Name, Positive, Section, as_written
 from caliv_graph.errors import ConfigError
 
 MOST_CHARACTERS = 80
@@ -40,13 +41,14 @@ class Job:
         config: the config.
         vehicle: jobs of the same vehicle are compared; None: with no other job.
         prior: an earlier calibration; None: none.
-        data, mode, require, limits: instead of the config's; empty or None: the config's.
+        data: drives, instead of the config's: paths, and URLs as text; empty: the config's.
+        mode, require, limits: instead of the config's; None: the config's.
     """
 
     name: str
     config: Path
     vehicle: str | None = None
-    data: tuple[Path, ...] = ()
+    data: tuple[Path | str, ...] = ()
     prior: Path | None = None
     mode: SolveMode | None = None
     require: tuple[Requirement, ...] | None = None
@@ -84,7 +86,7 @@ class _JobEntry(_Settings):
     """One job as it is written."""
 
     name: str = Field(description="of the job, and of its folder")
-    data: tuple[FilePath, ...] = Field((), description="drives, instead of the config's")
+    data: tuple[Name, ...] = Field((), description="drives or URLs, instead of the config's")
 
     @field_validator("name", mode="before")
     @classmethod
@@ -190,7 +192,7 @@ def _job(entry: _JobEntry, defaults: _Settings, base: Path, manifest: Path) -> J
         name=entry.name,
         config=base / config,
         vehicle=setting("vehicle"),
-        data=tuple(base / drive for drive in entry.data),
+        data=tuple(drive if is_url(drive) else base / drive for drive in entry.data),
         prior=None if prior is None else base / prior,
         mode=setting("mode"),
         require=setting("require"),

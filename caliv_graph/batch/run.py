@@ -17,6 +17,8 @@ from caliv_graph.batch.digests import DigestCache, job_digest, job_inputs
 from caliv_graph.batch.folder import BatchFolder, JobRecord
 from caliv_graph.batch.manifest import Job, effective_config
 from caliv_graph.batch.page import render_index
+from caliv_graph.batch.remote import is_url
+from caliv_graph.batch.remote_folder import RemoteBatchFolder
 from caliv_graph.batch.summary import Row, Summary, summary_csv, summary_json
 from caliv_graph.batch.worker import (
     MOST_ATTEMPTS,
@@ -50,7 +52,7 @@ _WRITING_SHARE = 0.05
 
 def run_batch(
     jobs: Sequence[Job],
-    out: Path,
+    out: str,
     progress: Progress,
     *,
     scheduler: str | None = None,
@@ -64,8 +66,8 @@ def run_batch(
 
     Args:
         jobs: of the manifest.
-        out: the folder of the batch. An earlier batch there is resumed: results from the same
-            inputs, config and version are kept.
+        out: the folder of the batch, a path or a URL. An earlier batch there is resumed: results
+            from the same inputs, config and version are kept.
         progress: shows the jobs.
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of workers; None: the number of processors, or of jobs if smaller.
@@ -76,7 +78,7 @@ def run_batch(
         OutputError: `out` is not the folder of a batch, or cannot be written.
         BatchError: Dask is not installed, or its scheduler or workers cannot be used.
     """
-    with BatchFolder(out) as folder:
+    with RemoteBatchFolder(out) if is_url(out) else BatchFolder(Path(out)) as folder:
         batch = _Batch(jobs, folder, force, manifest)
         batch.prepare(progress)
         if batch.todo:
@@ -162,8 +164,8 @@ class _Batch:
                     if digest == record.digest and self._take(job.name, record, reused=True):
                         return
                 self._files[job.name] = {str(path) for path in inputs.files}
-        except OSError:
-            pass  # the job itself reports a missing file
+        except (OSError, CalivError):
+            pass  # the job itself reports a missing file or URL
         self.todo[job.name] = Task(
             name=job.name,
             config=config,

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import json
 import os
+import shutil
 import socket
 import threading
 import time
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import caliv_graph
+from caliv_graph.batch.remote import Fetched, RemoteFolder
 from caliv_graph.common.exits import DEFECT, USAGE
 from caliv_graph.common.progress import SilentProgress, StageRecord, count_text
 from caliv_graph.config.model import Config
@@ -44,7 +46,7 @@ class Task:
 
     Attributes:
         config_file: path of the config, for messages.
-        data: drives; empty: `data.path` of the config.
+        data: drives, paths and URLs (text); empty: `data.path` of the config.
         prior: an earlier calibration.
         recorded: digest of the existing result; None: there is none, or it is made again.
         cache: known digests of the input files (`DigestCache.dump`).
@@ -53,7 +55,7 @@ class Task:
     name: str
     config: Config
     config_file: Path
-    data: tuple[Path, ...]
+    data: tuple[Path | str, ...]
     prior: Path | None
     recorded: str | None
     cache: str
@@ -183,6 +185,28 @@ def _keep_freed_memory() -> None:
 
 
 def _run(task: Task, attempt: int, start: float) -> Outcome:
+    scratch = task.work / f"{task.name}.data-{attempt}"
+    try:
+        return _calibrated(task, attempt, start, scratch)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _fetched(task: Task, scratch: Path, progress: SilentProgress) -> dict[str, Fetched]:
+    """Copies the drives behind URLs to the folder `scratch`; by URL.
+
+    Raises:
+        CalivError: one cannot be read.
+    """
+    urls = [drive for drive in task.data if isinstance(drive, str)]
+    out: dict[str, Fetched] = {}
+    for number, url in enumerate(dict.fromkeys(urls)):
+        with progress.stage("fetching"):
+            out[url] = RemoteFolder(url).fetch(scratch / str(number))
+    return out
+
+
+def _calibrated(task: Task, attempt: int, start: float, scratch: Path) -> Outcome:
     # Imported here: the process of the batch itself does not need the estimator.
     from threadpoolctl import threadpool_limits
 
@@ -202,12 +226,14 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     # The readers first: their messages about a drive or a prior are the most specific.
     check_guesses(task.config, task.config_file)
     prior = None if task.prior is None else read_calibration(task.prior)
-    recordings = open_recordings(task.config, task.data)
-    inputs = job_inputs(task.config, task.data, task.prior, task.out)
-    if inputs is None:
-        raise RecordingError(f"{recordings[0].name}: has no readable files")
     progress = _WatchedProgress(task)
     cache = DigestCache.parse(task.cache)
+    fetched = _fetched(task, scratch, progress)
+    drives = [fetched[d].copy if isinstance(d, str) else d for d in task.data]
+    recordings = open_recordings(task.config, drives)
+    inputs = job_inputs(task.config, task.data, task.prior, task.out, fetched)
+    if inputs is None:
+        raise RecordingError(f"{recordings[0].name}: has no readable files")
     before = inputs.states()
     with progress.stage("reading"):
         digest = job_digest(task.config, inputs, cache)
@@ -216,6 +242,8 @@ def _run(task: Task, attempt: int, start: float) -> Outcome:
     with threadpool_limits(limits=1), on_one_core(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = run_job(recordings, task.config, progress, prior)
+        if task.data and isinstance(task.data[0], str):
+            job = job.without_path()  # the copy goes
         with progress.stage("writing"):
             staged = task.work / f"{task.name}.result-{attempt}"
             staged.mkdir()

@@ -19,7 +19,14 @@ def batch(
             help="The jobs; configs/batch.yaml shows every key.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for all results.")],
+    out: Annotated[
+        str,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Folder for all results, or a URL such as s3://bucket/fleet.",
+        ),
+    ],
     scheduler: Annotated[
         str | None,
         typer.Option(
@@ -88,10 +95,10 @@ def batch(
             manifest=str(manifest),
         )
     if as_json:
-        streams.show_json({**summary_document(summary), "out": str(out)})
+        streams.show_json({**summary_document(summary), "out": out})
     else:
         streams.show(summary_table(summary))
-        streams.say(f"Written to {out}: see {out / 'index.html'}")
+        streams.say(f"Written to {out}: see {out.rstrip('/')}/index.html")
     streams.warn(f"{row.job}: {row.note}" for row in summary.rows if row.note)
     if summary.exit != DONE:
         raise typer.Exit(summary.exit)

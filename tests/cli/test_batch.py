@@ -193,6 +193,32 @@ def test_a_result_is_what_calibrate_writes(
         )
 
 
+def test_drives_and_results_behind_urls(
+    fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    drive = (fleet / "mon/caliv").as_uri()
+    manifest = write_manifest(
+        tmp_path / "urls.yaml",
+        {"name": "mon", "config": str(fleet / "mon/config.yaml"), "data": drive},
+    )
+    out = tmp_path / "store/fleet"
+    first = batch(manifest, "--out", out.as_uri(), "--workers", 1)
+
+    assert first.returncode == 0, first.stderr
+    assert f"see {out.as_uri()}/index.html" in first.stdout
+    # Its config names no drive: the copy that was calibrated is gone.
+    names = {file.name for file in (finished[0] / "mon").iterdir()}
+    assert {file.name for file in (out / "mon").iterdir()} == names
+    for name in ("calibration.yaml", "target.ply"):
+        assert (out / "mon" / name).read_bytes() == (finished[0] / "mon" / name).read_bytes()
+    assert "path" not in yaml.safe_load((out / "mon/config.yaml").read_text())["data"]
+    before = records(out)
+    again = batch(manifest, "--out", out.as_uri(), "--workers", 1)
+    assert again.returncode == 0, again.stderr
+    assert "1 were done or failed before" in again.stdout or "calibrating" not in again.stdout
+    assert records(out) == before
+
+
 def test_what_is_done_is_not_done_again_and_what_has_changed_is(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:

@@ -128,6 +128,8 @@ def connect(address: str, most: int | None = None) -> Iterator[Workers]:
                 f"--scheduler {address}: a server is there, but does not answer like a Dask "
                 f"scheduler within {CONNECT_S:g} s. Check the address, and that the scheduler has "
                 "the version of Dask of this environment"
+                + ", and distributed.comm.tls of Dask's configuration"
+                * address.startswith("tls:")
             )
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
@@ -270,7 +272,9 @@ def _await_answer(address: str) -> None:
 async def _identify(address: str) -> None:
     """Asks a server for its identity; raises if it is not a Dask scheduler."""
     core: Any = import_module("distributed.core")
-    comm = await core.connect(address, timeout=CONNECT_S)
+    # Certificates of tls:// are those of Dask's own configuration, as for the client.
+    security = _distributed().Security().get_connection_args("client")
+    comm = await core.connect(address, timeout=CONNECT_S, **security)
     try:
         await comm.write({"op": "identity", "reply": True})
         answer = await comm.read()

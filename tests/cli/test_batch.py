@@ -306,14 +306,33 @@ def test_a_job_that_kills_its_worker_twice_has_failed(fleet: Path) -> None:
     assert err == f"warning: mon: {mon['message']}\n"
 
 
-@pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[str]:
+def certified(folder: Path) -> dict[str, str]:
+    """The settings of Dask for a certificate that signs itself, as environment variables."""
+    key, certificate = folder / "key.pem", folder / "certificate.pem"
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl, which makes certificates, is not installed")
+    made = ("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
+    subject = ("-days", "1", "-subj", "/CN=127.0.0.1", "-keyout", key, "-out", certificate)
+    subprocess.run(["openssl", *made, *subject], check=True, capture_output=True)
+    files = {"CA_FILE": certificate}
+    files |= {f"{who}__{what}": path for who in ("SCHEDULER", "WORKER", "CLIENT")
+              for what, path in (("CERT", certificate), ("KEY", key))}  # fmt: skip
+    return {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(path) for name, path in files.items()}
+
+
+@pytest.fixture(params=["tcp", "tls"])
+def scheduler(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
     """A Dask scheduler and a worker, as an administrator would start them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+        address = f"{request.param}://127.0.0.1:{free.getsockname()[1]}"
+    if request.param == "tls":
+        for name, value in certified(tmp_path).items():
+            monkeypatch.setenv(name, value)
     dask = (sys.executable, "-m", "dask")
-    local = ("--no-dashboard", "--host", "127.0.0.1")
+    local = ("--no-dashboard", "--host", "127.0.0.1", "--protocol", request.param)
     # Without the process beside the worker that would start it again.
     worker = (*dask, "worker", address, *local, "--nthreads", "1", "--no-nanny")
     commands = [
@@ -335,7 +354,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
 def test_on_an_existing_scheduler(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]], scheduler: str
 ) -> None:
-    out = fleet / "elsewhere"
+    out = fleet / f"elsewhere-{scheduler[:3]}"
     manifest = write_manifest(fleet / "one.yaml", {"name": "tue", "config": "tue/config.yaml"})
 
     result = batch(manifest, "--out", out, "--scheduler", scheduler)

@@ -5,12 +5,14 @@ No result depends on the number: parallel work writes to separate places.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TypeVar, cast
 
 Item = TypeVar("Item")
 
@@ -19,6 +21,11 @@ THREADS = 2
 operations, so more threads mostly wait."""
 
 _one_core = False
+
+_sharing = threading.local()
+"""`on` in a thread that does a part of what is shared out."""
+
+_NONE = object()
 
 
 def cores() -> int:
@@ -49,14 +56,47 @@ def parts(count: int, number: int) -> list[slice]:
 def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
     """Does `work` on all items, several at a time, and raises whatever it raises.
 
-    `work` should release the interpreter's lock for most of its time.
+    This thread takes part. `work` should release the interpreter's lock for most of its time; what
+    it shares out itself, it does alone: the cores are given out already.
     """
     items = list(items)
-    threads = min(THREADS, cores(), len(items))
-    if threads < 2:
+    if min(THREADS, cores(), len(items)) < 2 or getattr(_sharing, "on", False):
         for item in items:
             work(item)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(work, items):
-            pass
+    left, lock = iter(items), threading.Lock()
+
+    def take() -> None:
+        nonlocal left
+        _sharing.on = True
+        try:
+            while True:
+                with lock:
+                    item = next(left, _NONE)
+                if item is _NONE:
+                    return
+                work(cast("Item", item))
+        except BaseException:
+            with lock:
+                left = iter(())  # nobody goes on
+            raise
+        finally:
+            _sharing.on = False
+
+    others = [_helpers().submit(take) for _ in range(THREADS - 1)]
+    try:
+        take()
+    finally:
+        wait(others)
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _helpers() -> ThreadPoolExecutor:
+    """The other threads, kept: to start one costs as much as a small piece of work."""
+    return ThreadPoolExecutor(THREADS - 1, "share_out")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a fork has none of the threads

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 
 import pytest
@@ -40,6 +41,50 @@ def test_what_goes_wrong_in_a_part_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable)
         with pytest.raises(ZeroDivisionError):
             share_out(lambda i: i // 0, range(3))
+
+
+def test_work_that_shares_out_work_does_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1})
+    both = threading.Barrier(2, timeout=20.0)
+    inside: list[set[int]] = [set(), set()]
+
+    def outer(i: int) -> None:
+        both.wait()
+        share_out(lambda _: inside[i].add(threading.get_ident()), range(50))
+
+    for _ in range(3):  # the helper is the same one, and has not stayed in its part
+        share_out(outer, range(2))
+        assert [len(threads) for threads in inside] == [1, 1]
+        assert inside[0] != inside[1]
+        inside[0].clear()
+        inside[1].clear()
+
+
+def test_a_fork_has_a_helper_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1})
+    share_out(lambda _: None, range(2))
+    child = os.fork()
+    if child == 0:
+        done: list[int] = []
+        share_out(done.append, range(8))
+        os._exit(0 if sorted(done) == list(range(8)) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_after_an_error_nobody_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1})
+    begun: list[int] = []
+    both = threading.Barrier(2, timeout=20.0)
+
+    def work(i: int) -> None:
+        begun.append(i)
+        if i < 2:
+            both.wait()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        share_out(work, range(1000))
+    assert sorted(begun) == [0, 1]
 
 
 def test_one_core_is_given_back_after_an_error() -> None:

@@ -127,11 +127,13 @@ class StructureEvidence:
             trajectory = trajectories[patches.drive]
             if not isinstance(trajectory, SmoothedTrajectory) or not trajectory.open_kinds:
                 continue
-            used = scans_for_errors(patches, likelihood_end_ns(trajectory))
+            end_ns = likelihood_end_ns(trajectory)
+            used = scans_for_errors(patches, end_ns)
             if not len(used.scan):
                 continue
             stamps = np.unique(used.stamps_ns)
-            joint, gain = poses_and_gain(trajectory, stamps, trajectory.open_kinds)
+            # Errors of later steps are taken for none.
+            joint, gain = poses_and_gain(trajectory, stamps, trajectory.open_kinds, end_ns)
             of_drives.append((used, plain_prior(joint, stamps, heave_m), gain, trajectory))
         if not of_drives:
             return NOTHING_TOLD

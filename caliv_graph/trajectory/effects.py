@@ -15,7 +15,7 @@ import numpy as np
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
-from caliv_graph.trajectory.chain_solution import inverse_columns, solved_columns
+from caliv_graph.trajectory.chain_solution import inverse_columns, solved_in_blocks
 from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.correlated import AXES, linearised
 from caliv_graph.trajectory.parameters import UncertainParameter
@@ -79,9 +79,14 @@ def error_effects(
 
 
 def poses_and_gain(
-    smoothed: SmoothedTrajectory, stamps_ns: Sequence[int] | IntArray, kinds: Sequence[str]
+    smoothed: SmoothedTrajectory,
+    stamps_ns: Sequence[int] | IntArray,
+    kinds: Sequence[str],
+    until_ns: int | None = None,
 ) -> tuple[JointInformation, Array]:
     """The Gaussian of m vehicle poses, and their gain (6 m, 3 k s) on errors of k kinds in s steps.
+
+    The steps are those that begin at nodes up to `until_ns`; None: all of the drive.
 
     The poses that the data mean are at minus the gain per unit of an error. Columns are by kind,
     then by axis of the map, then by step, as in `ErrorLikelihood`. Inputs that could be wrong are
@@ -114,13 +119,16 @@ def poses_and_gain(
         [np.zeros(0), *(np.square(1.0 / np.asarray(p.sigmas)) for p in parameters)]
     )
     first, _ = error_steps(smoothed.nodes_ns)
-    solution = solved_columns(both.leading(STATE), by_steps(both, first))
-    of_imu = solution[: n * STATE].reshape(n, STATE, -1)[i, :POSE]
+    within = smoothed.nodes_ns[first] <= (until_ns or smoothed.nodes_ns[-1])
+    errors = ErrorsByStep(both, first, int(np.count_nonzero(within)))
     # A parameter that moves T_vehicle_imu moves the vehicle, the IMU being where it is.
     moves = np.hstack([np.zeros((POSE, 0)), *(p.imu_moves(smoothed.data) for p in of)])
-    of_imu = of_imu - moves @ solution[n * STATE + len(common) :]
     Ad = np.asarray(smoothed.T_vehicle_imu.AdjointMap())
-    return joint, np.asarray((Ad @ of_imu).reshape(POSE * len(i), -1))
+    gain = np.empty((len(i), POSE, errors.count))
+    for block, solution in solved_in_blocks(both.leading(STATE), errors.columns, errors.count):
+        of_imu = solution[: n * STATE].reshape(n, STATE, -1)[i, :POSE]
+        gain[:, :, block] = Ad @ (of_imu - moves @ solution[n * STATE + len(common) :])
+    return joint, gain.reshape(POSE * len(i), -1)
 
 
 def _with_free_suspects(smoothed: SmoothedTrajectory) -> tuple[UncertainParameter, ...]:
@@ -131,23 +139,39 @@ def _with_free_suspects(smoothed: SmoothedTrajectory) -> tuple[UncertainParamete
     return (*free, *(p for p in known if p.sigmas is not None))
 
 
-def by_steps(both: Chain, first: IntArray) -> Array:
-    """(n STATE + k, e s) between states with common coordinates and errors by step.
+class ErrorsByStep:
+    """The information between states with common coordinates and errors by step.
 
-    `both` has e coordinates of errors after each state; `first` (s,) are the first nodes of the
-    steps. An error of a sensor acts at its own node: the coupling of neighbours has none.
+    (n STATE + k, e s) of e coordinates of errors in the first s steps, by coordinate, then by step.
+    An error of a sensor acts at its own node: the coupling of neighbours has none.
     """
-    n, width = both.diagonal.shape[:2]
-    k, e, m = len(both.corner), width - STATE, len(first)
-    of_state, of_error = slice(0, STATE), slice(STATE, width)
-    out = np.zeros((n * STATE + k, e * m))
-    step = np.searchsorted(first, np.arange(n), "right") - 1
-    columns = step[:, None] + m * np.arange(e)
-    by_state = out[: n * STATE].reshape(n, STATE, -1)
-    by_state[np.arange(n)[:, None], :, columns] = both.diagonal[:, of_error, of_state]
-    border = np.add.reduceat(both.border[:, of_error], first, 0)
-    out[n * STATE :] = border.transpose(2, 1, 0).reshape(k, e * m)
-    return out
+
+    def __init__(self, both: Chain, first: IntArray, steps: int) -> None:
+        """Of a chain that has e coordinates of errors after those of each state.
+
+        Args:
+            both: the chain.
+            first: first nodes of all steps of the drive.
+            steps: of them, the first ones that are wanted.
+        """
+        n, width = both.diagonal.shape[:2]
+        k, e = len(both.corner), width - STATE
+        self.count = e * steps
+        self._mixed = both.diagonal[:, STATE:, :STATE]
+        step = np.searchsorted(first, np.arange(n), "right") - 1
+        self._column = np.where(step < steps, step, -self.count)[:, None] + steps * np.arange(e)
+        border = np.add.reduceat(both.border[:, STATE:], first, 0)[:steps]
+        self.border: Array = border.transpose(2, 1, 0).reshape(k, self.count)
+
+    def columns(self, block: slice) -> Array:
+        """(n STATE + k, b) a slice of the columns."""
+        nodes, axes = np.nonzero((self._column >= block.start) & (self._column < block.stop))
+        n = len(self._column)
+        out = np.zeros((n * STATE + len(self.border), block.stop - block.start))
+        by_state = out[: n * STATE].reshape(n, STATE, -1)
+        by_state[nodes, :, self._column[nodes, axes] - block.start] = self._mixed[nodes, axes]
+        out[n * STATE :] = self.border[:, block]
+        return out
 
 
 def error_steps(nodes_ns: IntArray) -> tuple[IntArray, IntArray]:

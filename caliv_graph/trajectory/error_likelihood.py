@@ -17,10 +17,10 @@ from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import build_graph, to_values
 from caliv_graph.trajectory.chain import STATE, Chain, beside
-from caliv_graph.trajectory.chain_solution import solved_columns
+from caliv_graph.trajectory.chain_solution import solved_in_blocks
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, linearised
-from caliv_graph.trajectory.effects import by_steps, error_steps
+from caliv_graph.trajectory.effects import ErrorsByStep, error_steps
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.noise import orientation_covariances
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, first_nodes
@@ -170,15 +170,21 @@ def eliminated(
     by_node = slope[: n * width].reshape(n, width)
     first, middles = error_steps(nodes_ns)
     m = len(first)
-    shared = by_steps(both, first)
-    right = np.column_stack([shared, np.append(by_node[:, of_state], slope[n * width :])])
-    solution = solved_columns(both.leading(STATE), right)
-    # A dense product would take ten times as long: a step touches the states of few nodes.
-    by_state = solution[: n * STATE].reshape(n, STATE, -1)
+    errors = ErrorsByStep(both, first, m)
     mixed = both.diagonal[:, of_error, of_state]
-    near = np.add.reduceat(mixed @ by_state, first, 0)
-    taken = np.swapaxes(near, 0, 1).reshape(e * m, -1)
-    taken = taken + shared[n * STATE :].T @ solution[n * STATE :]
+    last = np.append(by_node[:, of_state], slope[n * width :])
+
+    def right(block: slice) -> Array:
+        of_errors = errors.columns(slice(block.start, min(block.stop, e * m)))
+        return np.column_stack([of_errors, last]) if block.stop > e * m else of_errors
+
+    taken = np.empty((e * m, e * m + 1))
+    for block, solution in solved_in_blocks(both.leading(STATE), right, e * m + 1):
+        # A dense product would take ten times as long: a step touches the states of few nodes.
+        by_state = solution[: n * STATE].reshape(n, STATE, -1)
+        near = np.add.reduceat(mixed @ by_state, first, 0)
+        taken[:, block] = np.swapaxes(near, 0, 1).reshape(e * m, -1)
+        taken[:, block] += errors.border.T @ solution[n * STATE :]
     own = np.zeros((e, m, e, m))
     blocks = np.add.reduceat(both.diagonal[:, of_error, of_error], first, 0)
     own[:, np.arange(m), :, np.arange(m)] = blocks

@@ -34,6 +34,7 @@ from caliv_graph.products import (
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import read_patches
+from caliv_graph.structure.without_targets import without_targets
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
@@ -129,7 +130,10 @@ def prepare(
     raise_fatal(raw)
     rough, findings, search, placements = _searched(recordings, config, motions, raw, progress)
     config, misplaced, observations, no_target = search
-    patches = _patches(recordings, rough, config, progress)
+    patches = tuple(
+        without_targets(of, observations, rough[of.drive], config)
+        for of in _patches(recordings, rough, config, progress)
+    )
     kept = kept_stamps(patches)
     if no_target is not None and not kept:
         raise no_target

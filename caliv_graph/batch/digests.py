@@ -288,12 +288,11 @@ def _remote_files(url: str, fetched: Fetched | None) -> dict[str, InputFile]:
     """The files of a drive behind a URL, by the names of a local one."""
     remote = RemoteFolder(url)
     listed = remote.files() if fetched is None else fetched.listed
-    copy = None if fetched is None else fetched.copy
-    if list(listed) == [remote.name]:
-        # A single file: only its kind is part of the name, as of a bag on a disk.
-        return {Path(remote.name).suffix: RemoteFile(remote.url, listed[remote.name], copy)}
+    # Of a single file only its kind is part of the name, as of a bag on a disk.
     return {
-        name: RemoteFile(f"{remote.url}/{name}", of, None if copy is None else copy / name)
+        name or Path(remote.name).suffix: RemoteFile(
+            f"{remote.url}/{name}".rstrip("/"), of, None if fetched is None else fetched.copy / name
+        )
         for name, of in listed.items()
     }
 

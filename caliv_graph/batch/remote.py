@@ -97,18 +97,18 @@ class RemoteFolder:
         return PurePosixPath(self.url.split("://", 1)[1]).name
 
     def files(self) -> dict[str, ListedFile]:
-        """All files below that are not hidden, by name; of a single file, itself.
+        """All files below that are not hidden, by name; a single file is itself, without a name.
 
         Empty if there is nothing.
 
         Raises:
             RecordingError: it cannot be listed.
         """
-        with self._read_errors():
+        with self._errors(RecordingError, "read"):
             system, path = self._opened
             system.invalidate_cache()
             if system.isfile(path):
-                return {self.name: _listed(system.info(path))}
+                return {"": _listed(system.info(path))}
             found = system.find(path, detail=True) if system.exists(path) else {}
             out = {}
             for full, info in sorted(found.items()):
@@ -123,7 +123,7 @@ class RemoteFolder:
         Raises:
             RecordingError: it cannot be read.
         """
-        with self._read_errors():
+        with self._errors(RecordingError, "read"):
             system, path = self._opened
             try:
                 return bytes(system.cat_file(f"{path}/{name}"))
@@ -143,24 +143,17 @@ class RemoteFolder:
                 f"{self.url}: nothing is there. Give the URL of a bag, or of the folder of a drive"
             )
         system, path = self._opened
-        single = list(listed) == [self.name] and system.isfile(path)
         copy = folder / (self.name or "drive")
-        for name in listed:
-            local = copy if single else copy / name
+        for name, of in listed.items():
+            local = copy / name
             local.parent.mkdir(parents=True, exist_ok=True)
-            with self._read_errors():
-                system.get_file(path if single else f"{path}/{name}", str(local))
-        sizes = {name: (copy if single else copy / name).stat().st_size for name in listed}
-        wrong = [name for name, of in listed.items() if sizes[name] != of.size]
-        if wrong or self.files() != listed:
-            raise RecordingError(
-                f"{self.url}: changed while it was read"
-                + (
-                    f" ({wrong[0]}: {sizes[wrong[0]]} bytes, not {listed[wrong[0]].size})"
-                    * bool(wrong)
-                )
-                + ". Run the batch again when the recording is complete"
-            )
+            with self._errors(RecordingError, "read"):
+                system.get_file(f"{path}/{name}".rstrip("/"), str(local))
+            size = local.stat().st_size
+            if size != of.size:
+                raise self._changed(f" ({name or self.name}: {size} bytes, not {of.size})")
+        if self.files() != listed:
+            raise self._changed()
         return Fetched(listed, copy)
 
     def put(self, files: Sequence[Path], below: str = "") -> None:
@@ -169,7 +162,7 @@ class RemoteFolder:
         Raises:
             OutputError: a file cannot be written.
         """
-        with self._write_errors():
+        with self._errors(OutputError, "written", ". Give another --out"):
             system, path = self._opened
             parent = f"{path}/{below}" if below else path
             system.makedirs(parent, exist_ok=True)
@@ -182,7 +175,7 @@ class RemoteFolder:
         Raises:
             OutputError: a file cannot be removed.
         """
-        with self._write_errors():
+        with self._errors(OutputError, "written", ". Give another --out"):
             system, path = self._opened
             for name in names:
                 try:
@@ -190,33 +183,25 @@ class RemoteFolder:
                 except FileNotFoundError:
                     continue
 
+    def _changed(self, how: str = "") -> RecordingError:
+        return RecordingError(
+            f"{self.url}: changed while it was read{how}. Run the batch again when the recording "
+            "is complete"
+        )
+
     @contextmanager
-    def _read_errors(self) -> Iterator[None]:
+    def _errors(self, kind: type[CalivError], done: str, remedy: str = "") -> Iterator[None]:
         # Each file system has exceptions of its own, of which few are an OSError.
         try:
             yield
         except CalivError:
             raise
         except Exception as e:
-            raise RecordingError(f"{self.url}: cannot be read: {_said(e)}") from None
-
-    @contextmanager
-    def _write_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except CalivError:
-            raise
-        except Exception as e:
-            raise OutputError(
-                f"{self.url}: cannot be written: {_said(e)}. Give another --out"
-            ) from None
+            said = " ".join(f"{type(e).__name__}: {e}".split())
+            raise kind(f"{self.url}: cannot be {done}: {said}{remedy}") from None
 
 
 def _listed(info: Mapping[str, Any]) -> ListedFile:
     said = [f"{key}={info[key]}" for key in MARKS if info.get(key) is not None]
     mark = hashlib.sha256("\n".join(said).encode()).hexdigest() if said else None
     return ListedFile(int(info.get("size") or 0), mark)
-
-
-def _said(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())

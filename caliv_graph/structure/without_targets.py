@@ -8,13 +8,15 @@ vehicle's S2S yaw went 10 degrees off.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
+import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config
-from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array, BoolArray, IntArray, TargetCloud, TargetObservation
+from caliv_graph.products import Array, BoolArray, IntArray, TargetObservation
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 MARGIN_M = 0.2
@@ -38,26 +40,26 @@ def without_targets(
         own = np.flatnonzero(patches.scan_lidar[patches.scan] == a)
         if not len(own):
             continue
-        R_guess, t_guess = (x[0] for x in stack([config.lidars[name].guess()]))
+        in_map = partial(
+            _in_map, trajectory=trajectory, T_vehicle_lidar=config.lidars[name].guess()
+        )
         stamps_ns = patches.stamps_ns[patches.scan[own]]
-        centres_map = _in_map(patches.centres_lidar[own], stamps_ns, trajectory, R_guess, t_guess)
+        centres_map = in_map(patches.centres_lidar[own], stamps_ns)
         for observation in observations:
-            clouds = sorted(
-                (c for c in observation.clouds if (c.lidar, c.drive) == (name, patches.drive)),
-                key=lambda cloud: cloud.stamp_ns,
+            of_lidar = (
+                c for c in observation.clouds if (c.lidar, c.drive) == (name, patches.drive)
             )
-            if clouds:
-                points_map = [
-                    _in_map(
-                        c.points_lidar,
-                        np.full(len(c.points_lidar), c.stamp_ns),
-                        trajectory,
-                        R_guess,
-                        t_guess,
-                    )
-                    for c in clouds
-                ]
-                keep[own] &= ~_inside(centres_map, stamps_ns, clouds, points_map)
+            clouds = sorted(of_lidar, key=lambda cloud: cloud.stamp_ns)
+            if not clouds:
+                continue
+            at_ns = np.array([cloud.stamp_ns for cloud in clouds])
+            sizes = [len(cloud.points_lidar) for cloud in clouds]
+            points_lidar = np.concatenate([cloud.points_lidar for cloud in clouds])
+            points_map = in_map(points_lidar, np.repeat(at_ns, sizes))
+            cylinders = np.array(
+                [_cylinder(x) for x in np.split(points_map, np.cumsum(sizes[:-1]))]
+            )
+            keep[own] &= ~_inside(centres_map, cylinders[nearest_node(at_ns, stamps_ns)])
     return patches if keep.all() else patches.part(keep)
 
 
@@ -65,38 +67,27 @@ def _in_map(
     points_lidar: Array,
     stamps_ns: IntArray,
     trajectory: VehicleTrajectory,
-    R_guess: Array,
-    t_guess: Array,
+    T_vehicle_lidar: gtsam.Pose3,
 ) -> Array:
-    """(N, 3) points at stamps (N,) in the map, by the guess (R, t) of T_vehicle_lidar."""
+    """(N, 3) points at stamps (N,) in the map."""
     stamps, which = np.unique(stamps_ns, return_inverse=True)
     R, t = trajectory.poses_at(stamps)
-    points_vehicle = points_lidar @ R_guess.T + t_guess
+    points_vehicle = (
+        points_lidar @ T_vehicle_lidar.rotation().matrix().T + T_vehicle_lidar.translation()
+    )
     return np.asarray(np.einsum("nab,nb->na", R[which], points_vehicle) + t[which])
 
 
-def _inside(
-    centres_map: Array,
-    stamps_ns: IntArray,
-    clouds: Sequence[TargetCloud],
-    points_map: Sequence[Array],
-) -> BoolArray:
-    """(N,) whether patches are in the cylinder of the cloud that is next in time."""
-    at = np.array([cloud.stamp_ns for cloud in clouds])
-    after = np.clip(np.searchsorted(at, stamps_ns), 1 if len(at) > 1 else 0, len(at) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(stamps_ns - at[before] < at[after] - stamps_ns, before, after)
-    middle = np.array([points[:, :2].mean(axis=0) for points in points_map])
-    radius = np.array(
-        [
-            np.linalg.norm(points[:, :2] - xy, axis=1).max()
-            for points, xy in zip(points_map, middle, strict=True)
-        ]
-    )
-    low = np.array([points[:, 2].min() for points in points_map])
-    high = np.array([points[:, 2].max() for points in points_map])
-    aside = np.linalg.norm(centres_map[:, :2] - middle[nearest], axis=1)
-    z = centres_map[:, 2]
-    return np.asarray(
-        (aside < radius[nearest] + MARGIN_M) & (z > low[nearest]) & (z < high[nearest] + MARGIN_M)
-    )
+def _cylinder(points: Array) -> tuple[float, float, float, float, float]:
+    """x, y and radius of an upright cylinder about points (n, 3), and where it begins and ends."""
+    x, y = points[:, :2].mean(axis=0).tolist()
+    radius_m = float(np.hypot(points[:, 0] - x, points[:, 1] - y).max())
+    return x, y, radius_m, float(points[:, 2].min()), float(points[:, 2].max())
+
+
+def _inside(places: Array, cylinders: Array) -> BoolArray:
+    """(N,) whether places (N, 3) are in a cylinder (N, 5) each, or up to `MARGIN_M` beside it."""
+    x, y, radius_m, low, high = cylinders.T
+    aside_m = np.hypot(places[:, 0] - x, places[:, 1] - y)
+    z = places[:, 2]
+    return np.asarray((aside_m < radius_m + MARGIN_M) & (z > low) & (z < high + MARGIN_M))

@@ -6,7 +6,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -65,18 +65,21 @@ def run_command(*arguments: object) -> str:
     return done.stdout
 
 
-def calibrate_measured(config: Path, result: Path, cores: int = 0) -> Usage:
+def calibrate_measured(
+    config: Path, result: Path, cores: int = 0, options: Sequence[str] = ()
+) -> Usage:
     """Runs `caliv-graph calibrate` in its own process.
 
     Args:
         config: config to calibrate with.
         result: folder for the result; an older one is replaced.
         cores: number of cores that it may use; 0: all.
+        options: further options of the command.
 
     Raises:
         CalivError: it left no result.
     """
-    command = map(str, (COMMAND, "calibrate", config, "--out", result, "--force"))
+    command = map(str, (COMMAND, "calibrate", config, "--out", result, "--force", *options))
     launch = [sys.executable, "-I", "-S", "-c", LAUNCHER, str(cores), *command]
     launched = subprocess.run(launch, check=True, capture_output=True, text=True)
     usage = json.loads(launched.stdout)

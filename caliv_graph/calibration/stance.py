@@ -15,7 +15,7 @@ import numpy as np
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
 from caliv_graph.calibration.structure import rows_of_lidars
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_ground
+from caliv_graph.conventions import key_ground, key_offset
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, skew
 from caliv_graph.products import Array, IntArray, Solution, Stance, StructureTerm
 from caliv_graph.trajectory.tilt import BODY_SIGMA_RAD
@@ -113,7 +113,16 @@ def _coordinates(solution: Solution, term: StructureTerm) -> tuple[Array, Array]
             else:
                 moved[row : row + 3] = values.atVector(KEYS[name]) - value
         row += 3
-    # Time offsets are left out: a clock that is late lifts and tilts nothing.
+    # A late clock lifts the ground where the vehicle pitches: without its column the row would not
+    # be that of the graph, and taking the height out of the graph would leave negative information.
+    for name, offset_s in term.time_offsets_s.items():
+        key = key_offset(solution.lidars.index(name)) if name in solution.lidars else -1
+        if key in graph.starts:
+            rows[row, graph.starts[key]] = 1.0
+            moved[row] = values.atVector(key)[0] - offset_s
+        else:
+            moved[row] = -offset_s
+        row += 1
     first = len(graph.gradient) - 6 * len(solution.lidars)
     for name, own in rows_of_lidars(term).items():
         if name in solution.lidars:

@@ -13,7 +13,7 @@ import scipy.sparse
 from caliv_graph.calibration.stance import stance_rows
 from caliv_graph.calibration.suspects import _Block, _Motion, _Quadratic, _Shared
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_lever_arm
+from caliv_graph.conventions import key_lever_arm, key_offset
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes
 from caliv_graph.products import Array, LinearisedGraph, Stance, StructureTerm
 from caliv_graph.trajectory.parameters import LEVER_ARM
@@ -80,11 +80,16 @@ def test_a_parameter_of_structure_is_that_of_the_motion_data() -> None:
     assert found.gradient == pytest.approx(b[12:] - H[12:, :12] @ inner[:, 3], rel=1e-5)
 
 
-def solution_of(term: StructureTerm, T_vehicle: gtsam.Pose3, T_lidar: gtsam.Pose3) -> Any:
-    values = gtsam.Values()
+def solution_of(
+    term: StructureTerm, T_vehicle: gtsam.Pose3, T_lidar: gtsam.Pose3, offset_s: float | None
+) -> Any:
+    values, starts = gtsam.Values(), {KEYS[ARM]: 6}
     values.insert(key_lever_arm(), np.array([0.1, 0.0, 0.0]))
-    graph = graph_of({KEYS[ARM]: 6})
+    if offset_s is not None:
+        values.insert(key_offset(0), np.array([offset_s]))
+        starts[key_offset(0)] = 9
     axes = joint_right_to_vehicle_axes([T_lidar])
+    gradient = np.zeros(M + (offset_s is not None))
     return SimpleNamespace(
         structure=(term,),
         lidars=("front",),
@@ -92,15 +97,17 @@ def solution_of(term: StructureTerm, T_vehicle: gtsam.Pose3, T_lidar: gtsam.Pose
         T_vehicle_lidar={"front": T_lidar},
         values=values,
         factor_kinds=("structure",),
-        linearised=SimpleNamespace(starts=graph.starts, gradient=np.zeros(M), to_vehicle_axes=axes),
+        linearised=SimpleNamespace(starts=starts, gradient=gradient, to_vehicle_axes=axes),
     )
 
 
-def test_the_stance_of_a_term_is_on_the_variables_of_the_graph() -> None:
+@pytest.mark.parametrize("offset_s", [0.02, None])
+def test_the_stance_of_a_term_is_on_the_variables_of_the_graph(offset_s: float | None) -> None:
+    """With the time offset of a LiDAR, which the graph estimates or holds at zero."""
     T_vehicle = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 0.0]))
     T_lidar = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([2.0, 0.0, 2.0]))
     rng = np.random.default_rng(5)
-    rows, step = rng.standard_normal((3, M)), 1e-3 * rng.standard_normal(12)
+    rows, step = rng.standard_normal((3, M + 1)), 1e-3 * rng.standard_normal(12)
     cov = np.diag([1e-4, 1e-6, 1e-6])
     stance = Stance(np.zeros(3), rows, cov, height_sigma_m=0.02, tilt_in_term=False)
     term = StructureTerm(
@@ -108,19 +115,21 @@ def test_the_stance_of_a_term_is_on_the_variables_of_the_graph() -> None:
         stamps_ns=np.array([7]),
         T_map_vehicle=(T_vehicle,),
         parameters={ARM: np.zeros(3)},
-        time_offsets_s={},
+        time_offsets_s={"front": 0.005},
         T_vehicle_lidar={"front": T_lidar},
-        information=np.zeros((M, M)),
-        gradient=np.zeros(M),
+        information=np.zeros((M + 1, M + 1)),
+        gradient=np.zeros(M + 1),
         strips=(),
         offset_m=0.0,
         stance=stance,
     )
-    moved = solution_of(term, T_vehicle.retract(step[:6]), T_lidar.retract(step[6:]))
+    moved = solution_of(term, T_vehicle.retract(step[:6]), T_lidar.retract(step[6:]), offset_s)
     (found,) = stance_rows(moved)
-    d = np.concatenate([step[:6], [0.1, 0.0, 0.0], step[6:]])
+    late = (0.0 if offset_s is None else offset_s) - 0.005
+    d = np.concatenate([step[:6], [0.1, 0.0, 0.0, late], step[6:]])
     assert found.residual == pytest.approx(rows @ d, abs=1e-6)
-    assert found.rows == pytest.approx(rows, abs=1e-12)
+    known = rows if offset_s is not None else np.delete(rows, 9, axis=1)
+    assert found.rows == pytest.approx(known, abs=1e-12)
     assert found.by_height.tolist() == [1.0, 0.0, 0.0]
     # The term has the height with its assumed sigma; the tilt is assumed here.
     in_graph = 1.0 / (1e-4 + 0.02**2)

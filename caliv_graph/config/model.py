@@ -313,9 +313,8 @@ class Config(Section):
         topics = [lidar.topic for lidar in self.lidars.values()]
         for topic in topics:
             if topics.count(topic) > 1:
-                raise ValueError(
-                    f"topic '{topic}' belongs to more than one LiDAR: give each its own"
-                )
+                of = " and ".join(f"'{n}'" for n, m in self.lidars.items() if m.topic == topic)
+                raise ValueError(f"topic '{topic}' belongs to LiDARs {of}: give each its own")
         return self
 
     def names_motion(self) -> bool:

@@ -97,7 +97,7 @@ def test_a_spoiled_recording(name: str, drive: Path, tmp_path: Path) -> None:
         ({"data__format": "caliv"}, "drive"),
         ({"data__path": "/dev/null"}, "is a pipe or a device"),
         ({"data__path": "a\x00b"}, "no such file"),
-        ({"lidars__rear__topic": FRONT}, "belongs to more than one LiDAR"),
+        ({"lidars__rear__topic": FRONT}, "belongs to LiDARs 'front' and 'rear'"),
         ({"lidars__front__min_range": 300.0, "lidars__rear__min_range": 300.0}, "no LiDAR sees"),
     ],
     ids=str,

@@ -38,7 +38,7 @@ from caliv_graph.uncertainty.consistency import (
     ScoreTest,
 )
 from caliv_graph.wording.contradictions import contradiction_sentence
-from caliv_graph.wording.suspects import ranking_sentence
+from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
 
 
 def _headings(
@@ -68,7 +68,7 @@ def check(
     `recordings` and `trajectories` are one per drive, `motions` by the index of the drive;
     `displaced`: some target is at one place only with late stamps or another guess. Returns
     the calibration, inconsistent if something contradicts something, with its suspects; and
-    warnings: headings that disagree, and what could not be tested.
+    warnings: an input that may be wrong, headings that disagree, and what could not be tested.
     """
     headings = _headings(trajectories, motions)
     drives = [Path(recording.name).name for recording in recordings]
@@ -112,7 +112,8 @@ def check(
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     disagreements = (heading.warning for heading in headings.values() if heading.warning)
-    return calibration, (*disagreements, *untested)
+    doubts = filter(None, [doubt_sentence(suspects)])
+    return calibration, (*doubts, *disagreements, *untested)
 
 
 def _between_parts(

@@ -29,6 +29,9 @@ REGISTRATION_BIAS = np.array([1e-3] * 3 + [5e-3] * 3)
 """Allowance, 1 sigma in rad and m: the common error of all registrations of clouds that see the
 target from one side: 1 mrad, which is some millimetres at the LiDAR."""
 
+DOUBT_SIGMAS = 4.0
+"""An input that explains more is named in a warning: chance does so in one of 16,000 tests."""
+
 CLOCK_BIAS_S = 2e-3
 """Allowance, 1 sigma: at 2 m/s it moves a cloud by 4 mm, about `REGISTRATION_BIAS`."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from caliv_graph.products import Suspect
-from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS, DOUBT_SIGMAS
 
 MOST_NEXT = 2
 """Suspects that are named after the first."""
@@ -25,6 +25,18 @@ def ranking_sentence(suspects: Sequence[Suspect]) -> str:
     return (
         f"most likely: {first.input}, {_by(first)}; it explains {100.0 * first.explains:.0f} "
         f"percent of the contradiction ({first.sigmas:.0f} sigma){then}. {remedy(first)}"
+    )
+
+
+def doubt_sentence(suspects: Sequence[Suspect]) -> str:
+    """The first suspect where it is no contradiction yet, but hardly chance; otherwise empty."""
+    if not suspects or not DOUBT_SIGMAS < suspects[0].sigmas <= CONTRADICTION_SIGMAS:
+        return ""
+    first = suspects[0]
+    return (
+        f"{first.input} may be wrong, {_by(first)}: the data would rather have it so by "
+        f"{first.sigmas:.1f} sigma, and {CONTRADICTION_SIGMAS:g} are a contradiction. "
+        f"{remedy(first)}"
     )
 
 

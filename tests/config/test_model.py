@@ -124,7 +124,8 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
         ({"lidars": lidar(sigma={"xyz": [1, 2]})}, "'lidars.front.sigma.xyz"),
         ({"lidars": lidar(min_range=5, max_range=4)}, "min_range (5.0 m) must be below max_range "
          "(4.0 m)"),
-        ({"lidars": {**lidar(), "rear": lidar()["front"]}}, "topic 'a' belongs to LiDARs 'front' and 'rear'"),
+        ({"lidars": {**lidar(), "rear": lidar()["front"]}},
+         "topic 'a' belongs to LiDARs 'front' and 'rear'"),
         ({"reference": "roof"}, "'roof' is not a LiDAR of this config: set it to one of"),
         ({"target": {"min": [0, 0, 0], "max": [1, 0, 1]}}, "min y (0.0 m) must be below max y "
          "(0.0 m)"),

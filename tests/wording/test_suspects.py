@@ -7,7 +7,13 @@ from dataclasses import replace
 import pytest
 
 from caliv_graph.products import Suspect
-from caliv_graph.wording.suspects import motion_sentence, ranking_sentence, remedy, suspect_row
+from caliv_graph.wording.suspects import (
+    doubt_sentence,
+    motion_sentence,
+    ranking_sentence,
+    remedy,
+    suspect_row,
+)
 
 ARM = Suspect(
     "gnss.lever_arm",
@@ -55,6 +61,22 @@ def test_a_clock_is_late_or_early_and_has_a_key() -> None:
 def test_nothing_is_said_below_five_sigma() -> None:
     assert motion_sentence([suspect("gnss.time_offset", 4.9, 4.9)]) == ""
     assert motion_sentence([]) == ""
+
+
+@pytest.mark.parametrize(("sigmas", "said"), [(3.9, False), (4.8, True), (5.1, False)])
+def test_what_is_nearly_a_contradiction_is_a_doubt(sigmas: float, said: bool) -> None:
+    height = Suspect(
+        "ground.vehicle_height", (0.0,), (0.041,), (-0.2,), ("m",), 0.9, sigmas, sigmas
+    )
+    text = doubt_sentence([height])
+    assert text == (
+        "ground.vehicle_height may be wrong, by -0.20 m, so that it is 0.00 m (sigma 0.04 m): the "
+        "data would rather have it so by 4.8 sigma, and 5 are a contradiction. Measure the height "
+        "of the vehicle frame above the ground again"
+        if said
+        else ""
+    )
+    assert doubt_sentence([]) == ""
 
 
 @pytest.mark.parametrize(

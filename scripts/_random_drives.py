@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,9 @@ WALL_FROM_PATH_M = 4.0
 AROUND_M = 22.0
 """Half side of the square about the path in which walls and walkers are placed."""
 
+LATE_S = 0.03
+"""Most that the stamps of a LiDAR are off where its time offset is estimated."""
+
 _TRIES = 1000
 
 
@@ -38,11 +41,13 @@ class RandomDrive:
         scenario: vehicle, LiDARs, world and noise.
         seed: of all draws.
         guess: whether the config has initial guesses.
+        options: keys of the config that differ from what `simulate` writes, by section.
     """
 
     scenario: Scenario
     seed: int
     guess: bool
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def text(self) -> str:
@@ -62,7 +67,10 @@ class RandomDrive:
         parts += [model.config_target] + ["walker"] * bool(model.world.walkers)
         parts += ["no orientation"] * (not model.imu.orientation.enabled)
         parts += ["no wheels"] * (not model.velocity.enabled)
-        return " ".join(parts + ["no guess"] * (not self.guess))
+        parts += ["no guess"] * (not self.guess)
+        for section, keys in self.options.items():
+            parts += [f"{section}.{key}: {value}" for key, value in keys.items()]
+        return " ".join(parts)
 
 
 @dataclass
@@ -119,6 +127,36 @@ def random_drive(seed: int) -> RandomDrive:
         "config_target": draw.one_of(["region", "search"]),
     }
     return RandomDrive(parse_scenario(raw, f"seed {seed}"), seed, guess=draw.happens(0.75))
+
+
+def with_options(drive: RandomDrive) -> RandomDrive:
+    """The same drive with options of the config drawn at random.
+
+    Where `solve.time_offset` is set, the LiDARs' stamps are late or early.
+    """
+    draw = _Draw(np.random.default_rng([20261124, drive.seed]))
+    model, options = drive.scenario, dict[str, dict[str, Any]]()
+
+    def option(probability: float, section: str, key: str, value: Any) -> bool:
+        happens = draw.happens(probability)
+        if happens:
+            options.setdefault(section, {})[key] = value
+        return happens
+
+    if option(0.4, "solve", "time_offset", True):
+        lidars = {
+            name: lidar.model_copy(update={"time_offset_s": draw.within(-LATE_S, LATE_S)})
+            for name, lidar in model.lidars.items()
+        }
+        model = model.model_copy(update={"lidars": lidars})
+    option(0.3, "solve", "mode", draw.one_of(["joint", "staged"]))
+    option(0.5, "robust", "kernel", draw.one_of(["tls", "trimmed", "none"]))
+    option(0.2, "gnss", "lever_arm", None)
+    option(0.2, "imu", "T_vehicle_imu", {"xyz": list(model.imu.mounting.xyz), "rpy_deg": None})
+    option(0.2, "structure", "use", False)
+    option(0.1, "ground", "use", False)
+    option(0.1, "ground", "parallel_sigma_deg", 0.3)
+    return replace(drive, scenario=model, options=options)
 
 
 def _drive(draw: _Draw) -> dict[str, Any]:

@@ -1,11 +1,13 @@
 """Calibrations of drives that are drawn at random, against the truth.
 
     .venv/bin/python scripts/benchmark_random.py --first 100 --last 139
+    .venv/bin/python scripts/benchmark_random.py --first 400 --last 419 --options
     .venv/bin/python scripts/benchmark_random.py --summary
 
 A drive is drawn from its seed: path, vehicle, one to three LiDARs, targets, walls, people, noise
 (`_random_drives.py`). It is simulated in memory and calibrated with the config that `simulate`
-writes, one in four without initial guesses. A run is a line in out/random/runs.jsonl, written when
+writes, one in four without initial guesses. With --options, keys of the config are drawn as well:
+mode, kernel, what is estimated. A run is a line in out/random/runs.jsonl, written when
 it ends; a second start runs the missing ones. Runs of another version of the program do not count
 unless --any-version is given. Errors are in vehicle axes, of the axes that the drive determines.
 """
@@ -19,6 +21,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +44,7 @@ from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from scripts._guesses import drop_guesses
 from scripts._judged import outcome_of, sigmas_off, worst
-from scripts._random_drives import RandomDrive, random_drive
+from scripts._random_drives import RandomDrive, random_drive, with_options
 from scripts._runs import add_line, code_digest, json_lines, performed
 
 OUT = REPOSITORY / "out" / "random"
@@ -63,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     guesses = parser.add_mutually_exclusive_group()
     guesses.add_argument("--guess", action="store_true", help="always give initial guesses")
     guesses.add_argument("--no-guess", action="store_true", help="never give initial guesses")
+    parser.add_argument("--options", action="store_true", help="draw keys of the config, too")
     parser.add_argument("--jobs", type=int, default=1, help="at a time (default: 1)")
     parser.add_argument("--show", action="store_true", help="only print the drives as scenarios")
     parser.add_argument("--summary", action="store_true", help="only print what is there")
@@ -73,34 +77,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seeds = range(asked.first, asked.last + 1)
     if asked.show:
         for seed in seeds:
-            print(f"# {random_drive(seed).text}\n{dump_scenario(random_drive(seed).scenario)}")
+            drive = drawn(seed, forced, asked.options)
+            print(f"# {drive.text}\n{dump_scenario(drive.scenario)}")
         return 0
     path = asked.out / "runs.jsonl"
     if not asked.summary:
         asked.out.mkdir(parents=True, exist_ok=True)
-        done = {(r["seed"], r["forced"]) for r in lines_of(path, asked.any_version)}
-        tasks = [(seed, forced) for seed in seeds if (seed, forced) not in done]
+        done = {key_of(line) for line in lines_of(path, asked.any_version)}
+        tasks = [
+            task for seed in seeds if (task := (seed, forced, bool(asked.options))) not in done
+        ]
         for _, line in performed(perform, tasks, asked.jobs):
             if isinstance(line, Exception):
                 raise line
             add_line(path, line)
             print(text_of(line), flush=True)
-    counted = [r for r in lines_of(path, asked.any_version) if r["forced"] == forced]
+    kind = (forced, bool(asked.options))
+    counted = [r for r in lines_of(path, asked.any_version) if key_of(r)[1:] == kind]
     print(summary([r for r in counted if asked.summary or r["seed"] in seeds]))
     return 0
 
 
-def perform(task: tuple[int, bool | None]) -> dict[str, Any]:
-    """Draws, simulates, calibrates and compares once; returns the line to write.
+Task = tuple[int, bool | None, bool]
+"""Seed; whether there are initial guesses, None: as drawn; whether keys of the config are drawn."""
 
-    Args:
-        task: seed, and whether there are initial guesses; None: as drawn.
-    """
-    seed, forced = task
-    drawn = random_drive(seed)
-    drive = drawn if forced is None else RandomDrive(drawn.scenario, seed, forced)
+
+def drawn(seed: int, forced: bool | None, options: bool) -> RandomDrive:
+    """The drive of a task."""
+    drive = random_drive(seed)
+    if forced is not None:
+        drive = replace(drive, guess=forced)
+    return with_options(drive) if options else drive
+
+
+def perform(task: Task) -> dict[str, Any]:
+    """Draws, simulates, calibrates and compares once; returns the line to write."""
+    seed, forced, options = task
+    drive = drawn(*task)
     recording = simulate_drive(drive.scenario, seed)
-    line: dict[str, Any] = {"seed": seed, "forced": forced, "code": code_digest()}
+    line: dict[str, Any] = {"seed": seed, "forced": forced, "options": options}
+    line["code"] = code_digest()
     line |= {"text": drive.text, "said": [], "warnings": [], "undetermined": [], "errors": {}}
     begun = time.process_time()
     try:
@@ -116,7 +132,7 @@ def perform(task: tuple[int, bool | None]) -> dict[str, Any]:
 
 
 def calibrated(recording: SimulatedRecording, drive: RandomDrive) -> CalibrationRun:
-    """Calibrates with the config that `simulate` writes.
+    """Calibrates with the config that `simulate` writes, and the options of the drive.
 
     Raises:
         CalivError: there is no result.
@@ -124,6 +140,8 @@ def calibrated(recording: SimulatedRecording, drive: RandomDrive) -> Calibration
     raw = config_of(recording, has_bag=True)
     if not drive.guess:
         drop_guesses(raw)
+    for section, keys in drive.options.items():
+        raw[section] = {**raw.get(section, {}), **keys}
     return calibrate([recording], parse_config(raw, drive.text, REPOSITORY), SilentProgress())
 
 
@@ -133,8 +151,13 @@ def calibrated(recording: SimulatedRecording, drive: RandomDrive) -> Calibration
 def lines_of(path: Path, any_version: bool) -> list[dict[str, Any]]:
     """The runs of a file that count, by seed; of a seed the last one."""
     lines = (x for x in json_lines(path) if any_version or x["code"] == code_digest())
-    last = {(line["seed"], line["forced"]): line for line in lines}
+    last = {key_of(line): line for line in lines}
     return sorted(last.values(), key=lambda line: int(line["seed"]))
+
+
+def key_of(line: Mapping[str, Any]) -> Task:
+    """The task of a line; older lines have no options."""
+    return int(line["seed"]), line["forced"], bool(line.get("options", False))
 
 
 def worst_sigmas(line: Mapping[str, Any]) -> float:

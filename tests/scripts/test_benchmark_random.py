@@ -9,7 +9,7 @@ import pytest
 
 from caliv_graph.scenario.drives import make_drive
 from scripts import benchmark_random as benchmark
-from scripts._random_drives import TARGET_FROM_PATH_M, random_drive
+from scripts._random_drives import TARGET_FROM_PATH_M, random_drive, with_options
 
 
 def a_line(exit_code: int, sigmas: float, **changes: Any) -> dict[str, Any]:
@@ -40,6 +40,17 @@ def test_the_vehicle_passes_every_target_and_hits_none(seed: int) -> None:
 def test_a_drive_is_drawn_from_its_seed_alone() -> None:
     assert random_drive(7) == random_drive(7)
     assert random_drive(7).scenario.drive != random_drive(8).scenario.drive
+
+
+def test_options_are_drawn_beside_the_drive() -> None:
+    found = [with_options(random_drive(seed)) for seed in range(40)]
+    assert found == [with_options(random_drive(seed)) for seed in range(40)]
+    for seed, drive in enumerate(found):
+        late = [lidar.time_offset_s for lidar in drive.scenario.lidars.values()]
+        assert any(late) == bool(drive.options.get("solve", {}).get("time_offset"))
+        assert drive.scenario.world == random_drive(seed).scenario.world
+    sections = {section for drive in found for section in drive.options}
+    assert sections == {"solve", "robust", "gnss", "imu", "structure", "ground"}
 
 
 @pytest.mark.parametrize(

@@ -151,8 +151,10 @@ def with_options(drive: RandomDrive) -> RandomDrive:
         model = model.model_copy(update={"lidars": lidars})
     option(0.3, "solve", "mode", draw.one_of(["joint", "staged"]))
     option(0.5, "robust", "kernel", draw.one_of(["tls", "trimmed", "none"]))
-    option(0.2, "gnss", "lever_arm", None)
-    option(0.2, "imu", "T_vehicle_imu", {"xyz": list(model.imu.mounting.xyz), "rpy_deg": None})
+    if option(0.2, "gnss", "lever_arm", None):
+        options["gnss"]["lever_arm_sigma"] = None
+    if option(0.2, "imu", "T_vehicle_imu", {"xyz": [*model.imu.mounting.xyz], "rpy_deg": None}):
+        options["imu"]["rotation_sigma_deg"] = None
     option(0.2, "structure", "use", False)
     option(0.1, "ground", "use", False)
     option(0.1, "ground", "parallel_sigma_deg", 0.3)

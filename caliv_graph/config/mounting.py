@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from caliv_graph.config.sections import Place, Positive, Section, Triple
 from caliv_graph.errors import ConfigError
@@ -18,6 +18,9 @@ _ARM_SIGMA_M = 0.01
 
 _UNKNOWN_ARM_SIGMA_M = 2.0
 """Of a lever arm that nobody measured: antennas are within some metres of the vehicle's origin."""
+
+_LEAST_UNKNOWN_ARM_SIGMA_M = 0.1
+"""A smaller sigma of an unknown lever arm is left over from a known one."""
 
 _ROTATION_SIGMA_DEG = 0.1
 """Of an IMU's mount on a surface that was made for it."""
@@ -87,6 +90,16 @@ class ImuConfig(Section):
         5.0, description="degrees, how large that yaw error may be, 1 sigma"
     )
 
+    @model_validator(mode="after")
+    def _has_a_rotation_for_its_sigma(self) -> ImuConfig:
+        if self.T_vehicle_imu.rpy_deg is None and self.rotation_sigma_deg is not None:
+            raise ValueError(
+                "T_vehicle_imu.rpy_deg is null (unknown), yet rotation_sigma_deg says that it is "
+                f"known to {self.rotation_sigma_deg:g} degrees: remove rotation_sigma_deg, or "
+                "enter rpy_deg"
+            )
+        return self
+
     def rotation_sigma_rad(self) -> float | None:
         """Sigma of a rotation that was measured, radians; None: it is exact, or unknown."""
         if self.T_vehicle_imu.rpy_deg is None:
@@ -108,6 +121,17 @@ class GnssConfig(Section):
         description="metres, sigma of the lever arm per axis; absent: 0.01, 2 where it is unknown, "
         "and none where it is exactly zero",
     )
+
+    @model_validator(mode="after")
+    def _has_an_arm_for_its_sigma(self) -> GnssConfig:
+        sigma = self.lever_arm_sigma
+        if self.lever_arm is None and sigma is not None and sigma < _LEAST_UNKNOWN_ARM_SIGMA_M:
+            raise ValueError(
+                "lever_arm is null (unknown), yet lever_arm_sigma says that the antenna is within "
+                f"{sigma:g} m of the vehicle's origin: remove lever_arm_sigma (then 2 m), or enter "
+                "lever_arm"
+            )
+        return self
 
     def arm_sigma(self) -> float | None:
         """Sigma of the lever arm per axis, metres; None: it is exact."""

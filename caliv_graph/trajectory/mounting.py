@@ -85,8 +85,6 @@ def with_guessed_rotation(
     R_vehicle_imu, yaw_sigma = _upright_and_ahead(data, nodes, states)
     T = gtsam.Pose3(gtsam.Rot3(R_vehicle_imu), data.T_vehicle_imu.translation())
     sigmas = np.array([LEVEL_SIGMA_RAD, LEVEL_SIGMA_RAD, yaw_sigma])
-    if data.config.imu.rotation_sigma_deg is not None:
-        sigmas = np.full(3, math.radians(data.config.imu.rotation_sigma_deg))
     return replace(data, T_vehicle_imu=T, rotation_sigmas=sigmas)
 
 

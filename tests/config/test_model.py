@@ -440,6 +440,16 @@ def test_the_sigma_of_the_imu_s_rotation(imu: dict[str, object], sigma_deg: floa
     assert sigma == (None if sigma_deg is None else pytest.approx(math.radians(sigma_deg)))
 
 
+def test_what_is_unknown_has_no_sigma_left_over_from_when_it_was_known() -> None:
+    """Taken as the prior of the guess, it gave an IMU that is 30 degrees off with exit 4."""
+    with pytest.raises(ValueError, match=r"known to 0\.1 degrees: remove rotation_sigma_deg"):
+        ImuConfig.model_validate(
+            {"T_vehicle_imu": {"xyz": [1, 0, 0], "rpy_deg": None}, "rotation_sigma_deg": 0.1}
+        )
+    with pytest.raises(ValueError, match=r"within 0.01 m of the vehicle's origin: remove"):
+        GnssConfig.model_validate({"lever_arm": None, "lever_arm_sigma": 0.01})
+
+
 def test_an_unknown_rotation_is_no_pose() -> None:
     config = ImuConfig.model_validate({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": None}})
     with pytest.raises(ConfigError, match="the rotation of the IMU is unknown"):

@@ -13,14 +13,14 @@ import gtsam
 import numpy as np
 import scipy.sparse
 
-from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
+from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import build_graph, from_values
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import solved
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised
-from caliv_graph.trajectory.solve import Estimate
+from caliv_graph.trajectory.solve import Estimate, step_of, without_right_side
 from caliv_graph.trajectory.uncertain import Settled, moved
 
 
@@ -59,11 +59,7 @@ def step_with_errors(
     linear = estimate.graph.factors.linearize(estimate.values)
     none = np.zeros((n, AXES * len(errors)))
     start = chain_with_errors(settled, linear, nodes, errors, none)
-    # The last common coordinate is the right-hand side.
-    gradient = -np.concatenate([start.border[:, :, -1].ravel(), start.corner[:-1, -1]])
-    chain = Chain(
-        start.diagonal, start.coupling, start.border[:, :, :-1], start.corner[:-1, :-1].copy()
-    )
+    chain, gradient = without_right_side(start)
     first = 1 if data.yaw_bias else 0
     if settled.parameters:
         at = np.arange(first, len(chain.corner))
@@ -74,17 +70,10 @@ def step_with_errors(
     found = solved(chain, gradient)
     width = STATE + AXES * len(errors)
     by_node, common = found.step[: n * width].reshape(n, width), found.step[n * width :]
-    step = gtsam.VectorValues()
-    for i, d in enumerate(by_node):
-        step.insert(key_imu(i), d[:6])
-        step.insert(key_velocity(i), d[6:9])
-        step.insert(key_bias(i), d[9:STATE])
-    if first:
-        step.insert(key_yaw_bias(), common[:1])
     parameters = settled.parameters
     if parameters:
         data, parameters = moved(data, parameters, common[first:])
-    values = estimate.values.retract(step)
+    values = estimate.values.retract(step_of(by_node, common, bool(first)))
     states = from_values(values, n, data)
     graph = build_graph(data, nodes, states, dropped, data.config.robust.kernel)
     columns = None

@@ -14,6 +14,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
 from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.chain_solution import solved_columns
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
@@ -146,10 +147,10 @@ def _step(
 ) -> gtsam.Values:
     """The values after one damped step; unchanged if the damped system is singular."""
     if damping == 0.0:
-        try:
-            return values.retract(linear.optimize(ordering))
-        except RuntimeError:  # GTSAM's report of a singular system
-            damping = MIN_DAMPING
+        stepped = _solved(linear, values, ordering, n)
+        if stepped is not None:
+            return stepped
+        damping = MIN_DAMPING
     damped = linear.clone()
     root = math.sqrt(damping)
     pose = np.diag([root / STEP_RAD] * 3 + [root] * 3)
@@ -159,10 +160,49 @@ def _step(
         damped.add(gtsam.JacobianFactor(key_imu(i), pose, np.zeros(6), unit6))
         damped.add(gtsam.JacobianFactor(key_velocity(i), root * np.eye(3), np.zeros(3), unit3))
         damped.add(gtsam.JacobianFactor(key_bias(i), bias, np.zeros(6), unit6))
+    stepped = _solved(damped, values, ordering, n)
+    return values if stepped is None else stepped
+
+
+def _solved(
+    linear: gtsam.GaussianFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, n: int
+) -> gtsam.Values | None:
+    """The values after an undamped step; None if the system is singular.
+
+    GTSAM's Cholesky does not scale its variables: where fixes of a metre stand beside an IMU of
+    micrometres per node, it calls a sound system singular. The chain is scaled.
+    """
     try:
-        return values.retract(damped.optimize(ordering))
-    except RuntimeError:
-        return values
+        return values.retract(linear.optimize(ordering))
+    except RuntimeError:  # GTSAM's report of a singular system
+        pass
+    yaw_bias = values.exists(key_yaw_bias())
+    chain, gradient = without_right_side(chain_of(linear, n, yaw_bias))
+    try:
+        step = solved_columns(chain, -gradient[:, None])[:, 0]
+    except TrajectoryError:
+        return None
+    width = len(gradient) // n
+    return values.retract(step_of(step[: n * width].reshape(n, width), step[n * width :], yaw_bias))
+
+
+def step_of(by_node: Array, common: Array, yaw_bias: bool) -> gtsam.VectorValues:
+    """A step of the graph's variables: (n, 15 or more) of pose, velocity and bias; the yaw bias."""
+    step = gtsam.VectorValues()
+    for i, d in enumerate(by_node):
+        step.insert(key_imu(i), d[:6])
+        step.insert(key_velocity(i), d[6:9])
+        step.insert(key_bias(i), d[9:15])
+    if yaw_bias:
+        step.insert(key_yaw_bias(), common[:1])
+    return step
+
+
+def without_right_side(chain: Chain) -> tuple[Chain, Array]:
+    """A chain of `chain_of` without its last common coordinate, and the gradient that is there."""
+    gradient = -np.concatenate([chain.border[:, :, -1].ravel(), chain.corner[:-1, -1]])
+    border, corner = chain.border[:, :, :-1], chain.corner[:-1, :-1].copy()
+    return Chain(chain.diagonal, chain.coupling, border, corner), gradient
 
 
 def chain_of(

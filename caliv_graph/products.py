@@ -327,7 +327,7 @@ class GroundObservation:
         by_rates: (3, 6) change of (a, b, distance) if the angular (rad/s) and linear velocity (m/s)
             that moved the points to `stamp_ns` were larger, vehicle axes; None: none were moved.
         taken_s: first and last time of the points after `stamp_ns`, seconds.
-        velocity_map: (3,) m/s that moved them; None likewise.
+        twist_map: (6,) rad/s and m/s that moved them, map axes; None likewise.
         R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
     """
 
@@ -346,7 +346,7 @@ class GroundObservation:
     by_range_bias: Array | None = None
     by_rates: Array | None = None
     taken_s: tuple[float, float] = (0.0, 0.0)
-    velocity_map: Array | None = None
+    twist_map: Array | None = None
     R_map_vehicle: Array | None = None
 
 

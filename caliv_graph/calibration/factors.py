@@ -16,6 +16,7 @@ from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
     right_to_vehicle_axes,
     skew,
+    turned_twist,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
@@ -70,11 +71,10 @@ class CloudMotion:
         return out
 
     def twist_from(self, pose: gtsam.Pose3) -> Array:
-        """(6,) the twist with the same angular velocity, and the same velocity in the map."""
+        """(6,) the twist with the same velocities in the map."""
         if self.R_map_vehicle is None:
             return self.twist
-        velocity_map = self.R_map_vehicle @ self.twist[3:]
-        return np.concatenate([self.twist[:3], pose.rotation().matrix().T @ velocity_map])
+        return turned_twist(pose.rotation().matrix().T @ self.R_map_vehicle, self.twist)
 
     def undone(self) -> gtsam.Pose3:
         """From the points as they were moved to the points as they were measured."""
@@ -113,9 +113,11 @@ def predict_cloud(
         moves[i] = moves[i] @ by_variable
     if motion.apart_s:
         Z = Z.compose(motion.undone())
-        # A turn of the pose turns the velocity in vehicle axes; rates are the last of `moved`.
+        # A turn of the pose turns the velocities in vehicle axes; rates are the last of `moved`.
         if motion.R_map_vehicle is not None:
-            by_turn = moves[len(moved) + 1][:, 3:] @ skew(motion.twist_from(X)[3:])
+            twist = motion.twist_from(X)
+            turned = np.vstack([skew(twist[:3]), skew(twist[3:])])
+            by_turn = moves[len(moved) + 1] @ turned
             moves[1] = np.hstack([moves[1][:, :3] + by_turn, moves[1][:, 3:]])
     return Z, moves
 

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
-from caliv_graph.geometry.se3 import skew
+from caliv_graph.geometry.se3 import skew, turned_twist
 from caliv_graph.products import Array, GroundObservation
 
 SWAY_SIGMA_RAD = 1e-3
@@ -169,29 +169,29 @@ def ground_plane_factor(
             for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
             if key_rates in nuisances:
-                jacobians[0][:, :3] -= with_velocity(observation, R_map_vehicle.matrix())[1]
+                jacobians[0][:, :3] -= with_twist(observation, R_map_vehicle.matrix())[1]
         for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
         if key_rates in nuisances:
-            said = said + with_velocity(observation, R_map_vehicle.matrix())[0]
+            said = said + with_twist(observation, R_map_vehicle.matrix())[0]
         return np.asarray(np.append(axes @ n_lidar, d) - said)
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 
 
-def with_velocity(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Array, Array]:
-    """(3,) change of an observation whose points moved with the same velocity in the map.
+def with_twist(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Array, Array]:
+    """(3,) change of an observation whose points moved with the same velocities in the map.
 
     By another rotation of the vehicle than that of the trajectory; and (3, 3) its derivative by a
     right perturbation of that rotation.
     """
-    V, R_0, by_rates = observation.velocity_map, observation.R_map_vehicle, observation.by_rates
+    V, R_0, by_rates = observation.twist_map, observation.R_map_vehicle, observation.by_rates
     if V is None or R_0 is None or by_rates is None:
         return np.zeros(3), np.zeros((3, 3))
-    velocity = R_map_vehicle.T @ V
-    by_velocity = by_rates[:, 3:]
-    return by_velocity @ (velocity - R_0.T @ V), by_velocity @ skew(velocity)
+    twist = turned_twist(R_map_vehicle.T, V)
+    change = by_rates @ (twist - turned_twist(R_0.T, V))
+    return change, by_rates @ np.vstack([skew(twist[:3]), skew(twist[3:])])
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

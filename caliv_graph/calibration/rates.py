@@ -16,7 +16,7 @@ from caliv_graph.calibration.ground_factors import moved
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND, key_rates, key_vehicle
-from caliv_graph.geometry.se3 import unstack
+from caliv_graph.geometry.se3 import turned_twist, unstack
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.rates import RATE_SIGMAS, RATES
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -44,7 +44,7 @@ def with_rates_of(
         seconds = max(int(ends[1] - ends[0]), 1) / NANOSECONDS_PER_SECOND
         twists.append(gtsam.Pose3.Logmap(begin.between(end)) / seconds)
     changed = moved(observation, observation.by_rates @ (twists[1] - twists[0]))
-    return replace(changed, velocity_map=R[0] @ twists[1][3:], R_map_vehicle=R[0])
+    return replace(changed, twist_map=turned_twist(R[0], twists[1]), R_map_vehicle=R[0])
 
 
 def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:

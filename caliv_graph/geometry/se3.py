@@ -81,6 +81,11 @@ def skew(vectors: Array) -> Array:
     return out
 
 
+def turned_twist(R_a_b: Array, twist_b: Array) -> Array:
+    """(6,) angular velocity and velocity in axes a, of those (6,) in axes b."""
+    return np.concatenate([R_a_b @ twist_b[:3], R_a_b @ twist_b[3:]])
+
+
 def rpy(R_a_b: Array) -> Array:
     """Roll, pitch, yaw in radians of a (3, 3) rotation matrix; shape (3,)."""
     return np.asarray(gtsam.Rot3(R_a_b).rpy(), dtype=np.float64)

@@ -125,9 +125,10 @@ def geometry_of(
         by_extrinsic = by_extrinsic + _by_compensation(
             sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
         )
-        # Points move with the velocity in the map, whatever way the vehicle is turned.
+        # Points move with the velocities in the map, whatever way the vehicle is turned.
+        turning, moving = (np.swapaxes(skew(twists[pose, i : i + 3]), 1, 2) for i in (0, 3))
         by_turn = sightings.time_s[:, None, None] * (
-            np.swapaxes(skew(twists[pose, 3:]), 1, 2) @ by_pose[:, 3:]
+            turning @ by_pose[:, :3] + moving @ by_pose[:, 3:]
         )
         turned = state.moved[6 * pose[:, None] + np.arange(3)]
         plain += np.einsum("qc,qci->qi", turned, by_turn)

@@ -20,7 +20,7 @@ from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 RATES = 6
-"""Angular velocity (rad/s) and velocity in the map (m/s), both along the vehicle's axes."""
+"""Angular velocity (rad/s) and velocity (m/s) in the map, both along the vehicle's axes."""
 
 MOST_TURN_RAD = 1.0
 """Largest rotation between two poses whose difference counts: the motion between them is taken as
@@ -37,8 +37,9 @@ def rate_rows(
     """(6, 6 m) derivatives of the mean rates by right perturbations of m poses.
 
     The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`; their mean is over time. What a
-    turn of the pose changes of the velocity in vehicle axes, which the velocity in the map is not,
-    is taken out: it is another at every speed, and follows from each pose by itself.
+    turn of the pose changes of the velocities in vehicle axes, which those in the map are not, is
+    taken out: it is another at every speed and in every curve, and follows from each pose by
+    itself.
 
     Args:
         stamps_ns: (m,) of the poses, strictly increasing.
@@ -58,9 +59,10 @@ def rate_rows(
         by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
         out[:, 6 * i + 6 : 6 * i + 12] += by_later
         out[:, 6 * i : 6 * i + 6] -= by_later @ step.inverse().AdjointMap()
-        half = 0.5 * skew(np.asarray(gtsam.Pose3.Logmap(step))[3:])
-        out[3:, 6 * i : 6 * i + 3] -= half
-        out[3:, 6 * i + 6 : 6 * i + 9] -= half
+        twist = np.asarray(gtsam.Pose3.Logmap(step))
+        half = 0.5 * np.vstack([skew(twist[:3]), skew(twist[3:])])
+        out[:, 6 * i : 6 * i + 3] -= half
+        out[:, 6 * i + 6 : 6 * i + 9] -= half
         total_s += int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND
     if not math.isclose(total_s, 0.0):
         return out / total_s

@@ -293,7 +293,7 @@ def test_jacobians(offset_m: float) -> None:
         moved = replace(
             observation,
             by_rates=np.random.default_rng(seed).normal(size=(3, 6)),
-            velocity_map=np.array([2.0, -1.0, 0.1]),
+            twist_map=np.array([0.1, -0.2, 0.5, 2.0, -1.0, 0.1]),
             R_map_vehicle=random_values(seed + 9, 1.0)[0].atPose3(X).rotation().matrix(),
         )
         values.insert(key_rates(0), np.random.default_rng(seed).normal(size=6))

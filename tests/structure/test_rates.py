@@ -37,6 +37,7 @@ def swept() -> Problem:
     problem = problem_of(yard(), path, 11, NOISE)
     assert problem.twists is not None
     off = np.tile(rows @ d.ravel(), (POSES, 1))
+    off[:, :3] += np.cross(problem.twists[:, :3], d[:, :3])
     off[:, 3:] += np.cross(problem.twists[:, 3:], d[:, :3])
     return with_sweeps(replace(problem, prior=prior), off)
 

@@ -27,12 +27,12 @@ def mean_rates(poses: list[gtsam.Pose3]) -> Array:
 
 
 def turned(poses: list[gtsam.Pose3], i: int) -> Array:
-    """(3, 3) what a turn of pose i changes of the mean of the velocities in vehicle axes."""
-    out = np.zeros((3, 3))
+    """(6, 3) what a turn of pose i changes of the mean of the rates in vehicle axes."""
+    out = np.zeros((6, 3))
     for k in (i - 1, i):
         if 0 <= k < len(poses) - 1:
-            shift = gtsam.Pose3.Logmap(poses[k].between(poses[k + 1]))[3:]
-            out += 0.5 * np.cross(shift, np.eye(3)).T
+            step = gtsam.Pose3.Logmap(poses[k].between(poses[k + 1]))
+            out += 0.5 * np.vstack([np.cross(part, np.eye(3)).T for part in (step[:3], step[3:])])
     return np.asarray(out / (STAMPS[-1] * 1e-9))
 
 
@@ -45,22 +45,38 @@ def test_rows_are_derivatives_of_the_mean_rates() -> None:
             ahead, behind = list(poses), list(poses)
             ahead[i], behind[i] = poses[i].retract(d), poses[i].retract(-d)
             change = (mean_rates(ahead) - mean_rates(behind)) / 2e-6
-            change[3:] -= turned(poses, i) @ d[:3] / 1e-6
+            change -= turned(poses, i) @ d[:3] / 1e-6
             assert rows[:, 6 * i + k] == pytest.approx(change, abs=1e-6)
 
 
-def test_a_constant_roll_on_an_arc_is_a_rate_of_pitch() -> None:
-    """0.2 rad/s times 3 mrad. A constant pitch is one of roll; the velocity in the map stays."""
-    arc = np.array([0.0, 0.0, 0.2, 2.0, 0.0, 0.0])
-    stamps = np.arange(0, 20) * 500_000_000
-    rows = rate_rows(stamps, [gtsam.Pose3.Expmap(1e-9 * s * arc) for s in stamps])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_turn_of_the_vehicle_frame_leaves_the_rates_in_the_map(way: float) -> None:
+    """A roll of 3 mrad at 0.2 rad/s is a rate of pitch of 0.6 mrad/s, and of -0.6 in the other
+    curve: no mean rate is both, so that it follows from each pose by itself."""
+    twists = [np.array([0.0, 0.0, turn, 2.0, 0.0, 0.0]) for turn in [0.2] * 10 + [0.2 * way] * 10]
+    poses = [gtsam.Pose3()]
+    for twist in twists:
+        poses.append(poses[-1].compose(gtsam.Pose3.Expmap(0.5 * twist)))
+    rows = rate_rows(np.arange(21) * 500_000_000, poses)
     assert rows is not None
-    assert rows @ np.tile([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0], 20) == pytest.approx(
-        [0.0, 6e-4, 0.0, 0.0, 0.0, 0.0], abs=1e-9
-    )
-    assert rows @ np.tile([0.0, 3e-3, 0.0, 0.0, 0.0, 0.0], 20) == pytest.approx(
-        [-6e-4, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-9
-    )
+    for turn in 3e-3 * np.eye(3):
+        common = np.tile([*turn, 0.0, 0.0, 0.0], 21)
+        assert rows @ common == pytest.approx(np.zeros(6), abs=1e-9)
+
+
+def test_a_gyroscope_that_is_off_is_a_rate() -> None:
+    """Poses that turn by 1 mrad/s more about y than those of the trajectory, for a second."""
+    arc = np.array([0.0, 0.0, 0.2, 2.0, 0.0, 0.0])
+    stamps = np.arange(3) * 500_000_000
+    poses = [gtsam.Pose3.Expmap(1e-9 * s * arc) for s in stamps]
+    faster = arc + np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 0.0])
+    off = [gtsam.Pose3.Expmap(1e-9 * s * faster) for s in stamps]
+    d = np.concatenate([T.localCoordinates(U) for T, U in zip(poses, off, strict=True)])
+    rows = rate_rows(stamps, poses)
+    assert rows is not None
+    # A pitch of 0.5 mrad in the mean, at 0.2 rad/s: a rate of roll of -0.1 mrad/s would be a turn
+    # of the poses, and there is none.
+    assert (rows @ d)[:3] == pytest.approx([1e-4, 1e-3, 0.0], abs=1e-5)
 
 
 def test_poses_that_are_far_apart_tell_no_rates() -> None:

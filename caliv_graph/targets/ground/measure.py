@@ -13,7 +13,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import cross
+from caliv_graph.geometry.se3 import cross, turned_twist
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -111,7 +111,7 @@ class GroundMeter:
             by_range_bias=changes[:, :biases],
             by_rates=changes[:, biases + 3 :] if times_s.any() else None,
             taken_s=(float(times_s.min()), float(times_s.max())),
-            velocity_map=R_map_vehicle[0] @ twists_at(self._trajectory, [at_ns])[0, 3:],
+            twist_map=turned_twist(R_map_vehicle[0], twists_at(self._trajectory, [at_ns])[0]),
             R_map_vehicle=R_map_vehicle[0],
         )
 

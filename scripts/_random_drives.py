@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import gtsam
 import numpy as np
 from pydantic import TypeAdapter
 
@@ -29,6 +30,10 @@ AROUND_M = 22.0
 
 LATE_S = 0.03
 """Most that the stamps of a LiDAR are off where its time offset is estimated."""
+
+ARM_SIGMA_M = 0.01
+ROTATION_SIGMA_DEG = 0.1
+"""Errors of what is measured by hand: the default sigmas of the config."""
 
 _TRIES = 1000
 
@@ -132,7 +137,8 @@ def random_drive(seed: int) -> RandomDrive:
 def with_options(drive: RandomDrive) -> RandomDrive:
     """The same drive with options of the config drawn at random.
 
-    Where `solve.time_offset` is set, the LiDARs' stamps are late or early.
+    Where `solve.time_offset` is set, the LiDARs' stamps are late or early. Lever arm and rotation
+    of the IMU are unknown, off by the sigmas that the program takes by default, or exact.
     """
     draw = _Draw(np.random.default_rng([20261124, drive.seed]))
     model, options = drive.scenario, dict[str, dict[str, Any]]()
@@ -158,6 +164,15 @@ def with_options(drive: RandomDrive) -> RandomDrive:
     option(0.2, "structure", "use", False)
     option(0.1, "ground", "use", False)
     option(0.1, "ground", "parallel_sigma_deg", 0.3)
+    if "gnss" not in options and draw.happens(0.5):
+        arm = draw.rng.normal(model.gnss.lever_arm, ARM_SIGMA_M)
+        options["gnss"] = {"lever_arm": np.round(arm, 4).tolist(), "lever_arm_sigma": None}
+    if "imu" not in options and draw.happens(0.5):
+        mounting, turn_deg = model.imu.mounting, draw.rng.normal(0.0, ROTATION_SIGMA_DEG, 3)
+        R = gtsam.Rot3.Expmap(np.radians(turn_deg)).compose(mounting.pose().rotation())
+        rpy_deg = np.round(np.degrees(R.rpy()), 4).tolist()
+        T: dict[str, Any] = {"xyz": [*mounting.xyz], "rpy_deg": rpy_deg}
+        options["imu"] = {"T_vehicle_imu": T, "rotation_sigma_deg": None}
     return replace(drive, scenario=model, options=options)
 
 

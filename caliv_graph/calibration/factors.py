@@ -7,7 +7,7 @@ their keys.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -48,6 +48,8 @@ class CloudMotion:
             that err; 0: none were.
         T_vehicle_lidar: the extrinsic with which they were moved; None likewise.
         R_map_vehicle: (3, 3) of that pose; None likewise.
+        acceleration: (6,) change of xi per second: 30 ms before a stamp, where a curve turns into
+            the other, the vehicle turned at another rate by 0.04 rad/s, and 0.5 mrad further.
     """
 
     twist: Array
@@ -55,17 +57,22 @@ class CloudMotion:
     apart_s: float = 0.0
     T_vehicle_lidar: gtsam.Pose3 | None = None
     R_map_vehicle: Array | None = None
+    acceleration: Array = field(default_factory=lambda: np.zeros(6))
 
     def moves(
         self, pose: gtsam.Pose3, keys: Sequence[int], values: gtsam.Values
     ) -> list[tuple[gtsam.Pose3, Array]]:
         """Each motion from a pose, and (6, size) its right perturbation by that of its variable."""
-        out, left = [], list(keys)
+        out, left, offset_s = [], list(keys), 0.0
         if self.offset:
             offset_s = float(values.atVector(left.pop(0))[0])
-            out.append((gtsam.Pose3.Expmap(-offset_s * self.twist), -self.twist[:, None]))
+            mean = self.twist - 0.5 * offset_s * self.acceleration
+            then = self.twist - offset_s * self.acceleration
+            by_offset = np.asarray(gtsam.Pose3.ExpmapDerivative(-offset_s * mean)) @ -then
+            out.append((gtsam.Pose3.Expmap(-offset_s * mean), by_offset[:, None]))
         if self.apart_s:
-            d = self.apart_s * (self.twist_from(pose) + values.atVector(left.pop(0)))
+            then = self.twist_from(pose) - offset_s * self.acceleration
+            d = self.apart_s * (then + values.atVector(left.pop(0)))
             by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
             out.append((gtsam.Pose3.Expmap(d), by_rates))
         return out
@@ -92,8 +99,9 @@ def predict_cloud(
 ) -> tuple[gtsam.Pose3, list[Array]]:
     """The pose that a cloud should have, and how it moves.
 
-    It is `C X_i Exp(-o xi) Exp(tau (xi + e)) E S_a U`, U (`undone`) what the present rates and
-    extrinsic do to points that were not moved.
+    It is `C X_i Exp(-o (xi - o a / 2)) Exp(tau (xi - o a + e)) E S_a U`, xi and a velocity and
+    acceleration at the stamp, U (`undone`) what the present rates and extrinsic do to points that
+    were not moved.
 
     Args:
         keys: of C, X_i, of `motion` the time offset o and the errors of the rates e, E and, unless
@@ -113,6 +121,8 @@ def predict_cloud(
         moves[i] = moves[i] @ by_variable
     if motion.apart_s:
         Z = Z.compose(motion.undone())
+        if motion.offset:
+            moves[2] = moves[2] - moves[3] @ motion.acceleration[:, None]
         # A turn of the pose turns the velocities in vehicle axes; rates are the last of `moved`.
         if motion.R_map_vehicle is not None:
             twist = motion.twist_from(X)

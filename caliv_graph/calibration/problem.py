@@ -38,7 +38,12 @@ from caliv_graph.products import Array, BoolArray, IntArray, TargetCloud, Target
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.rates import rate_rows_of_drives, turn_densities
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import (
+    GivenTrajectory,
+    VehicleTrajectory,
+    accelerations_at,
+    twists_at,
+)
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 HEAVE_SIGMA_M = 0.005
@@ -78,6 +83,7 @@ class Problem:
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is, and no points were moved.
+        accelerations: (n, 6) their change per second; None if no offset is free.
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
             it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
             one.
@@ -110,6 +116,7 @@ class Problem:
     parameters: Mapping[str, ParameterPrior] = field(default_factory=dict)
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
+    accelerations: Array | None = None
     stated_cov: Array | None = None
     views: Array | None = None
     heave_m: float = field(default_factory=usual_heave_m)
@@ -189,12 +196,14 @@ class Problem:
             return STILL
         pose, lidar = int(self.cloud_pose[j]), self.lidars[self.cloud_lidar[j]]
         twist, offset = np.asarray(self.twists[pose]), lidar in self.offsets
+        a = np.zeros(6) if self.accelerations is None else np.asarray(self.accelerations[pose])
         swept = self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows
         if self.cloud_apart_s is None or not swept or not self.cloud_apart_s[j]:
-            return CloudMotion(twist, offset)
+            return CloudMotion(twist, offset, acceleration=a)
         extrinsic = self.moved_with.get(lidar, self.guesses[lidar])
         R_map_vehicle = self.T_map_vehicle[pose].rotation().matrix()
-        return CloudMotion(twist, offset, float(self.cloud_apart_s[j]), extrinsic, R_map_vehicle)
+        apart_s = float(self.cloud_apart_s[j])
+        return CloudMotion(twist, offset, apart_s, extrinsic, R_map_vehicle, a)
 
     def swept_drives(self) -> set[int]:
         """Drives with a cloud whose points were moved with the rates of its trajectory."""
@@ -311,12 +320,15 @@ def pose_problem(
     index = {pose: i for i, pose in enumerate(poses)}
     T_map_vehicle: list[gtsam.Pose3] = []
     twists: list[Array] = []
+    accelerations: list[Array] = []
     apart_s = np.array([c.apart_s for _, c in clouds])
     for d in sorted({drive for drive, _ in poses}):
         stamps = [stamp for drive, stamp in poses if drive == d]
         T_map_vehicle += unstack(*trajectories[d].poses_at(stamps))
         if config.solve.time_offset or apart_s.any():
             twists.append(twists_at(trajectories[d], stamps))
+        if config.solve.time_offset:
+            accelerations.append(accelerations_at(trajectories[d], stamps))
     origins = {
         d: np.asarray(T.translation(), np.float64)
         for (d, _), T in reversed(list(zip(poses, T_map_vehicle, strict=True)))
@@ -353,6 +365,7 @@ def pose_problem(
         parameters=parameter_priors(list(smoothed.values())),
         offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
         twists=np.concatenate(twists) if twists else None,
+        accelerations=np.concatenate(accelerations) if accelerations else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,

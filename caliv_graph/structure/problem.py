@@ -40,6 +40,7 @@ class Problem:
         relative: (N, 4, 4) motion of the vehicle from the stamp of its scan to each patch's own
             time.
         twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
+        accelerations: (M, 6) their change per second; None: no time offset is free.
         offsets: indices of the LiDARs with a free time offset.
         guesses: n guesses of T_vehicle_lidar.
         guess_information: (6 n, 6 n) of them, vehicle axes.
@@ -63,6 +64,7 @@ class Problem:
     standing: Standing
     views: Views
     range_errors: RangeErrors = UNSTATED
+    accelerations: Array | None = None
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
@@ -145,7 +147,9 @@ def placed_patches(problem: Problem, state: State) -> PlacedPatches:
     scan = problem.patches.scan
     lidar = problem.patches.scan_lidar[scan]
     moments, normals = _at_stamp(problem, state, lidar)
-    R, t = lidar_poses(state, lidar, problem.pose_of_scan[scan], problem.twists)
+    R, t = lidar_poses(
+        state, lidar, problem.pose_of_scan[scan], problem.twists, problem.accelerations
+    )
     return PlacedPatches(moments, normals, R, t)
 
 
@@ -211,6 +215,7 @@ def geometry_at(
         problem.twists,
         dents,
         problem.turn_of_scan[scan],
+        problem.accelerations,
     )
 
 

@@ -64,14 +64,21 @@ def rows_of(data: Array, columns: IntArray, size: int) -> scipy.sparse.csr_array
 
 
 def lidar_poses(
-    state: State, lidar: IntArray, pose: IntArray, twists: Array | None
+    state: State,
+    lidar: IntArray,
+    pose: IntArray,
+    twists: Array | None,
+    accelerations: Array | None = None,
 ) -> tuple[Array, Array]:
     """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included."""
     R_e, t_e = stack(state.T_vehicle_lidar)
     R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
     if twists is not None and state.offsets_s.any():
-        late = [gtsam.Pose3.Expmap(v) for v in -state.offsets_s[lidar][:, None] * twists[pose]]
-        R_d, t_d = stack(late)
+        offset_s = state.offsets_s[lidar][:, None]
+        mean = twists[pose]
+        if accelerations is not None:
+            mean = mean - 0.5 * offset_s * accelerations[pose]
+        R_d, t_d = stack([gtsam.Pose3.Expmap(v) for v in -offset_s * mean])
         R_v, t_v = R_v @ R_d, t_v + np.einsum("qij,qj->qi", R_v, t_d)
     return R_v @ R_e[lidar], t_v + np.einsum("qij,qj->qi", R_v, t_e[lidar])
 
@@ -85,6 +92,7 @@ def geometry_of(
     twists: Array | None,
     dents: bool = True,
     turn: IntArray | None = None,
+    accelerations: Array | None = None,
 ) -> Geometry:
     """Residuals `n^T (L p - c)` of the points of all sightings, as functions of h = (p, 1).
 
@@ -98,11 +106,12 @@ def geometry_of(
             free.
         dents: whether dents of the ground tell where a LiDAR is (`smooth_normals`).
         turn: (Q,) which error of the angular velocity each has, where the layout has any.
+        accelerations: (M, 6) change of `twists` per second, for clouds that are late; None: zero.
     """
     q = sightings.count
     strip = sightings.strip
     surface = np.array(layout.surface_of, dtype=np.int64)[strip]
-    R, t = lidar_poses(state, lidar, pose, twists)
+    R, t = lidar_poses(state, lidar, pose, twists, accelerations)
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
     error_columns = _error_columns(layout, lidar, surface, strip)
@@ -145,7 +154,12 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    moved = _by_motion(state, sightings, layout, lidar, pose, twists, by_pose)
+    late = np.zeros((q, 6)) if accelerations is None else accelerations[pose]
+    # Points of a late sweep moved with the velocity of then.
+    swept = -sightings.time_s[:, None] * late
+    plain += np.einsum("qc,qci->qi", state.offsets_s[lidar][:, None] * swept, by_pose)
+    then = None if twists is None else twists[pose] - state.offsets_s[lidar][:, None] * late
+    moved = _by_motion(state, sightings, layout, lidar, then, swept, by_pose)
     if layout.turns and turn is not None:
         # What the gyroscope erred since the stamp: X Exp(tau w) in the place of X.
         own = layout.turn + 3 * turn[:, None] + np.arange(3)
@@ -177,14 +191,15 @@ def _by_motion(
     sightings: Sightings,
     layout: Layout,
     lidar: IntArray,
-    pose: IntArray,
     twists: Array | None,
+    swept: Array,
     by_pose: Array,
 ) -> list[tuple[Array, IntArray, Array]]:
     """What moves a whole scan, or its points by their times, as errors of its pose do.
 
     Each with its derivatives (Q, c, 4), their coordinates (Q, c), and the values (Q, c) that are
-    not in the poses of `state` yet.
+    not in the poses of `state` yet. `twists` (Q, 6) are those when the points were taken, `swept`
+    (Q, 6) the motion within the sweep by a second of lateness.
     """
     q = sightings.count
     out = []
@@ -195,12 +210,12 @@ def _by_motion(
         out.append((by_rates, own, state.moved[own]))
     if twists is None or not (layout.offsets or layout.jitters):
         return out
-    by_time = -np.einsum("qi,qij->qj", twists[pose], by_pose)[:, None]
+    by_time = -np.einsum("qi,qij->qj", twists, by_pose)[:, None]
     if layout.jitters:
         own = layout.jitter + sightings.scan[:, None]
         out.append((by_time, own, state.errors[own]))
     if layout.offsets:
-        by_offset = by_time.copy()
+        by_offset = by_time + np.einsum("qi,qij->qj", swept, by_pose)[:, None]
         place = np.full(layout.lidars, -1)
         place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
         by_offset[place[lidar] < 0] = 0.0

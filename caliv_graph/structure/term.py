@@ -38,7 +38,12 @@ from caliv_graph.structure.thickness import (
 from caliv_graph.structure.turns import turn_sigmas
 from caliv_graph.structure.views import views_of
 from caliv_graph.trajectory.odometry import OdometryPoses
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import (
+    GivenTrajectory,
+    VehicleTrajectory,
+    accelerations_at,
+    twists_at,
+)
 
 
 def structure_terms(
@@ -154,6 +159,7 @@ def problem_of(
         pose_of_scan=pose_of_scan,
         relative=relative_motions(patches, trajectory),
         twists=twists_at(trajectory, stamps),
+        accelerations=accelerations_at(trajectory, stamps) if offsets else None,
         offsets=offsets,
         guesses=tuple(guess.T_vehicle_lidar for guess in guesses),
         guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),

@@ -61,6 +61,7 @@ def with_scans(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         prior=_on(problem.prior, poses),
         pose_of_scan=np.searchsorted(poses, problem.pose_of_scan[keep]),
         twists=None if problem.twists is None else problem.twists[poses],
+        accelerations=None if problem.accelerations is None else problem.accelerations[poses],
         turn_rad_s=turns,
     )
     if keep.all():

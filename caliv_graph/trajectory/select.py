@@ -177,6 +177,17 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings), odometry)
 
 
+def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
+    """(m, 6) change of the velocity of `twists_at` per second at some stamps."""
+    begin, end = trajectory.span_ns
+    stamps = np.asarray(stamps_ns, dtype=np.int64)
+    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
+    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
+    seconds = np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)[:, None]
+    change = twists_at(trajectory, after.tolist()) - twists_at(trajectory, before.tolist())
+    return np.asarray(change / seconds)
+
+
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
     begin, end = trajectory.span_ns

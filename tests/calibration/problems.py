@@ -158,7 +158,11 @@ def with_poses(case: Case, poses: Sequence[gtsam.Pose3]) -> Problem:
 
 
 def numerical_jacobian(
-    error: Callable[[gtsam.Values], Array], values: gtsam.Values, key: int, step: float = 1e-5
+    error: Callable[[gtsam.Values], Array],
+    values: gtsam.Values,
+    key: int,
+    step: float = 1e-5,
+    size: int = 6,
 ) -> Array:
     """Central differences of an error by the tangent of one variable."""
 
@@ -167,4 +171,4 @@ def numerical_jacobian(
         delta.insert(key, d)
         return np.asarray(error(values.retract(delta)))
 
-    return np.array([(at(d) - at(-d)) / (2.0 * step) for d in step * np.eye(6)]).T
+    return np.array([(at(d) - at(-d)) / (2.0 * step) for d in step * np.eye(size)]).T

@@ -21,6 +21,7 @@ from caliv_graph.calibration.factors import (
 from caliv_graph.calibration.rates import rates_factor
 from caliv_graph.conventions import (
     key_extrinsic,
+    key_offset,
     key_pose_error,
     key_rates,
     key_sensor,
@@ -34,6 +35,7 @@ from tests.samples import MOUNTINGS, pose
 
 C, X, B, E, S = key_target(0), key_vehicle(0), key_pose_error(0), key_extrinsic(), key_sensor(1)
 V = key_rates(0)
+LATE = key_offset(0)
 
 OFFSETS_M = (0.0, 30.0, 2000.0)
 """How far poses are from their origin: at it, on a drive, and in a map of a city."""
@@ -65,11 +67,12 @@ def check_jacobians(
     assert list(factor.keys()) == list(keys)
     np.testing.assert_allclose(b, -error(values), atol=1e-9)
     assert 2.0 * factor.error(values) == pytest.approx(np.sum(error(values) ** 2))
-    for i, key in enumerate(keys):
-        numerical = numerical_jacobian(error, values, key)
+    sizes = [1 if key == LATE else 6 for key in keys]
+    for key, size, end in zip(keys, sizes, np.cumsum(sizes).tolist(), strict=True):
+        numerical = numerical_jacobian(error, values, key, size=size)
         scale = np.abs(numerical).max()
         np.testing.assert_allclose(
-            A[:, 6 * i : 6 * i + 6] / scale, numerical / scale, atol=1e-6, err_msg=str(key)
+            A[:, end - size : end] / scale, numerical / scale, atol=1e-6, err_msg=str(key)
         )
 
 
@@ -129,6 +132,48 @@ def test_jacobians_of_a_cloud_that_wrong_rates_moved(offset_m: float) -> None:
     factor = target_pose_factor((C, X, V, E), measured, correlated_information(rng), motion)
     assert np.abs(factor.unwhitenedError(values)).max() < 2e-3
     check_jacobians(factor, values, (C, X, V, E))
+
+
+def driven(t: float, turning: float) -> gtsam.Pose3:
+    """Starts to move: `turning` rad/s^2 about z and 3 m/s^2 along x, from 0.2 rad/s and 2 m/s."""
+    T, steps = gtsam.Pose3(), 400
+    for k in range(steps):
+        at = t * (k + 0.5) / steps
+        twist = np.array([0.0, 0.0, 0.2 + turning * at, 2.0 + 3.0 * at, 0.0, 0.0])
+        T = T.compose(gtsam.Pose3.Expmap(twist * t / steps))
+    return T
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 0.05])
+@pytest.mark.parametrize("late_s", [0.03, -0.03])
+def test_a_late_cloud_of_a_vehicle_that_accelerates(late_s: float, apart_s: float) -> None:
+    """1.35 mm and 0.54 mrad beyond a constant velocity, and in a sweep 1.8 mrad and 4.5 mm more:
+    on a curve that turns into another, such clouds took S2V x 25 mm off."""
+    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 1.0), np.array([1.0, 0.5, 2.0]))
+    values = values_of(C=gtsam.Pose3(), X=gtsam.Pose3(), E=T)
+    values.insert(LATE, np.array([late_s]))
+    keys = [C, X, LATE, E]
+    if apart_s:
+        values.insert(V, np.zeros(6))
+        keys.insert(3, V)
+    motion = CloudMotion(
+        np.array([0.0, 0.0, 0.2, 2.0, 0.0, 0.0]),
+        offset=True,
+        apart_s=apart_s,
+        T_vehicle_lidar=T if apart_s else None,
+        R_map_vehicle=np.eye(3) if apart_s else None,
+        acceleration=np.array([0.0, 0.0, 1.2, 3.0, 0.0, 0.0]),
+    )
+    Z, _ = predict_cloud(keys, values, motion)
+    # Points were taken apart_s after the cloud, and moved to it with the twist at the stamp.
+    taken = driven(apart_s - late_s, 1.2).compose(T)
+    off = gtsam.Pose3.Logmap(taken.compose(motion.undone()).between(Z))
+    sweep = 0.5 * apart_s**2 * np.array([1.2, 3.0])  # acceleration within the sweep itself
+    assert np.abs(off[:3]).max() < 1e-4 + sweep[0]
+    assert np.abs(off[3:]).max() < 2e-4 + sweep[1] + 2.5 * sweep[0]
+    measured = gtsam.Pose3.Expmap(np.full(6, 1e-3)).compose(Z)
+    information = correlated_information(np.random.default_rng(2))
+    check_jacobians(target_pose_factor(keys, measured, information, motion), values, keys)
 
 
 def test_a_turn_of_the_lidar_that_poses_and_rates_follow_changes_no_cloud() -> None:

@@ -21,6 +21,7 @@ LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
 STRIP = np.array([0, 1, 2, 1])
 TIME_S = (-0.05, 0.02, 0.0, 0.1)
+ACCELERATIONS = np.random.default_rng(9).standard_normal((2, 6))
 
 
 def state_of(rng: np.random.Generator) -> State:
@@ -44,7 +45,7 @@ def state_of(rng: np.random.Generator) -> State:
 
 
 def geometry_at(state: State, sightings: Sightings, twists: np.ndarray) -> Geometry:
-    return geometry_of(state, sightings, LAYOUT, LIDAR, POSE, twists)
+    return geometry_of(state, sightings, LAYOUT, LIDAR, POSE, twists, accelerations=ACCELERATIONS)
 
 
 @pytest.fixture

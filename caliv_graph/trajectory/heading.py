@@ -26,6 +26,13 @@ SIGMAS = 4.0
 FLOOR_RAD = math.radians(0.2)
 """A smaller disagreement is never reported: slip of the tyres and banked roads cause as much."""
 
+MAP_TURN_RAD = math.radians(10.0)
+"""The same against the path of the fixes: another zero of a compass, not noise of fixes."""
+
+PATH_NS = 2_000_000_000
+MIN_PATH_M = 1.0
+"""Pieces of the path that are compared: so long in time, and at least so far."""
+
 SPACING_NS = 100_000_000
 """Of the samples that are compared."""
 
@@ -74,6 +81,20 @@ def heading_disagreement(
     duration_s = float(fast.sum()) * SPACING_NS * 1e-9
     if duration_s < MIN_DRIVING_S:
         return None
+    map_turn = _turn_against_fixes(smoothed)
+    if abs(map_turn) > MAP_TURN_RAD:
+        return HeadingDisagreement(
+            yaw_rad=map_turn,
+            sigma_rad=_heading_sigma(smoothed),
+            axle_m=math.nan,
+            duration_s=duration_s,
+            measured=_measured_at(motion, at[fast], begin) is not None,
+            warning=(
+                f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
+                "against the path of the GNSS fixes, which hardly count therefore. Check that the "
+                "IMU's yaw counts from east to the left, and imu.T_vehicle_imu, or set imu.yaw_bias"
+            ),
+        )
     velocity, turn = velocity[fast, :2], rates[fast, 2]
     measured = _measured_at(motion, at[fast], begin)
     along = np.tile([1.0, 0.0], (len(turn), 1)) if measured is None else measured
@@ -106,6 +127,32 @@ def heading_disagreement(
         measured=measured is not None,
         warning=warning,
     )
+
+
+def _turn_against_fixes(smoothed: SmoothedTrajectory) -> float:
+    """Angle (rad) from the path of the fixes to that of the smoothed antenna, about the vertical.
+
+    Orientation and velocities together outvote fixes whose map is another; 0 without a path.
+    """
+    positions = smoothed.data.positions
+    if positions is None:
+        return 0.0
+    begin, end = smoothed.span_ns
+    inside = (positions.stamps_ns >= begin) & (positions.stamps_ns <= end)
+    stamps, fixes = positions.stamps_ns[inside], positions.position_map[inside]
+    later = np.searchsorted(stamps, stamps + PATH_NS)
+    first = np.flatnonzero(later < len(stamps))
+    if not len(first):
+        return 0.0
+    R, t = smoothed.poses_at(stamps)
+    antenna = t + R @ smoothed.data.lever_arm
+    a, b = ((x[later[first]] - x[first])[:, :2] for x in (fixes, antenna))
+    far = np.minimum(np.hypot(*a.T), np.hypot(*b.T)) > MIN_PATH_M
+    if not far.any():
+        return 0.0
+    a, b = a[far], b[far]
+    cross = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    return math.atan2(cross, float((a * b).sum()))
 
 
 def _fit(

@@ -76,9 +76,10 @@ def test_a_compass_that_counts_from_north_is_told(twist: bool) -> None:
     sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
     found = compared(Course(eight_drive(31.0)), sensors, 1, twist)
     assert found is not None
-    # Velocities pull the trajectory half-way: then the number says less, the warning the same.
-    assert found.yaw_rad > math.radians(20.0 if twist else 60.0)
+    # Orientation and velocities agree with each other: there the fixes tell.
+    assert found.yaw_rad == pytest.approx(math.radians(80.0), abs=math.radians(20.0))
     assert found.warning
+    assert ("against the path of the GNSS fixes" in found.warning) == twist
 
 
 def test_driving_backwards_is_no_disagreement() -> None:

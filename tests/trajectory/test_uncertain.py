@@ -14,7 +14,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData
 from caliv_graph.trajectory.inputs import check_input
-from caliv_graph.trajectory.mounting import with_guessed_rotation
+from caliv_graph.trajectory.mounting import COURSE_SIGMA_RAD, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.smooth import _solved_roughly, smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -134,7 +134,7 @@ def test_the_guess_of_an_imu_without_orientation_is_within_its_sigma(yaw_deg: fl
     guessed = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
 
     off = gtsam.Rot3.Logmap(guessed.T_vehicle_imu.rotation().compose(R.inverse()))
-    assert np.degrees(np.abs(off)).max() < 2.0  # 3 degrees are its sigma
+    assert np.abs(off).max() < COURSE_SIGMA_RAD
 
 
 def test_a_course_needs_gnss() -> None:

@@ -84,15 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not asked.summary:
         asked.out.mkdir(parents=True, exist_ok=True)
         done = {key_of(line) for line in lines_of(path, asked.any_version)}
-        tasks = [
-            task for seed in seeds if (task := (seed, forced, bool(asked.options))) not in done
-        ]
+        tasks = [task for seed in seeds if (task := (seed, forced, asked.options)) not in done]
         for _, line in performed(perform, tasks, asked.jobs):
             if isinstance(line, Exception):
                 raise line
             add_line(path, line)
             print(text_of(line), flush=True)
-    kind = (forced, bool(asked.options))
+    kind = (forced, asked.options)
     counted = [r for r in lines_of(path, asked.any_version) if key_of(r)[1:] == kind]
     print(summary([r for r in counted if asked.summary or r["seed"] in seeds]))
     return 0

@@ -15,8 +15,8 @@ import numpy as np
 from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
     right_to_vehicle_axes,
-    skew,
     turned_twist,
+    twist_by_turn,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
@@ -125,9 +125,7 @@ def predict_cloud(
             moves[2] = moves[2] - moves[3] @ motion.acceleration[:, None]
         # A turn of the pose turns the velocities in vehicle axes; rates are the last of `moved`.
         if motion.R_map_vehicle is not None:
-            twist = motion.twist_from(X)
-            turned = np.vstack([skew(twist[:3]), skew(twist[3:])])
-            by_turn = moves[len(moved) + 1] @ turned
+            by_turn = moves[len(moved) + 1] @ twist_by_turn(motion.twist_from(X))
             moves[1] = np.hstack([moves[1][:, :3] + by_turn, moves[1][:, 3:]])
     return Z, moves
 

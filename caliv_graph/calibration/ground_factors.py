@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
-from caliv_graph.geometry.se3 import skew, turned_twist
+from caliv_graph.geometry.se3 import skew, turned_twist, twist_by_turn
 from caliv_graph.products import Array, GroundObservation
 
 SWAY_SIGMA_RAD = 1e-3
@@ -157,6 +157,9 @@ def ground_plane_factor(
         n_lidar = R_lidar_map @ n
         R_map_vehicle = values.atPose3(poses[0]).rotation()
         said, by_turn = compensated(observation, R_map_vehicle.between(T.rotation()).matrix())
+        change, by_vehicle_turn = np.zeros(3), np.zeros((3, 3))
+        if key_rates in nuisances:
+            change, by_vehicle_turn = with_twist(observation, R_map_vehicle.matrix())
         if jacobians is not None:
             J = np.zeros((3, 6))
             J[:2, :3] = axes @ skew(n_lidar)
@@ -168,13 +171,10 @@ def ground_plane_factor(
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
             for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
-            if key_rates in nuisances:
-                jacobians[0][:, :3] -= with_twist(observation, R_map_vehicle.matrix())[1]
+            jacobians[0][:, :3] -= by_vehicle_turn
         for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
-        if key_rates in nuisances:
-            said = said + with_twist(observation, R_map_vehicle.matrix())[0]
-        return np.asarray(np.append(axes @ n_lidar, d) - said)
+        return np.asarray(np.append(axes @ n_lidar, d) - (said + change))
 
     noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
@@ -191,7 +191,7 @@ def with_twist(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Ar
         return np.zeros(3), np.zeros((3, 3))
     twist = turned_twist(R_map_vehicle.T, V)
     change = by_rates @ (twist - turned_twist(R_0.T, V))
-    return change, by_rates @ np.vstack([skew(twist[:3]), skew(twist[3:])])
+    return change, by_rates @ twist_by_turn(twist)
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

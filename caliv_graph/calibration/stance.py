@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
-from caliv_graph.calibration.structure import rows_of_lidars
+from caliv_graph.calibration.structure import rows_of_lidars, rows_of_offsets, rows_of_parameters
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.conventions import key_ground, key_offset
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, skew
@@ -104,25 +104,23 @@ def _coordinates(solution: Solution, term: StructureTerm) -> tuple[Array, Array]
         rows[row : row + 6, start : start + 6] = np.eye(6)
         moved[row : row + 6] = T.localCoordinates(solution.T_map_vehicle[place])
         row += 6
-    for name, value in term.parameters.items():
+    for name, own in rows_of_parameters(term).items():
+        value = term.parameters[name]
         if KEYS[name] in graph.starts:
             start = graph.starts[KEYS[name]]
-            rows[row : row + 3, start : start + 3] = np.eye(3)
+            rows[own, start : start + 3] = np.eye(3)
             if isinstance(value, gtsam.Rot3):
-                moved[row : row + 3] = value.localCoordinates(values.atRot3(KEYS[name]))
+                moved[own] = value.localCoordinates(values.atRot3(KEYS[name]))
             else:
-                moved[row : row + 3] = values.atVector(KEYS[name]) - value
-        row += 3
+                moved[own] = values.atVector(KEYS[name]) - value
     # A late clock lifts the ground where the vehicle pitches: without its column the row would not
     # be that of the graph, and taking the height out of the graph would leave negative information.
-    for name, offset_s in term.time_offsets_s.items():
+    for name, at in rows_of_offsets(term).items():
         key = key_offset(solution.lidars.index(name)) if name in solution.lidars else -1
         if key in graph.starts:
-            rows[row, graph.starts[key]] = 1.0
-            moved[row] = values.atVector(key)[0] - offset_s
-        else:
-            moved[row] = -offset_s
-        row += 1
+            rows[at, graph.starts[key]] = 1.0
+            moved[at] = values.atVector(key)[0]
+        moved[at] -= term.time_offsets_s[name]
     first = len(graph.gradient) - 6 * len(solution.lidars)
     for name, own in rows_of_lidars(term).items():
         if name in solution.lidars:

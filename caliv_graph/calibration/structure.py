@@ -56,6 +56,18 @@ def nearest_extrinsics(
     return {**rough, **{name: T for term in terms for name, T in term.T_vehicle_lidar.items()}}
 
 
+def rows_of_parameters(term: StructureTerm) -> dict[str, slice]:
+    """Where the coordinates of each parameter of the vehicle are in a term, after its poses."""
+    first = 6 * len(term.stamps_ns)
+    return {name: slice(first + 3 * i, first + 3 * i + 3) for i, name in enumerate(term.parameters)}
+
+
+def rows_of_offsets(term: StructureTerm) -> dict[str, int]:
+    """Where the time offset of each LiDAR that has one is in a term, after its parameters."""
+    first = 6 * len(term.stamps_ns) + 3 * len(term.parameters)
+    return {name: first + i for i, name in enumerate(term.time_offsets_s)}
+
+
 def rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
     """Where the coordinates of each LiDAR's extrinsic are in a term."""
     first = len(term.gradient) - 6 * len(term.T_vehicle_lidar)
@@ -76,16 +88,14 @@ def _factor(
     for i in _pose_indices(problem, term):
         by_graph[row : row + 6, columns[key_vehicle(i)]] = np.eye(6)
         row += 6
-    for name in term.parameters:
+    for name, rows in rows_of_parameters(term).items():
         if KEYS[name] in point:
-            by_graph[row : row + 3, columns[KEYS[name]]] = np.eye(3)
-        row += 3
-    for name, offset_s in term.time_offsets_s.items():
+            by_graph[rows, columns[KEYS[name]]] = np.eye(3)
+    for name, at in rows_of_offsets(term).items():
         if name in problem.offsets:
-            by_graph[row, columns[key_offset(problem.lidars.index(name))]] = 1.0
+            by_graph[at, columns[key_offset(problem.lidars.index(name))]] = 1.0
         else:
-            held[row] = -offset_s
-        row += 1
+            held[at] = -term.time_offsets_s[name]
     # T_a = E S_a, hence d(T_a) = Ad(S_a^-1) d(E) + d(S_a).
     for name, rows in rows_of_lidars(term).items():
         if name not in problem.lidars:

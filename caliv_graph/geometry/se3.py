@@ -86,6 +86,15 @@ def turned_twist(R_a_b: Array, twist_b: Array) -> Array:
     return np.concatenate([R_a_b @ twist_b[:3], R_a_b @ twist_b[3:]])
 
 
+def twist_by_turn(twists: Array) -> Array:
+    """(..., 6, 3) change of twists (..., 6) that are constant in the map, by a turn of their axes.
+
+    The derivative of `turned_twist(R^T, ...)` by a right perturbation of R, `ad(twist)` without its
+    last columns.
+    """
+    return np.concatenate([skew(twists[..., :3]), skew(twists[..., 3:])], axis=-2)
+
+
 def rpy(R_a_b: Array) -> Array:
     """Roll, pitch, yaw in radians of a (3, 3) rotation matrix; shape (3,)."""
     return np.asarray(gtsam.Rot3(R_a_b).rpy(), dtype=np.float64)

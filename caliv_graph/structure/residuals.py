@@ -154,11 +154,13 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    late = np.zeros((q, 6)) if accelerations is None else accelerations[pose]
-    # Points of a late sweep moved with the velocity of then.
-    swept = -sightings.time_s[:, None] * late
-    plain += np.einsum("qc,qci->qi", state.offsets_s[lidar][:, None] * swept, by_pose)
-    then = None if twists is None else twists[pose] - state.offsets_s[lidar][:, None] * late
+    then, swept = None if twists is None else twists[pose], None
+    if then is not None and accelerations is not None:
+        # Points of a late sweep moved with the velocity of then.
+        offset_s = state.offsets_s[lidar][:, None]
+        swept = -sightings.time_s[:, None] * accelerations[pose]
+        plain += np.einsum("qc,qci->qi", offset_s * swept, by_pose)
+        then = then - offset_s * accelerations[pose]
     moved = _by_motion(state, sightings, layout, lidar, then, swept, by_pose)
     if layout.turns and turn is not None:
         # What the gyroscope erred since the stamp: X Exp(tau w) in the place of X.
@@ -192,14 +194,14 @@ def _by_motion(
     layout: Layout,
     lidar: IntArray,
     twists: Array | None,
-    swept: Array,
+    swept: Array | None,
     by_pose: Array,
 ) -> list[tuple[Array, IntArray, Array]]:
     """What moves a whole scan, or its points by their times, as errors of its pose do.
 
     Each with its derivatives (Q, c, 4), their coordinates (Q, c), and the values (Q, c) that are
     not in the poses of `state` yet. `twists` (Q, 6) are those when the points were taken, `swept`
-    (Q, 6) the motion within the sweep by a second of lateness.
+    (Q, 6) the motion within the sweep by a second of lateness; None: none.
     """
     q = sightings.count
     out = []
@@ -215,7 +217,9 @@ def _by_motion(
         own = layout.jitter + sightings.scan[:, None]
         out.append((by_time, own, state.errors[own]))
     if layout.offsets:
-        by_offset = by_time + np.einsum("qi,qij->qj", swept, by_pose)[:, None]
+        by_offset = by_time.copy()
+        if swept is not None:
+            by_offset += np.einsum("qi,qij->qj", swept, by_pose)[:, None]
         place = np.full(layout.lidars, -1)
         place[list(layout.offsets)] = layout.offset + np.arange(len(layout.offsets))
         by_offset[place[lidar] < 0] = 0.0

@@ -81,6 +81,7 @@ def heading_disagreement(
     duration_s = float(fast.sum()) * SPACING_NS * 1e-9
     if duration_s < MIN_DRIVING_S:
         return None
+    measured = _measured_at(motion, at[fast], begin)
     map_turn = _turn_against_fixes(smoothed)
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
@@ -88,7 +89,7 @@ def heading_disagreement(
             sigma_rad=_heading_sigma(smoothed),
             axle_m=math.nan,
             duration_s=duration_s,
-            measured=_measured_at(motion, at[fast], begin) is not None,
+            measured=measured is not None,
             warning=(
                 f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
                 "against the path of the GNSS fixes, which hardly count therefore. Check that the "
@@ -96,7 +97,6 @@ def heading_disagreement(
             ),
         )
     velocity, turn = velocity[fast, :2], rates[fast, 2]
-    measured = _measured_at(motion, at[fast], begin)
     along = np.tile([1.0, 0.0], (len(turn), 1)) if measured is None else measured
     # The coarse part may be a right angle (north instead of east); the rest is small.
     coarse = _turn_between(velocity, along, axis_only=measured is None)

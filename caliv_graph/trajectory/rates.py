@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import skew
+from caliv_graph.geometry.se3 import twist_by_turn
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -59,8 +59,7 @@ def rate_rows(
         by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
         out[:, 6 * i + 6 : 6 * i + 12] += by_later
         out[:, 6 * i : 6 * i + 6] -= by_later @ step.inverse().AdjointMap()
-        twist = np.asarray(gtsam.Pose3.Logmap(step))
-        half = 0.5 * np.vstack([skew(twist[:3]), skew(twist[3:])])
+        half = 0.5 * twist_by_turn(np.asarray(gtsam.Pose3.Logmap(step)))
         out[:, 6 * i : 6 * i + 3] -= half
         out[:, 6 * i + 6 : 6 * i + 9] -= half
         total_s += int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND

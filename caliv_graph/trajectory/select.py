@@ -179,22 +179,25 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
 
 def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     """(m, 6) change of the velocity of `twists_at` per second at some stamps."""
-    begin, end = trajectory.span_ns
-    stamps = np.asarray(stamps_ns, dtype=np.int64)
-    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
-    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
-    seconds = np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)[:, None]
+    before, after, seconds = _windows(trajectory, stamps_ns)
     change = twists_at(trajectory, after.tolist()) - twists_at(trajectory, before.tolist())
-    return np.asarray(change / seconds)
+    return np.asarray(change / seconds[:, None])
 
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
+    before, after, seconds = _windows(trajectory, stamps_ns)
+    first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
+    steps = zip(first, second, seconds, strict=True)
+    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
+
+
+def _windows(
+    trajectory: VehicleTrajectory, stamps_ns: Sequence[int]
+) -> tuple[IntArray, IntArray, Array]:
+    """(m,) begin and end of the time around each stamp that is averaged over, and its seconds."""
     begin, end = trajectory.span_ns
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
     after = np.minimum(stamps + TWIST_WINDOW_NS, end)
-    first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
-    seconds = np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)
-    steps = zip(first, second, seconds, strict=True)
-    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
+    return before, after, np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)

@@ -13,7 +13,7 @@ from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bia
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
-from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.chain import STATE, Chain
 from caliv_graph.trajectory.chain_solution import solved_columns
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
@@ -182,17 +182,17 @@ def _solved(
         step = solved_columns(chain, -gradient[:, None])[:, 0]
     except TrajectoryError:
         return None
-    width = len(gradient) // n
-    return values.retract(step_of(step[: n * width].reshape(n, width), step[n * width :], yaw_bias))
+    by_node, common = step[: n * STATE].reshape(n, STATE), step[n * STATE :]
+    return values.retract(step_of(by_node, common, yaw_bias))
 
 
 def step_of(by_node: Array, common: Array, yaw_bias: bool) -> gtsam.VectorValues:
-    """A step of the graph's variables: (n, 15 or more) of pose, velocity and bias; the yaw bias."""
+    """A step of the graph from (n, `STATE` or more) pose, velocity and bias, and the yaw bias."""
     step = gtsam.VectorValues()
     for i, d in enumerate(by_node):
         step.insert(key_imu(i), d[:6])
         step.insert(key_velocity(i), d[6:9])
-        step.insert(key_bias(i), d[9:15])
+        step.insert(key_bias(i), d[9:STATE])
     if yaw_bias:
         step.insert(key_yaw_bias(), common[:1])
     return step

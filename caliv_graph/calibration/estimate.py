@@ -138,14 +138,12 @@ def _estimate(
         grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
         grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
-    solved = rough.state.problem
-    # All clouds from here on: those that the field of view cuts off have predicted poses now.
-    problem = replace(problem, offsets=solved.offsets)
     times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
     # depend on the data, not on the initial guess. Aligned clouds also give better normals.
     begun = time.perf_counter()
+    # All clouds from here on: those that the field of view cuts off have predicted poses now.
     lines = linearise_clouds(problem, rough.state.values)
     extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
     problem = replace(problem, moved_with=extrinsics)

@@ -30,7 +30,7 @@ from caliv_graph.calibration.solve import (
     SolveState,
     base_graph,
     covariance_of_mode,
-    keep_determined_offsets,
+    reduced_offset_sigmas,
     step_of_mode,
 )
 from caliv_graph.calibration.structure import (
@@ -144,10 +144,7 @@ def solve_structure_and_ground(
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
         loop = _Loop(problem, terms, grounds, config)
         loop.solve(advance)
-        problem, offsets_s = keep_determined_offsets(problem, loop.reduced)
-        if problem.offsets != loop.state.problem.offsets:
-            loop = _Loop(problem, terms, grounds, config)
-            loop.solve(advance)
+        offsets_s = reduced_offset_sigmas(problem, loop.reduced)
     times["graph"] = time.perf_counter() - begun
     return StructureSolve(
         loop.state,

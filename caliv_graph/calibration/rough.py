@@ -20,8 +20,8 @@ from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.solve import (
     OFFSET_DETERMINED_S,
     SolveState,
+    offset_sigmas,
     solve_registered,
-    with_determined_offsets,
 )
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
@@ -38,7 +38,7 @@ class RoughSolve:
     """The outcome of the rough solve.
 
     Attributes:
-        state: the solved graph; its problem has the time offsets that the drive determines, and
+        state: the solved graph; its problem has
             the clouds that took part.
         registrations: of those clouds, a placement each.
         offsets_s: LiDAR -> 1 sigma in seconds of each time offset that was asked for.
@@ -100,10 +100,7 @@ def rough_solve(
         )
         solve = solve_registered(problem, registrations, grounds, config, found)
         graph_s = solve.graph_seconds
-        problem, offsets_s = with_determined_offsets(solve, registrations)
-        if problem.offsets != solve.problem.offsets:
-            solve = solve_registered(problem, registrations, grounds, config, found)
-            graph_s += solve.graph_seconds
+        offsets_s = offset_sigmas(solve, registrations)
     return RoughSolve(solve, tuple(registrations), offsets_s, alike, registration_s, graph_s)
 
 

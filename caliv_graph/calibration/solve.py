@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -184,26 +184,20 @@ def _reweight(
             break
 
 
-def with_determined_offsets(
-    state: SolveState, registrations: Sequence[Registration]
-) -> tuple[Problem, dict[str, float]]:
-    """The problem without the time offsets that the drive does not determine.
+def offset_sigmas(state: SolveState, registrations: Sequence[Registration]) -> dict[str, float]:
+    """LiDAR -> 1 sigma in seconds of each time offset that is free, guesses included.
 
-    At constant speed on an arc a free offset of a LiDAR has the same effect as its own x and yaw.
-    `state` and `registrations` are those of `solve_registered`. Returns the problem; and LiDAR -> 1
-    sigma in seconds of each offset that was free.
+    `state` and `registrations` are those of `solve_registered`.
     """
     if not state.problem.offsets:
-        return state.problem, {}
-    return keep_determined_offsets(state.problem, reduced_registered(state, registrations))
+        return {}
+    return reduced_offset_sigmas(state.problem, reduced_registered(state, registrations))
 
 
-def keep_determined_offsets(problem: Problem, reduced: Reduced) -> tuple[Problem, dict[str, float]]:
-    """`with_determined_offsets` of a problem that is reduced to the extrinsics."""
+def reduced_offset_sigmas(problem: Problem, reduced: Reduced) -> dict[str, float]:
+    """`offset_sigmas` of a problem that is reduced to the extrinsics."""
     cov = np.asarray(np.linalg.inv(reduced.D + problem.guess_information()), np.float64)
-    sigmas = {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
-    kept = frozenset(name for name, sigma in sigmas.items() if sigma < OFFSET_DETERMINED_S)
-    return replace(problem, offsets=kept), sigmas
+    return {name: sigma for name, (_, sigma) in reduced.time_offsets(problem, cov).items()}
 
 
 def reduced_registered(state: SolveState, registrations: Sequence[Registration]) -> Reduced:

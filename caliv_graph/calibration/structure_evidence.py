@@ -10,7 +10,7 @@ import numpy as np
 
 from caliv_graph.calibration.pose_priors import plain_prior, pose_priors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
-from caliv_graph.calibration.solve import SolveState, solve_registered, with_determined_offsets
+from caliv_graph.calibration.solve import SolveState, offset_sigmas, solve_registered
 from caliv_graph.calibration.structure import nearest_extrinsics
 from caliv_graph.config.model import Config
 from caliv_graph.products import (
@@ -241,18 +241,13 @@ def solved_with_structure(
     terms: tuple[StructureTerm, ...],
     rough: Mapping[str, gtsam.Pose3],
 ) -> tuple[SolveState, dict[str, float]]:
-    """`solve_registered` with structure, without the time offsets that it leaves undetermined.
+    """`solve_registered` with structure; and LiDAR -> 1 sigma in seconds of each time offset.
 
-    Structure may determine what the target does not: all offsets of the problem are free first.
-    `rough` are extrinsics of the LiDARs that saw the target. Also returns LiDAR -> 1 sigma in
-    seconds of each offset.
+    `rough` are extrinsics of the LiDARs that saw the target.
     """
     start = nearest_extrinsics(rough, terms)
     solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
-    problem, sigmas_s = with_determined_offsets(solve, registrations)
-    if problem.offsets != solve.problem.offsets:
-        solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
-    return solve, sigmas_s
+    return solve, offset_sigmas(solve, registrations)
 
 
 def kept_stamps(patches: Sequence[DrivePatches]) -> dict[int, list[int]]:

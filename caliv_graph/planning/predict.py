@@ -357,10 +357,7 @@ def _guess_sigmas(scenario: Scenario) -> Array:
 def _without_offsets(
     information: Array, lidars: Sequence[str], prior: Array
 ) -> tuple[Array, dict[str, float]]:
-    """Information on the extrinsics alone, and the sigma of each time offset, if there are any.
-
-    As in `calibrate`, an offset that the drive does not determine stays fixed at zero.
-    """
+    """Information on the extrinsics alone, and the sigma of each time offset, if there are any."""
     size = 6 * len(lidars)
     if len(information) == size:
         return information, {}
@@ -372,9 +369,7 @@ def _without_offsets(
     scale = 1.0 / np.sqrt(np.diagonal(known))
     cov = np.linalg.inv(known * np.outer(scale, scale)) * np.outer(scale, scale)
     sigma = np.sqrt(np.diagonal(cov))[offsets]
-    kept = np.append(np.arange(size), offsets[sigma < OFFSET_DETERMINED_S])
-    D = eliminated(both[np.ix_(kept, kept)], size)
-    return D, dict(zip(lidars, sigma.tolist(), strict=True))
+    return eliminated(both, size), dict(zip(lidars, sigma.tolist(), strict=True))
 
 
 def sigma_of(prediction: Prediction, key: str) -> dict[str, float]:

@@ -11,6 +11,7 @@ def undetermined_offset_sentences(sigmas_s: Mapping[str, float], limit_s: float)
         if sigma >= limit_s:
             yield (
                 f"lidar '{name}': the drive does not determine its time offset (sigma "
-                f"{1e3 * sigma:.0f} ms, limit {1e3 * limit_s:.0f} ms): the offset stays 0. Drive a "
-                "figure-eight, or vary the speed"
+                f"{1e3 * sigma:.0f} ms, limit {1e3 * limit_s:.0f} ms), and the sigmas of its "
+                "extrinsics count that. Drive a figure-eight, or vary the speed; if its clock is "
+                "synchronised, set solve.time_offset: false"
             )

@@ -388,7 +388,7 @@ def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:
 
 
 def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
-    # At constant speed on an arc an offset has the direction of x/yaw; freeing it loses S2S.
+    # At constant speed on an arc an offset has the direction of x/yaw: S2S is lost, and says so.
     # Its start and its end, where the speed does change, are not seen.
     scenario = DRIVES["arc"][0]
     rolling = scenario.model_copy(
@@ -409,8 +409,11 @@ def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
 
     assert min(freed.covariance.offsets_s.values()) > 0.03
     assert sum("does not determine its time offset" in line for line in freed.warnings) == 2
-    # So it is not freed.
-    assert freed.sigma_s2s["front", "rear"] == pytest.approx(without.sigma_s2s["front", "rear"])
+    pair = "front", "rear"
+    # The clocks' 50 ms at 2 m/s are in the sigma of x, and what they do not touch stays.
+    assert freed.sigma_s2s[pair][3] > 0.05
+    assert not freed.covariance.determined_s2s[pair]["x"]
+    assert freed.sigma_s2s[pair][:2] == pytest.approx(without.sigma_s2s[pair][:2], rel=0.1)
     assert max(eight.covariance.offsets_s.values()) < 0.0015
     assert eight.undetermined == ()
     assert (

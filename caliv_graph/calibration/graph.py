@@ -25,7 +25,7 @@ from caliv_graph.conventions import (
 )
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, PoseNoise
-from caliv_graph.trajectory.factors import marginal_factor
+from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.rates import RATES
 
 OFFSET_SIGMA_S = 0.05
@@ -53,15 +53,30 @@ FactorKind = Literal[
 
 
 class CalibrationGraph(gtsam.NonlinearFactorGraph):
-    """A factor graph that knows the kind of each of its factors: `kinds`, in order."""
+    """A factor graph that knows what is in it.
+
+    Attributes:
+        kinds: the kind of each of its factors, in order.
+        gaussians: those on many poses at once.
+        others: all factors but these.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.kinds: list[FactorKind] = []
+        self.gaussians: list[Gaussian] = []
+        self.others = gtsam.NonlinearFactorGraph()
 
     def append(self, kind: FactorKind, factor: gtsam.NonlinearFactor) -> None:
         """Adds a factor."""
         self.add(factor)
+        self.others.add(factor)
+        self.kinds.append(kind)
+
+    def append_gaussian(self, kind: FactorKind, gaussian: Gaussian) -> None:
+        """Adds a Gaussian on many poses at once."""
+        self.add(gaussian.factor())
+        self.gaussians.append(gaussian)
         self.kinds.append(kind)
 
 
@@ -85,12 +100,16 @@ def motion_graph(problem: Problem) -> CalibrationGraph:
         poses = [problem.T_map_vehicle[i] for i in of_drive]
         term = problem.motion_terms.get(drive)
         if term is None:
-            graph.append("motion", marginal_factor(keys, information, poses))
+            nothing = np.zeros(len(information))
+            graph.append_gaussian(
+                "motion", Gaussian(tuple(keys), tuple(poses), information, nothing)
+            )
             continue
         keys += [KEYS[name] for name in term.values]
-        means = [*poses, *term.values.values()]
-        factor = marginal_factor(keys, term.information, means, term.gradient, term.constant)
-        graph.append("motion", factor)
+        means = (*poses, *term.values.values())
+        graph.append_gaussian(
+            "motion", Gaussian(tuple(keys), means, term.information, term.gradient, term.constant)
+        )
     for name, prior in problem.parameters.items():
         noise, mean = gtsam.noiseModel.Gaussian.Covariance(prior.cov), prior.mean
         if isinstance(mean, gtsam.Rot3):
@@ -240,7 +259,9 @@ def merged(*graphs: CalibrationGraph) -> CalibrationGraph:
     out = CalibrationGraph()
     for graph in graphs:
         out.push_back(graph)
+        out.others.push_back(graph.others)
         out.kinds += graph.kinds
+        out.gaussians += graph.gaussians
     return out
 
 

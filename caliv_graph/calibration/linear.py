@@ -12,10 +12,11 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.calibration.factors import predict_cloud
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_target
 from caliv_graph.errors import SolveError
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
 
 GAUGE = 1e-12
 """Relative ridge under which a dense system is solved: unobservable
@@ -125,9 +126,7 @@ class DenseSystem:
             ) from None
 
 
-def dense_system(
-    problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> DenseSystem:
+def dense_system(problem: Problem, graph: CalibrationGraph, values: gtsam.Values) -> DenseSystem:
     """Linearises `graph` at `values` and eliminates the Gauss-Markov pose errors.
 
     These form chains, which GTSAM eliminates sparsely, and are linear: their values do not matter.
@@ -135,14 +134,15 @@ def dense_system(
     """
     extrinsics = problem.extrinsic_keys()
     drifts = set(problem.pose_error_keys())
-    linear = graph.linearize(values)
-    touched = set(graph.keyVector())
+    linear = graph.others.linearize(values)
+    own = set(graph.others.keyVector())
+    touched = own.union(*(gaussian.keys for gaussian in graph.gaussians))
     known = (*problem.pose_keys(), *problem.target_keys())
     others = sorted(touched - drifts - {*known, *extrinsics})
     keys = (*known, *others, *extrinsics)
     zero = values.zeroVectors()
     sizes = tuple(6 if key in known or key in extrinsics else zero.at(key).size for key in keys)
-    chains = [key for key in problem.pose_error_keys() if key in touched]
+    chains = [key for key in problem.pose_error_keys() if key in own]
     if chains:
         try:
             _, linear = linear.eliminatePartialMultifrontal(chains)
@@ -150,24 +150,28 @@ def dense_system(
             raise SolveError(f"the given poses: {str(e).splitlines()[0]}") from None
     size = sum(sizes)
     H, b = np.zeros((size, size)), np.zeros(size)
-    order = [key for key in keys if key in touched and key not in drifts]
+    order = [key for key in keys if key in own and key not in drifts]
     if order:
         ordering = gtsam.Ordering()
         for key in order:
             ordering.push_back(key)
         H_part, b_part = linear.hessian(ordering)
-        present = set(order)
-        starts = np.cumsum([0, *sizes])
-        where = np.concatenate(
-            [
-                np.arange(start, start + n)
-                for key, start, n in zip(keys, starts, sizes, strict=False)
-                if key in present
-            ]
-        )
+        where = _coordinates(order, keys, sizes)
         H[np.ix_(where, where)] = H_part
         b[where] = np.asarray(b_part).ravel()
+    for gaussian in graph.gaussians:
+        where = _coordinates(gaussian.keys, keys, sizes)
+        H_part, b_part = gaussian.at(values)
+        H[np.ix_(where, where)] += H_part
+        b[where] += b_part
     return DenseSystem(keys, sizes, H, b, len(extrinsics))
+
+
+def _coordinates(wanted: Sequence[int], keys: Sequence[int], sizes: Sequence[int]) -> IntArray:
+    """Where the coordinates of some of the variables are among those of all, in their order."""
+    first = dict(zip(keys, np.cumsum([0, *sizes]).tolist(), strict=False))
+    of = dict(zip(keys, sizes, strict=True))
+    return np.concatenate([first[key] + np.arange(of[key]) for key in wanted])
 
 
 def add_shape(

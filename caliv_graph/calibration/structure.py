@@ -12,7 +12,7 @@ from caliv_graph.calibration.problem import Problem, moved_map
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.conventions import key_extrinsic, key_offset, key_vehicle
 from caliv_graph.products import Array, StructureTerm
-from caliv_graph.trajectory.factors import marginal_factor, tangent_size
+from caliv_graph.trajectory.factors import Gaussian, tangent_size
 
 RIDGE = 1e-9
 """Relative ridge under which the constant of a term is computed: a term is semidefinite."""
@@ -35,7 +35,7 @@ def structure_graph(
     graph = CalibrationGraph()
     guess = (start or {}).get(problem.reference, problem.guesses[problem.reference])
     for term in terms:
-        graph.append("structure", _factor(problem, term, guess))
+        graph.append_gaussian("structure", _gaussian(problem, term, guess))
     return graph
 
 
@@ -76,10 +76,8 @@ def rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
     }
 
 
-def _factor(
-    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3
-) -> gtsam.LinearContainerFactor:
-    """A term as a factor of the graph's variables, linearised where the term was."""
+def _gaussian(problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3) -> Gaussian:
+    """A term as a Gaussian of the graph's variables, about where the term was linearised."""
     point = _linearisation_point(problem, term, T_vehicle_ref)
     columns = _columns(point)
     by_graph = np.zeros((len(term.gradient), sum(tangent_size(value) for value in point.values())))
@@ -110,13 +108,8 @@ def _factor(
     information = by_graph.T @ term.information @ by_graph
     information = 0.5 * (information + information.T)
     gradient = by_graph.T @ (term.gradient - term.information @ held)
-    return marginal_factor(
-        list(point),
-        information,
-        list(point.values()),
-        gradient,
-        _constant(information, gradient),
-    )
+    constant = _constant(information, gradient)
+    return Gaussian(tuple(point), tuple(point.values()), information, gradient, constant)
 
 
 def _linearisation_point(

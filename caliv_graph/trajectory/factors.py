@@ -9,9 +9,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
@@ -219,6 +221,58 @@ def tangent_size(value: gtsam.Pose3 | gtsam.Rot3 | Array) -> int:
     if isinstance(value, gtsam.Pose3):
         return POSE_SIZE
     return ROTATION_SIZE if isinstance(value, gtsam.Rot3) else len(value)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A Gaussian on several variables at once: a quadratic in right perturbations about its means.
+
+    Twice its error is `d^T information d - 2 gradient^T d + constant`, where d has `log(T0^-1 T)`
+    of poses and rotations (of poses rotation then translation) and differences of vectors.
+
+    Attributes:
+        keys: its variables.
+        means: of each.
+        information: (n, n), n all coordinates.
+        gradient: (n,).
+        constant: what makes the error positive.
+    """
+
+    keys: tuple[int, ...]
+    means: tuple[gtsam.Pose3 | gtsam.Rot3 | Array, ...]
+    information: Array
+    gradient: Array
+    constant: float = 0.0
+
+    def factor(self) -> gtsam.LinearContainerFactor:
+        """As one native factor; see `at` for what it is away from the means."""
+        return marginal_factor(
+            self.keys, self.information, self.means, self.gradient, self.constant
+        )
+
+    def at(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """H (n, n) and b (n,) of `d^T H d / 2 - b^T d` in right perturbations of `values`.
+
+        The native factor takes the derivative of the logarithm for 1, which is off by half of what
+        a pose is turned. Where a direction is open, all poses move together by hundredths of a
+        radian, and what is known to hundredths of a milliradian would seem to tell of it.
+        """
+        apart, blocks = [], []
+        for key, mean in zip(self.keys, self.means, strict=True):
+            if isinstance(mean, gtsam.Pose3):
+                T = mean.between(values.atPose3(key))
+                apart.append(gtsam.Pose3.Logmap(T))
+                blocks.append(gtsam.Pose3.LogmapDerivative(T))
+            elif isinstance(mean, gtsam.Rot3):
+                turn = gtsam.Rot3.Logmap(mean.between(values.atRot3(key)))
+                apart.append(turn)
+                blocks.append(gtsam.Rot3.LogmapDerivative(turn))
+            else:
+                apart.append(values.atVector(key) - mean)
+                blocks.append(np.eye(len(mean)))
+        J = scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+        H = J.T @ (self.information @ J)
+        return 0.5 * (H + H.T), J.T @ (self.gradient - self.information @ np.concatenate(apart))
 
 
 def marginal_factor(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
+    CalibrationGraph,
     cloud_graph,
     initial_values,
     merged,
@@ -48,7 +49,7 @@ from tests.calibration.problems import (
 NOISE = PoseNoise(2e-4, 2e-3, 1e-3, 0.01, 1.5)
 
 
-def whole_graph(case: Case, measured: tuple[gtsam.Pose3, ...]) -> gtsam.NonlinearFactorGraph:
+def whole_graph(case: Case, measured: tuple[gtsam.Pose3, ...]) -> CalibrationGraph:
     return merged(
         pose_graph(case.problem, NOISE),
         prior_graph(case.problem, case.problem.lidars),
@@ -56,7 +57,7 @@ def whole_graph(case: Case, measured: tuple[gtsam.Pose3, ...]) -> gtsam.Nonlinea
     )
 
 
-def solved(case: Case, seed: int = 1) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def solved(case: Case, seed: int = 1) -> tuple[CalibrationGraph, gtsam.Values]:
     """A graph of noisy clouds, and its minimum."""
     graph = whole_graph(case, noisy(case, seed))
     return graph, optimise(graph, case.truth, 50)
@@ -410,7 +411,7 @@ def block_diagonal(blocks: Array) -> Array:
 
 
 def empty_system(case: Case, values: gtsam.Values) -> DenseSystem:
-    return dense_system(case.problem, gtsam.NonlinearFactorGraph(), values)
+    return dense_system(case.problem, CalibrationGraph(), values)
 
 
 @pytest.mark.parametrize("drives", [1, 2])

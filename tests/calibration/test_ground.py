@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
+    CalibrationGraph,
     cloud_graph,
     initial_values,
     merged,
@@ -484,9 +485,7 @@ SIGMA_UNKNOWN = 30.0
 known is known to one far better."""
 
 
-def vehicle_information(
-    case: Case, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> Array:
+def vehicle_information(case: Case, graph: CalibrationGraph, values: gtsam.Values) -> Array:
     """(12, 12) of both extrinsics, scaled, vehicle axes, all else eliminated."""
     D, _, _, _ = dense_system(case.problem, graph, values).schur()
     back = np.linalg.inv(case.problem.to_vehicle_axes(values))

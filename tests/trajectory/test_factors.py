@@ -6,7 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.products import Array
 from caliv_graph.trajectory.factors import (
+    Gaussian,
     baseline_factor,
     biased_orientation_factor,
     heading_factor,
@@ -15,6 +17,7 @@ from caliv_graph.trajectory.factors import (
     orientation_factor,
     position_factor,
     position_residuals,
+    tangent_size,
     velocity_factor,
     velocity_residuals,
 )
@@ -124,6 +127,74 @@ def test_a_marginal_factor_is_its_gaussian() -> None:
         moved.insert(key, pose.retract(step))
 
     assert factor.error(moved) == pytest.approx(0.5 * d.ravel() @ information @ d.ravel())
+
+
+def gaussian_and_moved() -> tuple[Gaussian, gtsam.Values]:
+    """A Gaussian on two poses, a rotation and a vector, and variables far from its means."""
+    rng = np.random.default_rng(1)
+    means: tuple[gtsam.Pose3 | gtsam.Rot3 | Array, ...] = (
+        gtsam.Pose3.Expmap(rng.standard_normal(6)),
+        gtsam.Pose3.Expmap(rng.standard_normal(6)),
+        gtsam.Rot3.Expmap(rng.standard_normal(3)),
+        rng.standard_normal(3),
+    )
+    A = rng.standard_normal((18, 18))
+    found = Gaussian((10, 11, 12, 13), means, A @ A.T, rng.standard_normal(18), 3.0)
+    moved = gtsam.Values()
+    for key, mean in zip(found.keys, means, strict=True):
+        d = 0.3 * rng.standard_normal(tangent_size(mean))
+        moved.insert(key, mean + d if isinstance(mean, np.ndarray) else mean.retract(d))
+    return found, moved
+
+
+def test_a_gaussian_is_linearised_where_its_variables_are() -> None:
+    found, moved = gaussian_and_moved()
+    H, b = found.at(moved)
+    factor, zero = found.factor(), moved.zeroVectors()
+
+    def error(d: Array) -> float:
+        delta, start = gtsam.VectorValues(), 0
+        for key in found.keys:
+            size = zero.at(key).size
+            delta.insert(key, d[start : start + size])
+            start += size
+        return float(factor.error(moved.retract(delta)))
+
+    slope = [(error(d) - error(-d)) / 2e-5 for d in 1e-5 * np.eye(18)]
+    np.testing.assert_allclose(-b, slope, rtol=1e-6, atol=1e-6)
+    # Nothing is to be gained at the means, and H is that of GTSAM there.
+    at_means = gtsam.Values()
+    for key, mean in zip(found.keys, found.means, strict=True):
+        at_means.insert(key, mean)
+    np.testing.assert_allclose(found.at(at_means)[0], found.information, atol=1e-9)
+    # GTSAM's own is far off: what `Gaussian` is there for.
+    assert np.abs(factor.linearize(moved).information() - H).max() > 0.1 * np.abs(H).max()
+
+
+def test_what_leaves_a_common_turn_open_leaves_it_open_wherever_it_went() -> None:
+    """Where a LiDAR is at two stamps, X_i E, is known: the vehicle's own axes are anyone's choice.
+
+    The choice moves hundredths of a radian while a graph is solved; here, it is half a radian.
+    """
+    rng = np.random.default_rng(2)
+    X = [gtsam.Pose3.Expmap(rng.standard_normal(6)) for _ in range(2)]
+    E = gtsam.Pose3.Expmap(rng.standard_normal(6))
+    of_vehicle, nothing = E.inverse().AdjointMap(), np.zeros((6, 6))
+    J = np.block([[of_vehicle, nothing, np.eye(6)], [nothing, of_vehicle, np.eye(6)]])
+    known = Gaussian((10, 11, 12), (*X, E), 1e8 * J.T @ J, np.zeros(18))
+    turn = gtsam.Pose3.Expmap(np.array([0.3, -0.2, 0.4, 1.0, 0.5, -0.3]))
+    values = gtsam.Values()
+    values.insert(10, X[0].compose(turn))
+    values.insert(11, X[1].compose(turn))
+    values.insert(12, turn.inverse().compose(E))
+
+    H, b = known.at(values)
+
+    other_turns = np.vstack([np.eye(6), np.eye(6), -values.atPose3(12).inverse().AdjointMap()])
+    assert np.abs(other_turns.T @ H @ other_turns).max() < 1e-12 * np.abs(H).max()
+    np.testing.assert_allclose(b, 0.0, atol=1e-12 * np.abs(H).max())
+    by_gtsam = known.factor().linearize(values).information()
+    assert np.abs(other_turns.T @ by_gtsam @ other_turns).max() > 0.01 * np.abs(H).max()
 
 
 def test_a_scaled_velocity_has_the_right_jacobians() -> None:

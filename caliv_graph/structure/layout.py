@@ -53,8 +53,8 @@ class State:
     Attributes:
         R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
-        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior; with
-            the errors of the rates, 6 more.
+        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior, T0 of
+            a pose: `log(T0^-1 T)`; with the errors of the rates, 6 more.
         T_vehicle_lidar: n poses.
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
@@ -194,9 +194,12 @@ class Layout:
 def stepped(state: State, layout: Layout, d: Array) -> State:
     """The estimate after a step (D,)."""
     m = layout.poses
-    xi = d[: 6 * m].reshape(m, 6)
-    moved = [gtsam.Pose3.Expmap(v) for v in xi]
-    R_d, t_d = stack(moved)
+    steps = [gtsam.Pose3.Expmap(v) for v in d[: 6 * m].reshape(m, 6)]
+    R_d, t_d = stack(steps)
+    moved = state.moved + d[: layout.offset]
+    before = state.moved[: 6 * m].reshape(m, 6)
+    for i, (xi, step) in enumerate(zip(before, steps, strict=True)):
+        moved[6 * i : 6 * i + 6] = gtsam.Pose3.Logmap(gtsam.Pose3.Expmap(xi).compose(step))
     tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
     planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
     errors = np.concatenate([layout.error_columns(), np.arange(layout.standing, layout.plane)])
@@ -211,7 +214,7 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
         state,
         R_map_vehicle=state.R_map_vehicle @ R_d,
         t_map_vehicle=state.t_map_vehicle + np.einsum("mij,mj->mi", state.R_map_vehicle, t_d),
-        moved=state.moved + d[: layout.offset],
+        moved=moved,
         T_vehicle_lidar=tuple(
             T.retract(v) for T, v in zip(state.T_vehicle_lidar, tangents, strict=True)
         ),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.rates import rate_rows, with_rates
@@ -56,3 +57,27 @@ class PosePrior:
             return self
         information, gradient = with_rates(self.information, self.gradient, rows)
         return replace(self, information=information, gradient=gradient)
+
+    def at(self, moved: Array) -> tuple[Array, Array]:
+        """H and b of `e^T H e / 2 - b^T e`, e from d = `moved`: of poses right perturbations there.
+
+        The derivative of d is not 1 where a pose is turned (`trajectory.factors.Gaussian`).
+        """
+        b = self.gradient - self.information @ moved
+        if not moved.any():
+            return self.information, b
+        by_now = self.by_now(moved)
+        return _turned(_turned(self.information, by_now).T, by_now), _turned(b, by_now)
+
+    def by_now(self, moved: Array) -> Array:
+        """(m, 6, 6) derivatives of the poses' part of d at `moved`."""
+        xi = moved[: 6 * len(self.stamps_ns)].reshape(-1, 6)
+        return np.array([gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(v)) for v in xi])
+
+
+def _turned(rows: Array, by_now: Array) -> Array:
+    """Rows (6 m + k, ...) with those of the poses multiplied by the transposed derivatives."""
+    out, size = rows.copy(), 6 * len(by_now)
+    of_poses = rows[:size].reshape(len(by_now), 6, -1)
+    out[:size] = (np.swapaxes(by_now, 1, 2) @ of_poses).reshape(rows[:size].shape)
+    return out

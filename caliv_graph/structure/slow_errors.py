@@ -82,8 +82,11 @@ def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array,
     """
     H, b = with_guesses(found.problem, found.state, found.system)
     moved = found.state.moved[: len(gain)]
-    pull = prior.gradient - prior.information @ moved
-    return of_moved_prior(H, b, prior.information, pull, gain)
+    information, pull = prior.at(moved)
+    by_now, size = prior.by_now(moved), 6 * len(prior.stamps_ns)
+    of_poses = np.linalg.solve(by_now, gain[:size].reshape(len(by_now), 6, -1))
+    gain = np.vstack([of_poses.reshape(size, -1), gain[size:]])
+    return of_moved_prior(H, b, information, pull, gain)
 
 
 def of_moved_prior(

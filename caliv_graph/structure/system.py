@@ -77,11 +77,11 @@ def system_of(
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
     size = layout.offset
     H, b, surfaces = eliminated(sparse, less, right, layout.plane, layout.of_surfaces())
-    b_prior = prior.gradient - prior.information @ state.moved
-    H[:size, :size] += prior.information
+    H_prior, b_prior = prior.at(state.moved)
+    H[:size, :size] += H_prior
     b[:size] += b_prior
     if layout.parameters:
         own = slice(6 * layout.poses, layout.rate)
         H[own, own] += prior.parameter_information
         b[own] -= prior.parameter_information @ (prior.parameter_offset + state.moved[own])
-    return System(layout, H, b, surfaces, prior.information, b_prior)
+    return System(layout, H, b, surfaces, H_prior, b_prior)

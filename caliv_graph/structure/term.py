@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+import scipy.linalg
 
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
@@ -202,17 +203,21 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         H[own] -= prior.parameter_information
         moved = prior.parameter_offset + found.state.moved[parameters]
         b[parameters] += prior.parameter_information @ moved
+    by_now = _parameters_by_now(found)
+    H, b = _in_perturbations(H, b, parameters, by_now)
+    H_prior, b_prior = _in_perturbations(system.H_prior, system.b_prior, parameters, by_now)
     # How the vehicle stands is kept at first: others test what is assumed of it.
     stand = np.arange(layout.standing, layout.standing + STANDING)
     tilt = mean_tilt(found)
-    of_tilt = np.zeros((0, len(H))) if tilt is None else tilt.rows
+    of_tilt = np.zeros((0, len(H))) if tilt is None else tilt.rows.copy()
+    of_tilt[:, parameters] = of_tilt[:, parameters] @ by_now
     both, both_gradient, rows, cov = _marginal(H, b, np.concatenate([keep, stand]), of_tilt)
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
     now_m = float(found.state.errors[layout.standing])
     stance = stance_of(found.problem.standing, now_m, both, both_gradient, tilt)
     information, gradient, *_ = _marginal(both, both_gradient, np.arange(len(keep)))
-    motion, motion_gradient, *_ = _marginal(system.H_prior, system.b_prior, of_motion)
+    motion, motion_gradient, *_ = _marginal(H_prior, b_prior, of_motion)
     own_part = slice(0, len(of_motion))
     information[own_part, own_part] -= motion
     gradient[own_part] -= motion_gradient
@@ -312,6 +317,27 @@ def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:
         at += 3
         out[name] = value.retract(d) if isinstance(value, gtsam.Rot3) else value + d
     return out
+
+
+def _parameters_by_now(found: Solved) -> Array:
+    """(3 k, 3 k) derivative of where the parameters are from their prior by right perturbations."""
+    at, blocks = 6 * found.layout.poses, [np.zeros((0, 0))]
+    for i, value in enumerate(found.problem.prior.parameters.values()):
+        moved = found.state.moved[at + 3 * i : at + 3 * i + 3]
+        turns = isinstance(value, gtsam.Rot3)
+        blocks.append(gtsam.Rot3.LogmapDerivative(moved) if turns else np.eye(3))
+    return np.asarray(scipy.linalg.block_diag(*blocks), np.float64)
+
+
+def _in_perturbations(
+    H: Array, b: Array, parameters: IntArray, by_now: Array
+) -> tuple[Array, Array]:
+    """A quadratic whose parameters are in right perturbations of where they are now."""
+    H, b = H.copy(), b.copy()
+    H[parameters] = by_now.T @ H[parameters]
+    H[:, parameters] = H[:, parameters] @ by_now
+    b[parameters] = by_now.T @ b[parameters]
+    return H, b
 
 
 def strips_of(found: Solved) -> tuple[Strip, ...]:

@@ -102,8 +102,6 @@ def on_all_poses(prior: PosePrior, poses: IntArray, state: State) -> State:
     R, t = stack(
         [T.compose(gtsam.Pose3.Expmap(d)) for T, d in zip(prior.T_map_vehicle, steps, strict=True)]
     )
-    # The poses that were solved for took several steps.
-    R[poses], t[poses] = state.R_map_vehicle, state.t_map_vehicle
     more = np.zeros(6 * (m - p) if len(state.errors) else 0)
     return replace(
         state,

@@ -1,0 +1,47 @@
+"""The motion data's Gaussian on poses, away from where it was linearised."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.products import Array
+from caliv_graph.structure.prior import PosePrior
+
+POSES = 3
+
+
+def test_a_prior_is_linearised_where_its_poses_are() -> None:
+    rng = np.random.default_rng(5)
+    A = rng.standard_normal((21, 21))
+    prior = PosePrior(
+        stamps_ns=np.arange(POSES),
+        T_map_vehicle=tuple(gtsam.Pose3.Expmap(v) for v in rng.standard_normal((POSES, 6))),
+        parameters={"gnss.lever_arm": np.zeros(3)},
+        information=A @ A.T,
+        gradient=rng.standard_normal(21),
+        parameter_information=np.eye(3),
+        parameter_offset=np.zeros(3),
+    )
+    moved = 0.3 * rng.standard_normal(21)
+
+    H, b = prior.at(moved)
+
+    def error(e: Array) -> float:
+        d = moved + e
+        for i in range(POSES):
+            own = slice(6 * i, 6 * i + 6)
+            T = gtsam.Pose3.Expmap(moved[own]).compose(gtsam.Pose3.Expmap(e[own]))
+            d[own] = gtsam.Pose3.Logmap(T)
+        return float(0.5 * d @ prior.information @ d - prior.gradient @ d)
+
+    slope = [(error(e) - error(-e)) / 2e-5 for e in 1e-5 * np.eye(21)]
+    assert -b == pytest.approx(np.array(slope), rel=1e-6, abs=1e-6)
+    # What d is to first order, squared: the curvature of the logarithm has no part in H.
+    first = np.eye(21)
+    for i, block in enumerate(prior.by_now(moved)):
+        own = slice(6 * i, 6 * i + 6)
+        first[own, own] = block
+    assert pytest.approx(first.T @ prior.information @ first) == H
+    assert prior.at(np.zeros(21))[0] is prior.information

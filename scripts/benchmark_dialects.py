@@ -43,7 +43,6 @@ from typing import Any
 import numpy as np
 import pymap3d
 import yaml
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,6 +58,7 @@ from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.scenario.model import load_scenario, parse_scenario
 from caliv_graph.simulation import write_drive
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._bags import copied
 from scripts._command import calibrate_measured
 from scripts._dialects_folders import poses_of_clouds, write_kitti, write_nuscenes, write_pcds
 from scripts._dialects_messages import FIXES, POSES, RECEIVERS, serialised
@@ -315,26 +315,19 @@ def inspvax(folder: Path, seed: int, row: str) -> Iterator[tuple[int, dict[str, 
 
 def rewritten(source: Path, target: Path, row: str, seed: int) -> None:
     """Copies a bag; adds messages of poses, or replaces its fixes by those of another receiver."""
-    store = _store()
-    with (
-        Reader(source) as reader,
-        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
-    ):
-        to = {
-            c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections
-        }
-        kind = {**POSES, **FIXES}[row]
-        gnss = load_scenario(SCENARIO).gnss
-        own = w.add_connection(f"/{row}", kind, typestore=store)
+    store, kind = _store(), {**POSES, **FIXES}[row]
+    own, gnss = f"/{row}", load_scenario(SCENARIO).gnss
+    with copied(source, target, store) as bag:
+        bag.topic(own, kind)
         for stamp, fields in inspvax(source.parent, seed, row) if row in POSES else ():
-            w.write(own, stamp, serialised(store, kind, stamp, fields))
-        for connection, stamp, data in reader.messages():
+            bag.write(own, stamp, serialised(store, kind, stamp, fields))
+        for connection, stamp, data in bag.messages():
             if connection.msgtype.endswith("NavSatFix") and row in FIXES:
                 fix: Any = store.deserialize_cdr(data, connection.msgtype)
                 at = fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec
-                w.write(own, stamp, serialised(store, kind, at, RECEIVERS[row](fix, at, gnss)))
+                bag.write(own, stamp, serialised(store, kind, at, RECEIVERS[row](fix, at, gnss)))
             else:
-                w.write(to[connection.id], stamp, data)
+                bag.write(connection.topic, stamp, data)
 
 
 def _store() -> Any:
@@ -355,24 +348,16 @@ def with_messages(
 ) -> None:
     """Copies a bag without some topics and with more messages; its IMU is `oriented` or not."""
     store = _store()
-    with (
-        Reader(source) as reader,
-        Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as w,
-    ):
-        kept = [c for c in reader.connections if c.topic not in without]
-        to = {c.id: w.add_connection(c.topic, c.msgtype, typestore=store) for c in kept}
-        own: dict[str, Any] = {}
+    with copied(source, target, store, without) as bag:
         for stamp, topic, kind, fields in messages:
-            if topic not in own:
-                own[topic] = w.add_connection(topic, kind, typestore=store)
-            w.write(own[topic], stamp, serialised(store, kind, stamp, fields))
-        for connection, stamp, data in reader.messages(connections=kept):
+            bag.topic(topic, kind)
+            bag.write(topic, stamp, serialised(store, kind, stamp, fields))
+        for connection, stamp, data in bag.messages():
             if connection.topic == "/imu/data" and not oriented:
                 message: Any = store.deserialize_cdr(data, connection.msgtype)
                 message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
-                w.write(to[connection.id], stamp, store.serialize_cdr(message, connection.msgtype))
-            else:
-                w.write(to[connection.id], stamp, data)
+                data = store.serialize_cdr(message, connection.msgtype)
+            bag.write(connection.topic, stamp, data)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import yaml
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -45,6 +44,7 @@ from caliv_graph.results.names import CALIBRATION_FILE, SUSPECT_FOLDER
 from caliv_graph.results.truth_file import read_truth
 from caliv_graph.scenario.model import dump_scenario, load_scenario
 from caliv_graph.simulation.writer import BAG_FOLDER, topic_of_lidar
+from scripts._bags import copied
 from scripts._command import calibrate_measured, exit_code_of, positive, run_command
 from scripts._judged import outcome_of, worst
 from scripts._runs import add_line, code_digest, json_lines, performed
@@ -249,19 +249,12 @@ def copy_of_front(folder: Path) -> None:
     """Copies the bag of a drive, the rear LiDAR's clouds replaced by those of the front one."""
     front, rear = (topic_of_lidar(name) for name in ("front", "rear"))
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with (
-        Reader(folder / BAG_FOLDER) as reader,
-        Writer(folder / TWICE_FOLDER, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
-    ):
-        to = {
-            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store)
-            for c in reader.connections
-        }
-        for connection, stamp, data in reader.messages():
+    with copied(folder / BAG_FOLDER, folder / TWICE_FOLDER, store) as bag:
+        for connection, stamp, data in bag.messages():
             if connection.topic != rear:
-                writer.write(to[connection.topic], stamp, data)
+                bag.write(connection.topic, stamp, data)
             if connection.topic == front:
-                writer.write(to[rear], stamp, data)
+                bag.write(rear, stamp, data)
 
 
 def write_drift(folder: Path) -> None:

@@ -329,6 +329,8 @@ class GroundObservation:
         taken_s: first and last time of the points after `stamp_ns`, seconds.
         twist_map: (6,) rad/s and m/s that moved them, map axes; None likewise.
         R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
+        repeated: (3,) variances of (a, b, distance) beside `cov` with which it counts for the part
+            of what it shares with other scans; None: it shares nothing.
     """
 
     lidar: str
@@ -348,6 +350,7 @@ class GroundObservation:
     taken_s: tuple[float, float] = (0.0, 0.0)
     twist_map: Array | None = None
     R_map_vehicle: Array | None = None
+    repeated: Array | None = None
 
 
 @dataclass(frozen=True)

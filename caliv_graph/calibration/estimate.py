@@ -15,6 +15,7 @@ import gtsam
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.ground_factors import held
+from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.no_target import (
     solution_without_target,
@@ -33,7 +34,6 @@ from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import (
     estimated_noise,
     noise_of_motion,
-    with_floors,
     with_noise,
 )
 from caliv_graph.calibration.solve import solve_registered
@@ -135,7 +135,8 @@ def _estimate(
         told = structure.slow_errors(trajectories, rough_extrinsics(rough.state), config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
-        grounds = with_floors(grounds, ground_floors(config.noise), noise.floors)
+        placed, usual = rough_extrinsics(rough.state), ground_floors(config.noise)
+        grounds = with_floors(grounds, trajectories, placed, usual, noise.floors)
         grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     times = {"registration": rough.registration_s}

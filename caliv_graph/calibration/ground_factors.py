@@ -176,7 +176,10 @@ def ground_plane_factor(
             said = said - by_one @ values.atVector(key)
         return np.asarray(np.append(axes @ n_lidar, d) - (said + change))
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(with_heave(observation, heave_m) / weight)
+    cov = with_heave(observation, heave_m)
+    if observation.repeated is not None:
+        cov += np.diag(observation.repeated)
+    noise = gtsam.noiseModel.Gaussian.Covariance(cov / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 
 

@@ -32,7 +32,7 @@ from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
-from caliv_graph.products import Array, GroundObservation, NoiseLevel, Registration
+from caliv_graph.products import Array, NoiseLevel, Registration
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
@@ -251,14 +251,6 @@ def with_noise(
             t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)
         out.append(t)
     return out
-
-
-def with_floors(
-    observations: Sequence[GroundObservation], before: Array, after: Array
-) -> tuple[GroundObservation, ...]:
-    """Ground observations with other sigmas (3,) of the ground's waves."""
-    change = np.diag(after**2 - before**2)
-    return tuple(replace(o, cov=o.cov + change) for o in observations)
 
 
 def _levels(

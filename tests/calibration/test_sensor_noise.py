@@ -15,11 +15,10 @@ from caliv_graph.calibration.sensor_noise import (
     SLOW,
     estimated,
     noise_of_motion,
-    with_floors,
 )
 from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
-from caliv_graph.products import Array, GroundObservation
+from caliv_graph.products import Array
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
 from tests.trajectory.test_variances import base, recorded, shifted, smoothed
@@ -173,18 +172,6 @@ def test_every_axis_of_an_error_has_a_sigma() -> None:
     assert all(
         low < level.median < high for level in LEVELS.values() for low, high in [level.bounds]
     )
-
-
-def test_floors_are_replaced() -> None:
-    observation = GroundObservation(
-        "front", 0, 0, np.array([0.0, 0.0, 1.0]), 2.0, np.eye(2, 3), np.eye(3), np.zeros(3), 100
-    )
-    before, after = np.array([1e-3, 1e-3, 2e-3]), np.array([2e-3, 2e-3, 1e-3])
-
-    (changed,) = with_floors([observation], before, after)
-
-    expected = replace(observation).cov + np.diag(after**2 - before**2)
-    assert changed.cov == pytest.approx(expected)
 
 
 def test_without_lidars_the_motion_data_must_rather_have_an_error(

@@ -1,0 +1,91 @@
+"""What scans of one place share of the ground's waves."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.calibration.ground_floors import disc_overlap, sharing_scans, with_floors
+from caliv_graph.products import Array, GroundObservation
+from caliv_graph.targets.ground.planes import RADII_M
+from caliv_graph.trajectory.select import VehicleTrajectory
+
+DIAMETER_M = 2.0 * RADII_M[-1]
+
+
+def axes(*headings_deg: float) -> Array:
+    """(N, 2, 3) level axes, turned."""
+    out = []
+    for heading in np.radians(headings_deg):
+        c, s = np.cos(heading), np.sin(heading)
+        out.append([[c, s, 0.0], [-s, c, 0.0]])
+    return np.array(out)
+
+
+def test_a_vehicle_that_stands_sees_one_plane() -> None:
+    assert sharing_scans(axes(*[30.0] * 7), np.zeros((7, 3))) == pytest.approx(np.full((7, 3), 7))
+
+
+def test_scans_a_disc_apart_share_nothing() -> None:
+    places = DIAMETER_M * np.arange(4)[:, None] * np.array([1.0, 0.0, 0.0])
+    assert sharing_scans(axes(*[0.0] * 4), places) == pytest.approx(np.ones((4, 3)))
+
+
+def test_a_turn_tells_the_tilt_of_the_ground_from_the_lidar_s_but_no_height() -> None:
+    """A right angle on the spot: two tilts that share nothing, one height."""
+    assert sharing_scans(axes(0.0, 90.0), np.zeros((2, 3))) == pytest.approx(
+        np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]])
+    )
+
+
+def test_a_full_turn_averages_the_tilt_out() -> None:
+    sharing = sharing_scans(axes(*range(0, 360, 30)), np.zeros((12, 3)))
+    assert sharing == pytest.approx(np.tile([1.0, 1.0, 12.0], (12, 1)))
+
+
+def test_overlap_of_discs() -> None:
+    """At half a diameter: two segments of 120 degrees, 2/3 - sqrt(3) / (2 pi) of the disc."""
+    assert disc_overlap(np.array([0.0, 0.5, 1.0, 3.0])) == pytest.approx(
+        [1.0, 2 / 3 - np.sqrt(3.0) / (2.0 * np.pi), 0.0, 0.0]
+    )
+
+
+class Driving:
+    """A vehicle that drives ahead at 3 m/s."""
+
+    def poses_at(self, stamps_ns: list[int]) -> tuple[Array, Array]:
+        count = len(stamps_ns)
+        return np.tile(np.eye(3), (count, 1, 1)), np.outer(3e-9 * np.array(stamps_ns), [1, 0, 0])
+
+
+def test_other_floors_in_observations() -> None:
+    """The floor of single scans changes, and what they share is beside it."""
+    observations = [
+        GroundObservation(
+            lidar=lidar,
+            drive=0,
+            stamp_ns=stamp_ns,
+            normal_lidar=np.array([0.0, 0.0, 1.0]),
+            distance_m=1.5,
+            axes_lidar=np.eye(2, 3),
+            cov=np.diag([2e-6, 2e-6, 9e-6]),
+            centre_lidar=np.array([2.0, 0.0, -1.5]),
+            points=500,
+        )
+        for lidar, stamp_ns in (("front", 0), ("front", 0), ("rear", 0), ("front", 10**11))
+    ]
+    before, after = np.array([1e-3, 1e-3, 2e-3]), np.array([2e-3, 2e-3, 1e-3])
+    places = {name: gtsam.Pose3() for name in ("front", "rear")}
+
+    changed = with_floors(
+        observations, [cast("VehicleTrajectory", Driving())], places, before, after
+    )
+
+    for o in changed:
+        assert o.cov == pytest.approx(np.diag([5e-6, 5e-6, 6e-6]))
+    # Twice from one place; once by another LiDAR; once 300 m away.
+    for o, shares in zip(changed, (1.0, 1.0, 0.0, 0.0), strict=True):
+        assert o.repeated == pytest.approx(shares * after**2)

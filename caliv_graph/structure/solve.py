@@ -280,6 +280,8 @@ def _round(
     if not strips.count:
         return None
     sightings = placed_sightings(problem, placed, strips, range_sigma)
+    if not sightings.count:
+        return None
     layout = layout_of(problem, strips)
     errors = np.zeros(layout.size)
     # The biases of the LiDARs go on; those on surfaces and strips, numbered anew, begin again.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +33,8 @@ def thickness_m(
     """
     middles = np.concatenate([sightings.centroids_lidar, np.ones((sightings.count, 1))], axis=1)
     rows = np.einsum("qci,qi->qc", geometry.by[:, PLANE_ROWS], middles)
-    r = offsets_m.reshape(sightings.count, -1)
+    # Nothing may be seen at the guesses: -1 would not tell how many there are.
+    r = offsets_m.reshape(sightings.count, math.prod(offsets_m.shape[1:]))
     squares = np.full((count, r.shape[1]), np.nan)
     for k, own in enumerate(by_strip(sightings, count)):
         w = weights[own]

@@ -15,6 +15,7 @@ from caliv_graph.structure.problem import Problem, part_of
 from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.term import term_of
+from caliv_graph.structure.thickness import thickness_at_guesses
 from caliv_graph.structure.views import Views
 from tests.structure.yards import (
     STEP_NS,
@@ -224,3 +225,19 @@ def test_nothing_to_see_is_said() -> None:
     problem = problem_of(PARALLEL, _straight(24), 3)
     few = part_of(problem, np.arange(len(problem.patches.scan)) < 5)
     assert solve_structure(few, dict(TRUE)) is None
+
+
+def test_strips_that_are_not_there_at_the_guesses_have_no_thickness_before(
+    solved: Solved,
+) -> None:
+    """At guesses that face away, no sighting of the solve is one: a run once ended with exit 1."""
+    away = gtsam.Pose3(gtsam.Rot3.Yaw(0.5 * np.pi), np.zeros(3))
+    guesses = tuple(away.compose(T) for T in solved.problem.guesses)
+    none = replace(
+        solved,
+        problem=replace(solved.problem, guesses=guesses),
+        sightings=solved.sightings.only(np.zeros(0, dtype=np.int64)),
+        weights=np.zeros(0),
+    )
+    assert np.isnan(thickness_at_guesses(none)).all()
+    assert not np.isnan(thickness_at_guesses(solved)).all()

@@ -16,8 +16,10 @@ import scipy.sparse
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, IntArray
 
-RIDGE = 1e-12
-"""Relative ridge under which the system is solved."""
+RIDGES = (1e-12, 1e-11, 1e-10)
+"""Relative ridges under which a system is solved, the first that rounding leaves positive: poses
+that are known to each other to micrometres lie on a map that an unknown lever arm places to
+metres."""
 
 
 @dataclass(frozen=True)
@@ -185,15 +187,21 @@ def factor_of(H: Array, overwrite: bool = False) -> tuple[Array, Array]:
         raise SolveError("structure: a variable has no information")
     scaled = np.divide(H, scale, out=H if overwrite else None)
     scaled /= scale[:, None]
-    scaled[np.arange(len(H)), np.arange(len(H))] += RIDGE
-    try:
-        # The transpose, which is the same, is in LAPACK's order of memory: no copy is needed.
-        factor, _ = scipy.linalg.cho_factor(
-            scaled.T, lower=True, overwrite_a=True, check_finite=False
-        )
-    except scipy.linalg.LinAlgError:
-        raise SolveError("structure: the system is singular") from None
-    return scale, np.asarray(factor)
+    diagonal = np.arange(len(H))
+    for ridge in RIDGES:
+        scaled[diagonal, diagonal] = 1.0 + ridge
+        try:
+            # The transpose, which is the same, is in LAPACK's order of memory: no copy is needed.
+            factor, _ = scipy.linalg.cho_factor(
+                scaled.T, lower=True, overwrite_a=True, check_finite=False
+            )
+        except scipy.linalg.LinAlgError:
+            # One half is spoiled, and the other one as it was.
+            below = np.tril(scaled, -1)
+            scaled = below + below.T
+            continue
+        return scale, np.asarray(factor)
+    raise SolveError("structure: the system is singular")
 
 
 def solved(factor: tuple[Array, Array], right: Array) -> Array:

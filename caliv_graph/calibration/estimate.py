@@ -132,10 +132,11 @@ def _estimate(
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
-        told = structure.slow_errors(trajectories, rough_extrinsics(rough.state), config)
+        placed = rough_extrinsics(rough.state)
+        told = structure.slow_errors(trajectories, placed, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
-        placed, usual = rough_extrinsics(rough.state), ground_floors(config.noise)
+        usual = ground_floors(config.noise)
         grounds = with_floors(grounds, trajectories, placed, usual, noise.floors)
         grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -83,6 +83,11 @@ class DenseSystem:
         """First coordinate of a variable."""
         return self.starts[key]
 
+    def coordinates(self, keys: Iterable[int]) -> IntArray:
+        """Where the coordinates of some variables are, in their order."""
+        size = dict(zip(self.keys, self.sizes, strict=True))
+        return np.concatenate([self.starts[key] + np.arange(size[key]) for key in keys])
+
     def covariance_of(self, key: int, cov_extrinsics: Array) -> Array:
         """Marginal covariance of a variable that is no extrinsic.
 
@@ -150,28 +155,22 @@ def dense_system(problem: Problem, graph: CalibrationGraph, values: gtsam.Values
             raise SolveError(f"the given poses: {str(e).splitlines()[0]}") from None
     size = sum(sizes)
     H, b = np.zeros((size, size)), np.zeros(size)
+    out = DenseSystem(keys, sizes, H, b, len(extrinsics))
     order = [key for key in keys if key in own and key not in drifts]
     if order:
         ordering = gtsam.Ordering()
         for key in order:
             ordering.push_back(key)
         H_part, b_part = linear.hessian(ordering)
-        where = _coordinates(order, keys, sizes)
+        where = out.coordinates(order)
         H[np.ix_(where, where)] = H_part
         b[where] = np.asarray(b_part).ravel()
     for gaussian in graph.gaussians:
-        where = _coordinates(gaussian.keys, keys, sizes)
+        where = out.coordinates(gaussian.keys)
         H_part, b_part = gaussian.at(values)
         H[np.ix_(where, where)] += H_part
         b[where] += b_part
-    return DenseSystem(keys, sizes, H, b, len(extrinsics))
-
-
-def _coordinates(wanted: Sequence[int], keys: Sequence[int], sizes: Sequence[int]) -> IntArray:
-    """Where the coordinates of some of the variables are among those of all, in their order."""
-    first = dict(zip(keys, np.cumsum([0, *sizes]).tolist(), strict=False))
-    of = dict(zip(keys, sizes, strict=True))
-    return np.concatenate([first[key] + np.arange(of[key]) for key in wanted])
+    return out
 
 
 def add_shape(

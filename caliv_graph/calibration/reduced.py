@@ -142,12 +142,7 @@ class Reduced:
     def _of_poses(self, problem: Problem, poses: CalibrationGraph) -> tuple[Array, Array]:
         """(M, M) and (M,) of a graph without clouds, in the coordinates of the system."""
         alone = dense_system(problem, poses, self._values)
-        where = np.concatenate(
-            [
-                self.system.offset(key) + np.arange(size)
-                for key, size in zip(alone.keys, alone.sizes, strict=True)
-            ]
-        )
+        where = self.system.coordinates(alone.keys)
         information, gradient = np.zeros_like(self.system.H), np.zeros_like(self.system.b)
         information[np.ix_(where, where)] = alone.H
         gradient[where] = alone.b

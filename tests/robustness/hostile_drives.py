@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.conventions import AXES
@@ -17,6 +16,7 @@ from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.truth_file import read_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s
+from scripts._bags import copied
 from tests.cli.commands import called
 
 FRONT, REAR = "/lidar/front/points", "/lidar/rear/points"
@@ -104,20 +104,12 @@ def write_config(drive: Path, path: Path, **sections: Any) -> Path:
 
 def rewritten(drive: Path, folder: Path, change: Change) -> Path:
     """Writes the drive's bag anew with other messages; returns its folder."""
-    with (
-        Reader(drive / "drive") as reader,
-        Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
-    ):
-        connections = {
-            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=_STORE)
-            for c in reader.connections
-        }
-        for connection, record_ns, raw in reader.messages():
+    with copied(drive / "drive", folder, _STORE) as bag:
+        for connection, record_ns, raw in bag.messages():
             name = connection.msgtype
             message = _STORE.deserialize_cdr(raw, name)
             for new_ns, new in change(connection.topic, record_ns, message):
-                made = _STORE.serialize_cdr(new, name)
-                writer.write(connections[connection.topic], new_ns, made)
+                bag.write(connection.topic, new_ns, _STORE.serialize_cdr(new, name))
     return folder
 
 

@@ -6,9 +6,11 @@ import functools
 import hashlib
 import json
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,7 +41,7 @@ def performed(
                 yield task, e
         return
     # Spawned, because threads of open3d do not survive a fork.
-    with ProcessPoolExecutor(jobs, get_context("spawn"), keep_freed_memory) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare_worker) as pool:
         futures = {pool.submit(work, task): task for task in tasks}
         try:
             for future in as_completed(futures):
@@ -51,6 +53,22 @@ def performed(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _prepare_worker() -> None:
+    """Settings of a process of the pool, which ends with the one that began it.
+
+    A pool's processes wait for work for ever where their parent was killed.
+    """
+    keep_freed_memory()
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(process: BaseProcess) -> None:
+    process.join()
+    os._exit(1)  # work in other threads goes on otherwise
 
 
 @functools.cache

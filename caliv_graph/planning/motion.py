@@ -22,6 +22,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Route, sample_stamps
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.trajectory.chain import POSE, STATE
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.noise import DEFAULT_FORCE_WALK_M_S3, DEFAULT_GYRO_WALK_RAD_S2
 
 NODE_NS = NANOSECONDS_PER_SECOND // 10
@@ -67,14 +68,7 @@ class PlannedMotion:
 
     def nodes_of(self, stamps_ns: IntArray) -> IntArray:
         """(m,) index of the node nearest to each stamp."""
-        return nearest(self.nodes_ns, stamps_ns)
-
-
-def nearest(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """(m,) index of the nearest of (n,) ascending nodes, n at least 2."""
-    right = np.clip(np.searchsorted(nodes_ns, stamps_ns), 1, len(nodes_ns) - 1)
-    left_nearer = stamps_ns - nodes_ns[right - 1] < nodes_ns[right] - stamps_ns
-    return np.asarray(right - left_nearer, dtype=np.int64)
+        return nearest_node(self.nodes_ns, stamps_ns)
 
 
 def plan_motion(
@@ -117,7 +111,7 @@ def _nodes(drive: Route, stamps_ns: IntArray, source: Source, spacing_ns: int) -
     if source == "poses":
         return fixed if len(fixed) > 1 else np.unique(np.append(fixed, [0, end]))
     fixed = fixed[np.concatenate([[True], np.diff(fixed) > MERGE_NS])]
-    extra = grid[np.abs(grid - fixed[nearest(fixed, grid)]) > spacing_ns // 2]
+    extra = grid[np.abs(grid - fixed[nearest_node(fixed, grid)]) > spacing_ns // 2]
     return np.unique(np.append(fixed, extra))
 
 
@@ -237,7 +231,7 @@ def _add_aiding(diagonal: Array, drive: Route, nodes: IntArray, scenario: Scenar
         J = np.zeros((n, 3, POSE))
         J[:, :, :3] = -R @ skew(arm)
         J[:, :, 3:] = R
-        fixes = np.bincount(nearest(nodes, _good_fixes(drive, scenario)), minlength=n)
+        fixes = np.bincount(nearest_node(nodes, _good_fixes(drive, scenario)), minlength=n)
         # The smoother drops outliers; the remaining fixes count.
         weight = fixes * (1.0 - gnss.outlier_probability)
         info = np.swapaxes(J, 1, 2) @ ((sigma**-2.0)[:, None] * J)
@@ -274,7 +268,7 @@ def _count(
 ) -> npt.NDArray[np.int64]:
     """(n,) number of samples nearest to each node."""
     stamps = sample_stamps(what, rate_hz, phase_s, drive.duration_s)
-    return np.asarray(np.bincount(nearest(nodes, stamps), minlength=len(nodes)))
+    return np.asarray(np.bincount(nearest_node(nodes, stamps), minlength=len(nodes)))
 
 
 def _good_fixes(drive: Route, scenario: Scenario) -> IntArray:

@@ -17,6 +17,7 @@ from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, plana
 from caliv_graph.targets.cloud.views import evenly_spread
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import log_so3
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 MAX_SCANS = 150
@@ -138,7 +139,9 @@ def chosen_scans(
     motion = _motion(instants, trajectory)
     most = int(np.clip(motion.sum() / MIN_STEP_M, MIN_SCANS, MAX_SCANS))
     while True:
-        found = [_nearest(instants[evenly_spread(motion, most)], s) for s in within]
+        at = instants[evenly_spread(motion, most)]
+        # A slow LiDAR has none within milliseconds of some, and the same one for several.
+        found = [np.unique(s[nearest_node(s, at)]) if len(s) else s for s in within]
         poses = len(np.unique(np.concatenate(found)))
         if poses <= MAX_POSES or most <= MIN_SCANS:
             return found
@@ -155,16 +158,6 @@ def _motion(instants_ns: IntArray, trajectory: VehicleTrajectory) -> Array:
     seconds = np.diff(instants_ns) / NANOSECONDS_PER_SECOND
     steps = moved + LEVER_M * turned + REST_M_S * seconds
     return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
-
-
-def _nearest(instants_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """The stamps nearest to instants, each once: a slow LiDAR has none within milliseconds."""
-    if not len(stamps_ns):
-        return stamps_ns
-    after = np.clip(np.searchsorted(stamps_ns, instants_ns), 0, len(stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    earlier = instants_ns - stamps_ns[before] < stamps_ns[after] - instants_ns
-    return np.unique(stamps_ns[np.where(earlier, before, after)])
 
 
 def scan_patches(

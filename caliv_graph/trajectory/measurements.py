@@ -76,8 +76,8 @@ class NodePositions:
 
 
 def nearest_node(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """(m,) index of the node nearest to each stamp."""
-    middles = nodes_ns[:-1] + np.diff(nodes_ns) // 2
+    """(m,) index of the nearest of (n,) ascending nodes, the later of two equally near ones."""
+    middles = nodes_ns[:-1] + (np.diff(nodes_ns) + 1) // 2
     return np.asarray(np.searchsorted(middles, stamps_ns, "right"), dtype=np.int64)
 
 

@@ -15,7 +15,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.planning.assumptions import Assumptions, Ground
 from caliv_graph.planning.information import Columns, add_clouds, add_ground, eliminate_heave
-from caliv_graph.planning.motion import NODE_NS, PlannedMotion, nearest, plan_motion
+from caliv_graph.planning.motion import NODE_NS, PlannedMotion, plan_motion
 from caliv_graph.planning.sightings import Sighting, ground_by_range_bias, placements, sight
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drive_models import ArcDrive, DriveModel, SCurveDrive, StraightDrive
@@ -26,6 +26,7 @@ from caliv_graph.simulation.recording import simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.chain import Chain
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from tests.drives_with_chair import paper_scenario
 
@@ -153,7 +154,7 @@ def test_nodes_are_at_the_stamps_and_dense_enough() -> None:
     assert set(stamps.tolist()) <= set(nodes.tolist())
     assert np.diff(nodes).max() <= 1.6 * NODE_NS
     assert np.diff(nodes).min() > 1_000_000
-    assert nearest(nodes, stamps + 400_000).tolist() == nearest(nodes, stamps).tolist()
+    assert nearest_node(nodes, stamps + 400_000).tolist() == nearest_node(nodes, stamps).tolist()
 
 
 # ------------------------------------------------------------------ Jacobians

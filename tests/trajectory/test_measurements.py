@@ -8,7 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from caliv_graph.products import ImuSamples
 from caliv_graph.trajectory.imu import DeadReckoning
-from caliv_graph.trajectory.measurements import NodeOrientations, orientations_at_nodes
+from caliv_graph.trajectory.measurements import (
+    NodeOrientations,
+    nearest_node,
+    orientations_at_nodes,
+)
 from caliv_graph.trajectory.noise import imu_noise
 from tests.trajectory.motions import START_NS, Sensors, config_for
 
@@ -31,6 +35,13 @@ def carried(nodes_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> NodeOrienta
     found = orientations_at_nodes(imu, cov, nodes_ns, dead, imu_noise(imu, config_for(Sensors())))
     assert found is not None
     return found
+
+
+def test_the_nearest_node_is_exact_to_the_nanosecond_and_the_later_of_two() -> None:
+    nodes = START_NS + np.array([0, 3, 7], np.int64)
+    stamps = START_NS + np.array([-5, 1, 2, 4, 5, 6, 20], np.int64)
+    np.testing.assert_array_equal(nearest_node(nodes, stamps), [0, 0, 1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(nearest_node(nodes[:1], stamps), np.zeros(7))
 
 
 @pytest.mark.parametrize("at_a_time", [1, 7, 64])

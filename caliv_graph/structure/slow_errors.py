@@ -68,11 +68,15 @@ def slow_errors(
             found = solve_roughly(problem_of(used, prior, trajectory, config, heave_m), aligned)
         out.append(None if found is None else told_of_errors(found, prior, gain))
         if found is not None:
-            aligned = {
-                **aligned,
-                **dict(zip(used.lidars, found.state.T_vehicle_lidar, strict=True)),
-            }
+            aligned = {**aligned, **seeing_lidars(found)}
     return tuple(out), aligned
+
+
+def seeing_lidars(found: Solved) -> dict[str, gtsam.Pose3]:
+    """T_vehicle_lidar of the LiDARs that have sightings; the others are only at their guesses."""
+    patches = found.problem.patches
+    seeing = np.unique(patches.scan_lidar[found.sightings.scan]).tolist()
+    return {patches.lidars[i]: found.state.T_vehicle_lidar[i] for i in seeing}
 
 
 def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array, Array]:

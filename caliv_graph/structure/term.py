@@ -20,7 +20,7 @@ from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem, relative_motions
-from caliv_graph.structure.read import level
+from caliv_graph.structure.read import level, lidars_above_ground
 from caliv_graph.structure.relative import (
     held_sigmas,
     relative_problem,
@@ -128,10 +128,15 @@ def usable(
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     config: Config,
 ) -> DrivePatches:
-    """The patches without those of the ground where the config does without it."""
+    """The patches without those of the ground of LiDARs for whose ground the strips do not stand.
+
+    Of none they do where the config does without the ground.
+    """
+    is_level = level(patches, trajectory, T_vehicle_lidar)
     if config.ground.use:
-        return patches
-    return patches.part(~level(patches, trajectory, T_vehicle_lidar))
+        seeing = lidars_above_ground(patches, trajectory, T_vehicle_lidar)
+        is_level &= ~seeing[patches.scan_lidar[patches.scan]]
+    return patches.part(~is_level) if is_level.any() else patches
 
 
 GROUND_SIGHTINGS = 50

@@ -10,13 +10,16 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import retract_vehicle_axes, stack, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.structure import pairs
 from caliv_graph.structure.align import PatchAlignment, _jacobians, align_patches
 from caliv_graph.structure.pairs import Pairs, gathered
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.read import _together, level, scan_patches
+from caliv_graph.structure.read import _together, level, lidars_above_ground, scan_patches
+from caliv_graph.structure.term import usable
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
 from tests.structure.worlds import Spinner, World, driven, ground, world_of, yard
@@ -183,6 +186,38 @@ def test_level_patches_are_those_of_the_ground() -> None:
     R, _ = stack([TRUTH[name] for name in patches.lidars])
     up = np.einsum("ni,ni->n", R[patches.scan_lidar[patches.scan], 2], patches.normal_lidar)
     np.testing.assert_array_equal(level(patches, TRAJECTORY, TRUTH), up > 0.9)
+
+
+def without_near_ground(patches: DrivePatches, lidar: int) -> DrivePatches:
+    """The patches without the ground that a LiDAR sees under less than 75 degrees of incidence."""
+    R, _ = stack([TRUTH[name] for name in patches.lidars])
+    of = patches.scan_lidar[patches.scan]
+    centres, up = patches.centres_lidar, R[of, 2]  # this vehicle drives on a plane
+    cosine = np.abs(np.sum(centres * up, axis=1)) / np.linalg.norm(centres, axis=1)
+    near = (of == lidar) & (np.abs(np.sum(patches.normal_lidar * up, axis=1)) > 0.9)
+    return patches.part(~(near & (cosine > np.cos(np.radians(75.0)))))
+
+
+def test_strips_stand_for_the_ground_only_of_lidars_that_see_it_at_no_grazing_angle() -> None:
+    patches = in_yard()
+    np.testing.assert_array_equal(lidars_above_ground(patches, TRAJECTORY, TRUTH), [True, True])
+    far = without_near_ground(patches, 1)
+    np.testing.assert_array_equal(lidars_above_ground(far, TRAJECTORY, TRUTH), [True, False])
+    nothing = patches.part(np.zeros(len(patches.scan), dtype=bool))
+    np.testing.assert_array_equal(lidars_above_ground(nothing, TRAJECTORY, TRUTH), [True, True])
+
+
+def test_level_patches_at_the_limit_of_incidence_are_left_to_the_ground_planes() -> None:
+    patches, config = in_yard(), Config(lidars={n: LidarConfig(topic=n) for n in SPINNERS})
+    assert usable(patches, TRAJECTORY, TRUTH, config) is patches
+    far = without_near_ground(patches, 1)
+    used = usable(far, TRAJECTORY, TRUTH, config)
+    is_level, lidar = level(used, TRAJECTORY, TRUTH), used.scan_lidar[used.scan]
+    walls = ~level(far, TRAJECTORY, TRUTH)
+    assert not is_level[lidar == 1].any()
+    assert (lidar[~is_level] == 1).sum() == (far.scan_lidar[far.scan[walls]] == 1).sum() > 0
+    of_front = far.scan_lidar[far.scan] == 0
+    assert (lidar == 0).sum() == of_front.sum()
 
 
 def test_jacobians_are_those_of_numerical_derivatives() -> None:

@@ -10,8 +10,13 @@ import pytest
 
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array
-from caliv_graph.structure.problem import Problem
-from caliv_graph.structure.slow_errors import of_moved_prior, scans_for_errors, told_of_errors
+from caliv_graph.structure.problem import Problem, part_of
+from caliv_graph.structure.slow_errors import (
+    of_moved_prior,
+    scans_for_errors,
+    seeing_lidars,
+    told_of_errors,
+)
 from caliv_graph.structure.thinning import FEW_SCANS
 from tests.structure.test_solve import problem_of, solve
 from tests.structure.yards import STEP_NS, figure_eight, yard
@@ -80,6 +85,15 @@ def test_walls_tell_how_far_the_poses_swing(north_m: float) -> None:
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
     assert (sigma < 6e-3).all()
     assert (np.abs(found - [0.0, north_m]) < 3.0 * sigma).all()
+
+
+def test_a_lidar_without_sightings_is_not_put_at_its_guess() -> None:
+    problem = past_walls()
+    both = seeing_lidars(solve(problem))
+    assert set(both) == set(problem.patches.lidars)
+    of = problem.patches.scan_lidar[problem.patches.scan]
+    alone = solve(part_of(problem, of == 1))
+    assert set(seeing_lidars(alone)) == {problem.patches.lidars[1]}
 
 
 def test_few_scans_of_the_first_part_are_used() -> None:

@@ -132,11 +132,13 @@ def usable(
 
     Of none they do where the config does without the ground.
     """
-    is_level = level(patches, trajectory, T_vehicle_lidar)
+    standing = np.zeros(len(patches.lidars), dtype=bool)
     if config.ground.use:
-        seeing = lidars_above_ground(patches, trajectory, T_vehicle_lidar)
-        is_level &= ~seeing[patches.scan_lidar[patches.scan]]
-    return patches.part(~is_level) if is_level.any() else patches
+        standing = lidars_above_ground(patches, trajectory, T_vehicle_lidar)
+    if standing.all():
+        return patches
+    is_level = level(patches, trajectory, T_vehicle_lidar)
+    return patches.part(~is_level | standing[patches.scan_lidar[patches.scan]])
 
 
 GROUND_SIGHTINGS = 50

@@ -43,45 +43,49 @@ class CloudMotion:
     Attributes:
         twist: (6,) xi, velocity of the vehicle at the stamp, a right perturbation per second, where
             the pose is the given or smoothed one.
+        R_map_vehicle: (3, 3) of that pose. The velocities in the map are what is known: in vehicle
+            axes they turn with the pose.
         offset: whether the time offset of the LiDAR is free.
         apart_s: tau, mean time of the points after the stamp, to which they were moved with rates
             that err; 0: none were.
         T_vehicle_lidar: the extrinsic with which they were moved; None likewise.
-        R_map_vehicle: (3, 3) of that pose; None likewise.
         acceleration: (6,) change of xi per second: 30 ms before a stamp, where a curve turns into
             the other, the vehicle turned at another rate by 0.04 rad/s, and 0.5 mrad further.
     """
 
     twist: Array
+    R_map_vehicle: Array
     offset: bool = False
     apart_s: float = 0.0
     T_vehicle_lidar: gtsam.Pose3 | None = None
-    R_map_vehicle: Array | None = None
     acceleration: Array = field(default_factory=lambda: np.zeros(6))
 
     def moves(
         self, pose: gtsam.Pose3, keys: Sequence[int], values: gtsam.Values
-    ) -> list[tuple[gtsam.Pose3, Array]]:
-        """Each motion from a pose, and (6, size) its right perturbation by that of its variable."""
+    ) -> list[tuple[gtsam.Pose3, Array, Array]]:
+        """Each motion from a pose.
+
+        With it (6, size) its right perturbation by that of its variable, and (6, 3) by a turn of
+        the pose.
+        """
         out, left, offset_s = [], list(keys), 0.0
         if self.offset:
             offset_s = float(values.atVector(left.pop(0))[0])
-            mean = self.twist - 0.5 * offset_s * self.acceleration
-            then = self.twist - offset_s * self.acceleration
-            by_offset = np.asarray(gtsam.Pose3.ExpmapDerivative(-offset_s * mean)) @ -then
-            out.append((gtsam.Pose3.Expmap(-offset_s * mean), by_offset[:, None]))
+            mean, then = (self.twist_from(pose, -share * offset_s) for share in (0.5, 1.0))
+            by_motion = np.asarray(gtsam.Pose3.ExpmapDerivative(-offset_s * mean))
+            by_turn = -offset_s * by_motion @ twist_by_turn(mean)
+            out.append((gtsam.Pose3.Expmap(-offset_s * mean), -by_motion @ then[:, None], by_turn))
         if self.apart_s:
-            then = self.twist_from(pose) - offset_s * self.acceleration
+            then = self.twist_from(pose, -offset_s)
             d = self.apart_s * (then + values.atVector(left.pop(0)))
             by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
-            out.append((gtsam.Pose3.Expmap(d), by_rates))
+            out.append((gtsam.Pose3.Expmap(d), by_rates, by_rates @ twist_by_turn(then)))
         return out
 
-    def twist_from(self, pose: gtsam.Pose3) -> Array:
-        """(6,) the twist with the same velocities in the map."""
-        if self.R_map_vehicle is None:
-            return self.twist
-        return turned_twist(pose.rotation().matrix().T @ self.R_map_vehicle, self.twist)
+    def twist_from(self, pose: gtsam.Pose3, after_s: float = 0.0) -> Array:
+        """(6,) the twist some time after the stamp, with the same velocities in the map."""
+        R = pose.rotation().matrix().T @ self.R_map_vehicle
+        return turned_twist(R, self.twist + after_s * self.acceleration)
 
     def undone(self) -> gtsam.Pose3:
         """From the points as they were moved to the points as they were measured."""
@@ -91,7 +95,7 @@ class CloudMotion:
         return self.T_vehicle_lidar.inverse().compose(back).compose(self.T_vehicle_lidar)
 
 
-STILL = CloudMotion(np.zeros(6))
+STILL = CloudMotion(np.zeros(6), np.eye(3))
 
 
 def predict_cloud(
@@ -115,18 +119,18 @@ def predict_cloud(
     target, vehicle, *others = keys
     X = values.atPose3(vehicle)
     moved = motion.moves(X, others, values)
-    chain = [values.atPose3(target), X, *(T for T, _ in moved)]
+    chain = [values.atPose3(target), X, *(T for T, _, _ in moved)]
     Z, moves = chain_jacobians(chain + [values.atPose3(key) for key in others[len(moved) :]])
-    for i, (_, by_variable) in enumerate(moved, start=2):
+    for i, (_, by_variable, by_turn) in enumerate(moved, start=2):
+        moves[1] = np.hstack([moves[1][:, :3] + moves[i] @ by_turn, moves[1][:, 3:]])
         moves[i] = moves[i] @ by_variable
     if motion.apart_s:
         Z = Z.compose(motion.undone())
         if motion.offset:
-            moves[2] = moves[2] - moves[3] @ motion.acceleration[:, None]
-        # A turn of the pose turns the velocities in vehicle axes; rates are the last of `moved`.
-        if motion.R_map_vehicle is not None:
-            by_turn = moves[len(moved) + 1] @ twist_by_turn(motion.twist_from(X))
-            moves[1] = np.hstack([moves[1][:, :3] + by_turn, moves[1][:, 3:]])
+            acceleration = turned_twist(
+                X.rotation().matrix().T @ motion.R_map_vehicle, motion.acceleration
+            )
+            moves[2] = moves[2] - moves[3] @ acceleration[:, None]
     return Z, moves
 
 

@@ -197,13 +197,13 @@ class Problem:
         pose, lidar = int(self.cloud_pose[j]), self.lidars[self.cloud_lidar[j]]
         twist, offset = np.asarray(self.twists[pose]), lidar in self.offsets
         a = np.zeros(6) if self.accelerations is None else np.asarray(self.accelerations[pose])
+        R_map_vehicle = self.T_map_vehicle[pose].rotation().matrix()
         swept = self.cloud_apart_s is not None and self.poses[pose][0] in self.rate_rows
         if self.cloud_apart_s is None or not swept or not self.cloud_apart_s[j]:
-            return CloudMotion(twist, offset, acceleration=a)
+            return CloudMotion(twist, R_map_vehicle, offset, acceleration=a)
         extrinsic = self.moved_with.get(lidar, self.guesses[lidar])
-        R_map_vehicle = self.T_map_vehicle[pose].rotation().matrix()
         apart_s = float(self.cloud_apart_s[j])
-        return CloudMotion(twist, offset, apart_s, extrinsic, R_map_vehicle, a)
+        return CloudMotion(twist, R_map_vehicle, offset, apart_s, extrinsic, a)
 
     def swept_drives(self) -> set[int]:
         """Drives with a cloud whose points were moved with the rates of its trajectory."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import scipy.sparse
+from scipy.spatial.transform import Rotation
 
-from caliv_graph.geometry.se3 import skew, stack, tangent_axes
+from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
@@ -71,16 +72,50 @@ def lidar_poses(
     accelerations: Array | None = None,
 ) -> tuple[Array, Array]:
     """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included."""
-    R_e, t_e = stack(state.T_vehicle_lidar)
+    R_e, t_e = _lidars_at_stamps(state, lidar, pose, twists, accelerations)
     R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
-    if twists is not None and state.offsets_s.any():
-        offset_s = state.offsets_s[lidar][:, None]
-        mean = twists[pose]
-        if accelerations is not None:
-            mean = mean - 0.5 * offset_s * accelerations[pose]
-        R_d, t_d = stack([gtsam.Pose3.Expmap(v) for v in -offset_s * mean])
-        R_v, t_v = R_v @ R_d, t_v + np.einsum("qij,qj->qi", R_v, t_d)
-    return R_v @ R_e[lidar], t_v + np.einsum("qij,qj->qi", R_v, t_e[lidar])
+    return R_v @ R_e, t_v + np.einsum("qij,qj->qi", R_v, t_e)
+
+
+def _lidars_at_stamps(
+    state: State, lidar: IntArray, pose: IntArray, twists: Array | None, accelerations: Array | None
+) -> tuple[Array, Array]:
+    """(Q, 3, 3) and (Q, 3): where LiDARs are from the vehicle at the stamps of their scans.
+
+    Where a LiDAR was at the late scan itself, `Exp(-o (xi - o a / 2)) E`.
+    """
+    R_e, t_e = stack(state.T_vehicle_lidar)
+    if twists is None or not state.offsets_s.any():
+        return R_e[lidar], t_e[lidar]
+    count = len(state.offsets_s)
+    both, own = np.unique(pose * count + lidar, return_inverse=True)
+    at, of = both // count, both % count
+    late = -state.offsets_s[of][:, None] * _mean_twists(state, of, at, twists, accelerations)
+    R, t = stack([gtsam.Pose3.Expmap(v) for v in late])
+    t = t + np.einsum("qij,qj->qi", R, t_e[of])
+    return (R @ R_e[of])[own], t[own]
+
+
+def _mean_twists(
+    state: State, lidar: IntArray, pose: IntArray, twists: Array, accelerations: Array | None
+) -> Array:
+    """(Q, 6) twists in the mean from the stamp to the late scan itself."""
+    mean = twists[pose]
+    if accelerations is not None:
+        mean = mean - 0.5 * state.offsets_s[lidar][:, None] * accelerations[pose]
+    return turned_with_poses(state, mean, pose)
+
+
+def turned_with_poses(state: State, twists: Array, pose: IntArray) -> Array:
+    """(Q, 6) twists (Q, 6) of the first poses, with the same velocities in the map.
+
+    A vehicle whose axes nobody knows (`rpy_deg: null`) turns by 30 mrad and more until all is
+    solved. Its yaw rate held in its own axes, a time offset would tilt each scan in a curve.
+    """
+    turned = state.moved[6 * pose[:, None] + np.arange(3)]
+    R = np.swapaxes(Rotation.from_rotvec(turned).as_matrix(), 1, 2)
+    both = np.einsum("qij,qkj->qki", R, twists.reshape(-1, 2, 3))
+    return np.asarray(both.reshape(-1, 6))
 
 
 def geometry_of(
@@ -129,19 +164,23 @@ def geometry_of(
     by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
-    by_own_pose = by_pose
-    if twists is not None and layout.rates:
-        by_extrinsic = by_extrinsic + _by_compensation(
-            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
-        )
+    by_own_pose, now = by_pose, None
+    if twists is not None:
         # Points move with the velocities in the map, whatever way the vehicle is turned.
-        turning, moving = (np.swapaxes(skew(twists[pose, i : i + 3]), 1, 2) for i in (0, 3))
-        by_turn = sightings.time_s[:, None, None] * (
-            turning @ by_pose[:, :3] + moving @ by_pose[:, 3:]
+        now = turned_with_poses(state, twists[pose], pose)
+        by_own_pose = _back(
+            *_lidars_at_stamps(state, lidar, pose, twists, accelerations), by_extrinsic
         )
-        turned = state.moved[6 * pose[:, None] + np.arange(3)]
-        plain += np.einsum("qc,qci->qi", turned, by_turn)
-        by_own_pose = np.concatenate([by_pose[:, :3] + by_turn, by_pose[:, 3:]], axis=1)
+        late = -state.offsets_s[lidar][:, None]
+        by_turn = twist_by_turn(late * _mean_twists(state, lidar, pose, twists, accelerations))
+        if layout.rates:
+            apart_s = sightings.time_s[:, None]
+            by_turn = by_turn + twist_by_turn(apart_s * now)
+            plain += np.einsum("qc,qci->qi", apart_s * (now - twists[pose]), by_pose)
+            by_extrinsic = by_extrinsic + _by_compensation(
+                sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
+            )
+        by_own_pose[:, :3] += np.swapaxes(by_turn, 1, 2) @ by_pose
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R
@@ -154,13 +193,14 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    then, swept = None if twists is None else twists[pose], None
+    then, swept = now, None
     if then is not None and accelerations is not None:
         # Points of a late sweep moved with the velocity of then.
         offset_s = state.offsets_s[lidar][:, None]
-        swept = -sightings.time_s[:, None] * accelerations[pose]
+        change = turned_with_poses(state, accelerations[pose], pose)
+        swept = -sightings.time_s[:, None] * change
         plain += np.einsum("qc,qci->qi", offset_s * swept, by_pose)
-        then = then - offset_s * accelerations[pose]
+        then = then - offset_s * change
     moved = _by_motion(state, sightings, layout, lidar, then, swept, by_pose)
     if layout.turns and turn is not None:
         # What the gyroscope erred since the stamp: X Exp(tau w) in the place of X.
@@ -172,6 +212,14 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+
+
+def _back(R: Array, t: Array, by_lidar: Array) -> Array:
+    """(Q, 6, 4) derivatives by right perturbations of X, from those by ones of X (R, t)."""
+    back = np.zeros((len(R), 6, 6))
+    back[:, :3, :3] = back[:, 3:, 3:] = R
+    back[:, :3, 3:] = skew(t) @ R
+    return np.asarray(back @ by_lidar)
 
 
 def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:

@@ -1,5 +1,7 @@
 """Derivatives, elimination, and errors of the structure system, against numbers and brute force."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -37,7 +39,7 @@ def state_of(rng: np.random.Generator) -> State:
         t_map_vehicle=t,
         moved=np.append(np.zeros(15), 1e-3 * rng.standard_normal(6)),
         T_vehicle_lidar=tuple(gtsam.Pose3.Expmap(v) for v in rng.uniform(-0.5, 0.5, (2, 6))),
-        offsets_s=np.zeros(2),
+        offsets_s=np.array([0.0, 0.02]),
         centres_map=np.array([[8.0, 1.0, 0.0], [1.0, 9.0, 1.0], [2.0, -7.0, 0.5]]),
         normals_map=normals / np.linalg.norm(normals, axis=1)[:, None],
         errors=errors,
@@ -96,6 +98,38 @@ def test_derivatives_are_those_of_the_residual(
         # The incidence, by which errors of ranges count, moves little with the estimate, and so
         # does what a jitter shifts.
         assert J[:, k] == pytest.approx((up - down) / (2.0 * step), abs=0.02)
+
+
+def test_a_turn_of_the_vehicle_frame_changes_no_distance(
+    world: tuple[State, Sightings, np.ndarray, np.ndarray],
+) -> None:
+    """By 30 mrad, as by an IMU that is askew, of LiDARs whose stamps are 20 and 30 ms late.
+
+    A yaw rate held in the vehicle's axes told S2V roll to 6 mrad, 11 to 34 mrad beside the truth.
+    """
+    state, sightings, _, twists = world
+    layout = replace(LAYOUT, offsets=(0, 1), rates=0, jitters=0)
+    late = replace(state, offsets_s=np.array([0.02, 0.03]), errors=np.zeros(layout.size))
+    turn = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([3e-2, 1e-2, 0.0])), np.zeros(3))
+    turned = replace(
+        late,
+        R_map_vehicle=late.R_map_vehicle @ turn.rotation().matrix(),
+        moved=np.concatenate([np.tile(gtsam.Pose3.Logmap(turn), 2), late.moved[12:]]),
+        T_vehicle_lidar=tuple(turn.inverse().compose(T) for T in late.T_vehicle_lidar),
+    )
+    at_stamp = replace(sightings, time_s=np.zeros(4))
+    of = (at_stamp, layout, LIDAR, POSE, twists)
+    before, after = (geometry_of(at, *of, accelerations=ACCELERATIONS) for at in (late, turned))
+    assert after.plain == pytest.approx(before.plain, abs=1e-12)
+    # Nor do the derivatives show it.
+    J = after.offset_rows(at_stamp, layout.size).toarray()
+    for axis in np.eye(6)[:3]:
+        d = np.zeros(layout.size)
+        d[:12] = np.tile(axis, 2)
+        for i, T in enumerate(turned.T_vehicle_lidar):
+            at = layout.extrinsic + 6 * i
+            d[at : at + 6] = -T.inverse().AdjointMap() @ axis
+        assert np.abs(J @ d).max() < 1e-3 * np.abs(J[:, :12]).max()
 
 
 def test_a_range_that_is_too_long_is_undone_all_over_a_strip() -> None:

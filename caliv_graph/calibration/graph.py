@@ -24,6 +24,7 @@ from caliv_graph.conventions import (
     key_vehicle,
 )
 from caliv_graph.errors import SolveError
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, PoseNoise
 from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.rates import RATES
@@ -102,13 +103,17 @@ def motion_graph(problem: Problem) -> CalibrationGraph:
         if term is None:
             nothing = np.zeros(len(information))
             graph.append_gaussian(
-                "motion", Gaussian(tuple(keys), tuple(poses), information, nothing)
+                "motion",
+                Gaussian(tuple(keys), tuple(poses), information, nothing, chart=PoseChart()),
             )
             continue
         keys += [KEYS[name] for name in term.values]
         means = (*poses, *term.values.values())
         graph.append_gaussian(
-            "motion", Gaussian(tuple(keys), means, term.information, term.gradient, term.constant)
+            "motion",
+            Gaussian(
+                tuple(keys), means, term.information, term.gradient, term.constant, term.chart
+            ),
         )
     for name, prior in problem.parameters.items():
         noise, mean = gtsam.noiseModel.Gaussian.Covariance(prior.cov), prior.mean

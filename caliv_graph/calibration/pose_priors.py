@@ -15,6 +15,7 @@ from caliv_graph.calibration.heave import with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     ParameterPrior,
     ParameterValue,
+    chart_of,
     motion_gaussian,
     parameter_priors,
 )
@@ -91,6 +92,7 @@ def _smoothed(
             np.asarray(scipy.linalg.block_diag(*np.linalg.inv(covs))) if covs else nothing
         ),
         parameter_offset=np.concatenate([np.zeros(0), *offsets]),
+        chart=chart_of(trajectory),
     )
 
 

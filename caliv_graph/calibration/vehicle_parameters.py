@@ -6,7 +6,7 @@ The motion data of a drive are a Gaussian on its poses and on them (`README.md`,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import gtsam
@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_wheels_rotation
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
 from caliv_graph.trajectory.parameters import (
@@ -64,20 +65,22 @@ look like shifts of the poses."""
 class MotionTerm:
     """What the motion data of a drive say of its m poses and of k parameters.
 
-    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`: right perturbations of the
-    poses, then of the parameters about `values`.
+    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`: coordinates of the poses in
+    `chart`, then right perturbations of the parameters about `values`.
 
     Attributes:
         information: (6 m + 3 k, 6 m + 3 k), heave included, priors of the parameters not.
         gradient: (6 m + 3 k,).
         constant: at least twice what the quadratic falls below zero.
         values: of the parameters where it was linearised, by name, in order.
+        chart: of the poses.
     """
 
     information: Array
     gradient: Array
     constant: float
     values: Mapping[str, ParameterValue]
+    chart: PoseChart = field(default_factory=PoseChart)
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,13 @@ def motion_term(
     if not _uncertain(trajectory):
         return None
     joint, values = motion_gaussian(trajectory, stamps_ns, heave_m)
-    return MotionTerm(joint.information, joint.gradient, _constant(joint), values)
+    chart = chart_of(trajectory)
+    return MotionTerm(joint.information, joint.gradient, _constant(joint), values, chart)
+
+
+def chart_of(trajectory: SmoothedTrajectory) -> PoseChart:
+    """Coordinates of the vehicle's poses in which a turn of the IMU on it is a straight line."""
+    return PoseChart(np.asarray(trajectory.T_vehicle_imu.translation()))
 
 
 def motion_gaussian(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.imu import exp_so3
@@ -54,12 +55,13 @@ class State:
         R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
         moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior, T0 of
-            a pose: `log(T0^-1 T)`; with the errors of the rates, 6 more.
+            a pose: `T0^-1 T` in `chart`; with the errors of the rates, 6 more.
         T_vehicle_lidar: n poses.
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
         normals_map: (K, 3).
         errors: (D,) errors of LiDARs, height and tilt at their coordinates; else zero.
+        chart: of `moved`.
     """
 
     R_map_vehicle: Array
@@ -70,6 +72,7 @@ class State:
     centres_map: Array
     normals_map: Array
     errors: Array
+    chart: PoseChart = field(default_factory=PoseChart)
 
 
 @dataclass(frozen=True)
@@ -199,7 +202,7 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
     moved = state.moved + d[: layout.offset]
     before = state.moved[: 6 * m].reshape(m, 6)
     for i, (xi, step) in enumerate(zip(before, steps, strict=True)):
-        moved[6 * i : 6 * i + 6] = gtsam.Pose3.Logmap(gtsam.Pose3.Expmap(xi).compose(step))
+        moved[6 * i : 6 * i + 6] = state.chart.coordinates(state.chart.pose(xi).compose(step))
     tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
     planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
     errors = np.concatenate([layout.error_columns(), np.arange(layout.standing, layout.plane)])

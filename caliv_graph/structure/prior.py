@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.rates import rate_rows, with_rates
 
@@ -16,11 +17,11 @@ from caliv_graph.trajectory.rates import rate_rows, with_rates
 class PosePrior:
     """What the motion data of one drive say of m poses and of k parameters of the vehicle.
 
-    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are right perturbations of
-    the poses (rotation then translation, rad and m), then of the parameters, three each: metres of
-    the lever arm; right perturbation of R_vehicle_imu; and, where points were moved by the rates of
-    the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a sigma of its own
-    at each pose, is part of the poses; the priors of the parameters are apart.
+    Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are coordinates of the
+    poses (`chart`; rotation then translation, rad and m), then of the parameters, three each:
+    metres of the lever arm; right perturbation of R_vehicle_imu; and, where points were moved by
+    the rates of the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a
+    sigma of its own at each pose, is part of the poses; the priors of the parameters are apart.
 
     Attributes:
         stamps_ns: (m,) of the poses, strictly increasing.
@@ -34,6 +35,7 @@ class PosePrior:
         parameter_information: (3 k, 3 k) of the priors of the parameters, one for all drives.
         parameter_offset: (3 k,) the present values less the means of these priors: the priors add
             `parameter_information` and `-parameter_information parameter_offset`.
+        chart: of the poses.
     """
 
     stamps_ns: IntArray
@@ -43,6 +45,7 @@ class PosePrior:
     gradient: Array
     parameter_information: Array
     parameter_offset: Array
+    chart: PoseChart = field(default_factory=PoseChart)
 
     @property
     def rates(self) -> int:
@@ -61,7 +64,7 @@ class PosePrior:
     def at(self, moved: Array) -> tuple[Array, Array]:
         """H and b of `e^T H e / 2 - b^T e`, e from d = `moved`: of poses right perturbations there.
 
-        The derivative of d is not 1 where a pose is turned (`trajectory.factors.Gaussian`).
+        The derivative of d is not 1 where a pose is turned.
         """
         b = self.gradient - self.information @ moved
         if not moved.any():
@@ -72,7 +75,7 @@ class PosePrior:
     def by_now(self, moved: Array) -> Array:
         """(m, 6, 6) derivatives of the poses' part of d at `moved`."""
         xi = moved[: 6 * len(self.stamps_ns)].reshape(-1, 6)
-        return np.array([gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(v)) for v in xi])
+        return np.array([self.chart.derivative(self.chart.pose(v)) for v in xi])
 
 
 def _turned(rows: Array, by_now: Array) -> Array:

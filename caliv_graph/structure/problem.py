@@ -107,6 +107,7 @@ def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
         centres_map=np.zeros((0, 3)),
         normals_map=np.zeros((0, 3)),
         errors=np.zeros(0),
+        chart=problem.prior.chart,
     )
 
 

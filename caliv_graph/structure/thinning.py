@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import stack
@@ -100,7 +99,7 @@ def on_all_poses(prior: PosePrior, poses: IntArray, state: State) -> State:
     moved[rest] = solved(factor_of(H[np.ix_(rest, rest)]), pull)
     steps = moved[: 6 * m].reshape(m, 6)
     R, t = stack(
-        [T.compose(gtsam.Pose3.Expmap(d)) for T, d in zip(prior.T_map_vehicle, steps, strict=True)]
+        [T.compose(prior.chart.pose(d)) for T, d in zip(prior.T_map_vehicle, steps, strict=True)]
     )
     more = np.zeros(6 * (m - p) if len(state.errors) else 0)
     return replace(

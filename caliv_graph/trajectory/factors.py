@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 import scipy.sparse
 
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.smoothed import States
@@ -228,7 +229,8 @@ class Gaussian:
     """A Gaussian on several variables at once: a quadratic in right perturbations about its means.
 
     Twice its error is `d^T information d - 2 gradient^T d + constant`, where d has `log(T0^-1 T)`
-    of poses and rotations (of poses rotation then translation) and differences of vectors.
+    of poses and rotations (of poses rotation then translation) and differences of vectors. Poses of
+    the vehicle about means without heave are in a `chart` instead.
 
     Attributes:
         keys: its variables.
@@ -236,6 +238,7 @@ class Gaussian:
         information: (n, n), n all coordinates.
         gradient: (n,).
         constant: what makes the error positive.
+        chart: of its poses, all the vehicle's; None: their logarithms.
     """
 
     keys: tuple[int, ...]
@@ -243,6 +246,7 @@ class Gaussian:
     information: Array
     gradient: Array
     constant: float = 0.0
+    chart: PoseChart | None = None
 
     def factor(self) -> gtsam.LinearContainerFactor:
         """As one native factor; see `at` for what it is away from the means."""
@@ -253,7 +257,7 @@ class Gaussian:
     def at(self, values: gtsam.Values) -> tuple[Array, Array]:
         """H (n, n) and b (n,) of `d^T H d / 2 - b^T d` in right perturbations of `values`.
 
-        The native factor takes the derivative of the logarithm for 1, which is off by half of what
+        The native factor takes the derivative of d for 1, which is off by half of what
         a pose is turned. Where a direction is open, all poses move together by hundredths of a
         radian, and what is known to hundredths of a milliradian would seem to tell of it.
         """
@@ -261,8 +265,12 @@ class Gaussian:
         for key, mean in zip(self.keys, self.means, strict=True):
             if isinstance(mean, gtsam.Pose3):
                 T = mean.between(values.atPose3(key))
-                apart.append(gtsam.Pose3.Logmap(T))
-                blocks.append(gtsam.Pose3.LogmapDerivative(T))
+                if self.chart is None:
+                    apart.append(gtsam.Pose3.Logmap(T))
+                    blocks.append(gtsam.Pose3.LogmapDerivative(T))
+                else:
+                    apart.append(self.chart.coordinates(T))
+                    blocks.append(self.chart.derivative(T))
             elif isinstance(mean, gtsam.Rot3):
                 turn = gtsam.Rot3.Logmap(mean.between(values.atRot3(key)))
                 apart.append(turn)

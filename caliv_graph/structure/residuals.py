@@ -71,51 +71,61 @@ def lidar_poses(
     twists: Array | None,
     accelerations: Array | None = None,
 ) -> tuple[Array, Array]:
-    """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included."""
-    R_e, t_e = _lidars_at_stamps(state, lidar, pose, twists, accelerations)
+    """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) of LiDARs at poses, time offsets included.
+
+    `twists` and `accelerations` as in `geometry_of`.
+    """
+    late = _late_motion(state, lidar, pose, _turned(state, twists), _turned(state, accelerations))
+    R_e, t_e = _lidars_at_stamps(state, lidar, pose, late)
     R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
     return R_v @ R_e, t_v + np.einsum("qij,qj->qi", R_v, t_e)
 
 
-def _lidars_at_stamps(
-    state: State, lidar: IntArray, pose: IntArray, twists: Array | None, accelerations: Array | None
-) -> tuple[Array, Array]:
-    """(Q, 3, 3) and (Q, 3): where LiDARs are from the vehicle at the stamps of their scans.
+def _turned(state: State, twists: Array | None) -> Array | None:
+    """(M, 6) twists (M, 6) of the first poses, in the axes of the present ones; None: of None.
 
-    Where a LiDAR was at the late scan itself, `Exp(-o (xi - o a / 2)) E`.
+    The velocities in the map are what is known. A vehicle whose axes nobody knows (`rpy_deg: null`)
+    turns by 30 mrad and more until all is solved: its yaw rate held in its own axes, a time offset
+    would tilt each scan in a curve.
+    """
+    if twists is None:
+        return None
+    turns = state.moved[: 6 * len(twists)].reshape(-1, 6)[:, :3]
+    R = np.swapaxes(Rotation.from_rotvec(turns).as_matrix(), 1, 2)
+    return np.asarray(np.einsum("mij,mkj->mki", R, twists.reshape(-1, 2, 3)).reshape(-1, 6))
+
+
+def _late_motion(
+    state: State, lidar: IntArray, pose: IntArray, twists: Array | None, accelerations: Array | None
+) -> Array | None:
+    """(Q, 6) motion from the stamp back to the late scan itself, `-o (xi - o a / 2)`.
+
+    Of twists and accelerations in present axes; None where no LiDAR is late.
+    """
+    if twists is None or not state.offsets_s.any():
+        return None
+    offset_s = state.offsets_s[lidar][:, None]
+    if accelerations is None:
+        return -offset_s * twists[pose]
+    return -offset_s * (twists[pose] - 0.5 * offset_s * accelerations[pose])
+
+
+def _lidars_at_stamps(
+    state: State, lidar: IntArray, pose: IntArray, late: Array | None
+) -> tuple[Array, Array]:
+    """(Q, 3, 3) and (Q, 3): where LiDARs of late scans are, from the vehicle at the stamps.
+
+    `Exp(late) E`, `late` (Q, 6) the same for the same LiDAR and pose; None: none is.
     """
     R_e, t_e = stack(state.T_vehicle_lidar)
-    if twists is None or not state.offsets_s.any():
+    if late is None:
         return R_e[lidar], t_e[lidar]
-    count = len(state.offsets_s)
-    both, own = np.unique(pose * count + lidar, return_inverse=True)
-    at, of = both // count, both % count
-    late = -state.offsets_s[of][:, None] * _mean_twists(state, of, at, twists, accelerations)
-    R, t = stack([gtsam.Pose3.Expmap(v) for v in late])
+    both = pose * len(state.offsets_s) + lidar
+    _, first, own = np.unique(both, return_index=True, return_inverse=True)
+    R, t = stack([gtsam.Pose3.Expmap(v) for v in late[first]])
+    of = lidar[first]
     t = t + np.einsum("qij,qj->qi", R, t_e[of])
     return (R @ R_e[of])[own], t[own]
-
-
-def _mean_twists(
-    state: State, lidar: IntArray, pose: IntArray, twists: Array, accelerations: Array | None
-) -> Array:
-    """(Q, 6) twists in the mean from the stamp to the late scan itself."""
-    mean = twists[pose]
-    if accelerations is not None:
-        mean = mean - 0.5 * state.offsets_s[lidar][:, None] * accelerations[pose]
-    return turned_with_poses(state, mean, pose)
-
-
-def turned_with_poses(state: State, twists: Array, pose: IntArray) -> Array:
-    """(Q, 6) twists (Q, 6) of the first poses, with the same velocities in the map.
-
-    A vehicle whose axes nobody knows (`rpy_deg: null`) turns by 30 mrad and more until all is
-    solved. Its yaw rate held in its own axes, a time offset would tilt each scan in a curve.
-    """
-    turned = state.moved[6 * pose[:, None] + np.arange(3)]
-    R = np.swapaxes(Rotation.from_rotvec(turned).as_matrix(), 1, 2)
-    both = np.einsum("qij,qkj->qki", R, twists.reshape(-1, 2, 3))
-    return np.asarray(both.reshape(-1, 6))
 
 
 def geometry_of(
@@ -164,23 +174,20 @@ def geometry_of(
     by_extrinsic[:, 3:, 3] = smooth
     back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
-    by_own_pose, now = by_pose, None
-    if twists is not None:
-        # Points move with the velocities in the map, whatever way the vehicle is turned.
-        now = turned_with_poses(state, twists[pose], pose)
-        by_own_pose = _back(
-            *_lidars_at_stamps(state, lidar, pose, twists, accelerations), by_extrinsic
+    by_own_pose = by_pose
+    now, change = _turned(state, twists), _turned(state, accelerations)
+    late = _late_motion(state, lidar, pose, now, change)
+    if late is not None:
+        by_own_pose = _back(*_lidars_at_stamps(state, lidar, pose, late), by_extrinsic)
+        by_own_pose[:, :3] += np.swapaxes(twist_by_turn(late), 1, 2) @ by_pose
+    if twists is not None and now is not None and layout.rates:
+        apart_s = sightings.time_s[:, None]
+        plain += np.einsum("qc,qci->qi", apart_s * (now - twists)[pose], by_pose)
+        by_turn = np.swapaxes(twist_by_turn(apart_s * now[pose]), 1, 2) @ by_pose
+        by_own_pose = np.concatenate([by_own_pose[:, :3] + by_turn, by_own_pose[:, 3:]], axis=1)
+        by_extrinsic = by_extrinsic + _by_compensation(
+            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
         )
-        late = -state.offsets_s[lidar][:, None]
-        by_turn = twist_by_turn(late * _mean_twists(state, lidar, pose, twists, accelerations))
-        if layout.rates:
-            apart_s = sightings.time_s[:, None]
-            by_turn = by_turn + twist_by_turn(apart_s * now)
-            plain += np.einsum("qc,qci->qi", apart_s * (now - twists[pose]), by_pose)
-            by_extrinsic = by_extrinsic + _by_compensation(
-                sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
-            )
-        by_own_pose[:, :3] += np.swapaxes(by_turn, 1, 2) @ by_pose
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R
@@ -193,14 +200,13 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    then, swept = now, None
-    if then is not None and accelerations is not None:
+    then, swept = None if now is None else now[pose], None
+    if then is not None and change is not None:
         # Points of a late sweep moved with the velocity of then.
         offset_s = state.offsets_s[lidar][:, None]
-        change = turned_with_poses(state, accelerations[pose], pose)
-        swept = -sightings.time_s[:, None] * change
+        swept = -sightings.time_s[:, None] * change[pose]
         plain += np.einsum("qc,qci->qi", offset_s * swept, by_pose)
-        then = then - offset_s * change
+        then = then - offset_s * change[pose]
     moved = _by_motion(state, sightings, layout, lidar, then, swept, by_pose)
     if layout.turns and turn is not None:
         # What the gyroscope erred since the stamp: X Exp(tau w) in the place of X.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -341,7 +342,7 @@ def cached_selection(
         return _read(path, tuple(scenario.lidars))
     selection = select_beams(scenario, threads, progress)
     folder.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_suffix(".part")
+    fresh = path.with_suffix(f".{os.getpid()}.part")  # others may write the same
     with fresh.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **_arrays(selection))
     fresh.replace(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ matplotlib.use("Agg")  # no display is needed
 
 from matplotlib import pyplot
 
+from caliv_graph.common.files import atomic_write
 from caliv_graph.conventions import AXES
 from scripts._tables_statistics import Line
 
@@ -54,10 +56,10 @@ def write_plot(path: Path, title: str, lines: Sequence[Line]) -> bool:
                 tick_labels=[f"{axis}\nn = {len(errors[axis])}" for axis in determined],
                 flierprops={"markersize": 3},
             )
-    fresh = path.with_name(f".{path.name}.part")
-    figure.savefig(fresh, format="png", dpi=120)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
     pyplot.close(figure)
-    fresh.replace(path)
+    atomic_write(path, content.getvalue(), force=True)
     return True
 
 

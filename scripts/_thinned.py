@@ -9,8 +9,8 @@ their number is a hundred times smaller.
 from __future__ import annotations
 
 import hashlib
+import io
 import math
-import os
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
+from caliv_graph.common.files import atomic_write
 from caliv_graph.common.progress import Progress, SilentProgress
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
@@ -341,11 +342,9 @@ def cached_selection(
     if path.exists():
         return _read(path, tuple(scenario.lidars))
     selection = select_beams(scenario, threads, progress)
-    folder.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_suffix(f".{os.getpid()}.part")  # others may write the same
-    with fresh.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **_arrays(selection))
-    fresh.replace(path)
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **_arrays(selection))
+    atomic_write(path, content.getvalue(), force=True)  # others may write the same
     return selection
 
 

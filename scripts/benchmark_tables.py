@@ -32,6 +32,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
 
 import caliv_graph
+from caliv_graph.common.files import atomic_write
 from caliv_graph.common.progress import PlainProgress
 from caliv_graph.config.load import dump_config
 from caliv_graph.errors import CalivError
@@ -175,10 +176,8 @@ def run_missing(tasks: Sequence[Task], jobs: int, *, fresh: bool = False) -> lis
     for scenario, row, out in dict.fromkeys((t.scenario, t.row, t.out) for t in tasks):
         path = file_of(scenario, row, out)
         kept = {} if fresh else {line["seed"]: line for line in _usable(path, scenario, row)}
-        out.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        part.write_text("".join(f"{json.dumps(kept[seed])}\n" for seed in sorted(kept)))
-        part.replace(path)
+        lines = "".join(f"{json.dumps(kept[seed])}\n" for seed in sorted(kept))
+        atomic_write(path, lines, force=True)
         missing += [
             t
             for t in tasks

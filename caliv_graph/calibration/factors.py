@@ -84,8 +84,11 @@ class CloudMotion:
 
     def twist_from(self, pose: gtsam.Pose3, after_s: float = 0.0) -> Array:
         """(6,) the twist some time after the stamp, with the same velocities in the map."""
-        R = pose.rotation().matrix().T @ self.R_map_vehicle
-        return turned_twist(R, self.twist + after_s * self.acceleration)
+        return self.in_axes_of(pose, self.twist + after_s * self.acceleration)
+
+    def in_axes_of(self, pose: gtsam.Pose3, twist: Array) -> Array:
+        """(6,) a twist (6,) or its change, in the axes of the present pose."""
+        return turned_twist(pose.rotation().matrix().T @ self.R_map_vehicle, twist)
 
     def undone(self) -> gtsam.Pose3:
         """From the points as they were moved to the points as they were measured."""
@@ -127,9 +130,7 @@ def predict_cloud(
     if motion.apart_s:
         Z = Z.compose(motion.undone())
         if motion.offset:
-            acceleration = turned_twist(
-                X.rotation().matrix().T @ motion.R_map_vehicle, motion.acceleration
-            )
+            acceleration = motion.in_axes_of(X, motion.acceleration)
             moves[2] = moves[2] - moves[3] @ acceleration[:, None]
     return Z, moves
 

@@ -6,7 +6,7 @@ The motion data of a drive are a Gaussian on its poses and on them (`README.md`,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import gtsam
@@ -80,7 +80,7 @@ class MotionTerm:
     gradient: Array
     constant: float
     values: Mapping[str, ParameterValue]
-    chart: PoseChart = field(default_factory=PoseChart)
+    chart: PoseChart
 
 
 @dataclass(frozen=True)

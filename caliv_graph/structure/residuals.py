@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 import scipy.sparse
-from scipy.spatial.transform import Rotation
 
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.strips import LEVEL
+from caliv_graph.trajectory.imu import exp_so3
 
 DENT_RAD = 0.05
 """Largest angle of a strip to its tile that is a dent of the ground. What is steeper, such as a
@@ -76,9 +77,7 @@ def lidar_poses(
     `twists` and `accelerations` as in `geometry_of`.
     """
     late = _late_motion(state, lidar, pose, _turned(state, twists), _turned(state, accelerations))
-    R_e, t_e = _lidars_at_stamps(state, lidar, pose, late)
-    R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
-    return R_v @ R_e, t_v + np.einsum("qij,qj->qi", R_v, t_e)
+    return _in_map(state, pose, *_lidars_at_stamps(state, lidar, pose, late))
 
 
 def _turned(state: State, twists: Array | None) -> Array | None:
@@ -91,8 +90,8 @@ def _turned(state: State, twists: Array | None) -> Array | None:
     if twists is None:
         return None
     turns = state.moved[: 6 * len(twists)].reshape(-1, 6)[:, :3]
-    R = np.swapaxes(Rotation.from_rotvec(turns).as_matrix(), 1, 2)
-    return np.asarray(np.einsum("mij,mkj->mki", R, twists.reshape(-1, 2, 3)).reshape(-1, 6))
+    both = np.einsum("mji,mkj->mki", exp_so3(turns), twists.reshape(-1, 2, 3))
+    return np.asarray(both.reshape(-1, 6))
 
 
 def _late_motion(
@@ -112,20 +111,31 @@ def _late_motion(
 
 def _lidars_at_stamps(
     state: State, lidar: IntArray, pose: IntArray, late: Array | None
-) -> tuple[Array, Array]:
-    """(Q, 3, 3) and (Q, 3): where LiDARs of late scans are, from the vehicle at the stamps.
+) -> tuple[Sequence[gtsam.Pose3], IntArray]:
+    """Where LiDARs of late scans are, from the vehicle at the stamps, and (Q,) which is whose.
 
     `Exp(late) E`, `late` (Q, 6) the same for the same LiDAR and pose; None: none is.
     """
-    R_e, t_e = stack(state.T_vehicle_lidar)
     if late is None:
-        return R_e[lidar], t_e[lidar]
+        return state.T_vehicle_lidar, lidar
     both = pose * len(state.offsets_s) + lidar
     _, first, own = np.unique(both, return_index=True, return_inverse=True)
-    R, t = stack([gtsam.Pose3.Expmap(v) for v in late[first]])
-    of = lidar[first]
-    t = t + np.einsum("qij,qj->qi", R, t_e[of])
-    return (R @ R_e[of])[own], t[own]
+    T = [gtsam.Pose3.Expmap(late[q]).compose(state.T_vehicle_lidar[lidar[q]]) for q in first]
+    return T, own
+
+
+def _in_map(
+    state: State, pose: IntArray, T_vehicle_lidar: Sequence[gtsam.Pose3], own: IntArray
+) -> tuple[Array, Array]:
+    """R_map_lidar (Q, 3, 3) and t_map_lidar (Q, 3) at poses, `own` (Q,) says of which LiDAR."""
+    R_e, t_e = stack(T_vehicle_lidar)
+    R_v, t_v = state.R_map_vehicle[pose], state.t_map_vehicle[pose]
+    return R_v @ R_e[own], t_v + np.einsum("qij,qj->qi", R_v, t_e[own])
+
+
+def _inverse_adjoints(poses: Sequence[gtsam.Pose3]) -> Array:
+    """(n, 6, 6) right perturbations of `X T` by right ones of X, of n poses T."""
+    return np.array([np.asarray(T.inverse().AdjointMap()) for T in poses])
 
 
 def geometry_of(
@@ -156,7 +166,10 @@ def geometry_of(
     q = sightings.count
     strip = sightings.strip
     surface = np.array(layout.surface_of, dtype=np.int64)[strip]
-    R, t = lidar_poses(state, lidar, pose, twists, accelerations)
+    now, change = _turned(state, twists), _turned(state, accelerations)
+    late = _late_motion(state, lidar, pose, now, change)
+    at_stamps, own_stamp = _lidars_at_stamps(state, lidar, pose, late)
+    R, t = _in_map(state, pose, at_stamps, own_stamp)
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
     error_columns = _error_columns(layout, lidar, surface, strip)
@@ -172,13 +185,12 @@ def geometry_of(
     by_extrinsic = np.zeros((q, 6, 4))
     by_extrinsic[:, :3, :3] = -skew(smooth)
     by_extrinsic[:, 3:, 3] = smooth
-    back = np.array([np.asarray(T.inverse().AdjointMap()) for T in state.T_vehicle_lidar])
+    back = _inverse_adjoints(state.T_vehicle_lidar)
     by_pose = np.swapaxes(back[lidar], 1, 2) @ by_extrinsic
     by_own_pose = by_pose
-    now, change = _turned(state, twists), _turned(state, accelerations)
-    late = _late_motion(state, lidar, pose, now, change)
     if late is not None:
-        by_own_pose = _back(*_lidars_at_stamps(state, lidar, pose, late), by_extrinsic)
+        at_scans = _inverse_adjoints(at_stamps)[own_stamp]
+        by_own_pose = np.swapaxes(at_scans, 1, 2) @ by_extrinsic
         by_own_pose[:, :3] += np.swapaxes(twist_by_turn(late), 1, 2) @ by_pose
     if twists is not None and now is not None and layout.rates:
         apart_s = sightings.time_s[:, None]
@@ -218,14 +230,6 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
-
-
-def _back(R: Array, t: Array, by_lidar: Array) -> Array:
-    """(Q, 6, 4) derivatives by right perturbations of X, from those by ones of X (R, t)."""
-    back = np.zeros((len(R), 6, 6))
-    back[:, :3, :3] = back[:, 3:, 3:] = R
-    back[:, :3, 3:] = skew(t) @ R
-    return np.asarray(back @ by_lidar)
 
 
 def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:

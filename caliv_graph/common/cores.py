@@ -9,16 +9,20 @@ import functools
 import itertools
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import TypeVar, cast
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 THREADS = 2
 """At most, for work on clouds and points: numpy holds the interpreter's lock between its
 operations, so more threads mostly wait."""
+
+TOGETHER = 6
+"""Items that are held while they are worked on together: memory stays bounded."""
 
 _one_core = False
 
@@ -90,6 +94,28 @@ def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
         wait(others)
     for other in others:
         other.result()
+
+
+def worked_together(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """`map(work, items)`, `TOGETHER` items being shared out at a time.
+
+    Results come in the order of the items. These are taken in the caller's thread, because readers
+    of files may not leave the thread that opened them.
+    """
+    if cores() < 2:
+        yield from map(work, items)
+        return
+    left = iter(items)
+    while some := list(itertools.islice(left, TOGETHER)):
+        results: dict[int, Result] = {}
+        share_out(functools.partial(_keep, results, work, some), range(len(some)))
+        yield from (results[k] for k in range(len(some)))
+
+
+def _keep(
+    results: dict[int, Result], work: Callable[[Item], Result], items: Sequence[Item], k: int
+) -> None:
+    results[k] = work(items[k])
 
 
 @functools.cache

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 
+from caliv_graph.common.cores import share_out
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, IntArray
 
@@ -20,6 +22,9 @@ RIDGES = (1e-12, 1e-11, 1e-10)
 """Relative ridges under which a system is solved, the first that rounding leaves positive: poses
 that are known to each other to micrometres lie on a map that an unknown lever arm places to
 metres."""
+
+PANEL = 512
+"""Rows of a product that are made at a time: temporary memory is small."""
 
 
 @dataclass(frozen=True)
@@ -106,53 +111,92 @@ def eliminated(
     """
     V_rest = V[:rest]
     out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
-    right = b[:rest].copy()
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
     rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
-    local = np.zeros(H.shape[0], dtype=np.int64)
-    done, end = [], 0
-    for own in blocks:
-        begin, end = end, end + len(own)
-        inside, cross, others = _dense_rows(rows, begin, own, rest, local)
-        row, column, value = _entries(V_own, np.arange(begin, end))
-        columns, column = np.unique(column, return_inverse=True)
-        low = np.zeros((len(own), len(columns)))
-        low[row, column] = value
-        inside -= low @ low.T
-        row, column, value = _entries(V_columns, columns)
-        across = np.zeros((len(columns), len(others)))
-        across[row, local[column]] = value
-        cross -= low @ across
-        try:
-            L = np.asarray(np.linalg.cholesky(inside), np.float64)
-        except np.linalg.LinAlgError:
-            raise SolveError("structure: a surface has no information") from None
-        coupling = _lower(L, cross)
-        out[np.ix_(others, others)] -= coupling.T @ coupling
-        right[others] -= coupling.T @ _lower(L, b[own])
-        done.append(_Block(own, others, L, coupling))
-    return np.asarray(out), right, Surfaces(rest, tuple(done), b[rest:])
+    ends = np.cumsum([len(own) for own in blocks])
+    found: dict[int, _Block] = {}
+
+    def factor(k: int) -> None:
+        found[k] = _block(rows, V_own, V_columns, int(ends[k]) - len(blocks[k]), blocks[k], rest)
+
+    # The largest first: what is left at the end is small.
+    share_out(factor, sorted(range(len(blocks)), key=lambda k: -len(blocks[k])))
+    done = tuple(found[k] for k in range(len(blocks)))
+    starts = range(0, rest, PANEL)
+    share_out(partial(_subtract_squares, out, done), reversed(starts))
+    right = b[:rest].copy()
+    for block in done:
+        right[block.others] -= block.coupling.T @ _lower(block.L, b[block.own])
+    return np.asarray(out), right, Surfaces(rest, done, b[rest:])
+
+
+def _block(
+    rows: scipy.sparse.csr_array,
+    V_own: scipy.sparse.csr_array,
+    V_columns: scipy.sparse.csr_array,
+    begin: int,
+    own: IntArray,
+    rest: int,
+) -> _Block:
+    """One block: its rows of `rows` and `V_own` are those from `begin` on.
+
+    `V_columns` (G, R) are the columns of V on what remains.
+
+    Raises:
+        SolveError: it is singular.
+    """
+    inside, cross, others, local = _dense_rows(rows, begin, own, rest)
+    row, column, value = _entries(V_own, np.arange(begin, begin + len(own)))
+    columns, column = np.unique(column, return_inverse=True)
+    low = np.zeros((len(own), len(columns)))
+    low[row, column] = value
+    inside -= low @ low.T
+    row, column, value = _entries(V_columns, columns)
+    across = np.zeros((len(columns), len(others)))
+    across[row, local[column]] = value
+    cross -= low @ across
+    try:
+        L = np.asarray(np.linalg.cholesky(inside), np.float64)
+    except np.linalg.LinAlgError:
+        raise SolveError("structure: a surface has no information") from None
+    return _Block(own, others, L, _lower(L, cross))
+
+
+def _subtract_squares(out: Array, blocks: Sequence[_Block], begin: int) -> None:
+    """Subtracts `coupling^T coupling` of each block from `out` (R, R), in place.
+
+    Of the lower half the rows from `begin` on, `PANEL` of them, and the same above the diagonal:
+    whoever does other rows touches nothing of this. The product for all would be as large as `out`.
+    """
+    for block in blocks:
+        first, last = np.searchsorted(block.others, [begin, begin + PANEL])
+        part = block.coupling[:, first:last].T @ block.coupling[:, :last]
+        some = block.others[first:last]
+        out[np.ix_(some, block.others[:last])] -= part
+        out[np.ix_(block.others[:first], some)] -= part[:, :first].T
 
 
 def _dense_rows(
-    rows: scipy.sparse.csr_array, begin: int, own: IntArray, rest: int, local: IntArray
-) -> tuple[Array, Array, IntArray]:
+    rows: scipy.sparse.csr_array, begin: int, own: IntArray, rest: int
+) -> tuple[Array, Array, IntArray, IntArray]:
     """The rows of a block: within it, with others of the first `rest`, and which these are.
 
-    They are those of `rows` from `begin` on.
-
-    `local` (D,) is overwritten: the places of `own` and of the others in the results.
+    They are those of `rows` from `begin` on. The last one (D,) has the places of `own` and of the
+    others in the results.
     """
     row, column, value = _entries(rows, np.arange(begin, begin + len(own)))
     across = column < rest
-    others = np.unique(column[across])
+    coupled = np.zeros(rest, dtype=bool)
+    coupled[column[across]] = True
+    others = np.flatnonzero(coupled)
+    local = np.zeros(rows.shape[1], dtype=np.int64)
     local[others] = np.arange(len(others))
     local[own] = np.arange(len(own))
     inside = np.zeros((len(own), len(own)))
     cross = np.zeros((len(own), len(others)))
     inside[row[~across], local[column[~across]]] = value[~across]
     cross[row[across], local[column[across]]] = value[across]
-    return inside, cross, np.asarray(others, dtype=np.int64)
+    return inside, cross, others, local
 
 
 def _entries(matrix: scipy.sparse.csr_array, rows: IntArray) -> tuple[IntArray, IntArray, Array]:
@@ -232,9 +276,8 @@ def marginal(H: Array, b: Array, keep: IntArray, rest: IntArray) -> tuple[Array,
     Raises:
         SolveError: `rest` is singular.
     """
-    half = half_solved(
-        factor_of(H[np.ix_(rest, rest)]), np.column_stack([H[np.ix_(keep, rest)].T, b[rest]])
-    )
+    factor = factor_of(H[np.ix_(rest, rest)], overwrite=True)
+    half = half_solved(factor, np.column_stack([H[np.ix_(keep, rest)].T, b[rest]]))
     known = half.T @ half
     return H[np.ix_(keep, keep)] - known[:-1, :-1], b[keep] - known[:-1, -1]
 

@@ -12,6 +12,9 @@ from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.rates import rate_rows, with_rates
 
+POSES_TOGETHER = 32
+"""Poses whose rows are turned at a time: temporary memory is small."""
+
 
 @dataclass(frozen=True)
 class PosePrior:
@@ -70,7 +73,11 @@ class PosePrior:
         if not moved.any():
             return self.information, b
         by_now = self.by_now(moved)
-        return _turned(_turned(self.information, by_now).T, by_now), _turned(b, by_now)
+        H = self.information.copy()
+        _turn(H, by_now)
+        _turn(H.T, by_now)
+        _turn(b[:, None], by_now)
+        return H, b
 
     def by_now(self, moved: Array) -> Array:
         """(m, 6, 6) derivatives of the poses' part of d at `moved`."""
@@ -78,9 +85,9 @@ class PosePrior:
         return np.array([self.chart.derivative(self.chart.pose(v)) for v in xi])
 
 
-def _turned(rows: Array, by_now: Array) -> Array:
-    """Rows (6 m + k, ...) with those of the poses multiplied by the transposed derivatives."""
-    out, size = rows.copy(), 6 * len(by_now)
-    of_poses = rows[:size].reshape(len(by_now), 6, -1)
-    out[:size] = (np.swapaxes(by_now, 1, 2) @ of_poses).reshape(rows[:size].shape)
-    return out
+def _turn(rows: Array, by_now: Array) -> None:
+    """Multiplies rows (6 m + k, n) of the poses by the transposed derivatives, in place."""
+    for begin in range(0, len(by_now), POSES_TOGETHER):
+        some = by_now[begin : begin + POSES_TOGETHER]
+        own = rows[6 * begin : 6 * (begin + len(some))]
+        own[:] = (np.swapaxes(some, 1, 2) @ own.reshape(len(some), 6, -1)).reshape(own.shape)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import gtsam
 import numpy as np
 
+from caliv_graph.common.cores import worked_together
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -92,11 +94,16 @@ def read_patches(
             for k, name in enumerate(names):
                 guess = config.lidars[name].guess()
                 stamps = frozenset(wanted[drive][k].tolist())
-                for scan in recording.scans(name, stamps) if stamps else ():
-                    patches = scan_patches(
-                        scan, guess, trajectories[drive], config.noise.lidar_range_m, keep_level
-                    )
-                    scans.append((k, scan.stamp_ns, patches))
+                reduced = partial(
+                    _stamped_patches,
+                    T_vehicle_lidar=guess,
+                    trajectory=trajectories[drive],
+                    sigma_range_m=config.noise.lidar_range_m,
+                    keep_level=keep_level,
+                )
+                clouds = recording.scans(name, stamps) if stamps else ()
+                for stamp_ns, patches in worked_together(reduced, clouds):
+                    scans.append((k, stamp_ns, patches))
                     advance()
             found.append(_together(drive, names, scans))
     return tuple(found)
@@ -200,6 +207,18 @@ def _motion(instants_ns: IntArray, trajectory: VehicleTrajectory) -> Array:
     seconds = np.diff(instants_ns) / NANOSECONDS_PER_SECOND
     steps = moved + LEVER_M * turned + REST_M_S * seconds
     return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
+
+
+def _stamped_patches(
+    scan: LidarScan,
+    T_vehicle_lidar: gtsam.Pose3,
+    trajectory: VehicleTrajectory,
+    sigma_range_m: float,
+    keep_level: bool,
+) -> tuple[int, ScanPatches]:
+    """The stamp of a scan in nanoseconds, and `scan_patches`."""
+    patches = scan_patches(scan, T_vehicle_lidar, trajectory, sigma_range_m, keep_level)
+    return scan.stamp_ns, patches
 
 
 def scan_patches(

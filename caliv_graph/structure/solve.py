@@ -163,10 +163,15 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         levels, state = Levels.of(found.nuisances), found.state
     if found is None:
         return None
-    jittering = _with_jitter(found)
-    if jittering is not None:
-        found = _settled(*jittering)
-    return _on_all_poses(found, problem, poses)
+    gradient = None
+    if own.twists is not None:
+        jittering, system = _with_jitter(found)
+        if jittering is None:
+            gradient = system.b[: found.layout.plane]
+        else:
+            found = _settled(jittering, LAST_STEPS, system)
+        del system
+    return _on_all_poses(found, problem, poses, gradient)
 
 
 def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -204,14 +209,12 @@ def _rough(
     return on_all_poses(problem.prior, poses, rough), levels
 
 
-def _with_jitter(found: Estimate) -> tuple[Estimate, int, System] | None:
+def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
     """The same estimate with a jitter of every scan's stamp; None where the data show none.
 
-    With the number of steps to go on with, and its system.
+    And its system. Where there is none, the jitters are its last coordinates, without a prior.
     """
     problem = found.problem
-    if problem.twists is None:
-        return None
     first, scans = found.layout.plane, len(problem.patches.stamps_ns)
     layout = replace(found.layout, jitters=scans)
     errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
@@ -219,24 +222,27 @@ def _with_jitter(found: Estimate) -> tuple[Estimate, int, System] | None:
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
     system = jittering.linearised()
-    H, b = with_guesses(problem, state, system)
-    sigma_s = jitter_sigma_s(H, b, layout)
+    sigma_s = jitter_sigma_s(*with_guesses(problem, state, system), layout)
     if sigma_s == 0.0:
-        return None
+        return None, system
     own = np.arange(layout.jitter, layout.plane)
-    known = system.H.copy()
-    known[own, own] += sigma_s**-2.0
-    jittering = replace(jittering, nuisances=replace(found.nuisances, jitter_s=sigma_s))
-    return jittering, LAST_STEPS, replace(system, H=known)
+    system.H[own, own] += sigma_s**-2.0
+    nuisances = replace(found.nuisances, jitter_s=sigma_s)
+    return replace(jittering, nuisances=nuisances), system
 
 
-def _on_all_poses(found: Estimate, problem: Problem, poses: IntArray) -> Solved:
+def _on_all_poses(
+    found: Estimate, problem: Problem, poses: IntArray, gradient: Array | None = None
+) -> Solved:
     """The same estimate with all poses of a drive, of which it has some (p,).
 
     Its information is without what dents of the ground tell. The steps use them: derivatives that
-    are not those of the residuals do not lead to the estimate.
+    are not those of the residuals do not lead to the estimate. `gradient` is with them, where it is
+    known.
     """
-    b = on_all_coordinates(found.linearised().b, problem.prior, poses)
+    if gradient is None:
+        gradient = found.linearised().b
+    b = on_all_coordinates(gradient, problem.prior, poses)
     state = on_all_poses(problem.prior, poses, found.state)
     layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
     geometry = geometry_at(problem, state, found.sightings, layout, dents=False)

@@ -24,17 +24,12 @@ class System:
         H: (R, R) of the first R = `layout.plane` coordinates, without guesses of extrinsics.
         b: (R,).
         surfaces: what was eliminated.
-        H_prior: (P, P) of it what the motion data say, P coordinates of poses, parameters and
-            rates, without the parameters' own priors.
-        b_prior: (P,).
     """
 
     layout: Layout
     H: Array
     b: Array
     surfaces: Surfaces
-    H_prior: Array
-    b_prior: Array
 
 
 def system_of(
@@ -84,4 +79,4 @@ def system_of(
         own = slice(6 * layout.poses, layout.rate)
         H[own, own] += prior.parameter_information
         b[own] -= prior.parameter_information @ (prior.parameter_offset + state.moved[own])
-    return System(layout, H, b, surfaces, H_prior, b_prior)
+    return System(layout, H, b, surfaces)

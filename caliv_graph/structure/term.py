@@ -203,16 +203,20 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     parameters = np.arange(6 * layout.poses, layout.rate)
     of_motion = np.concatenate([poses, parameters])
     keep = np.concatenate([of_motion, np.arange(layout.offset, layout.error)])
-    H, b = system.H.copy(), system.b.copy()
+    H, b = system.H, system.b
+    H_motion, b_motion = prior.at(found.state.moved)
+    by_now = _parameters_by_now(found)
     if layout.parameters:
+        H, b, H_motion, b_motion = (part.copy() for part in (H, b, H_motion, b_motion))
         # The graph of the calibration has the priors of the parameters.
         own = np.ix_(parameters, parameters)
         H[own] -= prior.parameter_information
         moved = prior.parameter_offset + found.state.moved[parameters]
         b[parameters] += prior.parameter_information @ moved
-    by_now = _parameters_by_now(found)
-    H, b = _in_perturbations(H, b, parameters, by_now)
-    H_prior, b_prior = _in_perturbations(system.H_prior, system.b_prior, parameters, by_now)
+        _to_perturbations(H, b, parameters, by_now)
+        _to_perturbations(H_motion, b_motion, parameters, by_now)
+    motion, motion_gradient, *_ = _marginal(H_motion, b_motion, of_motion)
+    del H_motion
     # How the vehicle stands is kept at first: others test what is assumed of it.
     stand = np.arange(layout.standing, layout.standing + STANDING)
     tilt = mean_tilt(found)
@@ -224,7 +228,6 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     now_m = float(found.state.errors[layout.standing])
     stance = stance_of(found.problem.standing, now_m, both, both_gradient, tilt)
     information, gradient, *_ = _marginal(both, both_gradient, np.arange(len(keep)))
-    motion, motion_gradient, *_ = _marginal(H_prior, b_prior, of_motion)
     own_part = slice(0, len(of_motion))
     information[own_part, own_part] -= motion
     gradient[own_part] -= motion_gradient
@@ -302,7 +305,7 @@ def _marginal(
         on_zero = np.column_stack([on_keep, np.zeros(len(rows))])
         return inside.copy(), b[keep].copy(), on_zero, np.zeros((len(rows), len(rows)))
     right = np.column_stack([H[np.ix_(keep, rest)].T, b[rest], on_rest.T])
-    half = half_solved(factor_of(H[np.ix_(rest, rest)]), right)
+    half = half_solved(factor_of(H[np.ix_(rest, rest)], overwrite=True), right)
     known = half.T @ half
     k = len(keep)
     information = inside - known[:k, :k]
@@ -336,15 +339,11 @@ def _parameters_by_now(found: Solved) -> Array:
     return np.asarray(scipy.linalg.block_diag(*blocks), np.float64)
 
 
-def _in_perturbations(
-    H: Array, b: Array, parameters: IntArray, by_now: Array
-) -> tuple[Array, Array]:
-    """A quadratic whose parameters are in right perturbations of where they are now."""
-    H, b = H.copy(), b.copy()
+def _to_perturbations(H: Array, b: Array, parameters: IntArray, by_now: Array) -> None:
+    """Makes the parameters of a quadratic right perturbations of where they are now, in place."""
     H[parameters] = by_now.T @ H[parameters]
     H[:, parameters] = H[:, parameters] @ by_now
     b[parameters] = by_now.T @ b[parameters]
-    return H, b
 
 
 def strips_of(found: Solved) -> tuple[Strip, ...]:

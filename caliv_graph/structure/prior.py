@@ -69,15 +69,24 @@ class PosePrior:
 
         The derivative of d is not 1 where a pose is turned.
         """
-        b = self.gradient - self.information @ moved
         if not moved.any():
-            return self.information, b
-        by_now = self.by_now(moved)
-        H = self.information.copy()
-        _turn(H, by_now)
-        _turn(H.T, by_now)
-        _turn(b[:, None], by_now)
+            return self.information, self.gradient
+        H, b = np.zeros_like(self.information), np.zeros_like(self.gradient)
+        self.add_to(H, b, moved)
         return H, b
+
+    def add_to(self, H: Array, b: Array, moved: Array) -> None:
+        """Adds `at(moved)` to the first coordinates of a quadratic, in place."""
+        size, poses = len(self.gradient), 6 * len(self.stamps_ns)
+        by_now = self.by_now(moved)
+        b[:size] += _turned((self.gradient - self.information @ moved)[None], by_now)[0]
+        # Some rows at a time: temporary memory is small.
+        for begin in range(0, len(by_now), POSES_TOGETHER):
+            some = by_now[begin : begin + POSES_TOGETHER]
+            own = slice(6 * begin, 6 * (begin + len(some)))
+            rows = np.swapaxes(some, 1, 2) @ self.information[own].reshape(-1, 6, size)
+            H[own, :size] += _turned(rows.reshape(-1, size), by_now)
+        H[poses:size, :size] += _turned(self.information[poses:], by_now)
 
     def by_now(self, moved: Array) -> Array:
         """(m, 6, 6) derivatives of the poses' part of d at `moved`."""
@@ -85,9 +94,8 @@ class PosePrior:
         return np.array([self.chart.derivative(self.chart.pose(v)) for v in xi])
 
 
-def _turn(rows: Array, by_now: Array) -> None:
-    """Multiplies rows (6 m + k, n) of the poses by the transposed derivatives, in place."""
-    for begin in range(0, len(by_now), POSES_TOGETHER):
-        some = by_now[begin : begin + POSES_TOGETHER]
-        own = rows[6 * begin : 6 * (begin + len(some))]
-        own[:] = (np.swapaxes(some, 1, 2) @ own.reshape(len(some), 6, -1)).reshape(own.shape)
+def _turned(rows: Array, by_now: Array) -> Array:
+    """Rows (n, 6 m + k) with the columns of each pose multiplied by its derivatives."""
+    size = 6 * len(by_now)
+    of_poses = rows[:, :size].reshape(len(rows), len(by_now), 6).swapaxes(0, 1) @ by_now
+    return np.hstack([of_poses.swapaxes(0, 1).reshape(len(rows), size), rows[:, size:]])

@@ -31,7 +31,6 @@ from caliv_graph.structure.problem import (
     layout_of,
     placed_patches,
     placed_sightings,
-    with_guesses,
 )
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.rows import whitened
@@ -80,18 +79,17 @@ class Estimate:
         problem, sightings = self.problem, self.sightings
         group = groups_of(sightings, self.strips)
         repeated = problem.views.count[sightings.scan]
-        rows = whitened(
-            self.geometry,
-            sightings,
-            group,
-            repeated,
-            alike(problem, sightings),
-            self.nuisances,
-            self.weights,
-            self.layout.size,
-        )
         return system_of(
-            rows,
+            whitened(
+                self.geometry,
+                sightings,
+                group,
+                repeated,
+                alike(problem, sightings),
+                self.nuisances,
+                self.weights,
+                self.layout.size,
+            ),
             self.state,
             self.layout,
             problem.prior,
@@ -222,7 +220,11 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
     system = jittering.linearised()
-    sigma_s = jitter_sigma_s(*with_guesses(problem, state, system), layout)
+    guessed = slice(layout.offset, layout.error)
+    without = system.H[guessed, guessed].copy(), system.b[guessed].copy()
+    add_guesses(problem, state, layout, system.H, system.b)
+    sigma_s = jitter_sigma_s(system.H, system.b, layout)
+    system.H[guessed, guessed], system.b[guessed] = without
     if sigma_s == 0.0:
         return None, system
     own = np.arange(layout.jitter, layout.plane)

@@ -43,6 +43,7 @@ def system_of(
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
     sparse, less, right = rows.normal_equations()
+    del rows  # as large as H
     own_errors = slice(layout.standing, layout.turn)
     J, r = standing_rows(
         standing,
@@ -70,11 +71,8 @@ def system_of(
         weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors
     sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
-    size = layout.offset
     H, b, surfaces = eliminated(sparse, less, right, layout.plane, layout.of_surfaces())
-    H_prior, b_prior = prior.at(state.moved)
-    H[:size, :size] += H_prior
-    b[:size] += b_prior
+    prior.add_to(H, b, state.moved)
     if layout.parameters:
         own = slice(6 * layout.poses, layout.rate)
         H[own, own] += prior.parameter_information

@@ -178,7 +178,7 @@ class StructureEvidence:
         priors = pose_priors(trajectories, stamps, heave_m, noise, config)
         return self.solve(
             patches,
-            [priors[of.drive] for of in patches],
+            [priors.pop(of.drive) for of in patches],
             [kept[of.drive] for of in patches],
             [trajectories[of.drive] for of in patches],
             start,

@@ -81,17 +81,22 @@ def structure_terms(
     if not aligned:
         start = aligned_start(patches, trajectories, start, config)
     out = []
-    for own, prior, kept, trajectory in zip(patches, priors, kept_ns, trajectories, strict=True):
+    # Each is as large as a system: the one that the rates are added to is not kept.
+    left = list(priors)
+    del priors
+    for own, kept, trajectory in zip(patches, kept_ns, trajectories, strict=True):
+        prior = left.pop(0)
         used = usable(own, trajectory, start, config)
         if not len(used.scan):
             continue
+        places = np.searchsorted(prior.stamps_ns, kept)
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
+        del prior
         if odometry is not None:
             problem = relative_problem(problem, odometry, start, config)
         found = solve_structure(problem, start)
         if found is None:
             continue
-        places = np.searchsorted(prior.stamps_ns, kept)
         own_odometry = odometry_of([trajectory])
         if own_odometry is None:
             out.append(term_of(found, places))

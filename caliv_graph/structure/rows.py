@@ -54,7 +54,9 @@ class Rows:
         B = self.shared
         J_t = self.J.T.tocsr()
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
-        V = (J_t @ (B @ scipy.sparse.diags_array(np.sqrt(inner)))).tocsr()
+        scaled = B.copy()
+        scaled.data *= np.sqrt(inner)[B.indices]
+        V = J_t @ scaled
         b = self.of_noise - J_t @ self.r
         b += V @ (np.sqrt(inner) * (B.T @ self.r - self.shared_noise))
         return (J_t @ self.J).tocsr(), V, np.asarray(b)

@@ -125,12 +125,14 @@ class PlacedPatches:
         normals_at_stamp: (N, 3) likewise.
         R_map_lidar: (N, 3, 3) at these stamps.
         t_map_lidar: (N, 3) metres.
+        T_vehicle_lidar: of each LiDAR, with which the points were moved to the stamps.
     """
 
     moments_at_stamp: Array
     normals_at_stamp: Array
     R_map_lidar: Array
     t_map_lidar: Array
+    T_vehicle_lidar: tuple[gtsam.Pose3, ...]
 
     @property
     def moments_map(self) -> Array:
@@ -151,7 +153,7 @@ def placed_patches(problem: Problem, state: State) -> PlacedPatches:
     R, t = lidar_poses(
         state, lidar, problem.pose_of_scan[scan], problem.twists, problem.accelerations
     )
-    return PlacedPatches(moments, normals, R, t)
+    return PlacedPatches(moments, normals, R, t, state.T_vehicle_lidar)
 
 
 def placed_sightings(
@@ -160,7 +162,14 @@ def placed_sightings(
     """Sightings of strips; `range_sigma_m` (L,) is the noise along the beam of each LiDAR."""
     own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
     normals = np.einsum("nji,nj->ni", placed.R_map_lidar, strips.normals_map[own])
-    return sightings_of(problem.patches, placed.moments_at_stamp, normals, strips, range_sigma_m)
+    return sightings_of(
+        problem.patches,
+        placed.moments_at_stamp,
+        normals,
+        strips,
+        range_sigma_m,
+        placed.T_vehicle_lidar,
+    )
 
 
 def layout_of(problem: Problem, strips: Strips) -> Layout:

@@ -89,9 +89,19 @@ def _turned(state: State, twists: Array | None) -> Array | None:
     """
     if twists is None:
         return None
-    turns = state.moved[: 6 * len(twists)].reshape(-1, 6)[:, :3]
-    both = np.einsum("mji,mkj->mki", exp_so3(turns), twists.reshape(-1, 2, 3))
-    return np.asarray(both.reshape(-1, 6))
+    R = exp_so3(state.moved[: 6 * len(twists)].reshape(-1, 6)[:, :3])
+    turn, shift = twists[:, :3], twists[:, 3:]
+    # The axes turn about the pivot of the chart: their origin moves to another point of the body.
+    pivot = state.chart.pivot_vehicle
+    shift = shift + np.cross(turn, pivot - R @ pivot)
+    return np.asarray(np.einsum("mji,mkj->mki", R, np.stack([turn, shift], 1)).reshape(-1, 6))
+
+
+def _by_turn_of_axes(twists: Array, pivot_vehicle: Array) -> Array:
+    """(Q, 6, 3) change of twists (Q, 6) by a turn of the axes about a pivot (3,)."""
+    out = twist_by_turn(twists)
+    out[:, 3:] += skew(twists[:, :3]) @ skew(pivot_vehicle)
+    return out
 
 
 def _late_motion(
@@ -166,6 +176,7 @@ def geometry_of(
     q = sightings.count
     strip = sightings.strip
     surface = np.array(layout.surface_of, dtype=np.int64)[strip]
+    pivot = state.chart.pivot_vehicle
     now, change = _turned(state, twists), _turned(state, accelerations)
     late = _late_motion(state, lidar, pose, now, change)
     at_stamps, own_stamp = _lidars_at_stamps(state, lidar, pose, late)
@@ -191,15 +202,18 @@ def geometry_of(
     if late is not None:
         at_scans = _inverse_adjoints(at_stamps)[own_stamp]
         by_own_pose = np.swapaxes(at_scans, 1, 2) @ by_extrinsic
-        by_own_pose[:, :3] += np.swapaxes(twist_by_turn(late), 1, 2) @ by_pose
+        by_own_pose[:, :3] += np.swapaxes(_by_turn_of_axes(late, pivot), 1, 2) @ by_pose
     if twists is not None and now is not None and layout.rates:
         apart_s = sightings.time_s[:, None]
-        plain += np.einsum("qc,qci->qi", apart_s * (now - twists)[pose], by_pose)
-        by_turn = np.swapaxes(twist_by_turn(apart_s * now[pose]), 1, 2) @ by_pose
+        # Points of other times were moved to the stamp with these twists and extrinsics, and are
+        # to be with the present ones.
+        made_with = _inverse_adjoints(sightings.T_vehicle_lidar)[lidar]
+        before = np.einsum("qij,qj->qi", made_with, twists[pose])
+        present = np.einsum("qij,qj->qi", back[lidar], now[pose])
+        plain += np.einsum("qc,qci->qi", apart_s * (present - before), by_extrinsic)
+        by_turn = np.swapaxes(_by_turn_of_axes(apart_s * now[pose], pivot), 1, 2) @ by_pose
         by_own_pose = np.concatenate([by_own_pose[:, :3] + by_turn, by_own_pose[:, 3:]], axis=1)
-        by_extrinsic = by_extrinsic + _by_compensation(
-            sightings.time_s, np.einsum("qij,qj->qi", back[lidar], twists[pose]), by_extrinsic
-        )
+        by_extrinsic = by_extrinsic + _by_compensation(sightings.time_s, present, by_extrinsic)
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R

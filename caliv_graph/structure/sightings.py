@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from caliv_graph.config.range_errors import GRAZING_COS
@@ -40,6 +41,7 @@ class Sightings:
             is fitted to moments with noise in them turns towards the beams: on ground seen under 70
             degrees by 0.1 mrad, of each LiDAR to its own side.
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
+        T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
     """
 
     scan: IntArray
@@ -47,6 +49,7 @@ class Sightings:
     moments: Array
     noise: Array
     time_s: Array
+    T_vehicle_lidar: tuple[gtsam.Pose3, ...]
 
     @property
     def count(self) -> int:
@@ -96,6 +99,7 @@ def sightings_of(
     normals_at_stamp: Array,
     strips: Strips,
     range_sigma_m: Array,
+    T_vehicle_lidar: tuple[gtsam.Pose3, ...],
 ) -> Sightings:
     """Adds up the patches of each strip in each scan.
 
@@ -105,6 +109,7 @@ def sightings_of(
         normals_at_stamp: (N, 3) normals of their strips in that frame, of patches on a strip.
         strips: which patch is on which.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
+        T_vehicle_lidar: of each LiDAR, with which points were moved to the stamp.
     """
     own = np.flatnonzero(strips.of_patch >= 0)
     places = moments_at_stamp[own, :3, 3]
@@ -114,8 +119,8 @@ def sightings_of(
     order = np.argsort(key, kind="stable")
     own, key = own[order], key[order]
     if not len(own):
-        none = np.zeros(0, np.int64)
-        return Sightings(none, none, np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0))
+        none, nothing = np.zeros(0, np.int64), np.zeros((0, 4, 4))
+        return Sightings(none, none, nothing, nothing, np.zeros(0), T_vehicle_lidar)
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
     sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
@@ -130,6 +135,7 @@ def sightings_of(
         moments=moments,
         noise=noise,
         time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
+        T_vehicle_lidar=T_vehicle_lidar,
     )
 
 

@@ -87,7 +87,7 @@ def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar)) / distance
     free = np.maximum(patches.points - 3.0, 1.0)
     # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
-    variance = patches.scatter_m**2 * patches.points / free / (1.0 - 2.0 / (9.0 * free)) ** 3
+    variance = patches.scatter_m**2 / (1.0 - 2.0 / (9.0 * free)) ** 3
     out = np.full(len(patches.lidars), stated_m)
     for i in range(len(out)):
         own = np.flatnonzero(

@@ -31,7 +31,7 @@ class DrivePatches:
         moments: (N, 4, 4) sum of h h^T over the points, h = (p, 1), p in metres, lidar frame as of
             the patch's own time. Element (3, 3) is the number of points.
         normal_lidar: (N, 3) unit normal towards the LiDAR.
-        scatter_m: (N,) standard deviation of the points along the normal.
+        scatter_m: (N,) standard deviation of the points along the normal, unbiased.
     """
 
     drive: int

@@ -140,7 +140,7 @@ def draw_patches(
                     out["scan"].append(scan)
                     out["moments"].append(h.T @ h)
                     out["normal"].append(nu if nu @ c < 0 else -nu)
-                    out["scatter"].append(np.sqrt(values[0]))
+                    out["scatter"].append(np.sqrt(values[0] * n / (n - 3.0)))
             scan += 1
     return DrivePatches(
         drive=0,

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Iterator
 
 import pytest
 
-from caliv_graph.common.cores import cores, on_one_core, parts, share_out
+from caliv_graph.common.cores import (
+    TOGETHER,
+    cores,
+    on_one_core,
+    parts,
+    share_out,
+    worked_together,
+)
 
 pytestmark = pytest.mark.usefixtures("all_cores")
 
@@ -41,6 +49,28 @@ def test_what_goes_wrong_in_a_part_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable)
         with pytest.raises(ZeroDivisionError):
             share_out(lambda i: i // 0, range(3))
+
+
+def test_work_done_together_comes_in_order_and_holds_few_items(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    here, taken, done = threading.get_ident(), 0, 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for i in range(3 * TOGETHER + 1):
+            assert threading.get_ident() == here  # readers of files stay in their thread
+            taken += 1
+            yield i
+
+    for usable in ({0}, {0, 1}):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, usable=usable: usable)
+        taken = done = 0
+        for i, square in enumerate(worked_together(lambda i: i * i, items())):
+            assert square == i * i
+            assert taken - done <= TOGETHER
+            done += 1
+        assert done == taken == 3 * TOGETHER + 1
 
 
 def test_work_that_shares_out_work_does_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:

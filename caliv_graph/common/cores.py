@@ -96,6 +96,17 @@ def share_out(work: Callable[[Item], object], items: Iterable[Item]) -> None:
         other.result()
 
 
+def shared_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """`list(map(work, items))`, shared out as `share_out` does; the first items begin first."""
+    found: dict[int, Result] = {}
+
+    def one(i: int) -> None:
+        found[i] = work(items[i])
+
+    share_out(one, range(len(items)))
+    return [found[i] for i in range(len(items))]
+
+
 def worked_together(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """`map(work, items)`, `TOGETHER` items being shared out at a time.
 
@@ -107,15 +118,7 @@ def worked_together(work: Callable[[Item], Result], items: Iterable[Item]) -> It
         return
     left = iter(items)
     while some := list(itertools.islice(left, TOGETHER)):
-        results: dict[int, Result] = {}
-        share_out(functools.partial(_keep, results, work, some), range(len(some)))
-        yield from (results[k] for k in range(len(some)))
-
-
-def _keep(
-    results: dict[int, Result], work: Callable[[Item], Result], items: Sequence[Item], k: int
-) -> None:
-    results[k] = work(items[k])
+        yield from shared_map(work, some)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.common.cores import parts, share_out
+from caliv_graph.common.cores import parts, shared_map
 from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, BoolArray, IntArray, Mixture
 from caliv_graph.registration.clouds import CloudStack, sampling_order
@@ -134,15 +134,12 @@ def expect(
     points = stack.moved(R, t)
     normals, beams = stack.rotated(R, stack.normals), stack.rotated(R, stack.beams)
     pieces = parts(len(points), len(points) // PART_POINTS + 1)
-    found: list[_Expected | None] = [None] * len(pieces)
 
-    def of_part(i: int) -> None:
-        part = pieces[i]
-        found[i] = step.of(part, points[part], normals[part], beams[part])
+    def of_part(part: slice) -> _Expected:
+        return step.of(part, points[part], normals[part], beams[part])
 
     # Parts are independent: the result is the same on any number of cores.
-    share_out(of_part, range(len(pieces)))
-    done = [part for part in found if part is not None]
+    done = shared_map(of_part, pieces)
     counts, *moments = np.sum([part.on_surfels for part in done], axis=0)
     explained = np.concatenate([part.explained for part in done])
     along = [part.weight_along for part in done if part.weight_along is not None]

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from caliv_graph.common.cores import parts, share_out
+from caliv_graph.common.cores import parts, shared_map
 from caliv_graph.geometry.se3 import cross, skew, tangent_axes
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
@@ -104,15 +104,14 @@ class ShapeQuadratic:
                 partial(self._lost_to_orientations, whitened, own)
                 for own in parts(len(self.coupling), ORIENTATION_PARTS)
             ]
-        squares = [np.empty(0)] * len(lost)
 
-        def square(i: int) -> None:
+        def square(of: Callable[[], Array]) -> Array:
             # Of a matrix and its own transpose: half the work, and the interpreter's lock is free.
-            rows = lost[i]()
-            squares[i] = rows.T @ rows
+            rows = of()
+            return np.asarray(rows.T @ rows)
 
         # The longest first: the others fill the gaps.
-        share_out(square, range(len(lost))[::-1])
+        squares = shared_map(square, lost[::-1])[::-1]
         H = squares[0]
         for square_of_part in squares[1:]:
             H += square_of_part

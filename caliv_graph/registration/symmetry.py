@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caliv_graph.common.cores import share_out
+from caliv_graph.common.cores import shared_map
 from caliv_graph.products import Array, IntArray, Mixture
 from caliv_graph.registration.self_comparison import (
     Comparison,
@@ -105,13 +105,7 @@ def symmetries(
         return ()
     shape = Shape(mixture, views, sigma_range_m)
     identity = shape.compare(np.eye(3), np.zeros(3))
-    axes = _axes(mixture)
-    found: list[Symmetry | None] = [None] * len(axes)
-
-    def look(i: int) -> None:
-        found[i] = _symmetry_about(shape, axes[i], identity)
-
-    share_out(look, range(len(axes)))
+    found = shared_map(lambda axis: _symmetry_about(shape, axis, identity), _axes(mixture))
     return tuple(symmetry for symmetry in found if symmetry is not None)
 
 

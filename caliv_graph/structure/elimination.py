@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from caliv_graph.common.cores import share_out
+from caliv_graph.common.cores import share_out, shared_map
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, IntArray
 
@@ -114,13 +114,13 @@ def eliminated(
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
     rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
     ends = np.cumsum([len(own) for own in blocks])
-    found: dict[int, _Block] = {}
 
-    def factor(k: int) -> None:
-        found[k] = _block(rows, V_own, V_columns, int(ends[k]) - len(blocks[k]), blocks[k], rest)
+    def factored(k: int) -> _Block:
+        return _block(rows, V_own, V_columns, int(ends[k]) - len(blocks[k]), blocks[k], rest)
 
     # The largest first: what is left at the end is small.
-    share_out(factor, sorted(range(len(blocks)), key=lambda k: -len(blocks[k])))
+    by_size = sorted(range(len(blocks)), key=lambda k: -len(blocks[k]))
+    found = dict(zip(by_size, shared_map(factored, by_size), strict=True))
     done = tuple(found[k] for k in range(len(blocks)))
     starts = range(0, rest, PANEL)
     share_out(partial(_subtract_squares, out, done), reversed(starts))

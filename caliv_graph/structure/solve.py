@@ -79,7 +79,7 @@ class Estimate:
         problem, sightings = self.problem, self.sightings
         group = groups_of(sightings, self.strips)
         repeated = problem.views.count[sightings.scan]
-        return system_of(
+        return system_of(  # it lets go of the rows, which nobody else may hold
             whitened(
                 self.geometry,
                 sightings,
@@ -220,6 +220,7 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
     system = jittering.linearised()
+    # The guesses in place, and out again: a copy would be as large as the system.
     guessed = slice(layout.offset, layout.error)
     without = system.H[guessed, guessed].copy(), system.b[guessed].copy()
     add_guesses(problem, state, layout, system.H, system.b)

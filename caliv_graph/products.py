@@ -648,7 +648,7 @@ class Solution:
             stamp minus true acquisition time.
         warnings: for the user, a line each.
         gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not computed.
-        course: the iterations of the joint loop; empty without one (`staged`).
+        course: the iterations of the joint loop; empty without a target.
         sensor_noise: noise levels that no message states, and where their figures are from.
         structure: the structure of each drive that has any.
     """

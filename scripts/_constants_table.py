@@ -202,7 +202,7 @@ CONSTANTS: tuple[Constant, ...] = (
         _MIXTURE,
         "SEED_FLATNESS",
         "",
-        "reliability of a point's normal from which on a surfel may begin there, but in `staged`",
+        "reliability of a point's normal from which on a surfel may begin; not in the joint loop",
         "half of the scale of the reliability; tried",
         SHORT,
     ),

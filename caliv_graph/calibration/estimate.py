@@ -29,6 +29,7 @@ from caliv_graph.calibration.refine import (
     per_placement,
     refined,
     refinements,
+    registered_with_motion,
 )
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import (
@@ -156,8 +157,6 @@ def _estimate(
             config,
             normals=False,
             views=problem.views_of(m),
-            # In the other modes this is a start for the joint loop.
-            by_beams=config.solve.mode == "staged",
         )
         for m, o in enumerate(observations)
     ]
@@ -190,14 +189,16 @@ def _estimate(
     else:
         solve = solve_registered(problem, registrations, grounds, config, found)
     times["graph"] = rough.graph_s
+    most = refinements(config.noise.lidar_range_m)
+    total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
+    with progress.stage("refining shape and graph together", total) as advance:
+        if config.solve.mode == "staged":
+            registrations, course = registered_with_motion(solve, states, most, advance)
+        else:
+            solution = refined(solve, states, most, advance)
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
-            solution = staged_solution(solve, registrations)
-    else:
-        most = refinements(config.noise.lidar_range_m)
-        total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
-        with progress.stage("refining shape and graph together", total) as advance:
-            solution = refined(solve, states, most, advance)
+            solution = replace(staged_solution(solve, registrations), course=course)
     times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
     times["graph"] += solve.graph_seconds
     said = (line for term in terms for line in term.warnings)

@@ -41,7 +41,7 @@ from caliv_graph.calibration.solve import (
     step_of_mode,
 )
 from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
-from caliv_graph.products import Array, Iteration, Solution
+from caliv_graph.products import Array, Iteration, Registration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
     FINE_SIGMA_M,
@@ -59,6 +59,10 @@ end, or near it."""
 REFINEMENTS = 30
 """Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
 more. Most drives take 12 to 18; two of 30 mm of noise and 30 clouds took 23 and 24."""
+
+HELD_PART = 1e-6
+"""Ridge, relative to each cloud's own information, on the poses that minimise the clouds'
+quadratic without the graph: numerical."""
 
 LAST_REFINEMENTS = 4
 """Iterations that are left at the noise level, at least."""
@@ -113,6 +117,86 @@ def refined(
     Raises:
         SolveError: a pose or a target has no measurement.
     """
+    loop, course, converged = _settled(state, states, most, advance)
+    return replace(
+        _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
+    )
+
+
+def registered_with_motion(
+    state: SolveState,
+    states: Sequence[JointRegistration],
+    most: int,
+    advance: Callable[..., None],
+) -> tuple[list[Registration], tuple[Iteration, ...]]:
+    """`refined`, but of each placement what the clouds alone say of their poses; and the course.
+
+    Poses that are all free wander where clouds are sparse and noisy: shape and poses together move
+    by ten times their sigmas in hundreds of iterations, and none of them is the end. So the graph
+    is the M-step here, too.
+
+    Args:
+        state: of `solve_registered`; gets values, weights, the scale of the registration, and what
+            biases of the ranges do to the poses.
+        states: the registration of each placement, taken along.
+        most: iterations per start.
+        advance: is called after each.
+
+    Raises:
+        SolveError: a pose or a target has no measurement.
+    """
+    loop, course, converged = _settled(state, states, most, advance)
+    shapes, reduced = loop.linearised()
+    begun = time.perf_counter()
+    loop.jackknife = loop.left_out(reduced)
+    loop.scaled(shapes, reduced)
+    state.bias_directions = loop.directions(shapes, reduced.lines)
+    last_step = course[-1].turn_rad, course[-1].shift_m
+    out = []
+    for own, shape, quadratic, fitting in zip(
+        state.problem.clouds_of_placements(), states, shapes.quadratics, shapes.poses, strict=True
+    ):
+        R, t, blocks, H = poses_by_clouds_alone(quadratic, state.weights.values[own], *fitting)
+        out.append(shape.result(R, t, blocks, H, len(course), converged, last_step))
+    state.graph_seconds += time.perf_counter() - begun
+    return out, tuple(course)
+
+
+def poses_by_clouds_alone(
+    quadratic: ShapeQuadratic, weights: Array, R: Array, t: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Poses that minimise the clouds' quadratic without a graph, and their information.
+
+    As pose factors with the joint information they have the gradient that the quadratic has. What
+    clouds do not tell stays where it is: the gauge, and clouds that have no surface in common.
+
+    Args:
+        quadratic: of the clouds at `T_target_lidar` (R, t).
+        weights: (J,) robust weights that it was made with. They are taken out: it is for pose
+            factors to have them.
+        R: (J, 3, 3).
+        t: (J, 3) metres.
+
+    Returns:
+        The poses (J, 3, 3) and (J, 3), information (J, 6, 6) of each given the shape, and
+        (6 J, 6 J) of all, in rad and m.
+    """
+    more = 1.0 / weights - 1.0
+    added = more[:, None, None] * quadratic.blocks
+    blocks, H = quadratic.blocks + added, quadratic.joint() + block_diag(*added)
+    gradient = quadratic.gradient + more[:, None] * quadratic.gradient_given_shape
+    held = H + block_diag(*(HELD_PART * blocks))
+    d = -np.asarray(np.linalg.solve(held, gradient.ravel()), np.float64).reshape(-1, 6)
+    return *left_step(R, t, d), blocks, H
+
+
+def _settled(
+    state: SolveState,
+    states: Sequence[JointRegistration],
+    most: int,
+    advance: Callable[..., None],
+) -> tuple[_Loop, list[Iteration], bool]:
+    """The loop at its end, its iterations, and whether it has converged; see `refined`."""
     none_m = np.zeros(sum(of.clouds.lidars for of in states))
     loop = _Loop(state, states, base_graph(state), state.problem.guess_information(), none_m)
     loop.begin_shapes(normals=False)
@@ -132,9 +216,7 @@ def refined(
                 advance()
             ends.append(loop.extrinsics())
         loop.move_to_mean(ends)
-    return replace(
-        _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
-    )
+    return loop, course, converged
 
 
 @dataclass
@@ -229,7 +311,7 @@ class _Loop:
 
     def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic; biases of ranges and turns eliminated."""
-        joint, directions = shapes.joint(self.state.scale), self._directions(shapes, lines)
+        joint, directions = shapes.joint(self.state.scale), self.directions(shapes, lines)
         return self._reduced(without_bias(*joint, directions, self._applied(directions)), lines)
 
     def _sizes(self) -> BiasSizes:
@@ -238,7 +320,7 @@ class _Loop:
         most_m = max(RANGE_BIAS_LIMIT_M, stated_m or 0.0)
         return replace(sizes, offset_m=min(sizes.offset_m, most_m))
 
-    def _directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
+    def directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
         """(6 J, B) by biases of the ranges, and by what the gyroscope turned since the stamps."""
         biases = shapes.biases.directions(self._sizes())
         return np.hstack([biases, turned_clouds(self.state.problem, lines)])
@@ -251,7 +333,7 @@ class _Loop:
 
     def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array) -> None:
         """Moves the offsets to their most likely values after a step."""
-        directions = self._directions(shapes, reduced.lines)
+        directions = self.directions(shapes, reduced.lines)
         joint, applied = shapes.joint(self.state.scale), self._applied(directions)
         found = most_likely_biases(*joint, directions, applied, reduced.moved_clouds(step))
         self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]

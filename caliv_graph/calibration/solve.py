@@ -38,7 +38,7 @@ from caliv_graph.calibration.noise import (
     squares_without_own_pose,
 )
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes
+from caliv_graph.calibration.range_bias import UNKNOWN, BiasSizes, without_bias
 from caliv_graph.calibration.rates import rates_graph
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.robust import RobustWeights, explained_part, weighted_joint
@@ -98,6 +98,8 @@ class SolveState:
     graph_seconds: float = 0.0
     bias_sizes: BiasSizes = UNKNOWN
     """1 sigma of the biases of the ranges; before the joint loop none are looked for."""
+    bias_directions: Array | None = None
+    """(6 J, B) how the poses of registered clouds seem to move by biases of sigma 1; None: none."""
     structure: tuple[StructureTerm, ...] = ()
     structure_factors: CalibrationGraph = field(default_factory=CalibrationGraph)
     """Of `structure`; like those of `motion` they take time to build."""
@@ -212,8 +214,10 @@ def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Call
 
     def reduced() -> Reduced:
         lines = linearise_clouds(problem, state.values)
-        r = cloud_residuals(lines, measured).ravel()
-        return reduce_to_extrinsics(problem, state.values, steady, (H, H @ r), lines)
+        clouds = H, H @ cloud_residuals(lines, measured).ravel()
+        if state.bias_directions is not None:
+            clouds = without_bias(*clouds, state.bias_directions)
+        return reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
 
     return reduced
 

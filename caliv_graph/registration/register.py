@@ -54,10 +54,6 @@ HELD_ALONG_M = 0.05
 holds the clouds: one of a flat side would slide along it to where noise fits best. It is a bias,
 towards where the beams of all clouds fell; the joint loop does without."""
 
-HELD_BY_BEAMS_M = 0.5
-"""The same once beams tell the surfels: enough against sliding, and less of a bias than 5 cm, which
-for 20 mm of noise weighs a sixth of a height."""
-
 DAMPING = 1e-3
 """Levenberg-Marquardt damping, relative to the block of each cloud. Clouds that share no component
 (two LiDARs that saw different skins) keep the relative pose of the pre-alignment."""
@@ -118,7 +114,6 @@ class JointRegistration:
         rough: bool = False,
         normals: bool = True,
         views: Array | None = None,
-        by_beams: bool = False,
     ) -> None:
         """Stacks the clouds of `observation`.
 
@@ -128,7 +123,6 @@ class JointRegistration:
             rough: the coarse pass: fewer points, half the components, a wider tolerance.
             normals: False if `refine_normals` follows.
             views: (J,) clouds that have the view of each (`targets.cloud.views`); None: 1.
-            by_beams: this is no start: its result counts (see the attribute).
 
         Raises:
             RegistrationError: fewer than two clouds.
@@ -163,7 +157,7 @@ class JointRegistration:
         self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)
         self.weights: Array = np.ones(self.clouds.count)
         self.held_along = HELD_ALONG_M**-2.0
-        self.by_beams = by_beams
+        self.by_beams = False
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
@@ -221,10 +215,10 @@ class JointRegistration:
         noise = replace(self.noise, floor_m=0.0 if self.finest else self._floor)
         density = self._gamma / (self._depth_m * (self._gamma + 1.0))
         weights = self.weights * self.view_weights
-        by_beams, held_along = self.by_beams and self.finest, self.held_along
-        if by_beams:
-            held_along = min(held_along, HELD_BY_BEAMS_M**-2.0)
-        who = expect(self.clouds, R, t, self.mixture, noise, density, weights, held_along, by_beams)
+        by_beams = self.by_beams and self.finest
+        who = expect(
+            self.clouds, R, t, self.mixture, noise, density, weights, self.held_along, by_beams
+        )
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)

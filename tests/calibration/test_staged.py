@@ -203,3 +203,24 @@ def test_clouds_of_several_targets_are_judged_together() -> None:
     state = solve_registered(problem, registrations, (), config_of("huber"))
     snoop_clouds(state, registrations)
     assert order[state.weights.values < 1e-3].tolist() == [14, 20]
+
+
+def test_what_biases_of_the_ranges_do_is_in_the_sigmas() -> None:
+    # Ranges of the front that are 20 mm too long: every cloud fits nearer to the target.
+    case = make_case(*LIDARS, count=20, seed=3)
+    directions = np.zeros((case.problem.clouds, 6, 1))
+    for j in np.flatnonzero(case.problem.cloud_lidar == LIDARS.index("front")).tolist():
+        place = case.measured[j].translation()
+        directions[j, 3:, 0] = 0.02 * place / np.linalg.norm(place)
+    measured = tuple(
+        gtsam.Pose3.Expmap(d[:, 0]).compose(T)
+        for d, T in zip(directions, noisy(case, 3), strict=True)
+    )
+    registrations = [registered(case, measured)]
+    nees = []
+    for known in (None, directions.reshape(-1, 1)):
+        state = solve_registered(case.problem, registrations, (), config_of("huber"))
+        state.bias_directions = known
+        nees.append(s2s_nees(case, staged_solution(state, registrations)))
+    assert nees[0] > 50.0
+    assert nees[1] < 16.8, nees  # the 99 % limit for six axes

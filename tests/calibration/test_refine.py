@@ -1,0 +1,65 @@
+"""What the clouds alone say of their poses, for pose factors."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import gtsam
+import numpy as np
+
+from caliv_graph.calibration.refine import poses_by_clouds_alone
+from caliv_graph.geometry.se3 import unstack
+from caliv_graph.products import Array
+from caliv_graph.registration.quadratic import ShapeQuadratic
+from caliv_graph.registration.register import JointRegistration, left_step
+from tests.registration.scenes import chair_scene, config_of, matrices
+
+CLOUDS = 8
+
+
+@cache
+def shaped() -> tuple[JointRegistration, Array, Array]:
+    """A chair reconstructed at the true poses of eight clouds, and poses beside the true ones."""
+    scene = chair_scene([45.0 * j for j in range(CLOUDS)], [6.0] * CLOUDS, 0.01, 1)
+    state = JointRegistration(scene.observation, config_of(components=150, max_points=200))
+    R, t = matrices(scene.T_target_lidar)
+    state.held_along = 0.0
+    state.seed(R, t, 0.02)
+    while not state.finest:
+        state.expect(R, t)
+        state.maximise(R, t)
+    beside = np.random.default_rng(2).normal(size=(CLOUDS, 6)) * 2e-3
+    return state, *left_step(R, t, beside)
+
+
+def quadratic_of(weights: Array) -> tuple[ShapeQuadratic, Array, Array]:
+    state, R, t = shaped()
+    state.weights = weights
+    return state.expect(R, t), R, t
+
+
+def test_as_pose_factors_they_have_the_gradient_of_the_quadratic() -> None:
+    quadratic, R, t = quadratic_of(np.ones(CLOUDS))
+    R_alone, t_alone, blocks, H = poses_by_clouds_alone(quadratic, np.ones(CLOUDS), R, t)
+    np.testing.assert_array_equal(blocks, quadratic.blocks)
+    np.testing.assert_array_equal(H, quadratic.joint())
+    found, before = unstack(R_alone, t_alone), unstack(R, t)
+    d = np.array(
+        [
+            gtsam.Pose3.Logmap(new.compose(old.inverse()))
+            for new, old in zip(found, before, strict=True)
+        ]
+    )
+    assert 1e-4 < np.abs(d).max() < 0.02
+    left = H @ d.ravel() + quadratic.gradient.ravel()
+    assert np.abs(left).max() < 1e-3 * np.abs(quadratic.gradient).max()
+
+
+def test_robust_weights_are_taken_out_of_a_clouds_own_information() -> None:
+    weights = np.ones(CLOUDS)
+    weights[3] = 1e-3
+    full = quadratic_of(np.ones(CLOUDS))[0].blocks
+    quadratic, R, t = quadratic_of(weights)
+    blocks = poses_by_clouds_alone(quadratic, weights, R, t)[2]
+    # The noise of the ranges is estimated in each E-step, and differs a little without the cloud.
+    np.testing.assert_allclose(blocks[3], full[3], rtol=0.05, atol=0.01 * np.abs(full[3]).max())

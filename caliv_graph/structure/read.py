@@ -105,7 +105,8 @@ def read_patches(
                 for stamp_ns, patches in worked_together(reduced, clouds):
                     scans.append((k, stamp_ns, patches))
                     advance()
-            found.append(_together(drive, names, scans))
+            guesses = tuple(config.lidars[name].guess() for name in names)
+            found.append(_together(drive, names, scans, guesses))
     return tuple(found)
 
 
@@ -271,9 +272,16 @@ def _sweep_motion(
 
 
 def _together(
-    drive: int, names: tuple[str, ...], scans: Sequence[tuple[int, int, ScanPatches]]
+    drive: int,
+    names: tuple[str, ...],
+    scans: Sequence[tuple[int, int, ScanPatches]],
+    moved_with: tuple[gtsam.Pose3, ...],
 ) -> DrivePatches:
-    """The patches of all scans (LiDAR, stamp, patches) of a drive."""
+    """The patches of all scans (LiDAR, stamp, patches) of a drive.
+
+    Those of LiDARs that take all at one instant have moments by time, too, where others do not:
+    zero.
+    """
     parts = [patches for _, _, patches in scans]
     number = [len(p.time_s) for p in parts]
     return DrivePatches(
@@ -286,4 +294,21 @@ def _together(
         moments=np.concatenate([np.zeros((0, 4, 4)), *(p.moments for p in parts)]),
         normal_lidar=np.concatenate([np.zeros((0, 3)), *(p.normal_lidar for p in parts)]),
         scatter_m=np.concatenate([np.zeros(0), *(p.scatter_m for p in parts)]),
+        time_moments=_or_zero([p.time_moments for p in parts], number, (4, 4)),
+        twist_lidar=_or_zero([p.twist_lidar for p in parts], number, (6,)),
+        moved_with=moved_with,
+    )
+
+
+def _or_zero(
+    parts: Sequence[Array | None], number: Sequence[int], shape: tuple[int, ...]
+) -> Array | None:
+    """Arrays (n, ...) one behind the other, zero for those missing; None if all are."""
+    if all(part is None for part in parts):
+        return None
+    return np.concatenate(
+        [
+            np.zeros((n, *shape)) if part is None else part
+            for n, part in zip(number, parts, strict=True)
+        ]
     )

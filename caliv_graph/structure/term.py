@@ -89,6 +89,7 @@ def structure_terms(
         used = usable(own, trajectory, start, config)
         if not len(used.scan):
             continue
+        used = used.followed(start)
         places = np.searchsorted(prior.stamps_ns, kept)
         problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
         del prior

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.products import Array
+from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.planar import (
     MAX_PATCHES,
     MIN_POINTS,
@@ -234,3 +236,60 @@ def test_nothing_comes_of_nothing() -> None:
         assert len(patches.time_s) == 0
         assert patches.moments.shape == (0, 4, 4)
         assert patches.undecided == len(points)
+
+
+def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
+    # A ground that is taken in turn, to the left, within 0.1 s.
+    rays = beams(np.arange(-20.0, -10.0, 0.25), np.arange(-60.0, 60.0, 0.25))
+    points = rays * on_plane(rays, np.array([0.0, 0.0, -1.0]), 1.6)[:, None]
+    times = 0.1 * (np.arctan2(rays[:, 1], rays[:, 0]) / np.radians(120.0) + 0.5)
+    of_vehicle = np.array([0.02, -0.03, 0.3, 3.0, 0.1, 0.0])
+    right = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.1, 0.4), np.array([1.0, 0.3, 1.6]))
+    guess = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.08, 0.42), np.array([1.1, 0.2, 1.6]))
+
+    def taken(T_vehicle_lidar: gtsam.Pose3) -> DrivePatches:
+        twist = T_vehicle_lidar.inverse().AdjointMap() @ of_vehicle
+        motion = SweepMotion(0.0, np.tile(twist[:3], (11, 1)), np.tile(twist[3:], (11, 1)))
+        found = planar_patches(points, SIGMA_M, times, motion)
+        return DrivePatches(
+            drive=0,
+            lidars=("front",),
+            stamps_ns=np.zeros(1, np.int64),
+            scan_lidar=np.zeros(1, np.int64),
+            scan=np.zeros(len(found.time_s), np.int64),
+            time_s=found.time_s,
+            moments=found.moments,
+            normal_lidar=found.normal_lidar,
+            scatter_m=found.scatter_m,
+            time_moments=found.time_moments,
+            twist_lidar=found.twist_lidar,
+            moved_with=(T_vehicle_lidar,),
+        )
+
+    def tilts(patches: DrivePatches) -> Array:
+        """Slope of each patch to the left of its beams, rad."""
+        centre = patches.centres_lidar
+        cov = patches.moments[:, :3, :3] / patches.points[:, None, None]
+        cov = cov - centre[:, :, None] * centre[:, None, :]
+        left = np.stack([-centre[:, 1], centre[:, 0], np.zeros(len(centre))], axis=1)
+        left /= np.linalg.norm(left, axis=1)[:, None]
+        along = np.einsum("ni,nij->nj", left, cov)
+        return np.asarray(along[:, 2] / np.einsum("ni,ni->n", along, left))
+
+    by_right, by_guess = taken(right), taken(guess)
+    assert len(by_guess.scan) == len(by_right.scan) > 50
+    wrong = tilts(by_guess) - tilts(by_right)
+    assert np.abs(wrong).mean() > 3e-4
+    followed = by_guess.followed({"front": right})
+    left = tilts(followed) - tilts(by_right)
+    assert np.abs(left).max() < 0.02 * np.abs(wrong).max()
+    # And as often as the estimate moves.
+    again = by_guess.followed({"front": gtsam.Pose3()}).followed({"front": right})
+    np.testing.assert_allclose(again.moments, followed.moments, rtol=1e-3, atol=1e-3)
+    assert again.moved_with == (right,)
+
+
+def test_patches_that_were_taken_at_once_follow_nothing() -> None:
+    found = planar_patches(DENSE * on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 8.0)[:, None], 0.01)
+    assert found.time_moments is None
+    assert found.twist_lidar is None

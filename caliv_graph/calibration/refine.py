@@ -146,10 +146,8 @@ def registered_with_motion(
         SolveError: a pose or a target has no measurement.
     """
     loop, course, converged = _settled(state, states, most, advance)
-    shapes, reduced = loop.linearised()
+    shapes, reduced = loop.at_the_end()
     begun = time.perf_counter()
-    loop.jackknife = loop.left_out(reduced)
-    loop.scaled(shapes, reduced)
     state.bias_directions = loop.directions(shapes, reduced.lines)
     last_step = course[-1].turn_rad, course[-1].shift_m
     out = []
@@ -181,10 +179,10 @@ def poses_by_clouds_alone(
         The poses (J, 3, 3) and (J, 3), information (J, 6, 6) of each given the shape, and
         (6 J, 6 J) of all, in rad and m.
     """
-    more = 1.0 / weights - 1.0
-    added = more[:, None, None] * quadratic.blocks
-    blocks, H = quadratic.blocks + added, quadratic.joint() + block_diag(*added)
-    gradient = quadratic.gradient + more[:, None] * quadratic.gradient_given_shape
+    blocks = quadratic.blocks / weights[:, None, None]
+    H = quadratic.joint() + block_diag(*(blocks - quadratic.blocks))
+    more = (1.0 / weights - 1.0)[:, None]
+    gradient = quadratic.gradient + more * quadratic.gradient_given_shape
     held = H + block_diag(*(HELD_PART * blocks))
     d = -np.asarray(np.linalg.solve(held, gradient.ravel()), np.float64).reshape(-1, 6)
     return *left_step(R, t, d), blocks, H
@@ -246,6 +244,15 @@ class _Loop:
         begun = time.perf_counter()
         reduced = self._without_bias(shapes, lines)
         state.graph_seconds += time.perf_counter() - begun
+        return shapes, reduced
+
+    def at_the_end(self) -> tuple[_Shapes, Reduced]:
+        """`linearised`, the registration's scale by a jackknife, too."""
+        shapes, reduced = self.linearised()
+        begun = time.perf_counter()
+        self.jackknife = self.left_out(reduced)
+        reduced = self.scaled(shapes, reduced)
+        self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
     def poses_of_clouds(self, lines: CloudLinearisation) -> list[tuple[Array, Array]]:
@@ -483,10 +490,8 @@ def _single_clouds(state: SolveState, shapes: _Shapes) -> tuple[Array, Array]:
 def _refined_solution(loop: _Loop, last: Iteration, iterations: int, converged: bool) -> Solution:
     """Reads covariance, residuals and registrations off the last estimate."""
     state, problem = loop.state, loop.state.problem
-    shapes, reduced = loop.linearised()
+    shapes, reduced = loop.at_the_end()
     begun = time.perf_counter()
-    loop.jackknife = loop.left_out(reduced)
-    reduced = loop.scaled(shapes, reduced)
     cov = covariance_of_mode(state, reduced, loop.undetermined)
     pull, information = _single_clouds(state, shapes)
     # The robust weights of the clouds are kept apart from their information.

@@ -211,13 +211,13 @@ def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Call
     """`reduced_registered` for values that move, weights and noise fixed."""
     problem, steady = state.problem, base_graph(state)
     H, measured = joint_information(state, registrations), measured_poses(registrations)[0]
+    if state.bias_directions is not None:
+        H = without_bias(H, np.zeros(len(H)), state.bias_directions)[0]
 
     def reduced() -> Reduced:
         lines = linearise_clouds(problem, state.values)
-        clouds = H, H @ cloud_residuals(lines, measured).ravel()
-        if state.bias_directions is not None:
-            clouds = without_bias(*clouds, state.bias_directions)
-        return reduce_to_extrinsics(problem, state.values, steady, clouds, lines)
+        r = cloud_residuals(lines, measured).ravel()
+        return reduce_to_extrinsics(problem, state.values, steady, (H, H @ r), lines)
 
     return reduced
 

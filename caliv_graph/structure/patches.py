@@ -6,7 +6,7 @@ sufficient for every later use, at any pose (`README.md`, section 2), so that no
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,6 +15,40 @@ import numpy as np
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True)
+class Swept:
+    """How the points of N patches, taken one after the other, were moved to the patch's time.
+
+    Attributes:
+        moments: (N, 4, 4) sum of s h h^T, s in seconds after that time.
+        twist_lidar: (N, 6) by which they were moved: turn rad/s, velocity m/s, lidar frame.
+    """
+
+    moments: Array
+    twist_lidar: Array
+
+    def part(self, keep: BoolArray | IntArray) -> Swept:
+        """Some of the patches (N,)."""
+        return Swept(self.moments[keep], self.twist_lidar[keep])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Swept | None], number: Sequence[int]) -> Swept | None:
+        """Of all patches, `number` of each part; zero where a part is taken at once.
+
+        None if all are.
+        """
+        if all(part is None for part in parts):
+            return None
+        known = [
+            cls(np.zeros((n, 4, 4)), np.zeros((n, 6))) if part is None else part
+            for part, n in zip(parts, number, strict=True)
+        ]
+        return cls(
+            np.concatenate([part.moments for part in known]),
+            np.concatenate([part.twist_lidar for part in known]),
+        )
 
 
 @dataclass(frozen=True)
@@ -35,9 +69,8 @@ class DrivePatches:
             the patch's own time. Element (3, 3) is the number of points.
         normal_lidar: (N, 3) unit normal towards the LiDAR.
         scatter_m: (N,) standard deviation of the points along the normal, unbiased.
-        time_moments: (N, 4, 4) sum of s h h^T, s in seconds after `time_s`; None: no sweeps.
-        twist_lidar: (N, 6) with which points were moved to that time: turn rad/s, velocity m/s.
-        moved_with: of each LiDAR the T_vehicle_lidar that this twist was made with.
+        swept: how points were moved to that time; None: all are taken at once.
+        moved_with: of each LiDAR the T_vehicle_lidar that this was done with.
     """
 
     drive: int
@@ -49,8 +82,7 @@ class DrivePatches:
     moments: Array
     normal_lidar: Array
     scatter_m: Array
-    time_moments: Array | None = None
-    twist_lidar: Array | None = None
+    swept: Swept | None = None
     moved_with: tuple[gtsam.Pose3, ...] = ()
 
     def part(self, keep: BoolArray) -> DrivePatches:
@@ -62,8 +94,7 @@ class DrivePatches:
             moments=self.moments[keep],
             normal_lidar=self.normal_lidar[keep],
             scatter_m=self.scatter_m[keep],
-            time_moments=None if self.time_moments is None else self.time_moments[keep],
-            twist_lidar=None if self.twist_lidar is None else self.twist_lidar[keep],
+            swept=self.swept and self.swept.part(keep),
         )
 
     def followed(self, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> DrivePatches:
@@ -72,23 +103,24 @@ class DrivePatches:
         With a guess that is 3 degrees off, what a LiDAR takes in turn on the ground is turned about
         its beams by up to a milliradian. To first order in the time within a patch, 5 ms.
         """
-        if self.time_moments is None or self.twist_lidar is None:
+        if self.swept is None:
             return self
         new = tuple(T_vehicle_lidar[name] for name in self.lidars)
         change = np.array(
             [
-                T.between(before).AdjointMap() - np.eye(6)
-                for T, before in zip(new, self.moved_with, strict=True)
+                T.between(guess).AdjointMap() - np.eye(6)
+                for T, guess in zip(new, self.moved_with, strict=True)
             ]
         )
-        twist = np.einsum("nij,nj->ni", change[self.scan_lidar[self.scan]], self.twist_lidar)
+        before = self.swept.twist_lidar
+        twist = np.einsum("nij,nj->ni", change[self.scan_lidar[self.scan]], before)
         along = np.zeros((len(twist), 4, 4))
         along[:, :3, :3], along[:, :3, 3] = skew(twist[:, :3]), twist[:, 3:]
-        moved = along @ self.time_moments
+        moved = along @ self.swept.moments
         return replace(
             self,
             moments=self.moments + moved + np.swapaxes(moved, 1, 2),
-            twist_lidar=self.twist_lidar + twist,
+            swept=replace(self.swept, twist_lidar=before + twist),
             moved_with=new,
         )
 

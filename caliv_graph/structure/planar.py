@@ -12,12 +12,12 @@ channels), is judged again together with its neighbours: first above and below, 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.patches import Swept
 
 PATCH_M = 0.5
 """Width of a patch across the beams: below the cells of 1 to 2 m over which real walls are uneven,
@@ -102,8 +102,7 @@ class ScanPatches:
         moments: (n, 4, 4) metres, lidar frame at the patch's own time.
         normal_lidar: (n, 3) unit, towards the LiDAR.
         scatter_m: (n,) standard deviation along the normal.
-        time_moments: (n, 4, 4) sum of s h h^T, s in seconds after `time_s`; None without motion.
-        twist_lidar: (n, 6) of the LiDAR, by which the points were moved; None without motion.
+        swept: how points were moved to that time; None without motion.
         undecided: points in groups that are too few or too thin to be judged.
         uneven: points in groups that are not flat.
         grazing: points in flat groups under a flat angle or too long.
@@ -113,8 +112,7 @@ class ScanPatches:
     moments: Array
     normal_lidar: Array
     scatter_m: Array
-    time_moments: Array | None = None
-    twist_lidar: Array | None = None
+    swept: Swept | None = None
     undecided: int = 0
     uneven: int = 0
     grazing: int = 0
@@ -126,8 +124,7 @@ class ScanPatches:
             self.moments[keep],
             self.normal_lidar[keep],
             self.scatter_m[keep],
-            None if self.time_moments is None else self.time_moments[keep],
-            None if self.twist_lidar is None else self.twist_lidar[keep],
+            self.swept and self.swept.part(keep),
             self.undecided,
             self.uneven,
             self.grazing,
@@ -276,21 +273,19 @@ def _judged(
     p = points[chosen].T.copy()
     time_s = np.zeros(len(count))
     if not len(count):
-        none = None if motion is None else np.zeros((0, 4, 4))
-        twists = None if motion is None else np.zeros((0, 6))
-        empty = ScanPatches(
-            time_s, np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0), none, twists
-        )
+        empty = ScanPatches(time_s, np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0))
         return empty, np.zeros(len(points), dtype=bool)
-    time_moments = twist_lidar = None
+    swept = None
     if times_s is not None and motion is not None:
         t = times_s[chosen]
         time_s = np.add.reduceat(t, first) / count
         k = slot[chosen]
         after_s = t - time_s[group]
         p += after_s * (np.cross(motion.turn[k].T, p, axis=0) + motion.velocity[k].T)
-        time_moments = _moments(p, first, np.add.reduceat(after_s, first), after_s)
-        twist_lidar = np.hstack([motion.turn, motion.velocity])[k[first]]
+        swept = Swept(
+            _moments(p, first, np.add.reduceat(after_s, first), after_s),
+            np.hstack([motion.turn, motion.velocity])[k[first]],
+        )
     moments = _moments(p, first, count)
     centre = moments[:, :3, 3] / count[:, None]
     cov = moments[:, :3, :3] / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
@@ -321,8 +316,7 @@ def _judged(
         moments=moments[good],
         normal_lidar=normal[good],
         scatter_m=scatter[good],
-        time_moments=None if time_moments is None else time_moments[good],
-        twist_lidar=None if twist_lidar is None else twist_lidar[good],
+        swept=swept and swept.part(good),
         uneven=int(count[decided & (~flat | uneven)].sum()),
         grazing=int(count[flat & broad & ~uneven & ~seen].sum()),
     )
@@ -386,12 +380,6 @@ def _shape(
     return spread, np.sqrt(bend), skewness, length * width[:, 2]
 
 
-def _all_of(parts: Sequence[Array | None]) -> Array | None:
-    """Arrays one behind the other; None if one of them is missing, or there are none."""
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known) if known and len(known) == len(parts) else None
-
-
 def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) -> ScanPatches:
     """All patches of a scan, at most `MAX_PATCHES`, and what became of its points."""
     joined = ScanPatches(
@@ -399,8 +387,7 @@ def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) ->
         moments=np.concatenate([f.moments for f in found]),
         normal_lidar=np.concatenate([f.normal_lidar for f in found]),
         scatter_m=np.concatenate([f.scatter_m for f in found]),
-        time_moments=_all_of([f.time_moments for f in found]),
-        twist_lidar=_all_of([f.twist_lidar for f in found]),
+        swept=Swept.joined([f.swept for f in found], [len(f.time_s) for f in found]),
         uneven=uneven,
         grazing=grazing,
     )
@@ -410,8 +397,7 @@ def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) ->
         joined.moments,
         joined.normal_lidar,
         joined.scatter_m,
-        joined.time_moments,
-        joined.twist_lidar,
+        joined.swept,
         points - used - uneven - grazing,
         uneven,
         grazing,

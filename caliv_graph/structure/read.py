@@ -14,7 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
 from caliv_graph.targets.cloud.views import evenly_spread
 from caliv_graph.trajectory.deskew import checked_times
@@ -82,6 +82,7 @@ def read_patches(
         TrajectoryError: times of points are invalid.
     """
     names = tuple(config.lidars)
+    guesses = tuple(lidar.guess() for lidar in config.lidars.values())
     wanted = [
         chosen_scans([recording.scan_stamps_ns(name) for name in names], trajectory)
         for recording, trajectory in zip(recordings, trajectories, strict=True)
@@ -92,11 +93,10 @@ def read_patches(
         for drive, recording in enumerate(recordings):
             scans: list[tuple[int, int, ScanPatches]] = []
             for k, name in enumerate(names):
-                guess = config.lidars[name].guess()
                 stamps = frozenset(wanted[drive][k].tolist())
                 reduced = partial(
                     _stamped_patches,
-                    T_vehicle_lidar=guess,
+                    T_vehicle_lidar=guesses[k],
                     trajectory=trajectories[drive],
                     sigma_range_m=config.noise.lidar_range_m,
                     keep_level=keep_level,
@@ -105,7 +105,6 @@ def read_patches(
                 for stamp_ns, patches in worked_together(reduced, clouds):
                     scans.append((k, stamp_ns, patches))
                     advance()
-            guesses = tuple(config.lidars[name].guess() for name in names)
             found.append(_together(drive, names, scans, guesses))
     return tuple(found)
 
@@ -277,11 +276,7 @@ def _together(
     scans: Sequence[tuple[int, int, ScanPatches]],
     moved_with: tuple[gtsam.Pose3, ...],
 ) -> DrivePatches:
-    """The patches of all scans (LiDAR, stamp, patches) of a drive.
-
-    Those of LiDARs that take all at one instant have moments by time, too, where others do not:
-    zero.
-    """
+    """The patches of all scans (LiDAR, stamp, patches) of a drive."""
     parts = [patches for _, _, patches in scans]
     number = [len(p.time_s) for p in parts]
     return DrivePatches(
@@ -294,21 +289,6 @@ def _together(
         moments=np.concatenate([np.zeros((0, 4, 4)), *(p.moments for p in parts)]),
         normal_lidar=np.concatenate([np.zeros((0, 3)), *(p.normal_lidar for p in parts)]),
         scatter_m=np.concatenate([np.zeros(0), *(p.scatter_m for p in parts)]),
-        time_moments=_or_zero([p.time_moments for p in parts], number, (4, 4)),
-        twist_lidar=_or_zero([p.twist_lidar for p in parts], number, (6,)),
+        swept=Swept.joined([p.swept for p in parts], number),
         moved_with=moved_with,
-    )
-
-
-def _or_zero(
-    parts: Sequence[Array | None], number: Sequence[int], shape: tuple[int, ...]
-) -> Array | None:
-    """Arrays (n, ...) one behind the other, zero for those missing; None if all are."""
-    if all(part is None for part in parts):
-        return None
-    return np.concatenate(
-        [
-            np.zeros((n, *shape)) if part is None else part
-            for n, part in zip(number, parts, strict=True)
-        ]
     )

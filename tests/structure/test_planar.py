@@ -261,8 +261,7 @@ def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
             moments=found.moments,
             normal_lidar=found.normal_lidar,
             scatter_m=found.scatter_m,
-            time_moments=found.time_moments,
-            twist_lidar=found.twist_lidar,
+            swept=found.swept,
             moved_with=(T_vehicle_lidar,),
         )
 
@@ -291,5 +290,4 @@ def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
 
 def test_patches_that_were_taken_at_once_follow_nothing() -> None:
     found = planar_patches(DENSE * on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 8.0)[:, None], 0.01)
-    assert found.time_moments is None
-    assert found.twist_lidar is None
+    assert found.swept is None

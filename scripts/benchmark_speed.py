@@ -10,6 +10,8 @@ process. Bags are simulated with `--seed` into a temporary folder and deleted. M
   each stage, the rest (first pass over a bag, report, files), and peak memory;
 - how processor time grows with clouds, points per cloud, LiDARs and components of the mixture,
   each 1, 2 and 4 times, LiDARs 8 times as well;
+- `caliv-graph inspect --config` of the last of these bags: on 2 cores and on 1, and how its
+  processor time grows while four other processes are busy;
 - the paper's own estimator, reimplemented (`benchmark_paper.py`), on the same clouds from the same
   guesses in the same process as ours, one thread each: end to end, and the optimisation alone;
 - `--help` of the program and of every command.
@@ -24,9 +26,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import statistics
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,8 +75,18 @@ MINUTES = 1.0
 
 READING = ("reading clouds", "reading the ground")
 
-TOTAL_LIMIT_S = 8.0
-READING_LIMIT_S = 3.0
+OTHERS = 4
+"""Processes that are busy beside `inspect`."""
+
+TOTAL_LIMIT_S = 4.0
+READINGS_LIMIT = 8.0
+"""Of the whole over reading clouds and cutting the target out of them."""
+
+SECOND_CORE_LIMIT = 1.0
+OTHERS_LIMIT = 1.3
+PAPER_LIMIT = 3.0
+"""Of the paper's estimator over ours, end to end, at least."""
+
 DOUBLE_LIMIT = 2.2
 LINEAR_LIMIT = 1.15
 COMPONENTS_LIMIT = 2.0
@@ -141,6 +156,23 @@ class Baseline:
 
 
 @dataclass(frozen=True)
+class Inspection:
+    """`inspect --config` of a bag.
+
+    Attributes:
+        name: of the drive.
+        walls_s: from the end of the imports, by number of cores.
+        cpu_s: processor time on all of these, nothing else busy.
+        busy_cpu_s: the same while others are busy.
+    """
+
+    name: str
+    walls_s: Mapping[int, float]
+    cpu_s: float
+    busy_cpu_s: float
+
+
+@dataclass(frozen=True)
 class Verdict:
     """A limit, and whether it is kept."""
 
@@ -148,10 +180,11 @@ class Verdict:
     value: float
     limit: float
     unit: str
+    at_least: bool = False
 
     @property
     def kept(self) -> bool:
-        return self.value <= self.limit
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
 @dataclass(frozen=True)
@@ -162,6 +195,7 @@ class Found:
         cases: drives, stage by stage.
         growths: by quantity.
         more_components: processor time with 1,000 components relative to 300; None: not measured.
+        inspection: of a bag.
         baselines: the paper's estimator and ours.
         helps_s: wall time of `--help` by command.
         load: load average before the start. It makes wall times longer.
@@ -170,6 +204,7 @@ class Found:
     cases: tuple[Case, ...]
     growths: tuple[Growth, ...]
     more_components: float | None
+    inspection: Inspection
     baselines: tuple[Baseline, ...]
     helps_s: Mapping[str, float]
     load: float
@@ -283,6 +318,7 @@ def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -
         with_bags("points per cloud", POINTS, arguments, folder, progress),
         with_bags("LiDARs", LIDARS, arguments, folder, progress),
     ]
+    inspection = inspected(names[-1], bags[names[-1]], repeated, progress)
     baselines = []
     if has_data:
         job = benchmark_paper.Job(
@@ -296,7 +332,8 @@ def benchmark(arguments: argparse.Namespace, folder: Path, progress: Progress) -
     with progress.stage("asking for help"):
         helps = {"caliv-graph": _child.help_s([], 5)}
         helps |= {command: _child.help_s([command], 3) for command in COMMANDS}
-    return Found(tuple(cases), tuple(growths), more_components, tuple(baselines), helps, load)
+    growth = tuple(growths)
+    return Found(tuple(cases), growth, more_components, inspection, tuple(baselines), helps, load)
 
 
 def timed(config: Path, cores: int, repeated: int, advance: Callable[[], object]) -> _child.Usage:
@@ -306,6 +343,51 @@ def timed(config: Path, cores: int, repeated: int, advance: Callable[[], object]
         usages.append(_child.calibrate(config, config.parent / "result", cores))
         advance()
     return _child.middle(usages)
+
+
+def inspected(name: str, config: Path, repeated: int, progress: Progress) -> Inspection:
+    """`inspect --config`, the median of some runs of each kind, in turn."""
+    asked = ["inspect", str(config.parent / "drive"), "--config", str(config)]
+    walls: dict[int, list[float]] = {cores: [] for cores in CORES}
+    cpus: list[float] = []
+    busy: list[float] = []
+    with progress.stage(f"inspecting {name}", (len(CORES) + 1) * repeated) as advance:
+        for _ in range(repeated):
+            for cores in CORES:
+                usage = inspect_once(asked, cores)
+                walls[cores].append(usage["wall_s"])
+                if cores == CORES[0]:
+                    cpus.append(usage["cpu_s"])
+                advance()
+            with busy_processes(OTHERS):
+                busy.append(inspect_once(asked, CORES[0])["cpu_s"])
+            advance()
+    by_cores = {cores: statistics.median(of_cores) for cores, of_cores in walls.items()}
+    return Inspection(name, by_cores, statistics.median(cpus), statistics.median(busy))
+
+
+def inspect_once(asked: Sequence[str], cores: int) -> Mapping[str, float]:
+    """Times of `inspect`.
+
+    Raises:
+        CalivError: it could not look at the drive.
+    """
+    code, usage = _child.run(asked, cores)
+    if code not in (0, 3):
+        raise CalivError(f"caliv-graph {' '.join(asked)}: exit code {code}")
+    return usage
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[Sequence[subprocess.Popen[bytes]]]:
+    """Keeps so many other processes computing."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield others
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
 
 
 def cloud_count(config: Path) -> int:
@@ -431,9 +513,10 @@ def verdicts(found: Found) -> list[Verdict]:
     for case in found.cases:
         if case.name == "authors' drive":
             usage = case.usages[CORES[0]]
+            readings = usage.wall_s / usage.stage_s(*READING)
             out += [
                 Verdict(f"{case.clouds} clouds, 2 cores, wall", usage.wall_s, TOTAL_LIMIT_S, "s"),
-                Verdict("of which reading", usage.stage_s(*READING), READING_LIMIT_S, "s"),
+                Verdict("over reading and cutting out", readings, READINGS_LIMIT, "times as long"),
             ]
     for growth in found.growths:
         if growth.what.startswith("clouds"):
@@ -447,6 +530,17 @@ def verdicts(found: Found) -> list[Verdict]:
     if found.more_components is not None:
         what = f"{MOST_COMPONENTS} components against {COMPONENTS[0]}, CPU"
         out.append(Verdict(what, found.more_components, COMPONENTS_LIMIT, "times as much"))
+    looked = found.inspection
+    second = looked.walls_s[CORES[0]] / looked.walls_s[CORES[-1]]
+    grown = looked.busy_cpu_s / looked.cpu_s
+    out += [
+        Verdict("inspect, 2 cores against 1, wall", second, SECOND_CORE_LIMIT, "times as long"),
+        Verdict(f"inspect beside {OTHERS} processes, CPU", grown, OTHERS_LIMIT, "times as much"),
+    ]
+    for baseline in found.baselines:
+        ratio = baseline.paper["total"] / max(baseline.ours["total"], 1e-9)
+        what = f"the paper's estimator, {baseline.name}"
+        out.append(Verdict(what, ratio, PAPER_LIMIT, "times as long", at_least=True))
     slowest = max(found.helps_s, key=lambda name: found.helps_s[name])
     out.append(Verdict(f"--help, slowest ({slowest})", found.helps_s[slowest], HELP_LIMIT_S, "s"))
     return out
@@ -456,6 +550,7 @@ def text(found: Found, limits: Sequence[Verdict]) -> str:
     """The result for a person."""
     parts = [*map(case_text, found.cases)]
     parts += ["\n".join(["Growth, CPU on one core", *map(growth_text, found.growths)])]
+    parts.append(inspection_text(found.inspection))
     parts += map(baseline_text, found.baselines)
     lines = ["Limits"]
     if found.load > 0.5:
@@ -464,10 +559,8 @@ def text(found: Found, limits: Sequence[Verdict]) -> str:
         )
     for verdict in limits:
         kept = "kept" if verdict.kept else "MISSED"
-        lines.append(
-            f"  {verdict.what:42}{verdict.value:8.2f} {verdict.unit}, at most {verdict.limit:g}: "
-            f"{kept}"
-        )
+        asked = f"at {'least' if verdict.at_least else 'most'} {verdict.limit:g}"
+        lines.append(f"  {verdict.what:42}{verdict.value:8.2f} {verdict.unit}, {asked}: {kept}")
     return "\n\n".join([*parts, "\n".join(lines)])
 
 
@@ -513,6 +606,16 @@ def growth_text(growth: Growth) -> str:
     return f"  {growth.what:36}{'; '.join(cells)}"
 
 
+def inspection_text(inspection: Inspection) -> str:
+    walls = ", ".join(
+        f"{wall:.1f} s on {n} core{'s' if n > 1 else ''}" for n, wall in inspection.walls_s.items()
+    )
+    return (
+        f"inspect --config, {inspection.name}\n  {walls}; {inspection.cpu_s:.1f} s of CPU, "
+        f"{inspection.busy_cpu_s:.1f} s beside {OTHERS} busy processes"
+    )
+
+
 def baseline_text(baseline: Baseline) -> str:
     lines = [f"The paper's estimator, written anew, and ours: {baseline.name}"]
     lines.append(f"  {'seconds, one thread':30}{'paper':>9}{'ours':>9}{'ratio':>9}")
@@ -547,6 +650,12 @@ def document(
             for growth in found.growths
         ],
         "components_1000_over_300": found.more_components,
+        "inspect": {
+            "name": found.inspection.name,
+            "wall_s_by_cores": {str(n): wall for n, wall in found.inspection.walls_s.items()},
+            "cpu_s": found.inspection.cpu_s,
+            "cpu_s_beside_busy_processes": found.inspection.busy_cpu_s,
+        },
         "paper": [
             {
                 "drive": baseline.name,

@@ -29,7 +29,7 @@ STAGES: Mapping[str, tuple[float, float]] = {
     "registering the clouds": (1.0, 1.2),
 }
 
-USAGE = Usage(code=0, wall_s=6.0, cpu_s=7.0, start_up_cpu_s=0.9, peak_mb=300.0, stages=STAGES)
+USAGE = Usage(code=0, wall_s=3.9, cpu_s=7.0, start_up_cpu_s=0.9, peak_mb=300.0, stages=STAGES)
 
 SECONDS = {"total": 60.0, "cpu": 60.0, "registration": 50.0, "optimisation": 10.0}
 
@@ -44,6 +44,7 @@ GOOD = benchmark.Found(
         benchmark.Growth("points", (1, 2, 4), (USAGE, USAGE, replace(USAGE, cpu_s=14.0))),
     ),
     more_components=1.6,
+    inspection=benchmark.Inspection("figure_eight", {2: 3.0, 1: 4.0}, 5.0, 6.0),
     baselines=(
         benchmark.Baseline("authors' drive", SECONDS, {k: v / 8.0 for k, v in SECONDS.items()}),
     ),
@@ -63,9 +64,16 @@ def with_usage(**changes: object) -> benchmark.Found:
 
 def test_every_limit_can_be_missed() -> None:
     assert missed(GOOD) == []
-    assert missed(with_usage(wall_s=8.1)) == ["136 clouds, 2 cores, wall"]
-    slow_reading = {"reading clouds": (2.0, 2.0), "reading the ground": (1.1, 1.0)}
-    assert missed(with_usage(stages=slow_reading)) == ["of which reading"]
+    assert missed(with_usage(wall_s=4.1)) == ["136 clouds, 2 cores, wall"]
+    little_reading = {"reading clouds": (0.2, 0.2), "reading the ground": (0.2, 0.2)}
+    assert missed(with_usage(stages=little_reading)) == ["over reading and cutting out"]
+    inspection = GOOD.inspection
+    slower = replace(inspection, walls_s={2: 4.1, 1: 4.0})
+    assert missed(replace(GOOD, inspection=slower)) == ["inspect, 2 cores against 1, wall"]
+    waiting = replace(inspection, busy_cpu_s=6.6)
+    assert missed(replace(GOOD, inspection=waiting)) == ["inspect beside 4 processes, CPU"]
+    near = benchmark.Baseline("demo", SECONDS, {k: v / 2.9 for k, v in SECONDS.items()})
+    assert missed(replace(GOOD, baselines=(near,))) == ["the paper's estimator, demo"]
     quarter, half, whole = GOOD.growths[0].usages
     dear = replace(GOOD.growths[0], usages=(quarter, half, replace(whole, cpu_s=8.9)))
     assert missed(replace(GOOD, growths=(dear,))) == ["twice the clouds, CPU"]
@@ -83,16 +91,24 @@ def test_the_text_has_stages_rest_ratios_and_limits() -> None:
 
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "reading clouds 1.50 1.40 1.50 1.40" in lines
-    # What no stage has: 6.0 - 2.5 of wall, 7.0 - 2.6 of CPU; on one core 7.2 - 2.5.
-    assert "first pass over a bag, tests, report, files 3.50 4.40 4.70 4.40" in lines
-    assert any(line.startswith("reading and cutting out: 25 percent") for line in lines)
+    # What no stage has: 3.9 - 2.5 of wall, 7.0 - 2.6 of CPU; on one core 7.2 - 2.5.
+    assert "first pass over a bag, tests, report, files 1.40 4.40 4.70 4.40" in lines
+    assert any(line.startswith("reading and cutting out: 38 percent") for line in lines)
     assert any("34: 2.5 s, 300 MB (1.00x); 68: 4.0 s, 300 MB (1.60x)" in line for line in lines)
     assert any(line.endswith("optimisation alone 10.00 1.25 8.00") for line in lines)
-    assert any(line.endswith("s, at most 8: kept") for line in lines)
+    assert any(line.endswith("s, at most 4: kept") for line in lines)
+    assert any(line.endswith("times as long, at least 3: kept") for line in lines)
+    assert "3.0 s on 2 cores, 4.0 s on 1 core; 5.0 s of CPU, 6.0 s beside 4 busy processes" in lines
     assert "longer" not in text
     assert "5.0 cores busy" in benchmark.text(replace(GOOD, load=5.0), [])
     arguments = argparse.Namespace(seed=1, quick=True)
     json.dumps(benchmark.document(arguments, GOOD, benchmark.verdicts(GOOD)), allow_nan=False)
+
+
+def test_busy_processes_end_with_the_block() -> None:
+    with benchmark.busy_processes(2) as others:
+        assert [other.poll() for other in others] == [None, None]
+    assert None not in [other.poll() for other in others]
 
 
 def test_the_middle_run_is_the_median() -> None:

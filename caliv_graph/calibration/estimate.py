@@ -44,6 +44,7 @@ from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
     other_grounds,
+    placed_extrinsics,
     rough_extrinsics,
     solved_with_structure,
 )
@@ -134,7 +135,7 @@ def _estimate(
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         placed = rough_extrinsics(rough.state)
-        told = structure.slow_errors(trajectories, placed, config)
+        told = structure.slow_errors(trajectories, placed, config, placed_extrinsics(rough.state))
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
         usual = ground_floors(config.noise)

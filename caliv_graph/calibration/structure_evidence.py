@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import gtsam
 import numpy as np
@@ -41,6 +42,7 @@ StructureTerms = Callable[
         Sequence[IntArray],
         Sequence[VehicleTrajectory],
         Mapping[str, gtsam.Pose3],
+        Mapping[str, gtsam.Pose3],
         Config,
         frozenset[str],
         float,
@@ -49,8 +51,9 @@ StructureTerms = Callable[
     tuple[StructureTerm, ...],
 ]
 """Patches, priors of the poses, stamps of the poses to keep and trajectory of each drive; rough
-extrinsics, config, names of the LiDARs with a free time offset, 1 sigma of the heave, whether the
-strips lie on each other at these extrinsics -> a term per drive."""
+extrinsics, those of them that a target has placed, config, names of the LiDARs with a free time
+offset, 1 sigma of the heave, whether the strips lie on each other at these extrinsics -> a term per
+drive."""
 
 
 SlowErrors = Callable[
@@ -60,14 +63,15 @@ SlowErrors = Callable[
         Sequence[Array],
         Sequence[VehicleTrajectory],
         Mapping[str, gtsam.Pose3],
+        Mapping[str, gtsam.Pose3],
         Config,
         float,
     ],
     tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]],
 ]
 """Patches, priors of their poses, gains of these on errors of sensors and trajectory of each drive;
-rough extrinsics, config, 1 sigma of the heave -> per drive information and gradient on the errors,
-and better extrinsics."""
+rough extrinsics, those of them that a target has placed, config, 1 sigma of the heave -> per drive
+information and gradient on the errors, and better extrinsics."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +115,11 @@ class StructureEvidence:
         trajectories: Sequence[VehicleTrajectory],
         start: Mapping[str, gtsam.Pose3],
         config: Config,
+        held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
     ) -> ToldErrors:
         """What the structure of smoothed drives says of slow errors of their sensors.
 
-        `start` are rough T_vehicle_lidar of every LiDAR.
+        `start` are rough T_vehicle_lidar of every LiDAR, `held` of those that a target has placed.
 
         Raises:
             SolveError: it could not be solved.
@@ -138,7 +143,9 @@ class StructureEvidence:
         if not of_drives:
             return NOTHING_TOLD
         drives, priors, gains, own = zip(*of_drives, strict=True)
-        told, T_vehicle_lidar = self.errors(drives, priors, gains, own, start, config, heave_m)
+        told, T_vehicle_lidar = self.errors(
+            drives, priors, gains, own, start, held, config, heave_m
+        )
         pairs = zip(drives, told, strict=True)
         by_drive = {patches.drive: of for patches, of in pairs if of is not None}
         return ToldErrors(by_drive, T_vehicle_lidar) if by_drive else NOTHING_TOLD
@@ -152,6 +159,7 @@ class StructureEvidence:
         noise: PoseNoise,
         config: Config,
         *,
+        held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
         aligned: bool = False,
     ) -> tuple[StructureTerm, ...]:
         """The term of each drive that has structure.
@@ -163,6 +171,7 @@ class StructureEvidence:
             heave_m: 1 sigma of the heave.
             noise: of given poses.
             config: guesses and noise.
+            held: T_vehicle_lidar of those that a target has placed.
             aligned: `start` is from `slow_errors`.
 
         Raises:
@@ -182,6 +191,7 @@ class StructureEvidence:
             [kept[of.drive] for of in patches],
             [trajectories[of.drive] for of in patches],
             start,
+            held,
             config,
             frozenset(config.lidars) if config.solve.time_offset else frozenset(),
             heave_m,
@@ -203,18 +213,26 @@ class StructureEvidence:
         start = told.T_vehicle_lidar or rough_extrinsics(state)
         aligned = told.T_vehicle_lidar is not None
         return self.terms(
-            trajectories, kept, start, heave_m, state.noise, state.config, aligned=aligned
+            trajectories,
+            kept,
+            start,
+            heave_m,
+            state.noise,
+            state.config,
+            held=placed_extrinsics(state),
+            aligned=aligned,
         )
+
+
+def placed_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:
+    """T_vehicle_lidar of the LiDARs of a solve."""
+    return {name: state.problem.extrinsic(state.values, name) for name in state.problem.lidars}
 
 
 def rough_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:
     """T_vehicle_lidar of every LiDAR: of a solve, and the guess of those that it is without."""
-    return {
-        name: state.problem.extrinsic(state.values, name)
-        if name in state.problem.lidars
-        else lidar.guess()
-        for name, lidar in state.config.lidars.items()
-    }
+    guesses = {name: lidar.guess() for name, lidar in state.config.lidars.items()}
+    return guesses | placed_extrinsics(state)
 
 
 def other_grounds(

@@ -139,7 +139,8 @@ def plan_structure(
         twists=motion.twist[nodes] if assumptions.time_offset else None,
         offsets=tuple(range(n)) if assumptions.time_offset else (),
         guesses=tuple(m.mounting.pose() for m in scenario.lidars.values()),
-        guess_information=np.zeros((6 * n, 6 * n)),
+        held_at=tuple(m.mounting.pose() for m in scenario.lidars.values()),
+        held_information=np.zeros((6 * n, 6 * n)),
         range_sigma_m=0.0,
         standing=Standing(
             height_m=0.0 if assumptions.ground == "height" else None,

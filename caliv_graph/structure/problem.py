@@ -42,8 +42,9 @@ class Problem:
         twists: (M, 6) velocity at each pose; None: no time offset is free, and no stamp jitters.
         accelerations: (M, 6) their change per second; None: no time offset is free.
         offsets: indices of the LiDARs with a free time offset.
-        guesses: n guesses of T_vehicle_lidar.
-        guess_information: (6 n, 6 n) of them, vehicle axes.
+        guesses: n guesses of T_vehicle_lidar, for what the strips were like with them.
+        held_at: n T_vehicle_lidar that hold what structure does not determine.
+        held_information: (6 n, 6 n) of them, vehicle axes.
         range_sigma_m: noise along the beam as stated.
         standing: what is known of how the vehicle stands on the ground.
         views: which scans are from one place.
@@ -59,7 +60,8 @@ class Problem:
     twists: Array | None
     offsets: tuple[int, ...]
     guesses: tuple[gtsam.Pose3, ...]
-    guess_information: Array
+    held_at: tuple[gtsam.Pose3, ...]
+    held_information: Array
     range_sigma_m: float
     standing: Standing
     views: Views
@@ -229,24 +231,24 @@ def geometry_at(
     )
 
 
-def with_guesses(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
-    """The system's H and b with the guesses: they hold what structure does not determine."""
+def with_hold(problem: Problem, state: State, system: System) -> tuple[Array, Array]:
+    """The system's H and b with what holds the extrinsics where structure does not."""
     H, b = system.H.copy(), system.b.copy()
-    add_guesses(problem, state, system.layout, H, b)
+    add_hold(problem, state, system.layout, H, b)
     return H, b
 
 
-def add_guesses(problem: Problem, state: State, layout: Layout, H: Array, b: Array) -> None:
-    """Adds the guesses to H (R, R) and b (R,) of a system, in place."""
+def add_hold(problem: Problem, state: State, layout: Layout, H: Array, b: Array) -> None:
+    """Adds what holds the extrinsics to H (R, R) and b (R,) of a system, in place."""
     own = slice(layout.extrinsic, layout.error)
     axes = np.zeros((6 * layout.lidars, 6 * layout.lidars))
     away = np.zeros(6 * layout.lidars)
-    pairs = zip(state.T_vehicle_lidar, problem.guesses, strict=True)
-    for i, (T, guess) in enumerate(pairs):
+    pairs = zip(state.T_vehicle_lidar, problem.held_at, strict=True)
+    for i, (T, held) in enumerate(pairs):
         part = slice(6 * i, 6 * i + 6)
         axes[part, part] = right_to_vehicle_axes(T)
-        away[part] = vehicle_axes_difference(T, guess)
-    H[own, own] += axes.T @ problem.guess_information @ axes
-    b[own] -= axes.T @ problem.guess_information @ away
+        away[part] = vehicle_axes_difference(T, held)
+    H[own, own] += axes.T @ problem.held_information @ axes
+    b[own] -= axes.T @ problem.held_information @ away
     for i in range(layout.offset, layout.extrinsic):
         H[i, i] += OFFSET_SIGMA_S**-2.0

@@ -61,7 +61,8 @@ def relative_problem(
     return replace(
         problem,
         guesses=tuple(start[name] for name in problem.patches.lidars),
-        guess_information=np.diag(np.concatenate(sigmas) ** -2.0),
+        held_at=tuple(start[name] for name in problem.patches.lidars),
+        held_information=np.diag(np.concatenate(sigmas) ** -2.0),
         standing=replace(problem.standing, height_m=None, tilt_sigma_rad=None),
     )
 

@@ -16,7 +16,7 @@ from caliv_graph.products import Array
 from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.problem import with_guesses
+from caliv_graph.structure.problem import with_hold
 from caliv_graph.structure.solve import Solved, solve_roughly
 from caliv_graph.structure.term import aligned_start, problem_of, usable
 from caliv_graph.structure.thinning import patches_of_scans, some_scans
@@ -35,6 +35,7 @@ def slow_errors(
     gains: Sequence[Array],
     trajectories: Sequence[VehicleTrajectory],
     start: Mapping[str, gtsam.Pose3],
+    held: Mapping[str, gtsam.Pose3],
     config: Config,
     heave_m: float,
 ) -> tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]]:
@@ -48,6 +49,7 @@ def slow_errors(
             unit of an error.
         trajectories: of each drive.
         start: rough T_vehicle_lidar.
+        held: those of LiDARs that a target has placed.
         config: guesses and noise.
         heave_m: 1 sigma of the heave.
 
@@ -65,7 +67,8 @@ def slow_errors(
         used = usable(own, trajectory, aligned, config)
         found = None
         if len(used.scan):
-            found = solve_roughly(problem_of(used, prior, trajectory, config, heave_m), aligned)
+            problem = problem_of(used, prior, trajectory, config, heave_m, held=held)
+            found = solve_roughly(problem, aligned)
         out.append(None if found is None else told_of_errors(found, prior, gain))
         if found is not None:
             aligned = {**aligned, **seeing_lidars(found)}
@@ -84,7 +87,7 @@ def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array,
 
     `prior` (m poses) is that of the drive, without rates.
     """
-    H, b = with_guesses(found.problem, found.state, found.system)
+    H, b = with_hold(found.problem, found.state, found.system)
     moved = found.state.moved[: len(gain)]
     information, pull = prior.at(moved)
     by_now, size = prior.by_now(moved), 6 * len(prior.stamps_ns)

@@ -23,7 +23,7 @@ from caliv_graph.structure.noise import (
 )
 from caliv_graph.structure.problem import (
     Problem,
-    add_guesses,
+    add_hold,
     alike,
     first_state,
     geometry_at,
@@ -220,12 +220,12 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
     system = jittering.linearised()
-    # The guesses in place, and out again: a copy would be as large as the system.
-    guessed = slice(layout.offset, layout.error)
-    without = system.H[guessed, guessed].copy(), system.b[guessed].copy()
-    add_guesses(problem, state, layout, system.H, system.b)
+    # The hold in place, and out again: a copy would be as large as the system.
+    held = slice(layout.offset, layout.error)
+    without = system.H[held, held].copy(), system.b[held].copy()
+    add_hold(problem, state, layout, system.H, system.b)
     sigma_s = jitter_sigma_s(system.H, system.b, layout)
-    system.H[guessed, guessed], system.b[guessed] = without
+    system.H[held, held], system.b[held] = without
     if sigma_s == 0.0:
         return None, system
     own = np.arange(layout.jitter, layout.plane)
@@ -358,6 +358,6 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:
-    """Factor of the system with the guesses, which takes its memory, and its right-hand side."""
-    add_guesses(found.problem, found.state, found.layout, system.H, system.b)
+    """Factor of the system with the hold, which takes its memory, and its right-hand side."""
+    add_hold(found.problem, found.state, found.layout, system.H, system.b)
     return factor_of(system.H, overwrite=True), system.b

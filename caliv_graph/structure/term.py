@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import gtsam
 import numpy as np
@@ -53,6 +54,7 @@ def structure_terms(
     kept_ns: Sequence[IntArray],
     trajectories: Sequence[VehicleTrajectory],
     start: Mapping[str, gtsam.Pose3],
+    held: Mapping[str, gtsam.Pose3],
     config: Config,
     free_offsets: frozenset[str],
     heave_m: float,
@@ -67,6 +69,7 @@ def structure_terms(
         kept_ns: per drive the stamps of the poses that the terms are to be on, ascending.
         trajectories: of each drive, for the motion within sweeps.
         start: rough T_vehicle_lidar.
+        held: those of LiDARs that a target has placed: the terms are linearised near them.
         config: guesses and noise.
         free_offsets: LiDARs whose time offset is estimated.
         heave_m: 1 sigma of the heave.
@@ -91,7 +94,7 @@ def structure_terms(
             continue
         used = used.followed(start)
         places = np.searchsorted(prior.stamps_ns, kept)
-        problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets)
+        problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets, held)
         del prior
         if odometry is not None:
             problem = relative_problem(problem, odometry, start, config)
@@ -151,6 +154,12 @@ GROUND_SIGHTINGS = 50
 """Fewest sightings of level strips with which they stand for the ground planes of a LiDAR."""
 
 
+PLACED_RAD, PLACED_M = 0.01, 0.1
+"""1 sigma that holds a LiDAR where a target has placed it, roughly. Level ground alone leaves yaw,
+x and y open, and a term that is linearised at a guess, 50 mrad of yaw away, is off by half the
+square of it times the tilt of the LiDAR: 0.1 mrad at 5 degrees, more than its sigma."""
+
+
 def problem_of(
     patches: DrivePatches,
     prior: PosePrior,
@@ -158,15 +167,21 @@ def problem_of(
     config: Config,
     heave_m: float,
     free_offsets: frozenset[str] = frozenset(),
+    held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
 ) -> Problem:
-    """What the solve of one drive is given."""
+    """What the solve of one drive is given; `held` are LiDARs that a target has placed."""
     offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)
     stamps = prior.stamps_ns.tolist()
     pose_of_scan = np.searchsorted(prior.stamps_ns, patches.stamps_ns)
     # An odometry is made of the same scans: its rates have no error apart from them.
     if patches.time_s.any() and odometry_of([trajectory]) is None:
         prior = prior.with_rates()
-    guesses = [configured_guess(config, name) for name in patches.lidars]
+    guesses = {name: configured_guess(config, name) for name in patches.lidars}
+    placed = np.repeat([PLACED_RAD, PLACED_M], 3)
+    sigmas = [
+        np.minimum(guess.sigmas, placed) if name in held else guess.sigmas
+        for name, guess in guesses.items()
+    ]
     return Problem(
         patches=patches,
         prior=prior,
@@ -175,8 +190,9 @@ def problem_of(
         twists=twists_at(trajectory, stamps),
         accelerations=accelerations_at(trajectory, stamps) if offsets else None,
         offsets=offsets,
-        guesses=tuple(guess.T_vehicle_lidar for guess in guesses),
-        guess_information=np.diag(np.concatenate([guess.sigmas for guess in guesses]) ** -2.0),
+        guesses=tuple(guess.T_vehicle_lidar for guess in guesses.values()),
+        held_at=tuple(held.get(n, guess.T_vehicle_lidar) for n, guess in guesses.items()),
+        held_information=np.diag(np.concatenate(sigmas) ** -2.0),
         range_sigma_m=config.noise.lidar_range_m,
         standing=standing_of(config, heave_m),
         views=views_of(patches, pose_of_scan, prior),

@@ -50,6 +50,7 @@ def problem_of(
     taken = [T.retract(d) for T, d in zip(true_poses, late_s[:, None] * twists, strict=True)]
     patches = draw_patches(walls, taken, rng, noise, extrinsics, patch_m=1.0)
     off = [rng.uniform(-0.005, 0.005, 6) for _ in extrinsics]
+    guesses = tuple(T.retract(d) for T, d in zip(extrinsics.values(), off, strict=True))
     return Problem(
         patches=patches,
         prior=draw_prior(true_poses, rng),
@@ -57,8 +58,9 @@ def problem_of(
         relative=np.tile(np.eye(4), (len(patches.scan), 1, 1)),
         twists=twists,
         offsets=(),
-        guesses=tuple(T.retract(d) for T, d in zip(extrinsics.values(), off, strict=True)),
-        guess_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
+        guesses=guesses,
+        held_at=guesses,
+        held_information=np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)),
         range_sigma_m=0.01,
         standing=NO_GROUND,
         views=Views.numbered(np.arange(len(patches.stamps_ns))),

@@ -156,8 +156,8 @@ GROUND_SIGHTINGS = 50
 
 PLACED_RAD, PLACED_M = 0.01, 0.1
 """1 sigma that holds a LiDAR where a target has placed it, roughly. Level ground alone leaves yaw,
-x and y open, and a term that is linearised at a guess, 50 mrad of yaw away, is off by half the
-square of it times the tilt of the LiDAR: 0.1 mrad at 5 degrees, more than its sigma."""
+x and y open. Linearised at a guess, 50 mrad of yaw away, a term turns the LiDAR by half of that
+times every tilt that is found later: 0.1 mrad for 4 mrad, more than its sigma."""
 
 
 def problem_of(

@@ -134,8 +134,8 @@ def _estimate(
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
-        placed = rough_extrinsics(rough.state)
-        told = structure.slow_errors(trajectories, placed, config, placed_extrinsics(rough.state))
+        extrinsics, placed = placed_extrinsics(rough.state), rough_extrinsics(rough.state)
+        told = structure.slow_errors(trajectories, placed, config, extrinsics)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
         usual = ground_floors(config.noise)
@@ -149,7 +149,6 @@ def _estimate(
     begun = time.perf_counter()
     # All clouds from here on: those that the field of view cuts off have predicted poses now.
     lines = linearise_clouds(problem, rough.state.values)
-    extrinsics = {name: problem.extrinsic(rough.state.values, name) for name in problem.lidars}
     problem = replace(problem, moved_with=extrinsics)
     grounds = _held_grounds(grounds, extrinsics, problem)
     states = [

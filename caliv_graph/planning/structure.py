@@ -131,6 +131,7 @@ def plan_structure(
         poses = recorded.poses(prior.stamps_ns, prior.T_map_vehicle)
         prior = replace(prior, T_map_vehicle=poses)
     pose_of_scan = np.searchsorted(nodes, motion.nodes_of(patches.stamps_ns))
+    mountings = tuple(model.mounting.pose() for model in scenario.lidars.values())
     problem = Problem(
         patches=patches,
         prior=prior,
@@ -138,8 +139,8 @@ def plan_structure(
         relative=relative,
         twists=motion.twist[nodes] if assumptions.time_offset else None,
         offsets=tuple(range(n)) if assumptions.time_offset else (),
-        guesses=tuple(m.mounting.pose() for m in scenario.lidars.values()),
-        held_at=tuple(m.mounting.pose() for m in scenario.lidars.values()),
+        guesses=mountings,
+        held_at=mountings,
         held_information=np.zeros((6 * n, 6 * n)),
         range_sigma_m=0.0,
         standing=Standing(
@@ -154,7 +155,7 @@ def plan_structure(
     )
     found = linearised(
         problem,
-        {name: model.mounting.pose() for name, model in scenario.lidars.items()},
+        dict(zip(scenario.lidars, mountings, strict=True)),
         np.array([model.range_sigma_m for model in scenario.lidars.values()])
         if recorded is None
         else recorded.range_sigma_m,

@@ -58,10 +58,11 @@ def relative_problem(
     for name in problem.patches.lidars:
         held = np.repeat([HELD_RAD, HELD_M], 3)
         sigmas.append(np.maximum(held_sigmas(odometry, config)[name], held))
+    begun = tuple(start[name] for name in problem.patches.lidars)
     return replace(
         problem,
-        guesses=tuple(start[name] for name in problem.patches.lidars),
-        held_at=tuple(start[name] for name in problem.patches.lidars),
+        guesses=begun,
+        held_at=begun,
         held_information=np.diag(np.concatenate(sigmas) ** -2.0),
         standing=replace(problem.standing, height_m=None, tilt_sigma_rad=None),
     )

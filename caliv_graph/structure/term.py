@@ -154,7 +154,7 @@ GROUND_SIGHTINGS = 50
 """Fewest sightings of level strips with which they stand for the ground planes of a LiDAR."""
 
 
-PLACED_RAD, PLACED_M = 0.01, 0.1
+PLACED_RAD, PLACED_M = 0.02, 0.1
 """1 sigma that holds a LiDAR where a target has placed it, roughly. Level ground alone leaves yaw,
 x and y open. Linearised at a guess, 50 mrad of yaw away, a term turns the LiDAR by half of that
 times every tilt that is found later: 0.1 mrad for 4 mrad, more than its sigma."""

@@ -214,7 +214,7 @@ def test_a_term_of_level_ground_is_linearised_at_the_yaw_that_a_target_tells() -
         stamps_ns=stamps,
         T_map_vehicle=tuple(tilted),
         parameters={},
-        information=np.linalg.inv(tilted_cov(len(stamps))),
+        information=np.asarray(np.linalg.inv(tilted_cov(len(stamps))), np.float64),
         gradient=np.zeros(6 * len(stamps)),
         parameter_information=np.zeros((0, 0)),
         parameter_offset=np.zeros(0),

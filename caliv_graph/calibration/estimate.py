@@ -44,7 +44,6 @@ from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
     other_grounds,
-    placed_extrinsics,
     rough_extrinsics,
     solved_with_structure,
 )
@@ -103,7 +102,7 @@ def estimate_with_noise(
         with threadpool_limits(limits=1):
             with progress.stage("estimating the noise of the sensors", None):
                 guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-                told = structure.slow_errors(trajectories, guesses, config)
+                told = structure.slow_errors(trajectories, guesses, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
                 trajectories = with_noise(noise, trajectories)
             solved = solve_structure_and_ground(
@@ -134,12 +133,13 @@ def _estimate(
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
-        extrinsics, placed = placed_extrinsics(rough.state), rough_extrinsics(rough.state)
-        told = structure.slow_errors(trajectories, placed, config, extrinsics)
+        extrinsics = problem.extrinsics(rough.state.values)
+        start = rough_extrinsics(rough.state)
+        told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
         usual = ground_floors(config.noise)
-        grounds = with_floors(grounds, trajectories, placed, usual, noise.floors)
+        grounds = with_floors(grounds, trajectories, start, usual, noise.floors)
         grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     times = {"registration": rough.registration_s}

@@ -55,7 +55,7 @@ def _residuals(
     """(n, 3) residuals of role a with the vehicle at `poses`; NaN where not taken."""
     out = np.full((len(observations), 3), np.nan)
     centres = {drive: ground_centre(problem, drive) for drive in seen_drives(observations, taken)}
-    extrinsics = {name: problem.extrinsic(values, name) for name in problem.lidars}
+    extrinsics = problem.extrinsics(values)
     for row, (o, i) in enumerate(zip(observations, taken.tolist(), strict=True)):
         if i >= 0:
             T = poses[i].compose(extrinsics[o.lidar])

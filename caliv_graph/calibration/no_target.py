@@ -124,6 +124,7 @@ def solve_structure_and_ground(
             trajectories,
             kept,
             told.T_vehicle_lidar or guesses,
+            {},
             noise.heave_m,
             first_pose_noise(config.noise),
             config,

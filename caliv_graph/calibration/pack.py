@@ -63,7 +63,7 @@ def packed_solution(
         mode=state.config.solve.mode,
         lidars=problem.lidars,
         reference=problem.reference,
-        T_vehicle_lidar={n: problem.extrinsic(state.values, n) for n in problem.lidars},
+        T_vehicle_lidar=problem.extrinsics(state.values),
         T_map_vehicle={
             pose: moved_map(state.values.atPose3(key_vehicle(i)), problem.origins_map[pose[0]])
             for i, pose in enumerate(problem.poses)

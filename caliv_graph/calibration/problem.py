@@ -259,6 +259,10 @@ class Problem:
             pose = pose.compose(values.atPose3(key))
         return pose
 
+    def extrinsics(self, values: gtsam.Values) -> dict[str, gtsam.Pose3]:
+        """T_vehicle_lidar of every LiDAR at given values, in the order of `lidars`."""
+        return {name: self.extrinsic(values, name) for name in self.lidars}
+
     def to_vehicle_axes(self, values: gtsam.Values) -> Array:
         """(6n, 6n) from tangents of `extrinsic_keys` (E, S_a, ...) to vehicle axes of `lidars`."""
         keys = self.extrinsic_keys()

@@ -261,8 +261,7 @@ class _Loop:
 
     def extrinsics(self) -> list[gtsam.Pose3]:
         """T_vehicle_lidar of every LiDAR."""
-        problem, values = self.state.problem, self.state.values
-        return [problem.extrinsic(values, name) for name in problem.lidars]
+        return list(self.state.problem.extrinsics(self.state.values).values())
 
     def move_to_mean(self, ends: Sequence[Sequence[gtsam.Pose3]]) -> None:
         """Takes the extrinsics to the mean of these, the last of which they are; all else follows.

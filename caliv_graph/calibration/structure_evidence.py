@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import gtsam
 import numpy as np
@@ -114,8 +113,8 @@ class StructureEvidence:
         self,
         trajectories: Sequence[VehicleTrajectory],
         start: Mapping[str, gtsam.Pose3],
+        held: Mapping[str, gtsam.Pose3],
         config: Config,
-        held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
     ) -> ToldErrors:
         """What the structure of smoothed drives says of slow errors of their sensors.
 
@@ -155,11 +154,11 @@ class StructureEvidence:
         trajectories: Sequence[VehicleTrajectory],
         kept_ns: Mapping[int, Sequence[int]],
         start: Mapping[str, gtsam.Pose3],
+        held: Mapping[str, gtsam.Pose3],
         heave_m: float,
         noise: PoseNoise,
         config: Config,
         *,
-        held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
         aligned: bool = False,
     ) -> tuple[StructureTerm, ...]:
         """The term of each drive that has structure.
@@ -168,10 +167,10 @@ class StructureEvidence:
             trajectories: one per drive, with nodes at the stamps of the patches.
             kept_ns: drive -> stamps of the poses that the calibration has.
             start: rough T_vehicle_lidar of every LiDAR.
+            held: of those that a target has placed.
             heave_m: 1 sigma of the heave.
             noise: of given poses.
             config: guesses and noise.
-            held: T_vehicle_lidar of those that a target has placed.
             aligned: `start` is from `slow_errors`.
 
         Raises:
@@ -216,23 +215,18 @@ class StructureEvidence:
             trajectories,
             kept,
             start,
+            state.problem.extrinsics(state.values),
             heave_m,
             state.noise,
             state.config,
-            held=placed_extrinsics(state),
             aligned=aligned,
         )
-
-
-def placed_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:
-    """T_vehicle_lidar of the LiDARs of a solve."""
-    return {name: state.problem.extrinsic(state.values, name) for name in state.problem.lidars}
 
 
 def rough_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:
     """T_vehicle_lidar of every LiDAR: of a solve, and the guess of those that it is without."""
     guesses = {name: lidar.guess() for name, lidar in state.config.lidars.items()}
-    return guesses | placed_extrinsics(state)
+    return guesses | state.problem.extrinsics(state.values)
 
 
 def other_grounds(

@@ -67,7 +67,7 @@ def slow_errors(
         used = usable(own, trajectory, aligned, config)
         found = None
         if len(used.scan):
-            problem = problem_of(used, prior, trajectory, config, heave_m, held=held)
+            problem = problem_of(used, prior, trajectory, config, heave_m, held)
             found = solve_roughly(problem, aligned)
         out.append(None if found is None else told_of_errors(found, prior, gain))
         if found is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 
 import gtsam
 import numpy as np
@@ -94,7 +93,7 @@ def structure_terms(
             continue
         used = used.followed(start)
         places = np.searchsorted(prior.stamps_ns, kept)
-        problem = problem_of(used, prior, trajectory, config, heave_m, free_offsets, held)
+        problem = problem_of(used, prior, trajectory, config, heave_m, held, free_offsets)
         del prior
         if odometry is not None:
             problem = relative_problem(problem, odometry, start, config)
@@ -166,8 +165,8 @@ def problem_of(
     trajectory: VehicleTrajectory,
     config: Config,
     heave_m: float,
+    held: Mapping[str, gtsam.Pose3],
     free_offsets: frozenset[str] = frozenset(),
-    held: Mapping[str, gtsam.Pose3] = MappingProxyType({}),
 ) -> Problem:
     """What the solve of one drive is given; `held` are LiDARs that a target has placed."""
     offsets = tuple(i for i, name in enumerate(patches.lidars) if name in free_offsets)

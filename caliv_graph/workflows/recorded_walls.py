@@ -82,7 +82,7 @@ def solved_walls(
         start = aligned_start([patches], [trajectory], guesses, config)
         patches = usable(patches, trajectory, start, config)
         try:
-            problem = problem_of(patches, priors[0], trajectory, config, heave_m)
+            problem = problem_of(patches, priors[0], trajectory, config, heave_m, {})
             found = solve_structure(problem, start)
         except SolveError:
             return None

@@ -24,6 +24,7 @@ from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
     other_grounds,
+    rough_extrinsics,
     solved_with_structure,
 )
 from caliv_graph.common.progress import Progress
@@ -141,9 +142,7 @@ def survey_observations(
         others = lidars_with_structure(terms)
         problem = pose_problem(used, trajectories, config, None, others)
         problem, used = roughly_used(problem, used, config.extraction.min_scans)
-        extrinsics = {
-            name: state.problem.extrinsic(state.values, name) for name in state.problem.lidars
-        }
+        extrinsics = state.problem.extrinsics(state.values)
         state, offsets_s = solved_with_structure(
             problem,
             rough.registrations,
@@ -176,10 +175,7 @@ def _verdict(
         D,
         problem.lidars,
         problem.reference,
-        {
-            name: problem.extrinsic(state.values, name) if name in problem.lidars else lidar.guess()
-            for name, lidar in config.lidars.items()
-        },
+        rough_extrinsics(state),
         {
             name: problem.guess_sigmas(name)
             if name in problem.lidars

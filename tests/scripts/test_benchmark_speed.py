@@ -65,6 +65,8 @@ def with_usage(**changes: object) -> benchmark.Found:
 def test_every_limit_can_be_missed() -> None:
     assert missed(GOOD) == []
     assert missed(with_usage(wall_s=4.1)) == ["136 clouds, 2 cores, wall"]
+    slow_reading = {"reading clouds": (2.0, 2.0), "reading the ground": (1.1, 1.0)}
+    assert missed(with_usage(stages=slow_reading)) == ["of which reading"]
     little_reading = {"reading clouds": (0.2, 0.2), "reading the ground": (0.2, 0.2)}
     assert missed(with_usage(stages=little_reading)) == ["over reading and cutting out"]
     inspection = GOOD.inspection

@@ -13,12 +13,7 @@ import pytest
 from caliv_graph.config.guesses import with_guess
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config
-from caliv_graph.geometry.se3 import (
-    retract_vehicle_axes,
-    stack,
-    unstack,
-    vehicle_axes_difference,
-)
+from caliv_graph.geometry.se3 import retract_vehicle_axes, stack, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.structure import pairs
 from caliv_graph.structure.align import PatchAlignment, _jacobians, align_patches
@@ -220,7 +215,7 @@ def test_a_term_of_level_ground_is_linearised_at_the_yaw_that_a_target_tells() -
         parameter_offset=np.zeros(0),
     )
 
-    problem = problem_of(flat, prior, TRAJECTORY, config, heave_m=0.005, held=placed)
+    problem = problem_of(flat, prior, TRAJECTORY, config, 0.005, placed)
     found = solve_structure(problem, placed)
 
     assert found is not None

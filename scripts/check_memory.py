@@ -32,7 +32,7 @@ from scripts import _child, benchmark_bag
 
 LAPS = (1, 4, 16)
 
-LIMIT_MB_PER_MINUTE = 6.0
+LIMIT_MB_PER_MINUTE = 1.0
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,10 @@ POSE = 6
 FACTORS_AT_A_TIME = 100
 """Factors of a graph that are turned into a part of the chain at once."""
 
+ROWS_AT_A_TIME = 1000
+"""Rows of a Jacobian that are added to a chain at once: their products take a hundred times the
+memory of the rows, gigabytes on a long drive."""
+
 UNDETERMINED = (
     "the motion data do not determine the trajectory. Check units, axes and gaps with 'caliv-graph "
     "inspect', and noise and the sigmas of imu and gnss in the config"
@@ -97,6 +101,10 @@ class Chain:
 
     def add(self, J: scipy.sparse.csr_array) -> None:
         """Adds the information of a whitened Jacobian, columns as in `places`, in place."""
+        for begin in range(0, J.shape[0], ROWS_AT_A_TIME):
+            self._add(J[begin : begin + ROWS_AT_A_TIME])
+
+    def _add(self, J: scipy.sparse.csr_array) -> None:
         n, width = self.diagonal.shape[:2]
         H = (J.T @ J).tocoo()
         row, column = (np.asarray(index, np.int64) for index in H.coords)

@@ -20,12 +20,16 @@ from caliv_graph.trajectory.chain import STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import solved_in_blocks
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, linearised
-from caliv_graph.trajectory.effects import ErrorsByStep, error_steps
+from caliv_graph.trajectory.effects import STEP_NS, ErrorsByStep, error_steps
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.noise import orientation_covariances
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, first_nodes
 from caliv_graph.trajectory.suspects import suspect_parameters
 from caliv_graph.trajectory.variances import NODES
+
+STEPS = 120
+"""Steps of errors that are used: a minute. Memory grows with their square: on long drives, whose
+nodes lie apart, `NODES` nodes would be five minutes and gigabytes."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ def error_likelihood(smoothed: SmoothedTrajectory, kinds: Sequence[str]) -> Erro
     Raises:
         TrajectoryError: the motion data leave the trajectory undetermined.
     """
-    data, nodes = smoothed.data, smoothed.nodes_ns[:NODES]
+    data, nodes = smoothed.data, _first_minute(smoothed)
     states = first_nodes(smoothed.states, len(nodes))
     graph = build_graph(data, nodes, states, smoothed.gnss_dropped, "none")
     values = to_values(states, data)
@@ -130,7 +134,12 @@ def error_likelihood(smoothed: SmoothedTrajectory, kinds: Sequence[str]) -> Erro
 
 def likelihood_end_ns(smoothed: SmoothedTrajectory) -> int:
     """Last stamp of which `error_likelihood` uses the data."""
-    return int(smoothed.nodes_ns[:NODES][-1])
+    return int(_first_minute(smoothed)[-1])
+
+
+def _first_minute(smoothed: SmoothedTrajectory) -> IntArray:
+    nodes = smoothed.nodes_ns[:NODES]
+    return nodes[nodes < nodes[0] + STEPS * STEP_NS]
 
 
 def eliminated(

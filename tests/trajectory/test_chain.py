@@ -99,9 +99,12 @@ STATES = 7
 KEYS = [(10 * i, 10 * i + 1, 10 * i + 2) for i in range(STATES)]
 
 
-@pytest.mark.parametrize("at_a_time", [1, 4, 1000])
-def test_a_graph_becomes_a_chain_in_parts(at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("caliv_graph.trajectory.chain.FACTORS_AT_A_TIME", at_a_time)
+@pytest.mark.parametrize(("factors", "rows"), [(1, 1000), (4, 1000), (1000, 1000), (1000, 5)])
+def test_a_graph_becomes_a_chain_in_parts(
+    factors: int, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("caliv_graph.trajectory.chain.FACTORS_AT_A_TIME", factors)
+    monkeypatch.setattr("caliv_graph.trajectory.chain.ROWS_AT_A_TIME", rows)
     graph = linear_graph(STATES)
     ordering = gtsam.Ordering()
     for key in [key for keys in KEYS for key in keys] + [COMMON]:

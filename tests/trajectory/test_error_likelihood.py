@@ -17,6 +17,7 @@ from caliv_graph.trajectory.error_likelihood import (
     ErrorLikelihood,
     eliminated,
     error_likelihood,
+    likelihood_end_ns,
     white_sigmas,
 )
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -84,6 +85,25 @@ def test_a_slow_error_of_the_fixes_shows_in_the_motion_data() -> None:
     sound, wavy = gain(base()), gain(smoothed(wave))
     assert sound < -3.0
     assert wavy > sound + 10.0
+
+
+def test_of_a_long_drive_the_first_steps_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes that lie apart cover more time: the size of the likelihood does not grow with it."""
+    trajectory = base()
+    whole = error_likelihood(trajectory, ["gnss"])
+    monkeypatch.setattr("caliv_graph.trajectory.error_likelihood.STEPS", 4)
+
+    short = error_likelihood(trajectory, ["gnss"])
+
+    assert len(whole.stamps_ns) > 4
+    np.testing.assert_array_equal(short.stamps_ns, whole.stamps_ns[:4])
+    end_s = 1e-9 * (likelihood_end_ns(trajectory) - trajectory.nodes_ns[0])
+    assert 1.5 <= end_s < 2.0
+    # Later data can only add to what is known of the first steps.
+    m = len(whole.stamps_ns)
+    first = (m * np.arange(3)[:, None] + np.arange(4)).ravel()
+    more = whole.information[np.ix_(first, first)] - short.information
+    assert np.linalg.eigvalsh(more).min() > -1e-6 * np.diag(whole.information).max()
 
 
 def test_white_sigmas_are_those_in_use() -> None:

@@ -139,7 +139,7 @@ def likelihood_end_ns(smoothed: SmoothedTrajectory) -> int:
 
 def _first_minute(smoothed: SmoothedTrajectory) -> IntArray:
     nodes = smoothed.nodes_ns[:NODES]
-    return nodes[nodes < nodes[0] + STEPS * STEP_NS]
+    return np.asarray(nodes[nodes < nodes[0] + STEPS * STEP_NS])
 
 
 def eliminated(

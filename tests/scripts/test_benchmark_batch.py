@@ -54,10 +54,25 @@ def test_a_result_that_is_there_by_half_is_told(tmp_path: Path) -> None:
 
 
 def test_the_best_of_each_counts() -> None:
-    runs = [Run(1, 20.0, 30.0, 0.0), Run(2, 12.0, 33.0, 1.0), Run(1, 24.0, 31.0, 2.0)]
+    runs = [
+        Run(1, 20.0, 30.0, 0.0, 18.0),
+        Run(2, 12.0, 33.0, 1.0, 20.0),
+        Run(1, 24.0, 31.0, 2.0, 22.0),
+    ]
 
     assert benchmark_batch.ratio_of(runs, "wall_s", 2) == pytest.approx(20.0 / 12.0)
     assert benchmark_batch.ratio_of(runs, "cpu_s", 2) == pytest.approx(30.0 / 33.0)
+
+
+def test_a_fleet_costs_what_the_workers_take() -> None:
+    """Two workers for 12 s are 24 s: 5 s for each of four drives, and 1 s that the batch adds."""
+    arguments = benchmark_batch.parse_arguments(["--fleet", "600", "--price", "0.5"])
+    runs = [Run(1, 22.0, 22.0, 0.0, 18.0), Run(2, 12.0, 21.0, 0.0, 20.0)]
+
+    plan = benchmark_batch.plan_of(runs, 4, arguments)
+
+    assert (plan.drive_s, plan.added_s) == pytest.approx((5.0, 1.0))
+    assert (plan.worker_hours, plan.usd) == pytest.approx((1.0, 0.5))
 
 
 @pytest.mark.parametrize("arguments", [["--drives", "0"], ["--kills", "-1"], ["--workers", "1"]])

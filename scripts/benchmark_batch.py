@@ -56,7 +56,7 @@ BAG = argparse.Namespace(minutes=1.0, lidars=2, points=12_000, zstd=False, searc
 PRICE_USD = 0.0425
 """Of one processor for an hour: c5 of AWS on demand in Virginia, 0.34 USD for eight."""
 
-LEAST_RATIO = 1.8
+LEAST_RATIO = 1.85
 """Smallest speed-up of two workers."""
 
 _TIMES_IN_REPORT = re.compile(rb"<h3>Time</h3>.*?</table>", re.DOTALL)

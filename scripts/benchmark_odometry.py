@@ -1,6 +1,6 @@
 """Calibrations of simulated drives of which nothing but the LiDARs was recorded.
 
-    .venv/bin/python scripts/benchmark_odometry.py --seeds 2 --out out/odometry
+    .venv/bin/python scripts/benchmark_odometry.py --seeds 1 2 --out out/odometry
 
 Walls and ground of `yard`. Without motion data S2S is determined, S2V's x and y are not, its roll
 and pitch are as good as the vehicle stands parallel to the ground, its yaw as good as it moves

@@ -34,10 +34,10 @@ def calibrate(
     force: Force = False,
     as_json: ResultAsJson = False,
 ) -> None:
-    """Calibrate the LiDARs of a vehicle from one or more drives past a target.
+    """Calibrate the LiDARs of a vehicle from drives past a target or walls.
 
     DIR contains calibration.yaml (extrinsics, covariance, undetermined directions), config.yaml
-    (the effective config), target.ply (the reconstructed target), graph.gtsam and
+    (the effective config), target.ply (the reconstructed target, if there is one), graph.gtsam and
     graph.values.gtsam (the extrinsics as priors for a GTSAM localiser), report.html (quality of the
     result, self-contained) and log.jsonl (all stages, for programs).
 

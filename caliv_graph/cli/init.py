@@ -13,7 +13,10 @@ from caliv_graph.cli.options import Force
 
 def init(
     data: Annotated[
-        Path, typer.Argument(metavar="DATA", help="The drive: a bag, or a CaLiV folder.")
+        Path,
+        typer.Argument(
+            metavar="DATA", help="The drive: a bag, a CaLiV folder, or a folder of clouds."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="CONFIG", help="The config to write.")],
     urdf: Annotated[
@@ -30,8 +33,8 @@ def init(
     come from /tf_static or a URDF, by the frames of the messages or by similar names; the height of
     the vehicle frame from base_footprint. For a CaLiV folder, initial guesses and the region of the
     target come from a config of the CaLiV or GMMCalib authors' program (transform_sensor_N,
-    min_bound, max_bound) in the same folder or in its folder config. Values to fill in are marked
-    TODO.
+    min_bound, max_bound) in the same folder or in its folder config. For a folder of clouds, a file
+    of poses in it is named. Values to fill in are marked TODO.
 
     Example: caliv-graph init drive/ --urdf vehicle.urdf --out config.yaml
     """

@@ -45,11 +45,11 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    help="Calibrates LiDARs to each other and to the vehicle from one drive past a target, with "
-    "covariance, and names the directions that the drive does not determine.",
+    help="Calibrates LiDARs to each other and to the vehicle from drives past a target or walls, "
+    "with covariance, and names the directions that a drive does not determine.",
     epilog="Exit codes: 0 done; 2 bad usage or input; 3 finished, but something required was not "
-    "determined; 4 finished, but the data contradict each other; 130 interrupted; 1 a defect of "
-    "the program.",
+    "reached, or a LiDAR saw nothing; 4 finished, but the data contradict each other, the initial "
+    "guess or an earlier calibration; 130 interrupted; 1 a defect of the program.",
 )
 
 

@@ -84,7 +84,8 @@ def _say(drive: SimulatedDrive, name: str, seed: int) -> None:
             f"points, {target}"
         )
     streams.say(
-        f"Written to {drive.folder}. Next: caliv-graph calibrate {drive.folder}/config.yaml"
+        f"Written to {drive.folder}. Next: caliv-graph calibrate {drive.folder}/config.yaml "
+        "--out result"
     )
 
 

@@ -58,8 +58,8 @@ def validate(
     Without motion data the poses are those of the odometry of one LiDAR, as in 'calibrate': only
     the places of the LiDARs to each other are validated then, not those on the vehicle.
 
-    Exit code 3: there is no structure to validate on. Exit code 4: distances or thicknesses exceed
-    the expected values by more than 5 sigma.
+    Exit code 3: there is no structure to validate on. Exit code 4: distances between LiDARs, on
+    walls and poles or on held-out strips, exceed the expected values by more than 5 sigma.
 
     Example: caliv-graph validate result/calibration.yaml config.yaml --data drive/ --out checked/
     """

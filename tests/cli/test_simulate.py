@@ -62,7 +62,8 @@ def test_a_bag_is_written_with_a_config_that_is_ready_to_run(
     assert "with a target of up to" in lines[-3]
     assert lines[-2].startswith("rear: 23 clouds of ")
     assert lines[-2].endswith("no target")
-    assert lines[-1] == f"Written to {out}. Next: caliv-graph calibrate {out}/config.yaml"
+    next_command = f"caliv-graph calibrate {out}/config.yaml --out result"
+    assert lines[-1] == f"Written to {out}. Next: {next_command}"
     config = load_config(out / "config.yaml")
     assert config.data.path == out / "drive"
     assert set(read_truth(out / "truth.yaml")) == set(config.lidars)

@@ -28,8 +28,8 @@ FACTORS_AT_A_TIME = 100
 """Factors of a graph that are turned into a part of the chain at once."""
 
 ROWS_AT_A_TIME = 1000
-"""Rows of a Jacobian that are added to a chain at once: their products take a hundred times the
-memory of the rows, gigabytes on a long drive."""
+"""Rows of a Jacobian that are added to a chain at once: the products of all rows would take 0.15 GB
+on a drive of 16 minutes."""
 
 UNDETERMINED = (
     "the motion data do not determine the trajectory. Check units, axes and gaps with 'caliv-graph "

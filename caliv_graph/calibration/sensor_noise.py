@@ -149,7 +149,7 @@ def noise_of_motion(
 
 def _with_other_levels(
     noise: SensorNoise, evidence: Evidence, trajectories: Sequence[VehicleTrajectory]
-) -> list[SmoothedTrajectory]:
+) -> list[VehicleTrajectory]:
     """The drives with the white levels that they have beside correlated errors; empty: the same.
 
     Without these, the accelerometer's level takes up a part of an error of the fixes, and hides it.
@@ -161,11 +161,14 @@ def _with_other_levels(
         t.data.scales for t in trajectories if isinstance(t, SmoothedTrajectory)
     ):
         return []
-    out, changed = [], False
+    out: list[VehicleTrajectory] = []
+    changed = False
     for before, after in zip(trajectories, with_noise(noise, trajectories), strict=True):
         if isinstance(before, SmoothedTrajectory) and isinstance(after, SmoothedTrajectory):
             changed |= _differ(before.data.scales, after.data.scales)
             out.append(replace(after, correlated=()))
+        else:
+            out.append(after)  # its place among the drives counts
     return out if changed else []
 
 

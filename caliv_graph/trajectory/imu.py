@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, ImuSamples, IntArray
+from caliv_graph.readers.common_stamps import MERGE_NS
 from caliv_graph.trajectory.noise import ImuNoise
 
 GAP_S = 0.1
@@ -321,7 +322,8 @@ def _bridged(inertial: Inertial, nodes_ns: IntArray) -> Array:
     """(n - 1,) length in seconds of the gap in which an interval lies, 0: none."""
     out = np.zeros(len(nodes_ns) - 1)
     for a, b in inertial.gaps_ns.tolist():
-        inside = (nodes_ns[:-1] >= a) & (nodes_ns[1:] <= b)
+        # In place of a gap's end there may be a scan's node (`nodes.place_nodes`).
+        inside = (nodes_ns[:-1] >= a - MERGE_NS) & (nodes_ns[1:] <= b + MERGE_NS)
         out[inside] = (b - a) * 1e-9
     return out
 

@@ -228,13 +228,21 @@ def _with_heading(data: SmootherInput) -> SmootherInput:
 def _positions(
     motion: MotionData, config: Config, inertial: Inertial, needed: bool
 ) -> tuple[Positions | None, float, list[str]]:
-    """The fixes in the map, None if none lies within the IMU's span; normal gravity; warnings."""
+    """The fixes in the map that lie within the IMU's span, None: none; normal gravity; warnings."""
     assert motion.gnss is not None
     positions, lines = positions_in_map(motion.gnss, config, motion.name)
     gravity = normal_gravity(positions.origin_deg_m[0], positions.origin_deg_m[2])
     stamps = positions.stamps_ns
     begin, end = inertial.begin_ns, inertial.end_ns
-    if ((stamps >= begin) & (stamps <= end)).any():
+    within = (stamps >= begin) & (stamps <= end)
+    if within.any():
+        # The others have no residuals: among those that judge the noise they would be perfect.
+        positions = replace(
+            positions,
+            stamps_ns=stamps[within],
+            position_map=positions.position_map[within],
+            cov_map=positions.cov_map[within],
+        )
         return positions, gravity, list(lines)
     span = "the IMU's span" if motion.imu is not None else "the span of the velocities"
     if needed:

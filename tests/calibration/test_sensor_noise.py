@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from caliv_graph.calibration import sensor_noise
 from caliv_graph.calibration.evidence import Evidence, motion_evidence
 from caliv_graph.calibration.sensor_noise import (
     LEVELS,
     OPEN,
     SLOW,
+    SensorNoise,
     estimated,
     noise_of_motion,
 )
@@ -21,6 +24,7 @@ from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.test_variances import base, recorded, shifted, smoothed
 
 POSES = 16
@@ -214,3 +218,20 @@ def test_structure_tells_whether_there_is_an_error() -> None:
     assert not any((np.array(e.sigmas) > 2e-3).any() for e in none.correlated if e.kind == "gnss")
     found = next(e for e in some.correlated if e.kind == "gnss")
     assert 0.01 < found.sigmas[0] < 0.04
+
+
+def test_drives_keep_their_numbers_beside_given_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the structure of drive 1 says is not taken for that of drive 0."""
+    given: Any = object()
+    drive = base()
+    quieter = replace(drive, data=replace(drive.data, scales={"orientation": 0.5}))
+    drive = replace(drive, data=replace(drive.data, scales={"orientation": 1.0}))
+    monkeypatch.setattr(sensor_noise, "with_noise", lambda *_: (given, quieter))
+    noise = SensorNoise(0.0, np.zeros(3), (CorrelatedError("gnss", (0.1, 0.1, 0.1), 8.0),))
+    evidence = motion_evidence([given, drive])
+
+    again = sensor_noise._with_other_levels(noise, evidence, [given, drive])
+
+    assert again[0] is given
+    assert isinstance(again[1], SmoothedTrajectory)
+    assert again[1].data.scales == {"orientation": 0.5}

@@ -115,6 +115,23 @@ def test_white_sigmas_are_those_in_use() -> None:
     assert white_sigmas(doubled, "orientation") == pytest.approx(2.0 * one)
 
 
+def test_white_sigmas_are_about_the_axes_of_the_map() -> None:
+    """An IMU that lies on its side, x as in the map: its z is the map's -y, its y the map's z."""
+    data = base().data
+    imu = data.motion.imu
+    assert imu is not None
+    n = len(imu.stamps_ns)
+    half = np.sqrt(0.5)
+    on_its_side = replace(
+        imu,
+        orientation_xyzw=np.tile([half, 0.0, 0.0, half], (n, 1)),
+        orientation_cov=np.tile(np.diag([1e-6, 4e-6, 9e-6]), (n, 1, 1)),
+    )
+    turned = replace(data, motion=replace(data.motion, imu=on_its_side))
+
+    assert white_sigmas(turned, "orientation") == pytest.approx([1e-3, 3e-3, 2e-3])
+
+
 def test_kinds_that_a_drive_has_not_say_nothing() -> None:
     none = ErrorLikelihood((), np.arange(3), np.zeros((0, 0)), np.zeros(0))
 

@@ -161,11 +161,14 @@ def test_an_unusable_imu_is_an_error(broken: object, message: str) -> None:
         clean_inertial(broken(some_imu(np.arange(100) * 0.01)), "drive/")
 
 
-def test_in_a_gap_the_factor_is_looser() -> None:
+@pytest.mark.parametrize("moved_ns", [(0, 0), (-600, 900)], ids=["own", "scan"])
+def test_in_a_gap_the_factor_is_looser(moved_ns: tuple[int, int]) -> None:
+    """Also where nodes of scans within a microsecond stand for the ends of the gap."""
     t = np.arange(300) * 0.01
     imu = some_imu(t[(t < 1.0) | (t > 1.5)])
     inertial, _ = clean_inertial(imu, "drive/")
-    nodes = np.array([inertial.begin_ns, *inertial.gaps_ns[0], inertial.end_ns])
+    ends = inertial.gaps_ns[0] + np.array(moved_ns)
+    nodes = np.array([inertial.begin_ns, *ends, inertial.end_ns])
     bias = [gtsam.imuBias.ConstantBias()] * 4
     noise = imu_noise(imu, config_for(EXACT))
 

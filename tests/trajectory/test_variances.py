@@ -136,6 +136,44 @@ def test_a_drive_that_is_smoothed_again_keeps_its_noise_levels(
         assert one.equals(other, 2e-5)  # a hundredth of its sigma
 
 
+def test_fixes_outside_the_imu_do_not_judge_the_noise() -> None:
+    """Sigmas stated ten times too small, and an IMU that ends halfway: as without these fixes."""
+    motion = recorded(gnss_horizontal=10.0, gnss_vertical=10.0)
+    imu, gnss = motion.imu, motion.gnss
+    assert imu is not None
+    assert imu.orientation_xyzw is not None
+    assert gnss is not None
+    middle_ns = (imu.stamps_ns[0] + imu.stamps_ns[-1]) // 2
+    early = imu.stamps_ns <= middle_ns
+    short = replace(
+        imu,
+        stamps_ns=imu.stamps_ns[early],
+        angular_velocity=imu.angular_velocity[early],
+        specific_force=imu.specific_force[early],
+        orientation_xyzw=imu.orientation_xyzw[early],
+    )
+    beside = gnss.stamps_ns <= short.stamps_ns[-1]
+    assert beside.mean() < 0.6
+    assert gnss.cov_enu is not None
+    cropped = replace(
+        gnss,
+        stamps_ns=gnss.stamps_ns[beside],
+        latitude_deg=gnss.latitude_deg[beside],
+        longitude_deg=gnss.longitude_deg[beside],
+        altitude_m=gnss.altitude_m[beside],
+        cov_enu=gnss.cov_enu[beside],
+    )
+
+    whole = smoothed(replace(motion, imu=short))
+    without = smoothed(replace(motion, imu=short, gnss=cropped))
+
+    np.testing.assert_array_equal(whole.states.p_map_imu, without.states.p_map_imu)
+    assert whole.warnings == without.warnings
+    assert whole.data.positions is not None
+    sigma = np.sqrt(np.median(whole.data.positions.cov_map[:, 0, 0]))
+    assert 0.01 < sigma < 0.03  # 0.0167 m, stated as 0.0017
+
+
 def test_sigmas_of_the_config_are_kept() -> None:
     trajectory = smoothed(recorded(), gnss_horizontal_m=0.05, gnss_vertical_m=0.05)
 

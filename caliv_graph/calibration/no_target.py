@@ -128,7 +128,7 @@ def solve_structure_and_ground(
             noise.heave_m,
             first_pose_noise(config.noise),
             config,
-            aligned=told.T_vehicle_lidar is not None,
+            aligned=told.aligned,
         )
     others = lidars_with_structure(terms)
     if not others:

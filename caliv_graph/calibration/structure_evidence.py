@@ -24,7 +24,7 @@ from caliv_graph.products import (
 from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.slow_errors import scans_for_errors
+from caliv_graph.structure.slow_errors import place_all, scans_for_errors
 from caliv_graph.trajectory.effects import poses_and_gain
 from caliv_graph.trajectory.error_likelihood import likelihood_end_ns
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -81,10 +81,12 @@ class ToldErrors:
         of_drives: drive -> information and gradient, as those of `ErrorLikelihood`.
         T_vehicle_lidar: of every LiDAR, where the strips of these drives lie on each other; None:
             no drive has any.
+        aligned: whether they do so for the LiDARs of all drives; else this is only a start.
     """
 
     of_drives: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
     T_vehicle_lidar: Mapping[str, gtsam.Pose3] | None = None
+    aligned: bool = False
 
 
 def no_terms(*_: object) -> tuple[StructureTerm, ...]:
@@ -147,7 +149,10 @@ class StructureEvidence:
         )
         pairs = zip(drives, told, strict=True)
         by_drive = {patches.drive: of for patches, of in pairs if of is not None}
-        return ToldErrors(by_drive, T_vehicle_lidar) if by_drive else NOTHING_TOLD
+        if not by_drive:
+            return NOTHING_TOLD
+        solved = [patches for patches in drives if patches.drive in by_drive]
+        return ToldErrors(by_drive, T_vehicle_lidar, place_all(solved, self.patches))
 
     def terms(
         self,
@@ -210,7 +215,6 @@ class StructureEvidence:
         for drive, stamp in problem.poses:
             kept.setdefault(drive, []).append(stamp)
         start = told.T_vehicle_lidar or rough_extrinsics(state)
-        aligned = told.T_vehicle_lidar is not None
         return self.terms(
             trajectories,
             kept,
@@ -219,7 +223,7 @@ class StructureEvidence:
             heave_m,
             state.noise,
             state.config,
-            aligned=aligned,
+            aligned=told.aligned,
         )
 
 

@@ -6,6 +6,7 @@ do not lie on each other. Motion data alone take most of it for motion.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import gtsam
@@ -21,6 +22,9 @@ from caliv_graph.structure.solve import Solved, solve_roughly
 from caliv_graph.structure.term import aligned_start, problem_of, usable
 from caliv_graph.structure.thinning import patches_of_scans, some_scans
 from caliv_graph.trajectory.select import VehicleTrajectory
+
+ALIGNED_SCANS = 25
+"""Scans of a LiDAR whose strips place it for all others too: fewer may be of one place."""
 
 
 def scans_for_errors(patches: DrivePatches, until_ns: int) -> DrivePatches:
@@ -73,6 +77,22 @@ def slow_errors(
         if found is not None:
             aligned = {**aligned, **seeing_lidars(found)}
     return tuple(out), aligned
+
+
+def place_all(used: Sequence[DrivePatches], patches: Sequence[DrivePatches]) -> bool:
+    """Whether strips that lie on each other in some scans place every LiDAR of all drives.
+
+    Not one that starts late, is of another drive, or has hardly a scan among those used.
+    """
+    those, every = _scans_of_lidars(used), _scans_of_lidars(patches)
+    return all(those[name] >= min(count, ALIGNED_SCANS) for name, count in every.items())
+
+
+def _scans_of_lidars(patches: Sequence[DrivePatches]) -> Counter[str]:
+    """LiDAR -> number of its scans that have patches."""
+    return Counter(
+        of.lidars[lidar] for of in patches for lidar in of.scan_lidar[np.unique(of.scan)].tolist()
+    )
 
 
 def seeing_lidars(found: Solved) -> dict[str, gtsam.Pose3]:

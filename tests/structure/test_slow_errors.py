@@ -13,6 +13,7 @@ from caliv_graph.products import Array
 from caliv_graph.structure.problem import Problem, part_of
 from caliv_graph.structure.slow_errors import (
     of_moved_prior,
+    place_all,
     scans_for_errors,
     seeing_lidars,
     told_of_errors,
@@ -110,3 +111,13 @@ def test_few_scans_of_the_first_part_are_used() -> None:
     )
     own = zip(used.stamps_ns[used.scan].tolist(), used.scatter_m.tolist(), strict=True)
     assert set(own) <= every
+
+
+def test_a_few_scans_of_one_drive_place_no_lidar_of_all() -> None:
+    patches = past_walls().patches
+    late = replace(patches, drive=1, lidars=("late", patches.lidars[1]))
+
+    assert place_all([scans_for_errors(patches, 120 * STEP_NS)], [patches])
+    assert not place_all([scans_for_errors(patches, 20 * STEP_NS)], [patches])
+    assert not place_all([patches], [patches, late])
+    assert place_all([patches, late], [patches, late])

@@ -33,6 +33,7 @@ from caliv_graph.calibration.refine import (
 )
 from caliv_graph.calibration.rough import rough_solve, symmetries_of_targets
 from caliv_graph.calibration.sensor_noise import (
+    SensorNoise,
     estimated_noise,
     noise_of_motion,
     with_noise,
@@ -104,7 +105,9 @@ def estimate_with_noise(
                 guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
                 told = structure.slow_errors(trajectories, guesses, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
-                trajectories = with_noise(noise, trajectories)
+                before, trajectories = trajectories, with_noise(noise, trajectories)
+                start = told.T_vehicle_lidar or guesses
+                grounds = _with_noise(grounds, before, trajectories, start, noise, config)
             solved = solve_structure_and_ground(
                 trajectories, config, progress, tuple(grounds), structure, noise, told
             )
@@ -138,9 +141,7 @@ def _estimate(
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         before, trajectories = trajectories, with_noise(noise, trajectories)
-        usual = ground_floors(config.noise)
-        grounds = with_floors(grounds, trajectories, start, usual, noise.floors)
-        grounds = tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
+        grounds = _with_noise(grounds, before, trajectories, start, noise, config)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     times = {"registration": rough.registration_s}
 
@@ -205,6 +206,20 @@ def _estimate(
     warnings = (*rough.warnings, *alike, *said, *_unconverged(solution.registrations))
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
     return solution, tuple(trajectories)
+
+
+def _with_noise(
+    grounds: Sequence[GroundObservation],
+    before: Sequence[VehicleTrajectory],
+    trajectories: Sequence[VehicleTrajectory],
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+    noise: SensorNoise,
+    config: Config,
+) -> tuple[GroundObservation, ...]:
+    """The ground with estimated noise: sigmas of its waves, and the rates of other trajectories."""
+    usual = ground_floors(config.noise)
+    grounds = with_floors(grounds, trajectories, T_vehicle_lidar, usual, noise.floors)
+    return tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
 
 
 def _held_grounds(

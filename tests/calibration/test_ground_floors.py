@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration import estimate
 from caliv_graph.calibration.ground_floors import disc_overlap, sharing_scans, with_floors
+from caliv_graph.calibration.sensor_noise import SensorNoise
+from caliv_graph.calibration.structure_evidence import StructureEvidence
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.targets.ground.planes import RADII_M
 from caliv_graph.trajectory.select import VehicleTrajectory
+from tests.calibration.test_structure import config_of
 
 DIAMETER_M = 2.0 * RADII_M[-1]
 
@@ -61,9 +67,9 @@ class Driving:
         return np.tile(np.eye(3), (count, 1, 1)), np.outer(3e-9 * np.array(stamps_ns), [1, 0, 0])
 
 
-def test_other_floors_in_observations() -> None:
-    """The floor of single scans changes, and what they share is beside it."""
-    observations = [
+def seen_from(*places: tuple[str, int]) -> list[GroundObservation]:
+    """Level ground, by the LiDAR and the time."""
+    return [
         GroundObservation(
             lidar=lidar,
             drive=0,
@@ -75,8 +81,13 @@ def test_other_floors_in_observations() -> None:
             centre_lidar=np.array([2.0, 0.0, -1.5]),
             points=500,
         )
-        for lidar, stamp_ns in (("front", 0), ("front", 0), ("rear", 0), ("front", 10**11))
+        for lidar, stamp_ns in places
     ]
+
+
+def test_other_floors_in_observations() -> None:
+    """The floor of single scans changes, and what they share is beside it."""
+    observations = seen_from(("front", 0), ("front", 0), ("rear", 0), ("front", 10**11))
     before, after = np.array([1e-3, 1e-3, 2e-3]), np.array([2e-3, 2e-3, 1e-3])
     places = {name: gtsam.Pose3() for name in ("front", "rear")}
 
@@ -89,3 +100,31 @@ def test_other_floors_in_observations() -> None:
     # Twice from one place; once by another LiDAR; once 300 m away.
     for o, shares in zip(changed, (1.0, 1.0, 0.0, 0.0), strict=True):
         assert o.repeated == pytest.approx(shares * after**2)
+
+
+def test_scans_of_one_place_share_waves_without_a_target_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two LiDARs' planes and no target: n scans of one place are no n independent ones."""
+    taken: list[GroundObservation] = []
+
+    def solve(*arguments: Any) -> None:
+        taken.extend(arguments[3])
+        raise SolveError("far enough")
+
+    floors = np.array([1e-3, 1e-3, 3e-3])
+    driving = cast("VehicleTrajectory", Driving())
+    monkeypatch.setattr(estimate, "noise_of_motion", lambda *_: SensorNoise(0.01, floors))
+    monkeypatch.setattr(estimate, "with_noise", lambda *_: (driving,))
+    monkeypatch.setattr(estimate, "solve_structure_and_ground", solve)
+    patches: Any = (object(),)
+    structure = StructureEvidence(patches)
+    grounds = seen_from(("front", 0), ("front", 0), ("rear", 0))
+
+    with pytest.raises(SolveError, match="far enough"):
+        estimate.estimate_with_noise(
+            [], [driving], config_of("front", "rear"), SilentProgress(), grounds, structure
+        )
+
+    for o, shares in zip(taken, (1.0, 1.0, 0.0), strict=True):
+        assert o.repeated == pytest.approx(shares * floors**2)

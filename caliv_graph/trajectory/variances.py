@@ -44,7 +44,8 @@ from caliv_graph.trajectory.smoothed import States, first_nodes
 COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {
     "gnss_horizontal": ("gnss", (0, 1)),
     "gnss_vertical": ("gnss", (2,)),
-    # GTSAM whitens from above: the rotation by itself, then position and velocity given it.
+    # GTSAM's root is upper triangular: the rotation given position and velocity, whose rows have a
+    # part of the rotation's error. The two levels mix where a stated one is wrong (section 9).
     "gyroscope": ("imu", (0, 1, 2)),
     "accelerometer": ("imu", (3, 4, 5, 6, 7, 8)),
     "orientation": ("orientation", (0, 1, 2)),

@@ -290,10 +290,9 @@ def time_batch(manifest: Path, out: Path, workers: int) -> Run:
 def plan_of(runs: Sequence[Run], drives: int, arguments: argparse.Namespace) -> Plan:
     """A fleet of such drives, from the quickest run with several workers."""
     best = min((run for run in runs if run.workers > 1), key=lambda run: run.wall_s)
-    drive_s = best.calibrating_s / drives
-    hours = arguments.fleet * best.workers * best.wall_s / drives / 3600.0
-    added_s = best.workers * best.wall_s / drives - drive_s
-    return Plan(arguments.fleet, drive_s, added_s, hours, hours * arguments.price)
+    worker_s, drive_s = best.workers * best.wall_s / drives, best.calibrating_s / drives
+    hours = arguments.fleet * worker_s / 3600.0
+    return Plan(arguments.fleet, drive_s, worker_s - drive_s, hours, hours * arguments.price)
 
 
 def ratio_of(runs: Sequence[Run], what: str, workers: int) -> float:

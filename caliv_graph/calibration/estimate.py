@@ -105,13 +105,12 @@ def estimate_with_noise(
                 guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
                 told = structure.slow_errors(trajectories, guesses, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
-                before, trajectories = trajectories, with_noise(noise, trajectories)
                 start = told.T_vehicle_lidar or guesses
-                grounds = _with_noise(grounds, before, trajectories, start, noise, config)
+                trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
             solved = solve_structure_and_ground(
-                trajectories, config, progress, tuple(grounds), structure, noise, told
+                trajectories, config, progress, grounds, structure, noise, told
             )
-            return solution_without_target(solved), tuple(trajectories)
+            return solution_without_target(solved), trajectories
     problem = pose_problem(used, trajectories, config)
     if config.solve.mode == "staged":
         grounds, structure = (), NO_STRUCTURE
@@ -140,8 +139,7 @@ def _estimate(
         start = rough_extrinsics(rough.state)
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
-        before, trajectories = trajectories, with_noise(noise, trajectories)
-        grounds = _with_noise(grounds, before, trajectories, start, noise, config)
+        trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
         problem = pose_problem(observations, trajectories, config, noise.heave_m)
     times = {"registration": rough.registration_s}
 
@@ -209,17 +207,18 @@ def _estimate(
 
 
 def _with_noise(
-    grounds: Sequence[GroundObservation],
-    before: Sequence[VehicleTrajectory],
-    trajectories: Sequence[VehicleTrajectory],
-    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     noise: SensorNoise,
+    trajectories: Sequence[VehicleTrajectory],
+    grounds: Sequence[GroundObservation],
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     config: Config,
-) -> tuple[GroundObservation, ...]:
-    """The ground with estimated noise: sigmas of its waves, and the rates of other trajectories."""
+) -> tuple[tuple[VehicleTrajectory, ...], tuple[GroundObservation, ...]]:
+    """Trajectories with estimated noise, and the ground: its waves, and the rates of the former."""
+    after = tuple(with_noise(noise, trajectories))
     usual = ground_floors(config.noise)
-    grounds = with_floors(grounds, trajectories, T_vehicle_lidar, usual, noise.floors)
-    return tuple(with_rates_of(o, before[o.drive], trajectories[o.drive]) for o in grounds)
+    changed = with_floors(grounds, after, T_vehicle_lidar, usual, noise.floors)
+    ground = (with_rates_of(o, trajectories[o.drive], after[o.drive]) for o in changed)
+    return after, tuple(ground)
 
 
 def _held_grounds(

@@ -176,7 +176,7 @@ class StructureEvidence:
             heave_m: 1 sigma of the heave.
             noise: of given poses.
             config: guesses and noise.
-            aligned: `start` is from `slow_errors`.
+            aligned: the strips lie on each other at `start` already.
 
         Raises:
             SolveError: it could not be solved.

@@ -22,7 +22,7 @@ from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, linearised
 from caliv_graph.trajectory.effects import STEP_NS, ErrorsByStep, error_steps
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
+from caliv_graph.trajectory.measurements import rotated, rotations_of, usable_orientations
 from caliv_graph.trajectory.noise import orientation_covariances
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, first_nodes
 from caliv_graph.trajectory.suspects import suspect_parameters
@@ -217,6 +217,6 @@ def white_sigmas(data: SmootherInput, kind: str) -> Array:
         usable = usable_orientations(imu)
         R = rotations_of(imu.orientation_xyzw[usable])
         of_imu = orientation_covariances(imu, data.config)[0][usable]
-        cov = R @ of_imu @ np.swapaxes(R, 1, 2)
+        cov = rotated(R, of_imu)
         scale = data.scales.get("orientation", 1.0)
     return np.asarray(scale * np.sqrt(np.median(np.diagonal(cov, axis1=1, axis2=2), axis=0)))

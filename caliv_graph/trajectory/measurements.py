@@ -81,7 +81,7 @@ def nearest_node(nodes_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     return np.asarray(np.searchsorted(middles, stamps_ns, "right"), dtype=np.int64)
 
 
-def _rotated(R: Array, cov: Array) -> Array:
+def rotated(R: Array, cov: Array) -> Array:
     """`R cov R^T` of (m, 3, 3) each."""
     return np.asarray(R @ cov @ np.swapaxes(R, 1, 2))
 
@@ -141,7 +141,7 @@ def _oriented(
     dR, _, _ = dead.between(stamps, at_node)
     R_node = R @ dR
     late_s = np.abs(stamps - at_node) * 1e-9
-    cov_node = _rotated(np.swapaxes(dR, 1, 2), cov[samples])
+    cov_node = rotated(np.swapaxes(dR, 1, 2), cov[samples])
     cov_node = cov_node + late_s[:, None, None] * noise.gyro_density
     # Averaged in the tangent space at the sample nearest to the node.
     order = np.lexsort((late_s, node))
@@ -209,7 +209,7 @@ def velocities_at_nodes(
     dR, dv, _ = dead.between(at_node, stamps)
     delay_s = (stamps - at_node) * 1e-9
     carried = np.einsum("nij,nj->ni", dR, at_imu) - scale * dv
-    cov_node = _rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
+    cov_node = rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
     weight = 1.0 / np.trace(cov_node, axis1=1, axis2=2)
     total = np.bincount(node, weight, len(nodes_ns))[nodes]

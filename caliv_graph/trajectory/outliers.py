@@ -137,7 +137,7 @@ def _outliers(squares: Array, config: Config, limit: float | None) -> tuple[IntA
 
 
 def _squared_residuals(data: SmootherInput, nodes: IntArray, states: States) -> Array:
-    """(k,) squared whitened residual of each fix at an estimate."""
+    """(k,) squared whitened residual of each fix at an estimate; 0 outside the nodes' span."""
     assert data.positions is not None
     dead = without_bias(data.inertial, nodes, states)
     carried = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)

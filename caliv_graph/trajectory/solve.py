@@ -18,6 +18,7 @@ from caliv_graph.trajectory.chain_solution import solved_columns
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.measurements import rotated
 from caliv_graph.trajectory.smoothed import States
 
 MAX_PASSES = 4
@@ -251,7 +252,7 @@ def covariances_of(
     except TrajectoryError:
         raise TrajectoryError(f"{wanting}the trajectory: record {advice}") from None
     R = states.R_map_imu
-    cov_map = R @ cov[:, :3, :3] @ np.swapaxes(R, 1, 2)
+    cov_map = rotated(R, cov[:, :3, :3])
     sigma = np.median(np.sqrt(np.diagonal(cov_map, axis1=1, axis2=2)), axis=0)
     if sigma[2] > MAX_YAW_SIGMA_RAD:
         raise TrajectoryError(

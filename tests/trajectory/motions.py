@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.products import (
     Array,
+    BoolArray,
     GnssFixes,
     ImuSamples,
     IntArray,
@@ -28,6 +30,8 @@ from caliv_graph.trajectory.gnss import normal_gravity
 ORIGIN = (48.2627, 11.6673, 480.0)
 GRAVITY = normal_gravity(ORIGIN[0], ORIGIN[2])
 START_NS = 1_700_000_000_000_000_000
+
+Samples = TypeVar("Samples", ImuSamples, GnssFixes)
 """Stamps of a bag are absolute: too large for a float."""
 
 
@@ -227,3 +231,10 @@ def mounted_askew() -> Sensors:
     rotation = gtsam.Rot3.RzRyRx(math.radians(5.0), math.radians(-4.0), math.radians(88.0))
     T = gtsam.Pose3(rotation, np.array([1.2, -0.4, 0.6]))
     return replace(Sensors(), T_vehicle_imu=T, lever_arm=(0.3, 0.5, 1.8))
+
+
+def rows_of(samples: Samples, keep: BoolArray) -> Samples:
+    """Some of the messages; covariances that all have in common stay."""
+    arrays = {f.name: getattr(samples, f.name) for f in fields(samples)}
+    own = {n: a for n, a in arrays.items() if a is not None and len(a) == len(keep)}
+    return replace(samples, **{n: a[keep] for n, a in own.items()})

@@ -30,6 +30,7 @@ from tests.trajectory.motions import (
     errors,
     mounted_askew,
     record,
+    rows_of,
     seconds,
     stamps,
 )
@@ -409,13 +410,7 @@ def test_an_outage_of_the_gnss_widens_the_covariance_there() -> None:
     assert gnss is not None
     t = seconds(gnss.stamps_ns)
     keep = (t < 12.0) | (t > 20.0)
-    cut = GnssFixes(
-        gnss.stamps_ns[keep],
-        gnss.latitude_deg[keep],
-        gnss.longitude_deg[keep],
-        gnss.altitude_m[keep],
-    )
-    motion = replace(motion, gnss=cut)
+    motion = replace(motion, gnss=rows_of(gnss, keep))
     smoothed = smooth_trajectory(
         motion, config_for(AWKWARD), stamps(ROUGH.duration_s, 10.0, 0.0512)
     )
@@ -432,16 +427,8 @@ def test_a_gap_in_the_imu_is_bridged_and_the_covariance_says_so() -> None:
     motion = record(ROUGH, AWKWARD, 7)
     imu = motion.imu
     assert imu is not None
-    assert imu.orientation_xyzw is not None
     t = seconds(imu.stamps_ns)
-    keep = (t < 10.0) | (t > 10.6)
-    cut = ImuSamples(
-        imu.stamps_ns[keep],
-        imu.angular_velocity[keep],
-        imu.specific_force[keep],
-        imu.orientation_xyzw[keep],
-    )
-    motion = replace(motion, imu=cut)
+    motion = replace(motion, imu=rows_of(imu, (t < 10.0) | (t > 10.6)))
     smoothed = smooth_trajectory(
         motion, config_for(AWKWARD), stamps(ROUGH.duration_s, 10.0, 0.0512)
     )

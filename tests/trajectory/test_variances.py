@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from typing import TypeVar
 
 import numpy as np
 import pytest
 
 from caliv_graph.conventions import key_bias, key_imu, key_velocity
-from caliv_graph.products import Array, BoolArray, GnssFixes, ImuSamples, IntArray, MotionData
+from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.build import build_graph
 from caliv_graph.trajectory.chain import STATE
 from caliv_graph.trajectory.chain_solution import inverse_columns, solved
@@ -25,13 +24,11 @@ from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.variances import NoiseLikelihood, free_components
-from tests.trajectory.motions import Course, Sensors, arc_drive, config_for, record, stamps
+from tests.trajectory.motions import Course, Sensors, arc_drive, config_for, record, rows_of, stamps
 from tests.trajectory.test_chain import random_chain
 
 COURSE = Course(arc_drive(8.0))
 WANTED = stamps(7.0, 2.0)[2:]
-
-Samples = TypeVar("Samples", ImuSamples, GnssFixes)
 
 
 @pytest.mark.parametrize("common", [0, 2])
@@ -137,13 +134,6 @@ def test_a_drive_that_is_smoothed_again_keeps_its_noise_levels(
         again.trajectory.T_map_vehicle, first.trajectory.T_map_vehicle, strict=True
     ):
         assert one.equals(other, 2e-5)  # a hundredth of its sigma
-
-
-def rows_of(samples: Samples, keep: BoolArray) -> Samples:
-    """Some of the messages; covariances that all have in common stay."""
-    arrays = {f.name: getattr(samples, f.name) for f in fields(samples)}
-    own = {n: a for n, a in arrays.items() if a is not None and len(a) == len(keep)}
-    return replace(samples, **{n: a[keep] for n, a in own.items()})
 
 
 def test_fixes_outside_the_imu_do_not_judge_the_noise() -> None:

@@ -406,6 +406,43 @@ class Stance:
 
 
 @dataclass(frozen=True)
+class StandingErrors:
+    """How a `StructureTerm` depends on errors of what the config says of the vehicle's stand.
+
+    They are eliminated in the term, by their priors. Other evidence of the same errors must not do
+    so once more: it takes them as variables, with what is here.
+
+    Attributes:
+        height: whether the first is that of the height above the ground (m).
+        tilt: whether the last two are those of the ground's normal in the vehicle frame (x and y).
+        value: (s,) at the linearisation of the term.
+        coupling: (n, s) information between the term's coordinates and them.
+        information: (s, s) of them, without their priors.
+        gradient: (s,) without their priors.
+        prior: (s,) 1 / sigma^2 of each.
+    """
+
+    height: bool
+    tilt: bool
+    value: Array
+    coupling: Array
+    information: Array
+    gradient: Array
+    prior: Array
+
+    def kept_in(self, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """The quadratic of a term, (n, n) and (n,), with them as its last s coordinates."""
+        total = self.information + np.diag(self.prior)
+        pull = self.gradient - self.prior * self.value
+        by_them = np.linalg.solve(total, np.column_stack([self.coupling.T, pull]))
+        taken = self.coupling @ by_them
+        both = np.block(
+            [[information + taken[:, :-1], self.coupling], [self.coupling.T, self.information]]
+        )
+        return both, np.concatenate([gradient + taken[:, -1], self.gradient])
+
+
+@dataclass(frozen=True)
 class StructureTerm:
     """What the structure of one drive says; its planes and all other poses are eliminated.
 
@@ -431,6 +468,8 @@ class StructureTerm:
         odometry_of: the LiDAR by whose odometry the poses are known, and of whose mounting ground
             and direction of travel alone tell the rotation; empty: there are motion data.
         stance: how the vehicle stands on the ground; None: no ground below it was seen.
+        standing: errors of what is stated of that, which are eliminated in it; None: there are
+            none, or no ground below the vehicle was seen.
     """
 
     drive: int
@@ -447,6 +486,7 @@ class StructureTerm:
     warnings: tuple[str, ...] = ()
     odometry_of: str = ""
     stance: Stance | None = None
+    standing: StandingErrors | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.calibration.structure_evidence import KEPT_POSES
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import (
     GroundConfig,
@@ -25,7 +26,8 @@ from caliv_graph.fusion.compare import compare
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import calibrate, look, with_prior
-from caliv_graph.products import Calibration
+from caliv_graph.products import Calibration, MotionData, Recording
+from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.report.folder import write_result
 from caliv_graph.report.tables import calibration_table
 from caliv_graph.results.calibration_file import read_calibration
@@ -213,6 +215,42 @@ def test_a_lidar_that_only_sees_structure_is_calibrated_by_it(
     T = run.calibration.lidars["rear"].T_vehicle_lidar.between(right.T_vehicle_lidar)
     off = vehicle_axes_difference(T, truth["rear"].between(truth["right"]))
     assert (np.abs(off) < 6.0 * np.array([3e-4] * 3 + [3e-3] * 3)).all()
+
+
+def test_a_drive_without_a_target_counts_beside_one_that_has_one(walls: Structure) -> None:
+    """Its structure and its ground, at poses that are kept for them."""
+
+    class Elsewhere(ForwardingRecording):
+        """The same drive at another place of the map, far from the target's region."""
+
+        @property
+        def name(self) -> str:
+            return "elsewhere"
+
+        def motion(self) -> MotionData:
+            motion = super().motion()
+            assert motion.poses is not None
+            away = gtsam.Pose3(gtsam.Rot3(), np.array([300.0, 0.0, 0.0]))
+            moved = tuple(map(away.compose, motion.poses.T_map_vehicle))
+            return replace(motion, poses=replace(motion.poses, T_map_vehicle=moved))
+
+    drives: list[Recording] = [arc().recording, Elsewhere(arc().recording)]
+
+    run = calibrate(drives, arc().config, NO_PROGRESS)
+
+    assert run.solution.factor_kinds.count("structure") == 2
+    kept = [stamp for drive, stamp in run.solution.T_map_vehicle if drive == 1]
+    assert 10 < len(kept) <= KEPT_POSES
+    assert run.record is not None
+    assert {g.stamp_ns for g in run.record.grounds if g.drive == 1} <= set(kept)
+    assert any(g.drive == 1 for g in run.record.grounds)
+    both = run.calibration
+    alone = run_on(arc()).calibration
+    # What `Structure` says of each LiDAR is said twice.
+    for name in ("front", "rear", "right"):
+        sigmas = [np.sqrt(np.diag(c.lidars[name].cov)) for c in (both, alone)]
+        assert (sigmas[0] < 0.95 * sigmas[1]).any(), name
+    assert survey(drives, arc().config, NO_PROGRESS).unmet == ()
 
 
 def test_other_commands_do_without_a_target(walls: Structure) -> None:

@@ -44,6 +44,7 @@ from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
+    kept_stamps,
     other_grounds,
     rough_extrinsics,
     solved_with_structure,
@@ -111,9 +112,9 @@ def estimate_with_noise(
                 trajectories, config, progress, grounds, structure, noise, told
             )
             return solution_without_target(solved), trajectories
-    problem = pose_problem(used, trajectories, config)
     if config.solve.mode == "staged":
         grounds, structure = (), NO_STRUCTURE
+    problem = pose_problem(used, trajectories, config, kept_ns=kept_stamps(structure.patches, used))
     # The matrices are small: threads of a linear algebra library would mostly wait for each other,
     # for seconds where the machine has other work.
     with threadpool_limits(limits=1):
@@ -131,6 +132,7 @@ def _estimate(
     """The stages of `estimate_with_noise`, timed."""
     grounds, structure = surroundings
     limit = config.registration.max_iterations
+    kept = kept_stamps(structure.patches, observations)
     guesses = {name: problem.guesses[name] for name in problem.lidars}
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)
@@ -140,7 +142,7 @@ def _estimate(
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
-        problem = pose_problem(observations, trajectories, config, noise.heave_m)
+        problem = pose_problem(observations, trajectories, config, noise.heave_m, kept_ns=kept)
     times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
@@ -179,7 +181,7 @@ def _estimate(
     if terms:
         others = lidars_with_structure(terms)
         grounds = other_grounds(grounds, terms)
-        problem = pose_problem(observations, trajectories, config, noise.heave_m, others)
+        problem = pose_problem(observations, trajectories, config, noise.heave_m, others, kept)
         problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics

@@ -90,6 +90,13 @@ def seen_drives(observations: Sequence[GroundObservation], taken: IntArray) -> l
     return sorted({o.drive for o, i in zip(observations, taken, strict=True) if i >= 0})
 
 
+def drives_with_planes(
+    problem: Problem, observations: Sequence[GroundObservation], config: GroundConfig
+) -> list[int]:
+    """Drives whose ground is a plane of the graph, and the errors of the vehicle's stand on it."""
+    return seen_drives(observations, taken_poses(problem, observations)) if config.use else []
+
+
 def biased_lidars(
     problem: Problem, observations: Sequence[GroundObservation], taken: IntArray
 ) -> list[int]:

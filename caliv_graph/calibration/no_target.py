@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caliv_graph.calibration.graph import initial_values, motion_graph
-from caliv_graph.calibration.ground import ground_values
+from caliv_graph.calibration.ground import drives_with_planes, ground_values
 from caliv_graph.calibration.ground_weights import ground_weights
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.noise import first_pose_noise
@@ -207,7 +207,9 @@ class _Loop:
             sound=np.ones(0, dtype=bool),
             grounds=grounds,
             structure=terms,
-            structure_factors=structure_graph(problem, terms, start),
+            structure_factors=structure_graph(
+                problem, terms, start, drives_with_planes(problem, grounds, config.ground)
+            ),
         )
         state = self.state
         state.values.insert(ground_values(problem, grounds, state.values, config.ground))

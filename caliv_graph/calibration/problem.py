@@ -367,7 +367,7 @@ def pose_problem(
         },
         motion_terms={d: term for d, term in terms.items() if term is not None},
         parameters=parameter_priors(list(smoothed.values())),
-        offsets=frozenset(lidars) if config.solve.time_offset else frozenset(),
+        offsets=config.free_offsets() & set(lidars),
         twists=np.concatenate(twists) if twists else None,
         accelerations=np.concatenate(accelerations) if accelerations else None,
         stated_cov=_stated_covariances(trajectories, poses, config),

@@ -27,7 +27,12 @@ from caliv_graph.calibration.graph import (
     prior_graph,
     with_given_poses,
 )
-from caliv_graph.calibration.ground import GroundWeights, ground_graph, ground_values
+from caliv_graph.calibration.ground import (
+    GroundWeights,
+    drives_with_planes,
+    ground_graph,
+    ground_values,
+)
 from caliv_graph.calibration.ground_weights import ground_weights
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import (
@@ -136,7 +141,9 @@ def solve_registered(
         grounds=grounds,
         turns=turns,
         structure=structure,
-        structure_factors=structure_graph(problem, structure, start),
+        structure_factors=structure_graph(
+            problem, structure, start, drives_with_planes(problem, grounds, config.ground)
+        ),
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and

@@ -15,7 +15,7 @@ import numpy as np
 from caliv_graph.calibration.ground_factors import normal_jacobian, plane_normal
 from caliv_graph.calibration.structure import rows_of_lidars, rows_of_offsets, rows_of_parameters
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_ground, key_offset
+from caliv_graph.conventions import key_ground, key_height, key_offset
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, skew
 from caliv_graph.products import Array, IntArray, Solution, Stance, StructureTerm
 from caliv_graph.trajectory.tilt import BODY_SIGMA_RAD
@@ -63,13 +63,38 @@ def _of_term(solution: Solution, term: StructureTerm) -> StanceRows:
     stance = term.stance
     assert stance is not None
     by_graph, moved = _coordinates(solution, term)
+    rows, residual = stance.rows @ by_graph, stance.value + stance.rows @ moved
+    start = solution.linearised.starts.get(key_height(term.drive))
+    if start is not None and stance.height_sigma_m is not None:
+        height_m = float(solution.values.atVector(key_height(term.drive))[0])
+        return _tilt_beside_height(stance, rows, residual, start, height_m)
     weight, in_graph, by_height = _weights(stance)
+    return StanceRows(rows, residual, weight, in_graph, by_height)
+
+
+def _tilt_beside_height(
+    stance: Stance, rows: Array, residual: Array, start: int, height_m: float
+) -> StanceRows:
+    """The tilt of a term, given the error of the height, which is a variable of the graph.
+
+    Args:
+        stance: of the term.
+        rows: (s, M) by the graph's variables, height first.
+        residual: (s,) at the estimate.
+        start: where the error of the height is among the graph's variables.
+        height_m: this error at the estimate.
+    """
+    follow = stance.cov[1:, 0] / stance.cov[0, 0]
+    by_graph = rows[1:] - np.outer(follow, rows[0])
+    by_graph[:, start] += follow
+    cov = stance.cov[1:, 1:] - np.outer(follow, stance.cov[0, 1:])
+    tilts = len(follow)
     return StanceRows(
-        rows=stance.rows @ by_graph,
-        residual=stance.value + stance.rows @ moved,
-        weight=weight,
-        in_graph=in_graph,
-        by_height=by_height,
+        rows=by_graph,
+        residual=residual[1:] + follow * (height_m - residual[0]),
+        weight=np.asarray(np.linalg.inv(cov + BODY_SIGMA_RAD**2 * np.eye(tilts)), np.float64),
+        in_graph=np.zeros((tilts, tilts)),
+        by_height=np.zeros(tilts),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -10,7 +10,13 @@ import numpy as np
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.problem import Problem, moved_map
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_extrinsic, key_offset, key_vehicle
+from caliv_graph.conventions import (
+    key_extrinsic,
+    key_height,
+    key_offset,
+    key_parallel,
+    key_vehicle,
+)
 from caliv_graph.products import Array, StructureTerm
 from caliv_graph.trajectory.factors import Gaussian, tangent_size
 
@@ -22,12 +28,14 @@ def structure_graph(
     problem: Problem,
     terms: Sequence[StructureTerm],
     start: Mapping[str, gtsam.Pose3] | None = None,
+    standing: Collection[int] = (),
 ) -> CalibrationGraph:
     """What the structure of each drive says of poses, parameters, time offsets and extrinsics.
 
     A parameter or an offset that the problem has not is held: a parameter at its value in the
     term, an offset at zero. `start` are extrinsics near the solution: E is linearised there where
-    the reference has no structure; None: the guesses.
+    the reference has no structure; None: the guesses. `standing` are drives of which the graph has
+    the errors of the vehicle's stand as variables, for ground planes (`ground.drives_with_planes`).
 
     Raises:
         ValueError: the problem does not have a pose or a LiDAR of a term.
@@ -35,7 +43,7 @@ def structure_graph(
     graph = CalibrationGraph()
     guess = (start or {}).get(problem.reference, problem.guesses[problem.reference])
     for term in terms:
-        graph.append_gaussian("structure", _gaussian(problem, term, guess))
+        graph.append_gaussian("structure", _gaussian(problem, term, guess, term.drive in standing))
     return graph
 
 
@@ -76,12 +84,34 @@ def rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
     }
 
 
-def _gaussian(problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3) -> Gaussian:
+def rows_of_standing(term: StructureTerm) -> dict[int, slice]:
+    """Keys of the errors of the vehicle's stand, and where they follow a term's coordinates."""
+    if term.standing is None:
+        return {}
+    first, height = len(term.gradient), int(term.standing.height)
+    out = {key_height(term.drive): slice(first, first + 1)} if height else {}
+    if term.standing.tilt:
+        out[key_parallel(term.drive)] = slice(first + height, first + height + 2)
+    return out
+
+
+def _gaussian(
+    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3, standing: bool
+) -> Gaussian:
     """A term as a Gaussian of the graph's variables, about where the term was linearised."""
     point = _linearisation_point(problem, term, T_vehicle_ref)
+    own_information, own_gradient = term.information, term.gradient
+    errors = rows_of_standing(term) if standing else {}
+    if term.standing is not None and errors:
+        own_information, own_gradient = term.standing.kept_in(own_information, own_gradient)
+        first = len(term.gradient)
+        point |= {
+            k: term.standing.value[o.start - first : o.stop - first] for k, o in errors.items()
+        }
     columns = _columns(point)
-    by_graph = np.zeros((len(term.gradient), sum(tangent_size(value) for value in point.values())))
-    held = np.zeros(len(term.gradient))
+    size = len(own_gradient)
+    by_graph = np.zeros((size, sum(tangent_size(value) for value in point.values())))
+    held = np.zeros(size)
     row = 0
     for i in _pose_indices(problem, term):
         by_graph[row : row + 6, columns[key_vehicle(i)]] = np.eye(6)
@@ -105,9 +135,11 @@ def _gaussian(problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3)
             assert isinstance(S, gtsam.Pose3)
             by_graph[rows, columns[key_extrinsic()]] = S.inverse().AdjointMap()
             by_graph[rows, columns[key]] = np.eye(6)
-    information = by_graph.T @ term.information @ by_graph
+    for key, rows in errors.items():
+        by_graph[rows, columns[key]] = np.eye(rows.stop - rows.start)
+    information = by_graph.T @ own_information @ by_graph
     information = 0.5 * (information + information.T)
-    gradient = by_graph.T @ (term.gradient - term.information @ held)
+    gradient = by_graph.T @ (own_gradient - own_information @ held)
     constant = _constant(information, gradient)
     return Gaussian(tuple(point), tuple(point.values()), information, gradient, constant)
 

@@ -20,6 +20,7 @@ from caliv_graph.products import (
     PoseNoise,
     Registration,
     StructureTerm,
+    TargetObservation,
 )
 from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.structure.patches import DrivePatches
@@ -197,7 +198,7 @@ class StructureEvidence:
             start,
             held,
             config,
-            frozenset(config.lidars) if config.solve.time_offset else frozenset(),
+            config.free_offsets(),
             heave_m,
             aligned,
         )
@@ -266,14 +267,18 @@ def solved_with_structure(
     return solve, offset_sigmas(solve, registrations)
 
 
-def kept_stamps(patches: Sequence[DrivePatches]) -> dict[int, list[int]]:
-    """Per drive with patches, stamps of the poses that a calibration without a target keeps.
+def kept_stamps(
+    patches: Sequence[DrivePatches], observations: Sequence[TargetObservation] = ()
+) -> dict[int, list[int]]:
+    """Per drive with patches and no cloud of a target, stamps of the poses to keep.
 
-    They are those of scans of the LiDAR with most of them, evenly chosen.
+    They are those of scans of the LiDAR with most of them, evenly chosen. A drive with clouds has
+    their poses; `observations` are the usable ones.
     """
+    seen = {cloud.drive for o in observations for cloud in o.clouds}
     out = {}
     for of in patches:
-        if len(of.scan):
+        if len(of.scan) and of.drive not in seen:
             most = int(np.bincount(of.scan_lidar).argmax())
             stamps = np.unique(of.stamps_ns[of.scan_lidar == most])
             chosen = np.linspace(0, len(stamps) - 1, min(KEPT_POSES, len(stamps)))

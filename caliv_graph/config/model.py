@@ -322,6 +322,10 @@ class Config(Section):
         topics = any(topic is not None for _, topic in self.topics)
         return topics or self.data.poses is not None or self.data.format == "caliv"
 
+    def free_offsets(self) -> frozenset[str]:
+        """Names of the LiDARs whose time offset is estimated."""
+        return frozenset(self.lidars) if self.solve.time_offset else frozenset()
+
     def lidar_order(self) -> tuple[str, ...]:
         """LiDAR names in the order of the file."""
         return tuple(self.lidars)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.calibration.choose import choose_static, displaced
+from caliv_graph.calibration.problem import usable
 from caliv_graph.calibration.structure_evidence import kept_stamps
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
@@ -134,7 +135,7 @@ def prepare(
         without_targets(of, observations, rough[of.drive], config)
         for of in _patches(recordings, rough, config, progress)
     )
-    kept = kept_stamps(patches)
+    kept = kept_stamps(patches, usable(observations))
     if no_target is not None and not kept:
         raise no_target
     with progress.stage("smoothing the trajectory at the scans", None):
@@ -147,10 +148,9 @@ def prepare(
     others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}
     # Without motion data the ground is in the structure, and in how the vehicle stands on it.
     if not any(isinstance(motion.poses, OdometryPoses) for motion in motions.values()):
-        kept_ns = None if observations else kept
         # Points are moved with the rates of the trajectory whose poses the graph has.
         grounds, ground_warnings = measure_grounds(
-            recordings, trajectories, observations, config, progress, others, kept_ns
+            recordings, trajectories, observations, config, progress, others, kept
         )
     warnings = [w for r in recordings for w in r.warnings()]
     warnings += map(placement_sentence, placements)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caliv_graph.products import Array, Stance
+from caliv_graph.products import Array, Stance, StandingErrors
 from caliv_graph.structure.solve import Solved
 from caliv_graph.structure.standing import Standing, tilt_rows
 
@@ -89,6 +89,40 @@ def stance_of(
         cov=cov[keep, keep],
         height_sigma_m=standing.height_sigma_m,
         tilt_in_term=stated,
+    )
+
+
+def standing_errors(
+    standing: Standing, now: Array, information: Array, gradient: Array
+) -> StandingErrors | None:
+    """The errors of height and tilt that the config states; None: it states neither.
+
+    Args:
+        standing: what is assumed.
+        now: (3,) the errors at the estimate.
+        information: (n + 3, n + 3), the errors last, their priors in it.
+        gradient: (n + 3,).
+    """
+    n = len(gradient) - STANDING
+    height, tilt = standing.height_m is not None, standing.tilt_sigma_rad is not None
+    stated = np.array([height, tilt, tilt])
+    if not stated.any():
+        return None
+    own, rest = n + np.flatnonzero(stated), n + np.flatnonzero(~stated)
+    kept = np.concatenate([np.arange(n), own])
+    by_rest = np.linalg.solve(information[np.ix_(rest, rest)], information[rest])
+    both = information[np.ix_(kept, kept)] - information[np.ix_(kept, rest)] @ by_rest[:, kept]
+    pull = gradient[kept] - by_rest[:, kept].T @ gradient[rest]
+    sigmas = np.array([standing.height_sigma_m, *[standing.tilt_sigma_rad or np.inf] * 2])
+    prior, value = sigmas[stated] ** -2.0, now[stated]
+    return StandingErrors(
+        height=height,
+        tilt=tilt,
+        value=value,
+        coupling=both[:n, n:],
+        information=both[n:, n:] - np.diag(prior),
+        gradient=pull[n:] + prior * value,
+        prior=prior,
     )
 
 

@@ -28,7 +28,7 @@ from caliv_graph.structure.relative import (
     start_about,
 )
 from caliv_graph.structure.solve import Solved, solve_structure
-from caliv_graph.structure.stance import STANDING, MeanTilt, mean_tilt, stance_of
+from caliv_graph.structure.stance import STANDING, MeanTilt, mean_tilt, stance_of, standing_errors
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.structure.thickness import (
@@ -246,8 +246,9 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     both, both_gradient, rows, cov = _marginal(H, b, np.concatenate([keep, stand]), of_tilt)
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
-    now_m = float(found.state.errors[layout.standing])
-    stance = stance_of(found.problem.standing, now_m, both, both_gradient, tilt)
+    now = found.state.errors[stand]
+    stance = stance_of(found.problem.standing, float(now[0]), both, both_gradient, tilt)
+    standing = standing_errors(found.problem.standing, now, both, both_gradient)
     information, gradient, *_ = _marginal(both, both_gradient, np.arange(len(keep)))
     own_part = slice(0, len(of_motion))
     information[own_part, own_part] -= motion
@@ -268,6 +269,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         offset_m=float(np.median(found.nuisances.sighting)),
         ground=lidars_with_ground(found),
         stance=stance,
+        standing=None if tilt is None else standing,
     )
 
 
@@ -291,6 +293,7 @@ def term_of_odometry(
     return replace(
         term,
         stance=None,
+        standing=None,
         stamps_ns=found.problem.prior.stamps_ns[kept],
         T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
         information=information,

@@ -154,7 +154,7 @@ def _drive(
         pose_noise(calibration, config),
         config,
     )
-    free = frozenset(config.lidars) if config.solve.time_offset else extrinsics.time_offset_s.keys()
+    free = config.free_offsets() or extrinsics.time_offset_s.keys()
     problem = problem_of(patches, priors[0], trajectory, config, noise.heave_m, {}, frozenset(free))
     placed = placed_patches(problem, first_state(problem, extrinsics.T_vehicle_lidar))
     moments = placed.moments_map

@@ -23,6 +23,7 @@ from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
     StructureEvidence,
+    kept_stamps,
     other_grounds,
     rough_extrinsics,
     solved_with_structure,
@@ -131,7 +132,8 @@ def survey_observations(
             trajectories, config, progress, tuple(grounds), structure
         )
         return _verdict(alone.state, alone.reduced.D, alone.offsets_s, alone.warnings, used, config)
-    problem = pose_problem(used, trajectories, config)
+    kept = kept_stamps(structure.patches, used)
+    problem = pose_problem(used, trajectories, config, kept_ns=kept)
     limit = min(config.registration.max_iterations, ROUGH_ITERATIONS)
     rough = rough_solve(
         problem, used, tuple(grounds), config, progress, limit, look_for_symmetries=True
@@ -140,7 +142,7 @@ def survey_observations(
     terms = structure.terms_beside(state, problem, trajectories, problem.heave_m)
     if terms:
         others = lidars_with_structure(terms)
-        problem = pose_problem(used, trajectories, config, None, others)
+        problem = pose_problem(used, trajectories, config, None, others, kept)
         problem, used = roughly_used(problem, used, config.extraction.min_scans)
         extrinsics = state.problem.extrinsics(state.values)
         state, offsets_s = solved_with_structure(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.graph import (
+    CalibrationGraph,
     initial_values,
     merged,
     motion_graph,
@@ -23,7 +24,14 @@ from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
 from caliv_graph.calibration.structure import structure_graph
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_offset, key_vehicle
-from caliv_graph.products import Array, IntArray, PoseNoise, StructureTerm, Trajectory
+from caliv_graph.products import (
+    Array,
+    IntArray,
+    PoseNoise,
+    StandingErrors,
+    StructureTerm,
+    Trajectory,
+)
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from tests.calibration.problems import PERIOD_NS, eight
 from tests.calibration.test_vehicle_parameters import CONFIG, WANTED, drive
@@ -220,6 +228,62 @@ def test_reduced_to_the_extrinsics_it_is_the_term_with_the_poses_prior() -> None
         axes[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6] = R
     np.testing.assert_allclose(reduced.D, axes @ D @ axes.T, rtol=1e-6, atol=1e-3)
     np.testing.assert_allclose(reduced.c, axes @ c, rtol=1e-6, atol=1e-3)
+
+
+@pytest.mark.parametrize(("height", "tilt"), [(True, True), (True, False), (False, True)])
+def test_errors_of_the_stand_count_once_as_variables_of_the_graph(height: bool, tilt: bool) -> None:
+    trajectory = given()
+    stamps = trajectory.trajectory.stamps_ns
+    config = config_of("front", "rear")
+    term = at_guesses(term_of(trajectory, stamps, ("front", "rear")), trajectory)
+    problem = pose_problem([], [trajectory], config, others=config.lidars, kept_ns={0: stamps})
+    rng, n = np.random.default_rng(6), len(term.gradient)
+    kinds = {"h": (1, 0.02)} if height else {}
+    kinds |= {"p": (2, 2e-3)} if tilt else {}
+    sigmas = np.concatenate([np.full(size, sigma) for size, sigma in kinds.values()])
+    rows, right = rng.standard_normal((4, n + len(sigmas))), rng.standard_normal(4)
+    scale = np.concatenate([np.sqrt(np.diag(term.information)) / 2.0, 2.0 / sigmas])
+    H, b = (rows * scale).T @ (rows * scale), (rows * scale).T @ right
+    standing = StandingErrors(
+        height=height,
+        tilt=tilt,
+        value=0.3 * sigmas,
+        coupling=H[:n, n:],
+        information=H[n:, n:],
+        gradient=b[n:],
+        prior=sigmas**-2.0,
+    )
+    # Eliminated under their priors, as in a term.
+    with_priors = H[n:, n:] + np.diag(sigmas**-2.0)
+    pull = b[n:] - standing.prior * standing.value
+    by_them = np.linalg.solve(with_priors, np.column_stack([H[n:, :n], pull]))
+    term = replace(
+        term,
+        information=term.information + H[:n, :n] - H[:n, n:] @ by_them[:, :-1],
+        gradient=term.gradient + b[:n] - H[:n, n:] @ by_them[:, -1],
+        standing=standing,
+    )
+    values = initial_values(problem, [])
+    priors = CalibrationGraph()
+    for letter, (size, sigma) in kinds.items():
+        noise = gtsam.noiseModel.Isotropic.Sigma(size, sigma)
+        key = gtsam.symbol(letter, 0)
+        priors.append("ground_height", gtsam.PriorFactorVector(key, np.zeros(size), noise))
+        values.insert(key, np.zeros(size))
+    none = np.zeros((0, 0)), np.zeros(0)
+
+    def reduced(base: CalibrationGraph) -> Reduced:
+        whole = merged(pose_graph(problem, NOISE), base)
+        return reduce_to_extrinsics(problem, values, whole, none, NO_CLOUDS)
+
+    eliminated = reduced(structure_graph(problem, [term]))
+    kept = reduced(merged(structure_graph(problem, [term], standing=[0]), priors))
+
+    np.testing.assert_allclose(kept.D, eliminated.D, rtol=1e-5, atol=1e-2)
+    np.testing.assert_allclose(kept.c, eliminated.c, rtol=1e-5, atol=1e-2)
+    # Planes of another LiDAR that know the errors add nothing but that.
+    known = merged(structure_graph(problem, [term], standing=[0]), priors, priors)
+    assert np.trace(reduced(known).D - eliminated.D) > 0.0
 
 
 def test_a_semidefinite_term_is_optimised_in_the_whole_graph() -> None:

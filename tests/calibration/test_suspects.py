@@ -13,7 +13,7 @@ import scipy.sparse
 from caliv_graph.calibration.stance import stance_rows
 from caliv_graph.calibration.suspects import _Block, _Motion, _Quadratic, _Shared
 from caliv_graph.calibration.vehicle_parameters import KEYS
-from caliv_graph.conventions import key_lever_arm, key_offset
+from caliv_graph.conventions import key_height, key_lever_arm, key_offset
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes
 from caliv_graph.products import Array, LinearisedGraph, Stance, StructureTerm
 from caliv_graph.trajectory.parameters import LEVER_ARM
@@ -136,3 +136,43 @@ def test_the_stance_of_a_term_is_on_the_variables_of_the_graph(offset_s: float |
     assert found.in_graph == pytest.approx(np.diag([in_graph, 0.0, 0.0]))
     tilt = 1.0 / (1e-6 + BODY_SIGMA_RAD**2)
     assert found.weight == pytest.approx(np.diag([in_graph, tilt, tilt]))
+
+
+def test_a_height_that_is_a_variable_of_the_graph_is_not_in_a_terms_stance_again() -> None:
+    """What is left is the tilt, given the height that the graph has."""
+    T = gtsam.Pose3()
+    stance = Stance(
+        value=np.array([0.01, 2e-3, -1e-3]),
+        rows=np.zeros((3, M)),
+        cov=np.array([[4e-4, 2e-5, 0.0], [2e-5, 3e-6, 0.0], [0.0, 0.0, 5e-6]]),
+        height_sigma_m=0.02,
+        tilt_in_term=False,
+    )
+    term = StructureTerm(
+        drive=0,
+        stamps_ns=np.array([7]),
+        T_map_vehicle=(T,),
+        parameters={ARM: np.zeros(3)},
+        time_offsets_s={},
+        T_vehicle_lidar={"front": T},
+        information=np.zeros((M, M)),
+        gradient=np.zeros(M),
+        strips=(),
+        offset_m=0.0,
+        stance=stance,
+    )
+    solution = solution_of(term, T, T, None)
+    solution.linearised.starts[key_height(0)] = M
+    solution.linearised.gradient = np.zeros(M + 1)
+    solution.linearised.to_vehicle_axes = np.hstack([np.zeros((6, 1)), np.eye(6)])[:, 1:]
+    solution.values.insert(key_height(0), np.array([0.05]))
+
+    (found,) = stance_rows(solution)
+
+    # By the joint Gaussian of height and tilt: 2e-5 / 4e-4 = 0.05 rad per metre.
+    assert found.residual == pytest.approx([2e-3 + 0.05 * (0.05 - 0.01), -1e-3])
+    assert found.rows[:, M] == pytest.approx([0.05, 0.0])
+    cov = np.diag([3e-6 - 0.05 * 2e-5, 5e-6]) + BODY_SIGMA_RAD**2 * np.eye(2)
+    assert found.weight == pytest.approx(np.linalg.inv(cov))
+    assert not found.in_graph.any()
+    assert not found.by_height.any()

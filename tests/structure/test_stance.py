@@ -11,7 +11,7 @@ import scipy.sparse
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array
 from caliv_graph.structure.elimination import eliminated
-from caliv_graph.structure.stance import MeanTilt, stance_of
+from caliv_graph.structure.stance import MeanTilt, stance_of, standing_errors
 from caliv_graph.structure.standing import UNEVEN_RAD, Standing, Stands, tilt_rows
 from caliv_graph.trajectory.imu import exp_so3
 
@@ -76,6 +76,43 @@ def test_what_is_stated_is_in_the_term_and_what_is_unknown_is_not_told() -> None
     assert (tilt_alone.value.shape, tilt_alone.height_sigma_m) == ((2,), None)
     assert stance_of(replace(stated, height_m=None), 0.0, H, b, tilt) is None
     assert stance_of(STANDING, 0.0, H, b, None) is None
+
+
+@pytest.mark.parametrize("tilt_sigma_rad", [2e-3, None])
+@pytest.mark.parametrize("height_m", [0.5, None])
+def test_errors_of_the_stand_can_be_taken_back_into_a_term(
+    height_m: float | None, tilt_sigma_rad: float | None
+) -> None:
+    """Kept as variables with their priors, they say the same as eliminated."""
+    standing = replace(STANDING, height_m=height_m, tilt_sigma_rad=tilt_sigma_rad)
+    stated = [height_m is not None, *[tilt_sigma_rad is not None] * 2]
+    rng = np.random.default_rng(4)
+    rows, right = rng.standard_normal((20, N + 3)), rng.standard_normal(20)
+    now = np.array([0.01, 2e-3, -1e-3])
+    priors = np.array([SIGMA_M, *[tilt_sigma_rad or 1.0] * 2]) ** -2.0
+    H, b = rows.T @ rows, rows.T @ right
+    H[np.ix_(range(N, N + 3), range(N, N + 3))] += np.diag(priors)
+    b[N:] -= priors * now
+
+    errors = standing_errors(standing, now, H, b)
+
+    if not any(stated):
+        assert errors is None
+        return
+    assert errors is not None
+    assert (errors.height, errors.tilt) == (stated[0], stated[1])
+    assert errors.value == pytest.approx(now[stated])
+    cross = np.linalg.solve(H[N:, N:], H[N:, :N])
+    term, gradient = H[:N, :N] - H[:N, N:] @ cross, b[:N] - cross.T @ b[N:]
+    both, pull = errors.kept_in(term, gradient)
+    # By the rows alone, what is not stated under its wide prior.
+    kept = np.concatenate([np.full(N, True), stated])
+    H_rows, b_rows = rows.T @ rows, rows.T @ right
+    own = np.diag(np.concatenate([np.zeros(N), np.where(stated, 0.0, priors)]))
+    b_rows[N:] -= np.where(stated, 0.0, priors * now)
+    inverse = np.linalg.inv(H_rows + own)
+    assert np.linalg.inv(both) == pytest.approx(inverse[np.ix_(kept, kept)])
+    assert np.linalg.solve(both, pull) == pytest.approx((inverse @ b_rows)[kept])
 
 
 def test_mean_tilt_and_its_derivatives() -> None:

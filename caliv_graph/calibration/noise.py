@@ -7,8 +7,9 @@ they absorb do not count as precision (Patterson & Thompson 1971;
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 
 import gtsam
@@ -60,6 +61,8 @@ GROSS = 30.0
 
 CLOUDS_USED = 50
 """Clouds that the variances are estimated from, spread evenly: the cost grows with their cube."""
+
+GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 
 def _configured(noise: NoiseConfig) -> list[float | None]:
@@ -290,15 +293,46 @@ class _RestrictedLikelihood:
 
 
 def evenly_over_drives(problem: Problem, sound: BoolArray, most: int | None = None) -> IntArray:
-    """At most so many sound clouds, evenly over the drives, in any order of the LiDARs.
+    """About so many sound clouds, evenly over the drives and over the LiDARs.
 
-    `most` None: `CLOUDS_USED`.
+    Clouds of one moment, at most one of each LiDAR and target, stay together: clouds of one pose
+    tell its errors from those of the clouds. Every second or fourth cloud would be of the same
+    LiDAR where two take turns; moments are taken by the golden ratio, which has no period.
+
+    `most` None: `CLOUDS_USED`. The order of the clouds and of the LiDARs does not matter.
     """
     most = CLOUDS_USED if most is None else most
     usable = np.flatnonzero(sound)
+    if len(usable) <= most:
+        return usable
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
-    step = max(1, math.ceil(len(usable) / most))
-    return np.sort(usable[::step])
+    moment = _moments(
+        problem.cloud_pose[usable].tolist(),
+        zip(
+            problem.cloud_lidar[usable].tolist(),
+            problem.cloud_placement[usable].tolist(),
+            strict=True,
+        ),
+    )
+    turn = np.mod(moment * GOLDEN_RATIO, 1.0)
+    return np.sort(usable[turn < most / len(usable)])
+
+
+def _moments(poses: Iterable[int], of: Iterable[tuple[int, int]]) -> IntArray:
+    """(n,) which moment each cloud is of; clouds in order of their poses, with LiDAR and target.
+
+    A moment ends before a pose with a cloud of a LiDAR and target that it has already.
+    """
+    out, now = [], 0
+    seen: set[tuple[int, int]] = set()
+    for _, group in itertools.groupby(zip(poses, of, strict=True), key=lambda pair: pair[0]):
+        here = [key for _, key in group]
+        if seen & set(here):
+            now += 1
+            seen = set()
+        seen |= set(here)
+        out += [now] * len(here)
+    return np.array(out, dtype=np.int64)
 
 
 def squares_without_own_pose(

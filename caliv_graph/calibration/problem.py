@@ -130,6 +130,22 @@ class Problem:
         """Number of clouds."""
         return len(self.cloud_lidar)
 
+    def with_clouds(self, kept: BoolArray) -> Problem:
+        """With a part of the clouds, a mask (J,), and all poses."""
+
+        def of(values: Array | None) -> Array | None:
+            return None if values is None else values[kept]
+
+        return replace(
+            self,
+            cloud_lidar=self.cloud_lidar[kept],
+            cloud_pose=self.cloud_pose[kept],
+            cloud_placement=self.cloud_placement[kept],
+            views=of(self.views),
+            cloud_apart_s=of(self.cloud_apart_s),
+            cloud_turn_rad=of(self.cloud_turn_rad),
+        )
+
     @cached_property
     def motion_cov(self) -> dict[int, Array]:
         """Per drive the (m, m, 6, 6) covariance of `motion`: its inverse, right perturbations."""

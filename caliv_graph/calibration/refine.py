@@ -223,8 +223,7 @@ class _Loop:
 
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
-    once it is fixed; `fine`: iterations at the noise level; `jackknife`: scale of the
-    registration's sigmas by it.
+    once it is fixed; `fine`: iterations at the noise level.
     """
 
     state: SolveState
@@ -234,7 +233,6 @@ class _Loop:
     offsets_m: Array
     undetermined: int | None = None
     fine: int = 0
-    jackknife: float = 1.0
 
     def linearised(self) -> tuple[_Shapes, Reduced]:
         """E-step at the poses that the graph predicts, and the graph with its quadratic."""
@@ -250,7 +248,7 @@ class _Loop:
         """`linearised`, the registration's scale by a jackknife, too."""
         shapes, reduced = self.linearised()
         begun = time.perf_counter()
-        self.jackknife = self.left_out(reduced)
+        self.state.least_scale = max(1.0, self.left_out(reduced))
         reduced = self.scaled(shapes, reduced)
         self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
@@ -298,7 +296,7 @@ class _Loop:
         state = self.state
         clouds, lines = shapes.joint(1.0), reduced.lines
         contradicted = fit_scale(state.problem, lines, clouds, state.values, state.noise)
-        state.scale = max(contradicted, self.jackknife)
+        state.scale = max(1.0, contradicted, state.least_scale)
         return self._without_bias(shapes, lines)
 
     def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:

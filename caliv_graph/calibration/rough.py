@@ -122,13 +122,7 @@ def roughly_used(
         kept += used
     if all(kept):
         return problem, out
-    return replace(
-        problem,
-        cloud_lidar=problem.cloud_lidar[kept],
-        cloud_pose=problem.cloud_pose[kept],
-        cloud_placement=problem.cloud_placement[kept],
-        views=None if problem.views is None else problem.views[kept],
-    ), out
+    return problem.with_clouds(np.array(kept)), out
 
 
 def prealigned(problem: Problem, placement: int) -> list[gtsam.Pose3]:

@@ -51,13 +51,19 @@ def snoop_clouds(state: SolveState, registrations: Sequence[Registration]) -> No
     weights below MIN_SNOOPED_WEIGHT become zero. Kernel `none` changes nothing.
 
     Args:
-        state: of `solve_registered`; gets new weights and values, and where clouds are lost new
-            noise levels.
+        state: of `solve_registered`, or of the joint loop; gets new weights and values, and where
+            clouds are lost new noise levels, the scale not below what a jackknife has said.
         registrations: what it was given.
 
     Raises:
         SolveError: the graph is singular.
     """
+    _snoop(state, registrations)
+    state.scale = max(state.scale, state.least_scale)
+
+
+def _snoop(state: SolveState, registrations: Sequence[Registration]) -> None:
+    """`snoop_clouds`; the noise levels are those that the residuals of what is left show."""
     if not state.weights.kernel.drops or not state.sound.any():
         return
     problem, fitted = state.problem, (state.noise, state.scale)

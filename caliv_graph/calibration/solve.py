@@ -105,6 +105,8 @@ class SolveState:
     """1 sigma of the biases of the ranges; before the joint loop none are looked for."""
     bias_directions: Array | None = None
     """(6 J, B) how the poses of registered clouds seem to move by biases of sigma 1; None: none."""
+    least_scale: float = 0.0
+    """What `scale` is at least after the joint loop: 1, or what a jackknife said."""
     structure: tuple[StructureTerm, ...] = ()
     structure_factors: CalibrationGraph = field(default_factory=CalibrationGraph)
     """Of `structure`; like those of `motion` they take time to build."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -18,12 +19,14 @@ from caliv_graph.calibration.noise import (
     FLOORS,
     TYPICAL,
     TYPICAL_SCALE,
+    evenly_over_drives,
     first_pose_noise,
     fit_pose_noise,
     fit_scale,
 )
+from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.noise import NoiseConfig
-from caliv_graph.products import PoseNoise
+from caliv_graph.products import IntArray, PoseNoise
 from tests.calibration.problems import PERIOD_NS, Case, make_case, noisy, with_poses
 
 
@@ -291,3 +294,42 @@ def test_first_levels_are_typical_where_the_config_is_silent() -> None:
         math.radians(0.1), TYPICAL.white_position_m, TYPICAL.drift_rotation_rad, 0.03, 9.0
     )
     assert TYPICAL_SCALE >= 1.0
+
+
+def test_the_clouds_of_the_noise_fit_are_of_all_lidars_at_all_times() -> None:
+    """Two LiDARs that take turns or scan together, one with gaps: every second cloud is of one."""
+    for apart in (0, 1):  # poses of their own, or common ones
+        for gaps in (False, True):
+            a = [(2 * i, 0) for i in range(80)]
+            b = [(2 * i + apart, 1) for i in range(80) if not (gaps and i % 3 == 0)]
+            poses, lidars = np.transpose(sorted(a + b, key=lambda pair: (pair[1], pair[0])))
+            problem = with_clouds_at(poses, lidars)
+
+            chosen = evenly_over_drives(problem, np.ones(len(poses), dtype=bool), 48)
+
+            share = np.bincount(lidars[chosen]) / 48
+            usual = np.bincount(lidars) / len(lidars)
+            assert len(chosen) == pytest.approx(48, abs=3)
+            assert share == pytest.approx(usual, abs=0.1)
+            # No quarter of the drive is without its part.
+            parts = np.histogram(poses[chosen], 4, (0, 160))[0]
+            assert parts.min() >= 0.2 * len(chosen)
+            if not apart:
+                # Clouds of one pose stay together.
+                _, count = np.unique(poses[chosen], return_counts=True)
+                assert (count == 2).mean() > 0.5
+            # In another order of the clouds they are the same.
+            turned = np.arange(len(poses))[::-1]
+            again = evenly_over_drives(
+                with_clouds_at(poses[turned], lidars[turned]), np.ones(len(poses), dtype=bool), 48
+            )
+            assert sorted(turned[again].tolist()) == chosen.tolist()
+
+
+def with_clouds_at(poses: IntArray, lidars: IntArray) -> Problem:
+    return replace(
+        make_case(count=6).problem,
+        cloud_pose=poses,
+        cloud_lidar=lidars,
+        cloud_placement=np.zeros(len(poses), np.int64),
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from caliv_graph.calibration.rough import roughly_used
 from caliv_graph.products import Side, TargetCloud, TargetObservation
@@ -24,7 +25,12 @@ def observation(front: list[frozenset[Side]], rear: list[frozenset[Side]]) -> Ta
 
 
 def test_cut_clouds_wait_where_there_are_enough_whole_ones() -> None:
-    problem = replace(make_case(count=6).problem, views=np.arange(1.0, 13.0))
+    problem = replace(
+        make_case(count=6).problem,
+        views=np.arange(1.0, 13.0),
+        cloud_apart_s=0.01 * np.arange(12.0),
+        cloud_turn_rad=np.arange(36.0).reshape(12, 3),
+    )
     seen = observation([WHOLE, CUT, WHOLE, WHOLE, CUT, WHOLE], [CUT, CUT, CUT, WHOLE, CUT, WHOLE])
 
     fewer, (used,) = roughly_used(problem, [seen], fewest=4)
@@ -38,6 +44,12 @@ def test_cut_clouds_wait_where_there_are_enough_whole_ones() -> None:
     # Each keeps its own number of scans of one view.
     assert fewer.clouds == 10
     assert fewer.views_of(0).tolist() == [1.0, 3.0, 4.0, 6.0, *range(7, 13)]
+    # And its own time from its pose, and what a gyroscope's noise does to it.
+    of_rear = list(range(6, 12))
+    assert fewer.cloud_apart_s is not None
+    assert fewer.cloud_apart_s == pytest.approx(0.01 * np.array([*front, *of_rear]))
+    assert fewer.cloud_turn_rad is not None
+    assert fewer.cloud_turn_rad[:, 0].tolist() == [3.0 * j for j in (*front, *of_rear)]
     # The graph predicts the poses of the others.
     assert fewer.poses == problem.poses
 

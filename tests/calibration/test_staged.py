@@ -169,6 +169,19 @@ def test_a_lidar_that_would_lose_many_clouds_keeps_them_all() -> None:
     assert np.flatnonzero(state.weights.values < 1e-3).tolist() == [7, 8, 9, 10]
 
 
+def test_a_lost_cloud_does_not_take_back_what_a_jackknife_said() -> None:
+    """Surfels hide errors that the clouds share: residuals alone show a scale near 1."""
+    case = make_case(*LIDARS, count=20, seed=1)
+    measured = list(noisy(case, 1))
+    measured[7] = gtsam.Pose3.Expmap(SLIDES[0]).compose(measured[7])
+    registrations = [registered(case, tuple(measured))]
+    state = solve_registered(case.problem, registrations, (), config_of("huber"))
+    state.scale = state.least_scale = 1.9
+    snoop_clouds(state, registrations)
+    assert np.flatnonzero(state.weights.values < 1e-3).tolist() == [7]
+    assert state.scale == 1.9
+
+
 def test_clouds_none_of_which_is_the_target_are_solved_as_they_are() -> None:
     case = make_case(*LIDARS, count=6, seed=1)
     registration = registered(case, case.measured)

@@ -141,10 +141,12 @@ class _Tracker:
         return np.asarray((stamps_ns - begin_ns) / NANOSECONDS_PER_SECOND)
 
     def follow(self, scan: LidarScan) -> None:
-        """The pose of the next scan."""
+        """The pose of the next scan; one without flat surfaces, such as an empty one, is skipped."""
         if self.poses and scan.stamp_ns <= self.stamps_ns[-1]:
             return
         patches = self._patches_of(scan)
+        if not len(patches.time_s):
+            return  # nothing to place it by: as if it had not been recorded
         if not self.poses:
             pose = gtsam.Pose3()
             self._insert(pose, patches)

@@ -71,8 +71,9 @@ def slow_errors(
         used = usable(own, trajectory, aligned, config)
         found = None
         if len(used.scan):
+            followed = used.followed(aligned)
             problem = problem_of(
-                used, prior, trajectory, config, heave_m, held, config.free_offsets()
+                followed, prior, trajectory, config, heave_m, held, config.free_offsets()
             )
             found = solve_roughly(problem, aligned)
         out.append(None if found is None else told_of_errors(found, prior, gain))

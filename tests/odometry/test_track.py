@@ -49,6 +49,29 @@ def test_a_scan_that_does_not_lie_on_the_map_loses_track() -> None:
         track([*scans[:15], replace(scans[15], points_lidar=rolled)], 0.01, ignored)
 
 
+def test_an_empty_scan_is_as_if_it_had_not_been_recorded() -> None:
+    scans = list(RoomDrive({"a": MOUNTED}, s_curve(3.0)).scans("a"))
+    empty = [0, 7]  # at the start, where nothing is in the map yet, and on the way
+    broken = [
+        replace(
+            scan,
+            points_lidar=scan.points_lidar[:0],
+            point_times_s=None if scan.point_times_s is None else scan.point_times_s[:0],
+        )
+        if i in empty
+        else scan
+        for i, scan in enumerate(scans)
+    ]
+    without = [scan for i, scan in enumerate(scans) if i not in empty]
+
+    found, expected = track(broken, 0.01, ignored), track(without, 0.01, ignored)
+
+    assert found.stamps_ns.tolist() == [scan.stamp_ns for scan in without]
+    last = expected.T_map_lidar[-1].localCoordinates(found.T_map_lidar[-1])
+    assert np.abs(last[:3]).max() < 0.02
+    assert np.abs(last[3:]).max() < 0.05
+
+
 def test_few_scans_are_refused() -> None:
     drive = RoomDrive({"a": MOUNTED}, s_curve(2.0))
     with pytest.raises(TrajectoryError, match="3 scans are too few"):

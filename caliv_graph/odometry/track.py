@@ -141,7 +141,7 @@ class _Tracker:
         return np.asarray((stamps_ns - begin_ns) / NANOSECONDS_PER_SECOND)
 
     def follow(self, scan: LidarScan) -> None:
-        """The pose of the next scan; one without flat surfaces, such as an empty one, is skipped."""
+        """The pose of the next scan; one without flat surfaces, as if empty, is skipped."""
         if self.poses and scan.stamp_ns <= self.stamps_ns[-1]:
             return
         patches = self._patches_of(scan)

@@ -16,6 +16,9 @@ UP = np.array([0.0, 0.0, 1.0])
 STRAIGHT_DOWN = 1e-3
 """Level part of a direction below which it has no azimuth: numerical."""
 
+NEAREST_AXIS = math.cos(math.radians(45.0))
+"""A direction within 45 degrees of an axis is along it."""
+
 LEAST_WIDE_M = 0.05
 """Smallest width and height of the volume that outliers are spread over."""
 
@@ -43,10 +46,11 @@ def centre_clouds(
         axes = _axes_of_view(beams[own].mean(axis=0))
         low, high = np.percentile(points[own] @ axes.T, [2, 98], axis=0)
         out[j] -= 0.5 * (low + high) @ axes
+        cut_ends = _cut_ends(own_sides, R[j], axes)
         spans.append(
             (
-                (axes[1], (low[1], high[1]), ("right" in own_sides, "left" in own_sides)),
-                (UP, (low[2], high[2]), ("bottom" in own_sides, "top" in own_sides)),
+                (axes[1], (low[1], high[1]), cut_ends[0]),
+                (UP, (low[2], high[2]), cut_ends[1]),
             )
         )
     for axis in (0, 1):
@@ -57,6 +61,28 @@ def centre_clouds(
             lacks = max(typical - (high - low), 0.0)
             out[j] += 0.5 * lacks * (float(cut_low) - float(cut_high)) * direction
     return out
+
+
+def _cut_ends(
+    sides: frozenset[Side], R_target_lidar: Array, axes: Array
+) -> tuple[tuple[bool, bool], tuple[bool, bool]]:
+    """Which ends are cut, (right, left) and (bottom, top), in the level axes of a view (3, 3).
+
+    `sides` are the LiDAR's own: upside down its top is below, on its side it is left or right. A
+    side that is nearer to none of the axes counts for none.
+    """
+    top = R_target_lidar[:, 2]
+    left = np.cross(top, axes[0])
+    directions = {"top": top, "bottom": -top, "left": left, "right": -left}
+    cut = np.zeros((2, 2), dtype=bool)
+    for side in sides:
+        direction = directions[side]
+        along = axes[1:] @ direction
+        which = int(np.abs(along).argmax())
+        if np.abs(along[which]) > NEAREST_AXIS * np.linalg.norm(direction):
+            cut[which, int(along[which] > 0.0)] = True
+    (right, left_end), (bottom, top_end) = cut.tolist()
+    return (right, left_end), (bottom, top_end)
 
 
 def _axes_of_view(view: Array) -> Array:

@@ -431,6 +431,31 @@ def test_centring_does_not_depend_on_the_axes_of_the_map() -> None:
     assert depths[0] == pytest.approx(depths[1])
 
 
+@pytest.mark.parametrize(
+    ("roll_deg", "side"), [(0.0, "top"), (90.0, "left"), (180.0, "bottom"), (270.0, "right")]
+)
+def test_a_cut_side_is_that_of_the_lidar_however_it_is_mounted(roll_deg: float, side: Side) -> None:
+    """What is above the target is at the left of a LiDAR that lies on its side."""
+    rng = np.random.default_rng(8)
+    whole = rng.uniform([4.0, -1.0, -0.5], [5.0, 1.0, 0.5], (400, 3))
+    part = whole[whole[:, 2] < 0.0]  # without its upper half
+    rolled = gtsam.Rot3.Roll(np.radians(roll_deg)).matrix()
+    state = JointRegistration(observe([whole, part @ rolled]), CONFIG)
+    state.clouds = replace(
+        state.clouds,
+        points=np.vstack([whole, part @ rolled]),
+        cloud=np.repeat([0, 1], [len(whole), len(part)]),
+        starts=np.array([0, len(whole)]),
+        beams=np.tile([1.0, 0.0, 0.0], (len(whole) + len(part), 1)),
+    )
+    R, t = np.array([np.eye(3), rolled]), np.zeros((2, 3))
+    centred = centre_clouds(state.clouds, R, t, [frozenset[Side](), frozenset[Side]({side})])
+    # The lower halves of both are at the same place.
+    assert centred[1] == pytest.approx(centred[0], abs=0.05)
+    cut_below = centre_clouds(state.clouds, R, t)
+    assert cut_below[1, 2] - centred[1, 2] == pytest.approx(0.24, abs=0.02)  # of the middle 96 %
+
+
 def test_a_left_step_is_a_motion_of_the_target_frame() -> None:
     rng = np.random.default_rng(9)
     poses = [looking_at_target(a, 8.0) for a in (10.0, 100.0)]

@@ -9,7 +9,7 @@ explains the places about as well, none is used: the LiDARs then share no object
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ COMPARED_SCANS = 5
 """Scans in which the gap between two objects is measured; the median counts."""
 
 MOST_OBJECTS = 6
-"""Objects of a LiDAR that are matched at most: two times six have 13327 matchings."""
+"""Objects of a LiDAR that are matched at most."""
 
 VIEWS_OF_A_TRACK = 4.0
 """Independent observations of an object's place that a track has at most: the middle of its visible
@@ -297,10 +297,7 @@ def _best_matching(
 ) -> tuple[tuple[tuple[int, int], ...], bool]:
     """The cheapest matching of objects a and b, and whether another one is about as cheap."""
     count = len(places_a) + len(places_b)
-    misfits = {
-        pairs: _misfit(pairs, places_a, cov_a, places_b, cov_b)
-        for pairs in _matchings(len(places_a), len(places_b))
-    }
+    misfits = _plausible_matchings(places_a, cov_a, places_b, cov_b)
     best = min(misfits, key=lambda pairs: misfits[pairs] + UNMATCHED * (count - 2 * len(pairs)))
     limit = misfits[best] + UNSEEN * (count - 2 * len(best)) + AMBIGUOUS
     return best, any(
@@ -327,12 +324,38 @@ def _coordinates(objects: Sequence[int]) -> IntArray:
     return (3 * np.array(objects, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
-def _matchings(count_a: int, count_b: int) -> Iterator[tuple[tuple[int, int], ...]]:
-    """All matchings of so many objects, each object in one pair at most."""
-    for size in range(min(count_a, count_b) + 1):
-        for of_a in itertools.combinations(range(count_a), size):
-            for of_b in itertools.permutations(range(count_b), size):
-                yield tuple(zip(of_a, of_b, strict=True))
+def _plausible_matchings(
+    places_a: Array, cov_a: Array, places_b: Array, cov_b: Array
+) -> dict[tuple[tuple[int, int], ...], float]:
+    """Matchings, each object in one pair at most, with their misfit; none that cannot count.
+
+    The best one costs no more than none, and a rival at most `AMBIGUOUS` more. A pair more never
+    lowers the misfit: where it is too large, so it is in all matchings with these pairs. There are
+    millions of matchings where each of several LiDARs sees objects of its own.
+    """
+    most = 2.0 * UNMATCHED * min(len(places_a), len(places_b)) + AMBIGUOUS
+    found: dict[tuple[tuple[int, int], ...], float] = {}
+
+    def extend(pairs: tuple[tuple[int, int], ...], misfit: float) -> None:
+        found[pairs] = misfit
+        first = pairs[-1][0] + 1 if pairs else 0
+        taken = {b for _, b in pairs}
+        for a, b in itertools.product(range(first, len(places_a)), range(len(places_b))):
+            if b in taken or alone[a, b] > most:
+                continue
+            more = (*pairs, (a, b))
+            misfit = _misfit(more, places_a, cov_a, places_b, cov_b)
+            if misfit <= most:
+                extend(more, misfit)
+
+    alone = np.array(
+        [
+            [_misfit(((a, b),), places_a, cov_a, places_b, cov_b) for b in range(len(places_b))]
+            for a in range(len(places_a))
+        ]
+    )
+    extend((), 0.0)
+    return found
 
 
 def _contradict(pairs: Sequence[tuple[int, int]], best: Sequence[tuple[int, int]]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -27,7 +28,15 @@ from caliv_graph.scenario.world import GROUND
 from caliv_graph.scenario.world_models import BoxModel, ChairModel, ObjectModel, WorldModel
 from caliv_graph.simulation.writer import config_of as written_config
 from caliv_graph.targets import extract_targets
-from caliv_graph.targets.cloud.constellation import LidarObjects, match_objects, one_object
+from caliv_graph.targets.cloud.constellation import (
+    AMBIGUOUS,
+    UNMATCHED,
+    LidarObjects,
+    _misfit,
+    _plausible_matchings,
+    match_objects,
+    one_object,
+)
 from caliv_graph.targets.cloud.region import Candidate, RegionExtractor
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.uncertainty.evaluation import evaluate
@@ -345,6 +354,34 @@ def test_a_third_lidar_is_matched_with_all_that_the_first_two_saw() -> None:
         [{"a": 0, "c": 0}, {"a": 1, "b": 0}, {"b": 1, "c": 1}],
         False,
     )
+
+
+def test_only_matchings_that_can_count_are_tried() -> None:
+    """Of twelve objects and six others there are 1.4 million; two metres apart few are plausible.
+
+    These are the same as of all: the cheapest, and every one that is nearly as cheap.
+    """
+    rng = np.random.default_rng(7)
+    a = in_a_row("a", *(2.0 * k for k in range(12)), common_m=0.3)
+    b = in_a_row("b", *(6.0 + 2.0 * k + rng.normal(0.0, 0.1) for k in range(6)), common_m=0.3)
+    found = _plausible_matchings(a.places, a.cov, b.places, b.cov)
+    assert len(found) < 5000
+    assert tuple((k + 3, k) for k in range(6)) in found
+    # Of few objects, by hand: all of them, and those below the limit.
+    a, b = in_a_row("a", 0.0, 1.0, 3.0, common_m=0.5), in_a_row("b", 1.0, 2.0, common_m=0.5)
+    found = _plausible_matchings(a.places, a.cov, b.places, b.cov)
+    every = [
+        tuple(zip(of_a, of_b, strict=True))
+        for size in range(3)
+        for of_a in itertools.combinations(range(3), size)
+        for of_b in itertools.permutations(range(2), size)
+    ]
+    assert len(every) == 13
+    limit = 2.0 * UNMATCHED * 2 + AMBIGUOUS
+    for pairs in every:
+        misfit = _misfit(pairs, a.places, a.cov, b.places, b.cov)
+        assert (pairs in found) == (misfit <= limit)
+        assert found.get(pairs, misfit) == pytest.approx(misfit)
 
 
 def test_order_and_names_of_lidars_do_not_matter() -> None:

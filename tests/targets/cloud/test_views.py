@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from caliv_graph.targets.cloud.views import (
+    SAME_VIEW_M,
     TYPICAL_SHARED,
     chosen,
     evenly_spread,
@@ -55,6 +57,22 @@ def test_scans_from_one_place_are_worth_a_few_together(count: int) -> None:
     # Millimetres of noise in the poses make no new view.
     shaky = np.random.default_rng(1).normal(scale=0.002, size=(count, 3))
     assert view_weights(shaky).sum() == pytest.approx(worth, rel=0.02)
+
+
+def test_minutes_of_standing_are_counted_in_little_memory() -> None:
+    """All pairs of 20000 scans would be 8 GB; places that wander count as Gaussians say."""
+    rng = np.random.default_rng(3)
+    places = rng.normal(scale=0.01, size=(20000, 3)) + np.array([8.0, 1.0, -1.0])
+    tracemalloc.start()
+    count = views(places)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6
+    some = slice(0, 20000, 500)
+    apart = np.linalg.norm(places[some, None] - places[None], axis=2)
+    expected = np.exp(-0.5 * (apart / SAME_VIEW_M) ** 2).sum(axis=1)
+    assert count[some] == pytest.approx(expected, rel=0.1)
+    assert count[some].mean() == pytest.approx(expected.mean(), rel=0.02)
 
 
 def test_views_are_counted_by_how_far_scans_are_apart() -> None:

@@ -159,9 +159,15 @@ def _add_orientations(
 def _add_velocities(
     graph: TrajectoryGraph, data: SmootherInput, velocities: NodeVelocities
 ) -> None:
+    # Rows along the axes in which they were measured, the forward one first: a root in those of the
+    # IMU would mix it with what odometry does not measure.
+    R_twist_imu = data.T_vehicle_twist.between(data.T_vehicle_imu).rotation().matrix()
+    roots = np.linalg.solve(
+        np.linalg.cholesky(R_twist_imu @ velocities.cov @ R_twist_imu.T), R_twist_imu
+    )
     for k, i in enumerate(velocities.nodes.tolist()):
         gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
-        noise = gtsam.noiseModel.Gaussian.Covariance(velocities.cov[k])
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(roots[k], False)
         factor = velocity_factor(
             key_imu(i),
             key_velocity(i),

@@ -13,6 +13,7 @@ import numpy as np
 
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.wheels import is_planar
 
 MIN_SPEED_M_S = 0.5
 """Below, velocity noise of 10 mm/s is more than 20 mrad of direction."""
@@ -178,19 +179,21 @@ def _or_axle(yaw: float, forward: Array, turn: Array, separated: bool) -> str:
     rate = float(np.median(turn / forward))
     if separated or abs(rate) < MIN_CURVATURE_RANGE_1_M:
         return ""
+    axle_m = yaw / rate
+    where = f"{abs(axle_m):.2f} m {'behind' if axle_m > 0.0 else 'ahead of'} the rear axle"
     return (
-        f". Nothing is wrong if the vehicle frame is {-yaw / rate:.2f} m behind the rear axle: "
-        "a single arc does not distinguish the two"
+        f". Nothing is wrong if the vehicle frame is {where}: a single arc does not distinguish "
+        "the two"
     )
 
 
 def _measured_at(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array | None:
     """(n, 2) measured velocities; None if the lateral one is not: odometry sets it to 0."""
-    if motion.twist is None:
+    if motion.twist is None or is_planar(motion.twist):
         return None
     finite = np.isfinite(motion.twist.velocity).all(axis=1)
     velocity = motion.twist.velocity[finite, :2]
-    if len(velocity) < 2 or not np.abs(velocity[:, 1]).any():
+    if len(velocity) < 2:
         return None
     times = np.asarray(motion.twist.stamps_ns[finite])
     x, xp = (stamps_ns - begin_ns) * 1e-9, (times - begin_ns) * 1e-9

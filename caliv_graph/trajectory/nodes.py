@@ -21,7 +21,7 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
-from caliv_graph.trajectory.wheels import wheel_covariances
+from caliv_graph.trajectory.wheels import forward_alone, is_planar, wheel_covariances
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -107,8 +107,12 @@ def _velocity_covariances(data: SmootherInput) -> Array:
     """(n, 3, 3) (m/s)^2 of the velocities, in their axes, scaled as the data ask for."""
     twist = data.motion.twist
     assert twist is not None
-    if data.wheels is None:
-        return velocity_covariances(twist, data.config)[0] * data.scales.get("velocity", 1.0) ** 2
-    cov, _ = wheel_covariances(twist, data.wheels, data.config)
     axes = np.array([data.scales.get("speed", 1.0), 1.0, 1.0])
+    if data.wheels is not None:
+        cov, _ = wheel_covariances(twist, data.wheels, data.config)
+    else:
+        cov, _ = velocity_covariances(twist, data.config)
+        cov = cov * data.scales.get("velocity", 1.0) ** 2
+        if is_planar(twist):
+            cov = forward_alone(cov, twist)
     return np.asarray(cov * np.outer(axes, axes))

@@ -40,6 +40,7 @@ from caliv_graph.trajectory.parameters import (
     speed_scale,
 )
 from caliv_graph.trajectory.smoothed import States, first_nodes
+from caliv_graph.trajectory.wheels import is_planar
 
 COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {
     "gnss_horizontal": ("gnss", (0, 1)),
@@ -97,15 +98,16 @@ def free_components(data: SmootherInput) -> list[str]:
         "baseline": noise.gnss_horizontal_m,
     }
     if data.wheels is not None:
-        for name in ("gyroscope", "accelerometer", *(["velocity"] if data.wheels.planar else [])):
+        for name in ("gyroscope", "accelerometer"):
             del configured[name]
-        if data.wheels.planar:
-            configured["speed"] = noise.velocity_m_s
         if data.wheels.yaw_rate:
             configured["yaw_rate"] = noise.yaw_rate_rad_s
         else:
             configured["steering"] = None
         configured["braking"] = None
+    if data.motion.twist is not None and is_planar(data.motion.twist):
+        del configured["velocity"]
+        configured["speed"] = noise.velocity_m_s
     return [name for name, value in configured.items() if value is None]
 
 

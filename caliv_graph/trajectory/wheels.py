@@ -57,6 +57,39 @@ LEAST_SLIP_M_S = 0.003
 """1 sigma of the lateral and vertical velocity of a standing vehicle."""
 
 
+ROUNDING = 1e-6
+"""Lateral and vertical velocities up to this part of the largest forward one were not measured: a
+filter in the plane leaves rounding where an odometry has zeros."""
+
+STANDING_M_S = 0.01
+"""Forward velocity up to which a vehicle stands, so that it does not move sideways either."""
+
+UNMEASURED_M_S = 100.0
+"""1 sigma of a velocity that nobody measured."""
+
+
+def is_planar(twist: TwistSamples) -> bool:
+    """Whether velocities are forward only: the zeros beside them are set, not measured."""
+    velocity = np.abs(twist.velocity[np.isfinite(twist.velocity).all(axis=1)])
+    if not len(velocity):
+        return False
+    return bool(velocity[:, 1:].max() <= ROUNDING * velocity[:, 0].max())
+
+
+def forward_alone(cov: Array, twist: TwistSamples) -> Array:
+    """(n, 3, 3) covariances of planar velocities beside an IMU, from stated ones, (m/s)^2.
+
+    What moves sideways is the axle, not the vehicle's origin: 1.4 m before it, in a curve of 10 m,
+    the origin goes 140 mrad beside the vehicle's x. Forward velocities are alike all along x.
+    """
+    out = np.zeros_like(cov)
+    out[:, 0, 0] = cov[:, 0, 0]
+    standing = np.abs(twist.velocity[:, 0]) <= STANDING_M_S
+    for axis in (1, 2):
+        out[:, axis, axis] = np.where(standing, cov[:, axis, axis], UNMEASURED_M_S**2)
+    return out
+
+
 @dataclass(frozen=True)
 class WheelModel:
     """What is known of the axle's motion beside its speed.
@@ -79,9 +112,8 @@ class WheelModel:
 
 def wheel_model(twist: TwistSamples, config: Config) -> WheelModel:
     """The model of a drive's odometry."""
-    finite = np.isfinite(twist.velocity).all(axis=1)
     return WheelModel(
-        planar=not twist.velocity[finite, 1:].any(),
+        planar=is_planar(twist),
         yaw_rate=twist.yaw_rate is not None,
         slip_rad=math.radians(config.wheels.slip_sigma_deg),
         tilt_rad=math.radians(config.wheels.tilt_sigma_deg),

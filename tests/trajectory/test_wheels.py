@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -12,19 +14,29 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData, TwistSamples
+from caliv_graph.scenario.drives import Drive
+from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.wheels import WheelModel, level_sigmas, node_spans_s, wheel_noise
+from caliv_graph.trajectory.wheels import (
+    WheelModel,
+    level_sigmas,
+    node_spans_s,
+    wheel_model,
+    wheel_noise,
+)
 from caliv_graph.wording.physics import motion_findings
 from tests.trajectory.motions import (
     START_NS,
     Course,
     Sensors,
+    arc_drive,
     config_for,
     eight_drive,
     errors,
+    mounted_askew,
     record,
     seconds,
     stamps,
@@ -99,6 +111,67 @@ def test_with_an_imu_the_scale_is_found_if_it_is_asked_for() -> None:
     exact = smooth_trajectory(motion, settings(), wanted)
     assert exact.data.speed_scale == 1.0
     assert exact.sigmas_of("twist.scale") is None
+
+
+AHEAD_M = 1.4
+"""Of the axle, where the frame of the vehicle may be: in a curve it does not go along its x."""
+
+
+@pytest.mark.parametrize("drive", [eight_drive(20.0), arc_drive(14.0)], ids=["eight", "arc"])
+def test_beside_an_imu_odometry_tells_the_forward_velocity_alone(drive: Drive) -> None:
+    """Its zeros to the side are those of the axle, not of the vehicle's origin: 140 mrad of yaw."""
+    course, there = Course(drive), mounted_askew()
+    motion = record(course, there, 5)
+    assert motion.imu is not None
+    truth = course.at(seconds(at := stamps(course.duration_s, 50.0)))
+    velocity = np.zeros((len(at), 3))
+    noise = 0.03 * np.random.default_rng(6).standard_normal(len(at))
+    velocity[:, 0] = np.linalg.norm(truth.velocity_map, axis=1) + noise
+    motion = replace(
+        motion,
+        imu=replace(motion.imu, orientation_xyzw=None),
+        twist=TwistSamples(at, velocity),
+    )
+    # The course is that of the axle; seen from a frame that is ahead of it.
+    back = np.array([-AHEAD_M, 0.0, 0.0])
+    T = gtsam.Pose3(there.T_vehicle_imu.rotation(), there.T_vehicle_imu.translation() + back)
+    x, y, z = np.array(there.lever_arm) + back
+    config = config_for(replace(there, T_vehicle_imu=T, lever_arm=(x, y, z)))
+    wanted = stamps(course.duration_s, 4.0, 0.05)
+
+    found = smooth_trajectory(motion, config, wanted)
+
+    R, p = stack(found.trajectory.T_map_vehicle)
+    turn, _ = errors(course, motion, found.trajectory.stamps_ns, R, p)
+    assert found.trajectory.cov is not None
+    sigma = np.sqrt(np.median(found.trajectory.cov[:, 2, 2]))
+    assert np.abs(turn[:, 2]).max() < 4.0 * sigma
+    assert sigma < 0.012
+    # Stated as 0.1 m/s; of one axis, however the IMU is turned.
+    assert found.data.scales == {"speed": pytest.approx(0.3, rel=0.1)}
+    assert not len(found.gnss_rejected)
+    seen = heading_disagreement(found, motion)
+    assert seen is not None
+    assert not seen.measured
+    if drive.duration_s == pytest.approx(20.0):
+        assert seen.axle_m == pytest.approx(-AHEAD_M, abs=0.1)
+        assert not seen.warning
+    else:
+        assert re.search(r"vehicle frame is 1\.[345]\d m ahead of the rear axle", seen.warning)
+    # A filter in the plane leaves rounding in the place of zeros.
+    velocity = velocity + 1e-12 * np.random.default_rng(7).standard_normal(velocity.shape)
+    rounded = smooth_trajectory(replace(motion, twist=TwistSamples(at, velocity)), config, wanted)
+    np.testing.assert_allclose(stack(rounded.trajectory.T_map_vehicle)[0], R, atol=1e-6)
+
+
+def test_rounding_does_not_change_the_model_of_an_axle() -> None:
+    motion = wheels(1)
+    assert motion.twist is not None
+    noise = 1e-12 * np.random.default_rng(7).standard_normal(motion.twist.velocity.shape)
+    rounded = replace(motion.twist, velocity=motion.twist.velocity + noise)
+    assert wheel_model(rounded, settings()) == wheel_model(motion.twist, settings())
+    slipping = motion.twist.velocity + np.array([0.0, 0.01, 0.0])
+    assert not wheel_model(replace(motion.twist, velocity=slipping), settings()).planar
 
 
 def test_without_fixes_nothing_pulls_the_scale() -> None:

@@ -183,7 +183,7 @@ def linearised_evidence(
             *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
         )
     known = scipy.linalg.block_diag(*(row.known for row in rows))
-    effects, motion, inputs, scales = [], [], np.zeros((starts[-1], 0)), np.zeros(0)
+    effects, inputs, scales = [], np.zeros((starts[-1], 0)), np.zeros(0)
     drives = _of_drives(problem, poses, trajectories)
     if drives:
         # What the user typed may be wrong: an arm that is off moves the poses as slowly as the
@@ -198,17 +198,15 @@ def linearised_evidence(
         information = of.trajectory.joint_information(of.stamps_ns)[0]
         known = known + J @ np.linalg.solve(information, J.T)
         inputs += J @ parts_of[drive].poses
-        kinds = of.trajectory.open_kinds
-        found = error_effects(of.trajectory, of.stamps_ns, kinds)
+        found = error_effects(of.trajectory, of.stamps_ns, of.trajectory.open_kinds)
         effects.append((of.columns, {effect.kind: effect for effect in found}))
-        if kinds:
-            motion.append(_of_errors(of.trajectory, structure.get(drive)))
     weak = partial(_weak, problem, range_errors(state.config.noise))
     ridge = np.concatenate([*(weak(key, sizes[key]) for key in others), scales**-2.0])
     residuals = np.concatenate([row.residual for row in rows])
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
-    sigmas = _sensor_sigmas([of.trajectory for of in drives.values()])
-    return Evidence(observed, by_pose, white, effects, motion, sigmas)
+    # Of all drives, those in which nobody sees a target too.
+    by_motion = motion_evidence(trajectories, structure)
+    return Evidence(observed, by_pose, white, effects, by_motion.motion, by_motion.sensor_sigmas)
 
 
 @dataclass(frozen=True)

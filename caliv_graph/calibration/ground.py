@@ -199,11 +199,15 @@ def ground_graph(
 def place_weights(
     problem: Problem, observations: Sequence[GroundObservation], taken: IntArray
 ) -> Array:
-    """(n,) weights for repeated views: a standing vehicle sees the same bumps in every scan."""
+    """(n,) weights for repeated views: a standing vehicle sees the same bumps in every scan.
+
+    Once the waves of the ground are known, observations say themselves how often they count
+    (`GroundObservation.repeated`), and have full weight.
+    """
     out = np.ones(len(observations))
     alike: dict[tuple[int, str], list[int]] = {}
     for n, (o, i) in enumerate(zip(observations, taken.tolist(), strict=True)):
-        if i >= 0:
+        if i >= 0 and o.repeated is None:
             alike.setdefault((o.drive, o.lidar), []).append(n)
     for own in alike.values():
         places = [problem.T_map_vehicle[taken[n]].translation() for n in own]

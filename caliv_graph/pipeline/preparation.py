@@ -33,6 +33,7 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.readers.common_stamps import with_common_stamps
+from caliv_graph.readers.pose_pauses import without_pauses
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import read_patches
 from caliv_graph.structure.without_targets import without_targets
@@ -41,7 +42,12 @@ from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
-from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
+from caliv_graph.trajectory.select import (
+    VehicleTrajectory,
+    noise_scales,
+    smooth_trajectories,
+    takes_given_poses,
+)
 from caliv_graph.wording.mounting import placement_sentence, region_sentence
 from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import no_target_sentence
@@ -127,6 +133,7 @@ def prepare(
     """
     check_clouds(recordings, config)
     recordings = [with_common_stamps(recording) for recording in recordings]
+    recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
     rough, findings, search, placements = _searched(recordings, config, motions, raw, progress)
@@ -152,7 +159,7 @@ def prepare(
         grounds, ground_warnings = measure_grounds(
             recordings, trajectories, observations, config, progress, others, kept
         )
-    warnings = [w for r in recordings for w in r.warnings()]
+    warnings = [*pauses, *(w for r in recordings for w in r.warnings())]
     warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]
     warnings += [w for o in observations for w in o.warnings]
@@ -169,6 +176,20 @@ def prepare(
         patches,
         no_target,
     )
+
+
+def _with_poses(
+    recordings: Sequence[Recording], config: Config, motions: Mapping[int, MotionData]
+) -> tuple[list[Recording], list[str]]:
+    """Without the scans for which given poses pause; and a warning for each drive with such."""
+    out, lines = [], []
+    for index, recording in enumerate(recordings):
+        poses, line = motions[index].poses, ""
+        if poses is not None and takes_given_poses(motions[index], config):
+            recording, line = without_pauses(recording, poses.stamps_ns)
+        out.append(recording)
+        lines += [line] if line else []
+    return out, lines
 
 
 Search = tuple[Config, tuple[str, ...], tuple[TargetObservation, ...], TargetError | None]

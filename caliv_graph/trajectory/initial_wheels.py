@@ -6,6 +6,7 @@ import numpy as np
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate
 from caliv_graph.trajectory.initial import positions_and_velocities, turned_to_antennas
 from caliv_graph.trajectory.inputs import SmootherInput
@@ -19,6 +20,12 @@ MIN_SPEED_M_S = 0.5
 
 MIN_FAST = 2
 """Windows with a course that a heading is made of."""
+
+MIN_CHORD_M = 1.0
+CHORD_SIGMAS = 5.0
+MOST_CHORD_NS = 3_000_000_000
+"""Two fixes tell a course if they are so far apart, and this many of their sigmas, within so long:
+in a curve the way between them is the course halfway."""
 
 
 def first_wheel_states(data: SmootherInput, nodes: IntArray) -> States:
@@ -66,15 +73,39 @@ def _courses(data: SmootherInput) -> tuple[IntArray, Array]:
     begin, end = data.inertial.begin_ns, data.inertial.end_ns
     windows: Windows = antenna_windows(data.positions, begin, end)
     moving = windows.where(windows.speed_m_s > MIN_SPEED_M_S)
-    if len(moving.stamps_ns) < MIN_FAST:
+    stamps, v = moving.stamps_ns, moving.velocity_map
+    if len(stamps) < MIN_FAST:
+        stamps, v = _chords(data.positions, begin, end)
+    if len(stamps) < MIN_FAST:
         raise TrajectoryError(
             f"{data.name}: there is no IMU, and the vehicle hardly moves faster than "
             f"{MIN_SPEED_M_S:g} m/s while there are fixes: heading is unknown. Record GNSS along "
             "the whole drive, or set topics.imu or topics.heading"
         )
-    v = moving.velocity_map
     course = np.arctan2(v[:, 1], v[:, 0])
     twist = data.motion.twist
     usable = np.isfinite(twist.velocity).all(axis=1)
-    forward = interpolate(moving.stamps_ns, twist.stamps_ns[usable], twist.velocity[usable, :1])
-    return moving.stamps_ns, course + np.where(forward[:, 0] < 0.0, np.pi, 0.0)
+    forward = interpolate(stamps, twist.stamps_ns[usable], twist.velocity[usable, :1])
+    return stamps, course + np.where(forward[:, 0] < 0.0, np.pi, 0.0)
+
+
+def _chords(positions: Positions, begin_ns: int, end_ns: int) -> tuple[IntArray, Array]:
+    """Instants (m,) between fixes that are well apart, and the way (m, 3) from one to the other.
+
+    For receivers of 1 or 2 Hz, whose fixes are too few for a window.
+    """
+    inside = (positions.stamps_ns >= begin_ns) & (positions.stamps_ns <= end_ns)
+    at, place = positions.stamps_ns[inside], positions.position_map[inside]
+    sigma_m = np.sqrt(np.trace(positions.cov_map[inside, :2, :2], axis1=1, axis2=2))
+    stamps, ways, first = [], [], 0
+    for i in range(1, len(at)):
+        while first < i - 1 and at[i] - at[first] > MOST_CHORD_NS:
+            first += 1
+        way = place[i] - place[first]
+        apart_m = float(np.hypot(way[0], way[1]))
+        far = apart_m > max(MIN_CHORD_M, CHORD_SIGMAS * float(sigma_m[[first, i]].max()))
+        if far and at[i] - at[first] <= MOST_CHORD_NS:
+            stamps.append((int(at[first]) + int(at[i])) // 2)
+            ways.append(way)
+            first = i
+    return np.array(stamps, dtype=np.int64), np.array(ways).reshape(-1, 3)

@@ -856,3 +856,28 @@ def test_simulated_sweeps_tie_the_lidars_together() -> None:
     assert abs(up @ (between.translation() - true_between.translation())) < 1.5e-3
     assert np.abs(front[:2]).max() < 1.5e-4
     assert abs(front[5] - (truth.level_z_map - recording.world.ground_z_map)) < 3e-3
+
+
+@pytest.mark.parametrize("scans", [5, 40])
+def test_scans_of_one_place_know_the_waves_of_the_ground_as_one_does(scans: int) -> None:
+    """By what each says of how often it counts, and not by the weight of a view once more."""
+    case = make_case(count=scans)
+    still = on_path(case, [case.truth.atPose3(X)] * scans)
+    values = with_planes(still.truth, np.array([0.003, 0.0, GROUND_Z]))
+    one, *_ = observed(still.problem, still.truth, np.array([0.0, 0.0, GROUND_Z]))
+    floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
+    one = replace(one, cov=np.diag(floors**2))
+    alike = [
+        replace(one, stamp_ns=stamp_ns, repeated=(scans - 1.0) * floors**2)
+        for _, stamp_ns in still.problem.poses
+    ]
+
+    def squares(observations: Sequence[GroundObservation]) -> float:
+        graph = ground_graph(still.problem, observations, GroundConfig(use=True))
+        factors = [graph.at(i) for i, kind in enumerate(graph.kinds) if kind == "ground_plane"]
+        assert len(factors) == len(observations)
+        return sum(factor.error(values) for factor in factors)
+
+    assert squares(alike) == pytest.approx(squares([one]), rel=1e-6)
+    # Before the waves are known, a view counts as four scans at most.
+    assert 2.0 < squares([replace(o, repeated=None) for o in alike]) / squares([one]) < 4.0

@@ -38,6 +38,7 @@ from tests.trajectory.motions import (
     errors,
     mounted_askew,
     record,
+    rows_of,
     seconds,
     stamps,
 )
@@ -111,6 +112,27 @@ def test_with_an_imu_the_scale_is_found_if_it_is_asked_for() -> None:
     exact = smooth_trajectory(motion, settings(), wanted)
     assert exact.data.speed_scale == 1.0
     assert exact.sigmas_of("twist.scale") is None
+
+
+@pytest.mark.parametrize("hz", [1, 2])
+def test_receivers_of_one_hertz_tell_the_course_too(hz: int) -> None:
+    motion, usual = wheels(1), smoothed(True)[1]
+    assert motion.gnss is not None
+    kept = np.arange(len(motion.gnss.stamps_ns)) % (10 // hz) == 0
+    few = replace(motion, gnss=rows_of(motion.gnss, kept))
+    found = smooth_trajectory(few, settings(), stamps(DRIVE.duration_s, 5.0, 0.05))
+    nees, turn, _ = whitened(few, found)
+    assert np.sqrt((turn[:, 2] ** 2).mean()) < 15e-3
+    assert nees.mean() < 12.0
+    assert found.data.speed_scale == pytest.approx(usual.data.speed_scale, abs=0.01)
+
+
+def test_fixes_that_stay_where_they_are_tell_no_course() -> None:
+    motion = wheels(1)
+    assert motion.gnss is not None
+    still = rows_of(motion.gnss, np.arange(len(motion.gnss.stamps_ns)) < 10)
+    with pytest.raises(TrajectoryError, match="heading is unknown"):
+        smooth_trajectory(replace(motion, gnss=still), settings(), stamps(DRIVE.duration_s, 5.0))
 
 
 AHEAD_M = 1.4

@@ -126,9 +126,29 @@ def _instead_of_folder(path: Path) -> str:
 
 
 def dump_config(config: Config) -> str:
-    """The effective configuration as YAML that `load_config` reads back to the same values."""
-    data = config.model_dump(mode="json", exclude_none=True)
+    """The effective configuration as YAML that `load_config` reads back to the same values.
+
+    Absent keys stay absent. A null that is not the default stays: `lever_arm: null` is an unknown
+    lever arm, and an absent one is exactly zero.
+    """
+    data = _without_absent(config, config.model_dump(mode="json"))
     for lidar in data["lidars"].values():
         if "initial" not in lidar:
             del lidar["sigma"]  # of a guess that is not there
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _without_absent(value: Any, dumped: Any) -> Any:
+    """What a value of a model is dumped as, without the nulls of fields whose default is null."""
+    if isinstance(value, BaseModel):
+        fields = type(value).model_fields
+        return {
+            name: _without_absent(getattr(value, name), entry)
+            for name, entry in dumped.items()
+            if entry is not None or fields[name].default is not None
+        }
+    if isinstance(value, Mapping):
+        return {key: _without_absent(value[key], entry) for key, entry in dumped.items()}
+    if isinstance(value, tuple):
+        return [_without_absent(*pair) for pair in zip(value, dumped, strict=True)]
+    return dumped

@@ -251,6 +251,23 @@ def test_what_is_dumped_is_loaded_again(tmp_path: Path) -> None:
     assert dump_config(load_config(path)) == dump_config(config)
 
 
+@pytest.mark.parametrize("arm", [None, [0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
+@pytest.mark.parametrize("rpy_deg", [None, [0.0, 0.0, 0.0], [0.0, 0.0, 90.0]])
+def test_what_is_unknown_stays_unknown_in_the_dump(arm: Any, rpy_deg: Any) -> None:
+    config = parse(
+        gnss={"lever_arm": arm},
+        imu={"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": rpy_deg}},
+        lidars={"a": {"topic": "a"}, "b": {"topic": "b", "initial": {"xyz": [1, 0, 0]}}},
+    )
+    dumped = dump_config(config)
+    again = parse_config(yaml.safe_load(dumped), "config.yaml", Path("/base"))
+
+    assert again == config
+    assert again.gnss.arm_sigma() == config.gnss.arm_sigma()
+    # What was not given is not written.
+    assert dumped.count("null") == (arm is None) + (rpy_deg is None)
+
+
 def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "broken.yaml").write_text("a: 1\nb: [1\nc: 2\n")

@@ -9,7 +9,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from caliv_graph.errors import ExportError
+from caliv_graph.config.load import dump_config, load_config
+from caliv_graph.errors import ConfigError, ExportError
 from caliv_graph.export.consumers.autoware import export as export_autoware
 from caliv_graph.export.consumers.tf import export as export_tf
 from caliv_graph.export.prepare import Options, prepare
@@ -135,6 +136,17 @@ def test_the_imu_is_where_the_config_or_the_option_says(calibration: Path, tmp_p
     imu = prepare(calibration, Options("glim", OUT, config=other)).imu
     assert imu is not None
     assert imu.stated
+
+
+def test_an_imu_of_unknown_rotation_is_not_exported_as_aligned(
+    calibration: Path, tmp_path: Path
+) -> None:
+    unknown = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": None}}
+    asked = load_config(write_config(tmp_path / "asked.yaml", imu=unknown))
+    (calibration.parent / "config.yaml").write_text(dump_config(asked))
+
+    with pytest.raises(ConfigError, match="rpy_deg is null: the rotation of the IMU is unknown"):
+        prepare(calibration, Options("fast-lio", OUT))
 
 
 @pytest.mark.parametrize(

@@ -172,9 +172,16 @@ def run_job(
 
 
 def _unused_keys(config: Config) -> list[str]:
-    """A line per section that is set and has no effect."""
+    """A line per section, or topic of a bag, that is set and has no effect."""
     if config.data.format == "rosbag":
-        return []
+        named = [key for key, topic in config.topics if topic is not None and key != "pose"]
+        source = "data.poses" if config.data.poses is not None else "topics.pose"
+        return [
+            f"topics.{key}: has no effect on the trajectory, since {source} stands instead. Remove "
+            "one of the two"
+            for key in named
+            if config.names_poses()
+        ]
     what = (
         "a CaLiV folder contains the vehicle poses"
         if config.data.format == "caliv"

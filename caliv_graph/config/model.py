@@ -40,7 +40,7 @@ class DataConfig(Section):
     format: Literal["rosbag", "caliv", "clouds"] = "rosbag"
     path: FilePath | None = Field(None, description="folder or file, relative to the config")
     poses: FilePath | None = Field(
-        None, description="file with the vehicle's poses, instead of topics.pose, relative likewise"
+        None, description="file with the vehicle's poses, instead of topics, relative likewise"
     )
     pose_axes: PoseAxes = Field(
         "flu",
@@ -316,6 +316,10 @@ class Config(Section):
                 of = " and ".join(f"'{n}'" for n, m in self.lidars.items() if m.topic == topic)
                 raise ValueError(f"topic '{topic}' belongs to LiDARs {of}: give each its own")
         return self
+
+    def names_poses(self) -> bool:
+        """Whether the config names poses, which are taken instead of all other motion data."""
+        return self.topics.pose is not None or self.data.poses is not None
 
     def names_motion(self) -> bool:
         """Whether the config names anything that measures the vehicle's motion."""

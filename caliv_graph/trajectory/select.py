@@ -113,7 +113,7 @@ def smooth_trajectories(
     motions: Mapping[int, MotionData] | None = None,
     scales: Sequence[Mapping[str, float] | None] | None = None,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
-    """The trajectory of each drive: given poses if `topics.pose` is set or there is no IMU.
+    """The trajectory of each drive: given poses (`takes_given_poses`), or smoothed raw sensors.
 
     `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
     `motions` are motion data by the recording's index, if they have been read already. `scales` are
@@ -146,8 +146,12 @@ def noise_scales(
 
 
 def takes_given_poses(motion: MotionData, config: Config) -> bool:
-    """Whether the trajectory of a drive is its given poses."""
-    return config.topics.pose is not None or (motion.poses is not None and motion.imu is None)
+    """Whether the trajectory of a drive is its given poses.
+
+    It is where the config names them, whatever else it names (`names_poses`), or where there is no
+    IMU beside them.
+    """
+    return config.names_poses() or (motion.poses is not None and motion.imu is None)
 
 
 def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:

@@ -18,6 +18,7 @@ from caliv_graph.errors import ConfigError, OutputError, RecordingError
 from caliv_graph.products import Calibration, Recording
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from tests.cli.commands import write_config, write_drive
+from tests.readers.bags import SECOND, START, cloud, imu, write_bag
 from tests.samples import make_calibration, make_solution, unseen
 
 
@@ -248,6 +249,28 @@ def test_keys_without_effect_are_warned_about_in_a_line_each(
 
     assert result.exit_code == 0
     assert result.stderr.splitlines() == [f"warning: {line}" for line in lines]
+
+
+def test_topics_that_a_file_of_poses_stands_instead_of_are_warned_about(
+    pipeline: Pipeline, tmp_path: Path
+) -> None:
+    at = [START + k * SECOND // 10 for k in range(5)]
+    clouds = [("/lidar", t, cloud(t, [[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]])) for t in at]
+    write_bag(tmp_path / "drive", [*clouds, *(("/imu", t, imu(t)) for t in at)])
+    (tmp_path / "p.tum").write_text("".join(f"{t / 1e9:.1f} 0 0 0 0 0 0 1\n" for t in at))
+    config = write_config(
+        tmp_path / "config.yaml",
+        data={"path": "drive", "poses": "p.tum"},
+        topics={"imu": "/imu"},
+        lidars={"a": {"topic": "/lidar", "initial": {"xyz": [1, 0, 1]}}},
+    )
+
+    result = calibrate(config, "--out", tmp_path / "out")
+
+    assert (
+        "warning: topics.imu: has no effect on the trajectory, since data.poses stands instead. "
+        "Remove one of the two"
+    ) in result.stderr.splitlines()
 
 
 def test_guesses_that_nobody_filled_in(pipeline: Pipeline, config: Path) -> None:

@@ -91,9 +91,15 @@ def test_given_poses_beside_raw_sensors_are_taken_if_asked_for() -> None:
     motion = replace(record(Course(arc_drive(5.0)), Sensors(), 0), poses=given(51).poses)
     drive = Drive(motion, (START_NS,))
     (smoothed,) = smooth_trajectories([drive], config_for(Sensors()))
-    (taken,) = smooth_trajectories([drive], config_for(Sensors(), topics={"pose": "/pose"}))
     assert isinstance(smoothed, SmoothedTrajectory)
-    assert isinstance(taken, GivenTrajectory)
+    for asked in (
+        {"topics": {"pose": "/pose"}},
+        {"topics": {"imu": "/imu", "pose": "/pose"}},
+        {"topics": {"imu": "/imu", "gnss": "/gnss"}, "data": {"poses": "poses.tum"}},
+    ):
+        (taken,) = smooth_trajectories([drive], config_for(Sensors(), **asked))
+        assert isinstance(taken, GivenTrajectory)
+        assert taken.poses_at([START_NS + 10**9])[1] == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
 
 
 def test_between_given_poses_the_vehicle_moves_evenly() -> None:

@@ -5,7 +5,7 @@ samples/LIDAR_TOP/n015-..__LIDAR_TOP__1532402927647951.pcd.bin               nuS
 LiDAR/Ouster/1693019372543222016.bin, LiDAR_GT/Ouster_gt.txt                 HeLiPR
 
 The time of a cloud is in its name (ns, us or ms since 1970, or seconds with a point), or in the
-line of a file of times beside it.
+line of a file of times beside it: clouds count by the numbers in their names, 2.bin before 10.bin.
 """
 
 from __future__ import annotations
@@ -259,11 +259,14 @@ def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
     folder = root / lidar.topic
     try:
         paths = sorted(
-            entry
-            for entry in folder.iterdir()
-            if entry.suffix in (".bin", ".pcd")
-            and not entry.name.startswith(".")
-            and entry.is_file()
+            (
+                entry
+                for entry in folder.iterdir()
+                if entry.suffix in (".bin", ".pcd")
+                and not entry.name.startswith(".")
+                and entry.is_file()
+            ),
+            key=lambda path: _by_number(path.name),
         )
     except OSError:
         there = ", ".join(cloud_folders(root)) or "none"
@@ -286,6 +289,12 @@ def _clouds(root: Path, lidar: LidarConfig, name: str) -> dict[int, Path]:
             raise RecordingError(f"{path}: {what}. Rename or remove the cloud")
         clouds[stamp_ns] = path
     return dict(sorted(clouds.items()))
+
+
+def _by_number(name: str) -> tuple[list[str | int], str]:
+    """Key to sort names by the numbers in them: 2.bin stands before 10.bin."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
 def _times_in_names(names: Sequence[str]) -> list[int | None] | None:
@@ -313,7 +322,7 @@ def _times_in_names(names: Sequence[str]) -> list[int | None] | None:
 
 
 def _listed_times(folder: Path, root: Path, count: int, name: str) -> list[int | None]:
-    """The times of clouds that are numbered, from the lines of a file."""
+    """The times of numbered clouds, from the lines of a file, in the order of the numbers."""
     for place in dict.fromkeys((folder, folder.parent, root)):
         for file in _TIMES_FILES:
             path = place / file

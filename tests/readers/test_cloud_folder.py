@@ -84,6 +84,19 @@ def test_a_sequence_of_kitti(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses.T_map_vehicle[5].rotation().matrix(), np.eye(3), atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["{}.bin", "cloud_{}.bin", "run2_{}_left.bin"])
+def test_numbers_that_are_not_equally_long_count_as_numbers(tmp_path: Path, name: str) -> None:
+    root = kitti(tmp_path / "00", count=12)
+    for k in range(12):
+        (root / f"velodyne/{k:06d}.bin").rename(root / "velodyne" / name.format(k))
+
+    scans = list(opened(root, "velodyne").scans("top"))
+
+    assert [scan.stamp_ns for scan in scans] == [k * PERIOD for k in range(12)]
+    for k, scan in enumerate(scans):
+        np.testing.assert_array_equal(scan.points_lidar, points_of(k))
+
+
 def test_the_dates_of_kitti_raw(tmp_path: Path) -> None:
     root = kitti(tmp_path / "velodyne_points")
     (root / "times.txt").unlink()

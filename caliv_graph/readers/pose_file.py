@@ -39,6 +39,10 @@ _TUM = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
 _WHOLE_SECONDS = re.compile(r"(^|[^a-z])secs?$")
 """Name of a column with the seconds of a stamp, whose nanoseconds are in another one."""
 
+_HEADER_STAMP = re.compile(r"(^|[^a-z])stamp$")
+"""Name of a column with the stamp of a message: field.header.stamp, /odom/header/stamp. Another
+time beside it is that of the recording: %time of `rostopic echo -b`, __time of PlotJuggler."""
+
 _MATRIX_TOLERANCE = 1e-3
 """By which a rotation matrix may differ from one: rounding to four decimals."""
 
@@ -108,11 +112,7 @@ def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> Give
                 f"{where}: {len(values)} values, expected timestamp x y z qx qy qz qw (TUM), or a "
                 "header line that names the columns (CSV)"
             )
-        stamp_ns = stamp_of(values[columns["time"]])
-        if stamp_ns is None:
-            raise RecordingError(
-                f"{where}: {values[columns['time']][:40]!r} is not a time. Write seconds"
-            )
+        stamp_ns = _time(values[columns["time"]], where)
         if "nanoseconds" in columns:
             part_ns = _number(values[columns["nanoseconds"]], where)
             if not 0 <= part_ns < NANOSECONDS_PER_SECOND:
@@ -122,6 +122,9 @@ def read_poses(path: Path, cloud_stamps_ns: Sequence[int] | None = None) -> Give
             stamp_ns += int(part_ns)
         stamps[i] = stamp_ns
         rows[i] = [_number(values[columns[name]], where) for name in _TUM[1:]]
+    if "recorded" in columns and not stamps.any():  # nobody set the stamps: as in a bag
+        recorded = [(f"{path}, line {n}", values[columns["recorded"]]) for n, values in lines]
+        stamps = np.array([_time(text, where) for where, text in recorded], np.int64)
     return _given(stamps, rows, path)
 
 
@@ -140,7 +143,7 @@ def _table(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
             # A comment of a TUM file may name its columns, too, but in the order that it has; and
             # one with a comma need not name any.
             header = [v.lstrip("#% ") for v in values]
-            if comment and (len(values) == 1 or set(_TUM) - set(map(_plain_meaning, header))):
+            if comment and (len(values) == 1 or set(_TUM) - {_meaning(_plain(v)) for v in header}):
                 continue
             if not lines and (not comment or re.search("[,;]", bare)):
                 names = header
@@ -152,20 +155,32 @@ def _table(text: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
-    """Index of each value of a pose by the header of a CSV."""
+    """Index of each value of a pose by the header of a CSV.
+
+    Where messages are recorded with their stamps, `time` is the stamp and `recorded` the other.
+    """
     found: dict[str, int] = {}
     seconds: int | None = None
+    stamp: int | None = None
     for index, name in enumerate(names):
-        meaning = _plain_meaning(name)
+        plain = _plain(name)
+        meaning = _meaning(plain)
         if meaning is not None:
             found.setdefault(meaning, index)
-        if meaning == "time" and seconds is None and _WHOLE_SECONDS.search(name.strip().lower()):
+        if meaning == "time" and seconds is None and _WHOLE_SECONDS.search(plain):
             seconds = index
+        if meaning == "time" and stamp is None and _HEADER_STAMP.search(plain):
+            stamp = index
+    first = found.get("time")
     # Beside the two parts of a stamp there may be the time of recording, with its fraction.
     if "nanoseconds" in found and seconds is not None:
         found["time"] = seconds
     elif "nanoseconds" in found and "time" not in found:
         found["time"] = found.pop("nanoseconds")
+    elif stamp is not None:
+        found["time"] = stamp
+    if first is not None and first != found["time"]:
+        found["recorded"] = first
     missing = [name for name in _TUM if name not in found]
     if missing:
         raise RecordingError(
@@ -175,9 +190,9 @@ def _columns(names: Sequence[str], path: Path) -> dict[str, int]:
     return found
 
 
-def _plain_meaning(name: str) -> str | None:
-    """`_meaning` of a name that may have a unit in brackets."""
-    return _meaning(re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower())
+def _plain(name: str) -> str:
+    """A name in lower case, without a unit in brackets."""
+    return re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
 
 
 def _meaning(plain: str) -> str | None:
@@ -195,6 +210,13 @@ def _meaning(plain: str) -> str | None:
     if re.search(r"^q|quat|orient|rot", before):
         return f"q{axis}"
     return axis if axis != "w" and re.fullmatch(r"|[pt]|[pt]_.*|.*(pos|trans).*", before) else None
+
+
+def _time(text: str, where: str) -> int:
+    stamp_ns = stamp_of(text)
+    if stamp_ns is None:
+        raise RecordingError(f"{where}: {text[:40]!r} is not a time. Write seconds")
+    return stamp_ns
 
 
 def _number(text: str, where: str) -> float:

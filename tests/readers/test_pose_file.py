@@ -41,6 +41,12 @@ def test_times_of_all_units_to_the_nanosecond(text: str, stamp_ns: int | None) -
     assert stamp_of(text) == stamp_ns
 
 
+ROSTOPIC = ",".join(
+    f"field.pose.pose.{part}"
+    for part in (*(f"position.{a}" for a in "xyz"), *(f"orientation.{a}" for a in "xyzw"))
+)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -57,6 +63,14 @@ def test_times_of_all_units_to_the_nanosecond(text: str, stamp_ns: int | None) -
         "field.pose.pose.orientation.z,field.pose.pose.orientation.w,"
         f"field.twist.twist.linear.x\n{T},7,1,2,3,0,0,{HALF},{HALF},9\n",
         # The time of recording comes before the stamp, which counts.
+        f"%time,field.header.seq,field.header.stamp,{ROSTOPIC}\n"
+        f"1700000000750000000,7,{T},1,2,3,0,0,{HALF},{HALF}\n",
+        f"__time,/odom/header/stamp,{ROSTOPIC.replace('field.', '/odom/').replace('.', '/')}\n"
+        f"1700000000.75,1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        f"timestamp,header.stamp [s],{ROSTOPIC}\n"
+        f"1700000000.75,1700000000.123456789,1,2,3,0,0,{HALF},{HALF}\n",
+        # Where nobody set the stamp, the time of recording stands in.
+        f"%time,field.header.stamp,{ROSTOPIC}\n{T},0,1,2,3,0,0,{HALF},{HALF}\n",
         "Time,header.stamp.secs,header.stamp.nsecs,pose.pose.position.x,pose.pose.position.y,"
         "pose.pose.position.z,pose.pose.orientation.x,pose.pose.orientation.y,"
         "pose.pose.orientation.z,pose.pose.orientation.w\n"

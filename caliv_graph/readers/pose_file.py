@@ -328,11 +328,14 @@ def in_vehicle_axes(poses: GivenPoses, axes: PoseAxes) -> GivenPoses:
 
 
 def check_overlap(poses: GivenPoses, path: Path, span_ns: tuple[int, int], what: str) -> None:
-    """Raises RecordingError if the poses are of another time than the recording `what`."""
+    """Raises RecordingError if the poses are of another time than the clouds of a recording.
+
+    `span_ns` are the first and last stamp of the clouds, `what` names the recording.
+    """
     first, last = int(poses.stamps_ns[0]), int(poses.stamps_ns[-1])
     if last < span_ns[0] or first > span_ns[1]:
         raise RecordingError(
-            f"{path}: its poses are of {first / 1e9:.3f} to {last / 1e9:.3f} s, {what} is of "
-            f"{span_ns[0] / 1e9:.3f} to {span_ns[1] / 1e9:.3f} s. Give the times of the poses in "
-            "the clock of the clouds"
+            f"{path}: its poses are of {first / 1e9:.3f} to {last / 1e9:.3f} s, the clouds of "
+            f"{what} of {span_ns[0] / 1e9:.3f} to {span_ns[1] / 1e9:.3f} s. Give the times of the "
+            "poses in the clock of the clouds"
         )

@@ -259,7 +259,11 @@ class RosbagRecording:
                 self._warnings.append(f"{where}: holds nothing that can be used")
         if self._poses is not None:
             found["pose"] = read_poses(self._poses)
-            check_overlap(found["pose"], self._poses, self.span_ns, self._bag.name)
+            # Record times are of the recorder's clock, poses of that of the stamps.
+            stamps = [stamp_ns for scans in index.scans.values() for stamp_ns in scans]
+            if stamps:
+                span_ns = min(stamps), max(stamps)
+                check_overlap(found["pose"], self._poses, span_ns, self._bag.name)
         if found.get("pose") is not None:
             found["pose"] = in_vehicle_axes(found["pose"], self._pose_axes)
         motion = MotionData(

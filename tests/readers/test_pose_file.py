@@ -200,5 +200,5 @@ def test_poses_of_another_time_are_refused(tmp_path: Path) -> None:
     poses = read_poses(path)
 
     check_overlap(poses, path, (10**9, 5 * 10**9), "bag")
-    with pytest.raises(RecordingError, match=r"of 1\.000 to 2\.000 s, bag is of 7\.000"):
+    with pytest.raises(RecordingError, match=r"of 1\.000 to 2\.000 s, the clouds of bag of 7\.000"):
         check_overlap(poses, path, (7 * 10**9, 8 * 10**9), "bag")

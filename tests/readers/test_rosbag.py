@@ -13,6 +13,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import TopicsConfig
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError, RecordingError
+from caliv_graph.products import GivenPoses
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.pointcloud2 import DecodedCloud
 from caliv_graph.readers.rosbag import RosbagRecording
@@ -115,6 +116,27 @@ def test_a_drive_in_every_kind_of_bag(tmp_path: Path, kind: str) -> None:
     assert motion.gnss.latitude_deg[3] == 48 + 3e-5
     assert motion.twist.velocity[0].tolist() == [2, 0, 0]
     assert recording.warnings() == []
+
+
+def test_a_file_of_poses_is_in_the_clock_of_the_stamps_not_of_the_recorder(tmp_path: Path) -> None:
+    # A simulated drive: the stamps count from 0, the record times from 1970.
+    begin = 10 * SECOND
+    messages = [
+        (FRONT, stamp_of(k), cloud(begin + k * SECOND // 10, points_of(k))) for k in range(20)
+    ]
+    bag = write_bag(tmp_path / "drive", messages)
+
+    def read(first_s: float) -> GivenPoses | None:
+        path = tmp_path / "poses.tum"
+        path.write_text("".join(f"{first_s + 0.1 * k:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
+        lidars = {"front": lidar(FRONT)}
+        return RosbagRecording(bag, lidars, TopicsConfig(), poses=path).motion().poses
+
+    poses = read(10.0)
+    assert poses is not None
+    assert poses.stamps_ns[0] == begin
+    with pytest.raises(RecordingError, match=r"of 1700000000\.000 .*drive of 10\.000 to 11\.900 s"):
+        read(START / SECOND)
 
 
 @pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2"])

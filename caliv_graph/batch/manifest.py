@@ -163,10 +163,16 @@ def effective_config(job: Job) -> Config:
             raw["limits"] = dict(job.limits)
             raw["require"] = _without_limits(raw.get("require"))
         if job.require is not None:
-            raw["require"] = [*job.require]
+            raw["require"] = [*job.require, *_limits_inside(raw.get("require"))]
         if raw.get("require") is None:
             raw.pop("require", None)
     return parse_config(raw, str(job.config), job.config.parent)
+
+
+def _limits_inside(require: Any) -> list[Any]:
+    """The limits that the config has inside `require`: they are not what a job has instead."""
+    items = require if isinstance(require, list) else [require]
+    return [item for item in items if isinstance(item, Mapping)]
 
 
 def _without_limits(require: Any) -> Any:

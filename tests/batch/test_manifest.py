@@ -140,7 +140,32 @@ def test_overrides_take_the_place_of_what_the_config_says(tmp_path: Path) -> Non
     assert effective(limits={"s2s_x_m": 0.01}).require == ("s2v",)
     assert effective(limits={}).limits == {}
     assert effective(require=()).require == ()
+    # The limits of the config stay, wherever it has them.
+    assert effective(require=("s2s",)).require == ("s2s",)
+    assert effective(require=("s2s",)).limits == {"s2v_yaw_deg": 0.1}
+    assert effective(require=("s2s",), limits={"s2s_x_m": 0.01}).limits == {"s2s_x_m": 0.01}
+    assert effective(require=("s2s",), limits={}).limits == {}
     assert effective().data.path == tmp_path / "drive"
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        {"limits": {"s2v_yaw_deg": 0.1}},
+        {"s2v_yaw_deg": 0.1},
+        ["s2v", {"s2v_yaw_deg": 0.1}],
+        [{"limits": {"s2v_yaw_deg": 0.1}}],
+    ],
+)
+def test_a_job_with_other_requirements_keeps_the_limits_inside_them(
+    tmp_path: Path, inside: Any
+) -> None:
+    config = write_config(tmp_path / "config.yaml", require=inside, limits={"s2s_x_m": 0.02})
+
+    effective = effective_config(Job("a", config, require=("s2s", "s2v_rotation")))
+
+    assert effective.require == ("s2s", "s2v_rotation")
+    assert effective.limits == {"s2s_x_m": 0.02, "s2v_yaw_deg": 0.1}
 
 
 def test_a_section_that_is_empty_or_no_section(tmp_path: Path) -> None:

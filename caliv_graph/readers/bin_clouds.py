@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from caliv_graph.common.inputs import read_input, unreadable
 from caliv_graph.errors import RecordingError
 from caliv_graph.readers.bag import DamagedMessageError
+from caliv_graph.readers.plain_points import as_message
 from caliv_graph.readers.pointcloud2 import (
     DecodedCloud,
     UnusableCloudsError,
@@ -21,9 +21,6 @@ from caliv_graph.readers.pointcloud2 import (
 
 KITTI = ("x f4", "y f4", "z f4", "intensity f4")
 NUSCENES = (*KITTI, "ring f4")
-
-_DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-"""Numbers of the types in `sensor_msgs/PointField`. It has none for 64-bit integers."""
 
 _FARTHEST_M = 1e4
 """Beyond the range of any LiDAR: such a coordinate is another field, read as one."""
@@ -99,15 +96,6 @@ def _as_message(path: Path, fields: Sequence[str]) -> Any:
     described, offset = [], 0
     for field in fields:
         name, _, kind = field.partition(" ")
-        if kind in _DATATYPES:
-            described.append(SimpleNamespace(name=name, offset=offset, datatype=_DATATYPES[kind]))
+        described.append((name, kind, offset))
         offset += np.dtype(kind).itemsize
-    return SimpleNamespace(
-        fields=described,
-        is_bigendian=False,
-        width=len(data) // step,
-        height=1,
-        point_step=step,
-        row_step=len(data),
-        data=np.frombuffer(data, np.uint8),
-    )
+    return as_message(np.frombuffer(data, np.uint8), described, step)

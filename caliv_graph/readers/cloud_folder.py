@@ -16,6 +16,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,10 +31,15 @@ from caliv_graph.readers.bag import Topic
 from caliv_graph.readers.bin_clouds import bin_sweep_times, plain_fields, read_bin
 from caliv_graph.readers.clock import Clock, read_clock
 from caliv_graph.readers.imu import ImuCheck
-from caliv_graph.readers.pcd import read_pcd
-from caliv_graph.readers.pointcloud2 import DecodedCloud
+from caliv_graph.readers.pcd import read_pcd_table
+from caliv_graph.readers.plain_points import table_as_message
+from caliv_graph.readers.pointcloud2 import (
+    TIME_FIELDS,
+    DecodedCloud,
+    decode_pointcloud2,
+    sweep_times,
+)
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of
-from caliv_graph.readers.returns import is_return
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import TimesSeen, is_sampled, mark_of_clouds, times_warnings
 
@@ -208,9 +214,11 @@ class CloudFolder:
         for name, clouds in self._clouds.items():
             period_s = self._period_s(name)
             times = [
-                bin_sweep_times(path, self._fields[name], stamp_ns, period_s)
+                sweep_times(_pcd_message(path), stamp_ns, period_s)
+                if path.suffix == ".pcd"
+                else bin_sweep_times(path, self._fields[name], stamp_ns, period_s)
                 for i, (stamp_ns, path) in enumerate(clouds.items())
-                if is_sampled(i) and path.suffix == ".bin"
+                if is_sampled(i)
             ]
             # No time of recording tells anything: as if each were its stamp.
             marks[name] = mark_of_clouds(self._lidars[name].stamp, times, np.zeros(1), period_s)
@@ -223,13 +231,19 @@ class CloudFolder:
         lidar, stamp_ns = item
         config, path = self._lidars[lidar], self._clouds[lidar][stamp_ns]
         ranges = (config.min_range, config.max_range)
+        period_s = self._period_s(lidar)
         if path.suffix == ".pcd":
-            points = read_pcd(path)
-            return stamp_ns, DecodedCloud(points[is_return(points, *ranges)], None)
-        cloud = read_bin(path, self._fields[lidar], stamp_ns, ranges, self._period_s(lidar))
+            cloud = decode_pointcloud2(_pcd_message(path), stamp_ns, *ranges, period_s)
+        else:
+            cloud = read_bin(path, self._fields[lidar], stamp_ns, ranges, period_s)
         if cloud.times_s is not None:
             cloud = replace(cloud, times_s=cloud.times_s + self._marks[lidar].shift_s)
         return stamp_ns, cloud
+
+
+def _pcd_message(path: Path) -> Any:
+    """The points of a PCD file and their times, with the attributes of a `PointCloud2`."""
+    return table_as_message(read_pcd_table(path, TIME_FIELDS))
 
 
 def poses_file(path: Path) -> Path | None:

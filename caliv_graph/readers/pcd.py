@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import io
 import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import lzf  # type: ignore[import-not-found]
 import numpy as np
@@ -61,16 +63,19 @@ class _Field:
     column: int
 
     @property
-    def dtype(self) -> np.dtype[np.floating]:
-        """Of a coordinate. PCD has no mark for byte order: that of the machine, so little."""
-        return np.dtype(f"<f{self.size}")
+    def dtype(self) -> np.dtype[Any]:
+        """Of a number. PCD has no mark for byte order: that of the machine, so little."""
+        return np.dtype(f"<{self.kind.lower()}{self.size}")
 
 
 @dataclass(frozen=True)
 class _Header:
-    """The expected content of the body: bytes and numbers of one point; and the header's size."""
+    """The expected content of the body: bytes and numbers of one point; and the header's size.
 
-    xyz: tuple[_Field, _Field, _Field]
+    Of the fields only those that are wanted; x, y and z come first.
+    """
+
+    fields: tuple[_Field, ...]
     points: int
     point_size: int
     columns: int
@@ -79,10 +84,17 @@ class _Header:
 
 
 def read_pcd(path: Path) -> Array:
-    """Reads all points of a PCD file, NaN and zero returns included: (N, 3) float64, metres.
+    """The x, y, z of `read_pcd_table`: (N, 3) float64, metres."""
+    table = read_pcd_table(path)
+    return np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64, order="C")
 
-    Float x, y, z may stand among its fields in any order. VIEWPOINT is not applied: as in PCL and
-    Open3D, it is the place of the sensor, and the points are the sensor's.
+
+def read_pcd_table(path: Path, also: Sequence[str] = ()) -> npt.NDArray[np.void]:
+    """Reads all points of a PCD file, NaN and zero returns included: (N,) with named fields.
+
+    Float x, y, z (metres) may stand among its fields in any order. VIEWPOINT is not applied: as in
+    PCL and Open3D, it is the place of the sensor, and the points are the sensor's. Of the fields
+    that `also` names those that the file has are read, too, each of one number.
 
     Raises:
         RecordingError: the file is missing, empty, cut off or damaged, or has no x, y, z.
@@ -92,7 +104,7 @@ def read_pcd(path: Path) -> Array:
     except OSError as e:
         raise RecordingError(f"{path}: {unreadable(e)}") from None
     try:
-        header = _read_header(data)
+        header = _read_header(data, also)
         if header.encoding == "ascii":
             return _read_ascii(data, header)
         if header.encoding == "binary":
@@ -102,7 +114,7 @@ def read_pcd(path: Path) -> Array:
         raise RecordingError(f"{path}: {e}") from None
 
 
-def _read_header(data: bytes) -> _Header:
+def _read_header(data: bytes, also: Sequence[str]) -> _Header:
     if not data:
         raise _Unreadable("is empty (0 bytes)", _ADVICE_EMPTY)
     entries, size = _header_entries(data)
@@ -120,11 +132,13 @@ def _read_header(data: bytes) -> _Header:
             f"{width * height}"
         )
     xyz = _coordinates(fields)
+    names = [field.name for field in fields]
+    others = [f for f in fields if f.name in also and f.count == names.count(f.name) == 1]
     if points == 0:
         raise _Unreadable("holds no points (POINTS 0)", _ADVICE_EMPTY)
     last = fields[-1]
     return _Header(
-        xyz=xyz,
+        fields=(*xyz, *others),
         points=points,
         point_size=last.offset + last.size * last.count,
         columns=last.column + last.count,
@@ -234,7 +248,7 @@ def _check_end(data: bytes, end: int, declared: str) -> None:
         )
 
 
-def _read_binary(data: bytes, header: _Header) -> Array:
+def _read_binary(data: bytes, header: _Header) -> npt.NDArray[np.void]:
     _check_end(
         data,
         header.size + header.points * header.point_size,
@@ -242,17 +256,16 @@ def _read_binary(data: bytes, header: _Header) -> Array:
     )
     record = np.dtype(
         {
-            "names": [field.name for field in header.xyz],
-            "formats": [field.dtype for field in header.xyz],
-            "offsets": [field.offset for field in header.xyz],
+            "names": [field.name for field in header.fields],
+            "formats": [field.dtype for field in header.fields],
+            "offsets": [field.offset for field in header.fields],
             "itemsize": header.point_size,
         }
     )
-    points = np.frombuffer(data, record, count=header.points, offset=header.size)
-    return _stack([points[field.name] for field in header.xyz])
+    return np.frombuffer(data, record, count=header.points, offset=header.size)
 
 
-def _read_compressed(data: bytes, header: _Header) -> Array:
+def _read_compressed(data: bytes, header: _Header) -> npt.NDArray[np.void]:
     """Reads fields that were stored one after another, all points of each, and LZF-compressed."""
     body = header.size + _COMPRESSED_SIZES.size
     _check_end(data[:body], body, "header and the sizes of the compressed data")
@@ -271,15 +284,17 @@ def _read_compressed(data: bytes, header: _Header) -> Array:
         raise _Unreadable(
             f"the compressed data are damaged: {packed_size} bytes do not unpack to {size}"
         )
-    return _stack(
-        [
-            np.frombuffer(unpacked, field.dtype, header.points, header.points * field.offset)
-            for field in header.xyz
-        ]
+    return _table(
+        {
+            field.name: np.frombuffer(
+                unpacked, field.dtype, header.points, header.points * field.offset
+            )
+            for field in header.fields
+        }
     )
 
 
-def _read_ascii(data: bytes, header: _Header) -> Array:
+def _read_ascii(data: bytes, header: _Header) -> npt.NDArray[np.void]:
     try:
         text = data[header.size :].decode("ascii")
         # An empty body is a warning to loadtxt, and an error here.
@@ -298,8 +313,22 @@ def _read_ascii(data: bytes, header: _Header) -> Array:
             f"{header.columns} numbers expected per point (FIELDS, COUNT), {rows.shape[1]} found; "
             "the header does not belong to these data"
         )
-    return _stack([rows[:, field.column] for field in header.xyz])
+    return _table({field.name: _of_type(rows[:, field.column], field) for field in header.fields})
 
 
-def _stack(coordinates: list[npt.NDArray[np.floating]]) -> Array:
-    return np.stack(coordinates, axis=1).astype(np.float64, order="C")
+def _of_type(numbers: Array, field: _Field) -> npt.NDArray[Any]:
+    """Numbers of an ascii file in the type of their field; coordinates with all of their digits."""
+    if field.name in ("x", "y", "z"):
+        return numbers
+    with np.errstate(invalid="ignore", over="ignore"):
+        cast = numbers.astype(field.dtype)
+    # A whole number that is none, or too large, stays as it is written.
+    return cast if field.kind == "F" or np.array_equal(cast, numbers) else numbers
+
+
+def _table(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.void]:
+    count = len(next(iter(columns.values())))
+    table = np.empty(count, [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    return table

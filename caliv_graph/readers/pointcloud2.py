@@ -59,10 +59,17 @@ def packets_hint(type_name: str) -> str:
     )
 
 
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""numpy's names of the types of `sensor_msgs/PointField`."""
+_TYPES = {
+    **{1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"},
+    **{-1: "i8", -2: "u8"},
+}
+"""numpy's names of the types of `sensor_msgs/PointField`. It has none for 64-bit integers, which
+stand in files: no message has these numbers."""
 
-_TIME_FIELDS = (
+DATATYPES = {kind: number for number, kind in _TYPES.items()}
+"""The numbers of the types."""
+
+TIME_FIELDS = (
     "t",
     "time",
     "timestamp",
@@ -76,6 +83,9 @@ _TIME_FIELDS = (
 _MOST_S = 1.0
 """Seconds between a cloud's stamp and its points, at most: a sweep takes less. Other times follow a
 convention that is not known."""
+
+_WHOLE = {"ns": 1, "us": 1_000, "ms": 1_000_000}
+"""Nanoseconds of the units of whole numbers. Whole seconds are no times of points."""
 
 _ABSOLUTE = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -165,7 +175,7 @@ def _time_columns(message: Any) -> list[tuple[TimeField, npt.NDArray[Any]]]:
     fields = {field.name: field for field in reversed(message.fields)}
     return [
         (TimeField(name, _type_name(fields[name]), ""), _column(message, fields[name]))
-        for name in _TIME_FIELDS
+        for name in TIME_FIELDS
         if name in fields and fields[name].datatype in _TYPES
     ]
 
@@ -278,6 +288,8 @@ def _readings(
     """Meanings of the values, the most common first: unit, and seconds after the stamp, (N,)."""
     if field.type in ("uint32", "int32"):
         yield "ns after the stamp", values * 1e-9
+    elif field.type in ("uint64", "int64"):
+        yield from _whole_readings(field, values, stamp_ns)
     elif field.type == "float32":
         yield "s after the stamp", values.astype(np.float64)
     elif field.type == "float64":
@@ -291,6 +303,23 @@ def _readings(
             yield f"{unit}, absolute", (values - seconds / scale) * scale - nanoseconds * 1e-9
         if field.name in ("timestamp", "time_stamp"):
             yield after
+
+
+def _whole_readings(
+    field: TimeField, values: npt.NDArray[Any], stamp_ns: int
+) -> Iterable[tuple[str, Array]]:
+    """`_readings` of 64-bit integers."""
+    values = values.astype(np.int64)
+    after = ("ns after the stamp", values * 1e-9)
+    if field.name not in ("timestamp", "time_stamp"):
+        yield after
+    for unit, scale_ns in _WHOLE.items():
+        # Whole numbers are subtracted: a float of both would be off by 256 ns.
+        whole, rest_ns = divmod(stamp_ns, scale_ns)
+        times_s = (values - whole) * (scale_ns * 1e-9) - rest_ns * 1e-9
+        yield f"{unit}, absolute", times_s
+    if field.name in ("timestamp", "time_stamp"):
+        yield after
 
 
 def _problem(field: TimeField, readings: Sequence[tuple[str, Array]]) -> str:

@@ -58,6 +58,23 @@ def nuscenes(root: Path, lidars: tuple[str, ...] = ("LIDAR_TOP",)) -> Path:
     return root
 
 
+def write_cloud(path: Path, table: np.ndarray[Any, Any], body: str = "binary") -> None:
+    """A cloud as `.bin`, or as `.pcd` with an ascii or binary body."""
+    if path.suffix == ".bin":
+        table.tofile(path)
+        return
+    kinds = [table.dtype[i] for i in range(len(table.dtype))]
+    letters = {"f": "F", "i": "I", "u": "U"}
+    header = (
+        f"FIELDS {' '.join(table.dtype.names or ())}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
+        f"TYPE {' '.join(letters[kind.kind] for kind in kinds)}\n"
+        f"WIDTH {len(table)}\nHEIGHT 1\nPOINTS {len(table)}\nDATA {body}\n"
+    )
+    rows = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist())
+    path.write_bytes(header.encode() + (rows.encode() if body == "ascii" else table.tobytes()))
+
+
 def opened(root: Path, topic: str, poses: str | None = None, **lidar: Any) -> Recording:
     raw: dict[str, Any] = {
         "data": {"format": "clouds", "path": str(root)},
@@ -119,6 +136,86 @@ def test_clouds_and_poses_of_nuscenes(tmp_path: Path) -> None:
     poses = recording.motion().poses
     assert poses is not None
     assert [pose.x() for pose in poses.T_map_vehicle] == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "unit_ns", "absolute"),
+    [
+        ("timestamp", "u8", 1, True),
+        ("timestamp", "i8", 1_000, True),
+        ("time_stamp", "u8", 1_000_000, True),
+        ("t", "i8", 1, False),
+        ("t", "u8", 1, True),
+        ("timestamp", "u8", 1, False),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["bin", "pcd"])
+def test_times_that_are_64_bit_integers(
+    tmp_path: Path, suffix: str, name: str, kind: str, unit_ns: int, absolute: bool
+) -> None:
+    table = np.zeros(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<" + kind)])
+    (tmp_path / "top").mkdir()
+    for k in range(3):
+        for axis, column in zip("xyz", points_of(k).T, strict=True):
+            table[axis] = column
+        stamp = BEGIN + k * PERIOD
+        table[name] = ((stamp if absolute else 0) + np.arange(30) * 3_000_000) // unit_ns
+        write_cloud(tmp_path / "top" / f"{stamp}.{suffix}", table)
+    fields = ["x f4", "y f4", "z f4", f"{name} {kind}"] if suffix == "bin" else None
+
+    scans = list(opened(tmp_path, "top", bin_fields=fields).scans("top"))
+
+    for k, scan in enumerate(scans):
+        np.testing.assert_array_equal(scan.points_lidar, points_of(k))
+        assert scan.point_times_s is not None
+        np.testing.assert_allclose(scan.point_times_s, np.arange(30) * 3e-3, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("body", ["binary", "ascii"])
+@pytest.mark.parametrize(
+    ("name", "kind", "first", "scale"),
+    [("timestamp", "f8", BEGIN / 1e9, 1.0), ("t", "u4", 0.0, 1e9), ("time", "f4", 0.0, 1.0)],
+)
+def test_pcd_clouds_have_the_times_of_their_fields(
+    tmp_path: Path, body: str, name: str, kind: str, first: float, scale: float
+) -> None:
+    table = np.zeros(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<" + kind)])
+    table["x"], table["y"], table["z"] = points_of(0).T
+    table["x"][0] = np.nan  # no return
+    table[name] = first + np.arange(30) * 3e-3 * scale
+    (tmp_path / "top").mkdir()
+    for k in range(2):
+        if first:
+            table[name] += k * PERIOD / 1e9
+        write_cloud(tmp_path / "top" / f"{BEGIN + k * PERIOD}.pcd", table, body)
+
+    recording = opened(tmp_path, "top")
+    scans = list(recording.scans("top"))
+
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points_lidar, points_of(0)[1:])
+        assert scan.point_times_s is not None
+        np.testing.assert_allclose(scan.point_times_s, np.arange(1, 30) * 3e-3, atol=1e-6)
+    # The sweep ends where its beams hit nothing, too; at which end it is stamped is not known.
+    assumed = any("assumed to mark the start" in line for line in recording.warnings())
+    assert assumed is (first == 0.0)
+    (ended,) = opened(tmp_path, "top", stamp="end").scans("top", {BEGIN})
+    assert ended.point_times_s is not None
+    assert ended.point_times_s.max() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_times_of_pcd_clouds_that_cannot_be_are_told(tmp_path: Path) -> None:
+    table = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
+    table["x"], table["timestamp"] = 2.0, 1e6
+    (tmp_path / "top").mkdir()
+    write_cloud(tmp_path / "top" / f"{BEGIN}.pcd", table)
+
+    recording = opened(tmp_path, "top")
+
+    assert next(recording.scans("top")).point_times_s is None
+    assert any(
+        "the times of the points of 1 clouds are not used" in w for w in recording.warnings()
+    )
 
 
 def test_fields_of_the_config_and_a_stamp_at_the_end(tmp_path: Path) -> None:

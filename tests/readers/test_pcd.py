@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.errors import RecordingError
-from caliv_graph.readers.pcd import read_pcd
+from caliv_graph.readers.pcd import read_pcd, read_pcd_table
 
 POINTS = np.array([[1.5, -2.25, 0.125], [10.0, 20.0, -30.0], [0.1, 0.2, 0.3], [7.0, 8.0, 9.0]])
 
@@ -110,6 +110,39 @@ def test_compressed_fields_are_stored_one_after_another(tmp_path: Path) -> None:
     points = read_pcd(path)
     np.testing.assert_array_equal(points[:, 0], POINTS[:, 0])
     np.testing.assert_array_equal(points[:, 1:], POINTS[:, 1:].astype("<f4"))
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed", "ascii"])
+def test_fields_that_are_asked_for_have_their_types(tmp_path: Path, encoding: str) -> None:
+    count = len(POINTS)
+    whole = np.array([2**40 + k for k in range(count)], "<u8")
+    columns = {
+        "t": whole,
+        **{axis: POINTS[:, i].astype("<f8") for i, axis in enumerate("xyz")},
+        "rgb": np.ones(count, "<f4"),
+        "time": np.arange(count).astype("<i4"),
+    }
+    fields = {
+        "FIELDS": " ".join(columns),
+        "SIZE": "8 8 8 8 4 4",
+        "TYPE": "U F F F F I",
+        "COUNT": "1 1 1 1 1 1",
+        "DATA": encoding,
+    }
+    rows = list(zip(*columns.values(), strict=True))
+    body = {
+        "binary": b"".join(b"".join(v.tobytes() for v in row) for row in rows),
+        "binary_compressed": compressed_body(b"".join(c.tobytes() for c in columns.values())),
+        "ascii": "".join(" ".join(str(v) for v in row) + "\n" for row in rows).encode(),
+    }[encoding]
+
+    table = read_pcd_table(write(tmp_path, header(**fields), body), ("time", "t", "timestamp"))
+
+    assert table.dtype.names == ("x", "y", "z", "t", "time")
+    assert [table[name].dtype.str for name in ("t", "time")] == ["<u8", "<i4"]
+    np.testing.assert_array_equal(table["t"], whole)
+    np.testing.assert_array_equal(table["time"], np.arange(count))
+    np.testing.assert_array_equal(table["x"], POINTS[:, 0])
 
 
 def test_compressed_back_reference(tmp_path: Path) -> None:

@@ -41,7 +41,13 @@ from caliv_graph.readers.pointcloud2 import (
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses, stamp_of
 from caliv_graph.readers.stamps import StampMark
-from caliv_graph.readers.sweeps import TimesSeen, is_sampled, mark_of_clouds, times_warnings
+from caliv_graph.readers.sweeps import (
+    TimesSeen,
+    is_sampled,
+    mark_of_clouds,
+    times_warnings,
+    with_mark,
+)
 
 CLOUD_TYPE = "folder of clouds"
 
@@ -236,9 +242,7 @@ class CloudFolder:
             cloud = decode_pointcloud2(_pcd_message(path), stamp_ns, *ranges, period_s)
         else:
             cloud = read_bin(path, self._fields[lidar], stamp_ns, ranges, period_s)
-        if cloud.times_s is not None:
-            cloud = replace(cloud, times_s=cloud.times_s + self._marks[lidar].shift_s)
-        return stamp_ns, cloud
+        return stamp_ns, cloud if cloud.times_s is None else with_mark(cloud, self._marks[lidar])
 
 
 def _pcd_message(path: Path) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import textwrap
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from caliv_graph.readers.pointcloud2 import (
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
 from caliv_graph.readers.stamps import StampMark
-from caliv_graph.readers.sweeps import TimesSeen, decode_cloud, times_warnings
+from caliv_graph.readers.sweeps import TimesSeen, decode_cloud, times_warnings, with_mark
 
 _KINDS = {
     "imu": "IMU",
@@ -301,10 +300,7 @@ class RosbagRecording:
             ) from None
         except DamagedMessageError as e:
             return stamp_ns, str(e)
-        if cloud.times_s is not None:
-            shift_s = self._index.marks[lidar].shift_s
-            cloud = replace(cloud, times_s=cloud.times_s + shift_s)
-        return stamp_ns, cloud
+        return stamp_ns, with_mark(cloud, self._index.marks[lidar])
 
     def _source(self, lidar: str, stamp_ns: int) -> str:
         return f"{self._topics[lidar].name} at {_seconds(stamp_ns)} s"

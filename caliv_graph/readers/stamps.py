@@ -45,12 +45,14 @@ class StampMark:
         told_by: what tells it.
         shift_s: seconds, to be added to the times of all points.
         note: what a person should know, a sentence without a subject; empty: nothing.
+        time_problem: why the times of the points cannot be right; empty: they may be.
     """
 
     marks: Literal["start", "end"] = "start"
     told_by: Told = ""
     shift_s: float = 0.0
     note: str = ""
+    time_problem: str = ""
 
 
 def sweep_span(spans_s: Sequence[tuple[float, float]], period_s: float | None) -> Array | None:

@@ -29,6 +29,16 @@ from caliv_graph.readers.velodyne_packets import decode_velodyne
 _ANY_RANGE_M = 1e6
 """Farther than any return."""
 
+_MOST_PERIODS = 2.5
+"""Times between two clouds that the points of one may span. Two sweeps in a message span two, and
+times that are a part of the sweep (0 to 1) five at 5 Hz."""
+
+_LEAST_PERIODS = 0.01
+"""The same, at least, where a LiDAR sweeps: microseconds taken for nanoseconds span 0.001."""
+
+_SLOWEST_S = 0.2
+"""Of a sweep. Clouds of a recorder that drops most of them come more rarely."""
+
 
 @dataclass(frozen=True)
 class TimesSeen:
@@ -42,6 +52,7 @@ class TimesSeen:
         problems: clouds whose times are not used.
         problem: the reason, of the first such cloud.
         packets: most packets of a cloud with which its times start anew; 0: they do not.
+        span_s: most seconds from the first to the last point of a cloud.
     """
 
     field: TimeField | None = None
@@ -51,6 +62,7 @@ class TimesSeen:
     problems: int = 0
     problem: str = ""
     packets: int = 0
+    span_s: float = 0.0
 
     def with_cloud(self, cloud: DecodedCloud) -> TimesSeen:
         """With those of one more cloud."""
@@ -61,6 +73,7 @@ class TimesSeen:
         if times_s is None or cloud.time_field is None or not len(times_s):
             return self
         first_s, last_s = float(times_s.min()), float(times_s.max())
+        span_s = max(self.span_s, last_s - first_s)
         if self.field is not None:
             first_s, last_s = min(first_s, self.first_s), max(last_s, self.last_s)
         return replace(
@@ -70,6 +83,7 @@ class TimesSeen:
             last_s=last_s,
             clouds=self.clouds + 1,
             packets=max(self.packets, cloud.packets),
+            span_s=span_s,
         )
 
 
@@ -138,13 +152,50 @@ def mark_of(
 def mark_of_clouds(
     setting: StampSetting, clouds: Iterable[DecodedCloud], delays_s: Array, period_s: float | None
 ) -> StampMark:
-    """What stamps mark, by the times of some clouds; the others as in `stamp_mark`."""
-    spans, is_absolute = [], False
+    """What stamps mark, by the times of some clouds; the others as in `stamp_mark`.
+
+    Times that span more than a sweep can take tell nothing, and are not to be used.
+    """
+    spans: list[tuple[float, float]] = []
+    field: TimeField | None = None
     for cloud in clouds:
         if cloud.times_s is not None and len(cloud.times_s) and cloud.time_field:
             spans.append((float(cloud.times_s.min()), float(cloud.times_s.max())))
-            is_absolute = cloud.time_field.unit.endswith("absolute")
+            field = cloud.time_field
+    problem = "" if field is None else _span_problem(field, spans, period_s)
+    if problem:
+        return StampMark("end" if setting == "end" else "start", time_problem=problem)
+    is_absolute = field is not None and field.unit.endswith("absolute")
     return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, delays_s)
+
+
+def _span_problem(
+    field: TimeField, spans_s: Sequence[tuple[float, float]], period_s: float | None
+) -> str:
+    """Why the times of a LiDAR cannot be right, by those of the median cloud; empty: they may be.
+
+    A single cloud may hold several sweeps.
+    """
+    span_s = float(np.median(np.diff(np.array(spans_s), axis=1)))
+    if period_s is None or span_s <= _MOST_PERIODS * period_s:
+        return ""
+    return (
+        f"{_shown(field)}, spans {span_s:.3g} s in a cloud, and a cloud comes every {period_s:.3g} "
+        f"s: no sweep takes {span_s / period_s:.2g} times that. Perhaps it is a part of the sweep "
+        "(0 to 1), or in another unit: convert the field, and give that recording"
+    )
+
+
+def with_mark(cloud: DecodedCloud, mark: StampMark) -> DecodedCloud:
+    """A cloud whose times count from where they do by what the stamps mark.
+
+    It is without times where those of its LiDAR cannot be right.
+    """
+    if cloud.times_s is None:
+        return cloud
+    if mark.time_problem:
+        return DecodedCloud(cloud.points_lidar, None, time_problem=mark.time_problem)
+    return replace(cloud, times_s=cloud.times_s + mark.shift_s)
 
 
 def _times(bag: Bag, topic: Topic, sample: Sample, period_s: float | None) -> DecodedCloud:
@@ -167,6 +218,13 @@ def times_warnings(
         lines.append(
             f"{where}: field '{times.field.name}' is 0 for all points: its clouds carry no times"
         )
+    elif times.field and period_s and 0.0 < times.span_s < _least_span_s(period_s):
+        lines.append(
+            f"{where}: {_shown(times.field)}, spans {times.span_s:.2g} s in a cloud, and a cloud "
+            f"comes every {period_s:.3g} s. If its points are not taken at once, the field is in "
+            "another unit, and the motion in a sweep is not compensated: convert the field, and "
+            "give that recording"
+        )
     if times.packets and times.field and period_s:
         lines.append(
             f"{where}: field '{times.field.name}' starts anew with every packet, "
@@ -176,3 +234,11 @@ def times_warnings(
     if mark.note:
         lines.append(f"{where}: {mark.note}")
     return lines
+
+
+def _least_span_s(period_s: float) -> float:
+    return _LEAST_PERIODS * min(period_s, _SLOWEST_S)
+
+
+def _shown(field: TimeField) -> str:
+    return f"field '{field.name}' ({field.type}), read as {field.unit}"

@@ -60,7 +60,8 @@ def drive(count: int = 20) -> list[Recorded]:
         out.append(("/vehicle/twist", stamp + 2, twist(stamp, (2, 0, 0))))
         out.append(("/gnss/fix", stamp + 3, fix(stamp, latitude=48 + k * 1e-5)))
         out.append((FRONT, stamp + 4, cloud(stamp, points_of(k), np.arange(40) * 1_000_000)))
-        out.append((REAR, stamp + 5, livox(stamp + 50, points_of(-k % 97, 9), range(9))))
+        times_ns = [200_000 * i for i in range(9)]
+        out.append((REAR, stamp + 5, livox(stamp + 50, points_of(-k % 97, 9), times_ns)))
     return out
 
 

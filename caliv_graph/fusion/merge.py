@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,8 @@ from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
 from caliv_graph.fusion.terms import Fused, fuse, guess_of, moved_to, own_term
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
-from caliv_graph.uncertainty.observability import assess
+from caliv_graph.uncertainty.assemble import determined_axes
+from caliv_graph.uncertainty.observability import assess, unguessed
 from caliv_graph.wording.directions import named
 from caliv_graph.wording.remedies import evidence_of
 
@@ -90,9 +91,8 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         vehicle={},
         structure=None,
     )
-    calibration = _assembled(
-        draft, _together_per_lidar(calibrations, guesses), fused, data, disagree
-    )
+    results = _together_per_lidar(calibrations, guesses)
+    calibration = _assembled(draft, results, guesses, fused, data, disagree)
     warnings = [
         *_disagreements(agreement, len(calibrations)),
         *(
@@ -106,11 +106,11 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
 
 
 def _together_per_lidar(
-    calibrations: Mapping[str, Calibration], guesses: Mapping[str, Guess]
+    calibrations: Mapping[str, Calibration], names: Iterable[str]
 ) -> dict[str, LidarResult]:
     """Per LiDAR the first result, with the scans and time offsets of all calibrations."""
     out = {}
-    for name, guess in guesses.items():
+    for name in names:
         of_all = [c.lidars[name] for c in calibrations.values() if name in c.lidars]
         out[name] = replace(
             of_all[0],
@@ -118,7 +118,6 @@ def _together_per_lidar(
             saw_target=any(r.saw_target for r in of_all),
             saw_structure=any(r.saw_structure for r in of_all),
             time_offset=_mean_offset(of_all),
-            guess=guess,
         )
     return out
 
@@ -190,9 +189,6 @@ def with_earlier(
     comparison = compare_terms((before, own), (guesses, guesses), calibration.reference, p_value)
     mode = "joint" if calibration.provenance.get("mode") == "joint" else "auto"
     fused = fuse((*terms, own), guesses, mode)
-    results = {
-        name: replace(lidar, guess=guesses[name]) for name, lidar in calibration.lidars.items()
-    }
     draft = replace(
         calibration,
         earlier=terms,
@@ -204,7 +200,7 @@ def with_earlier(
         f"--prior and this drive disagree: {_largest(comparison)}. {comparison.conclusion} The "
         "result mixes both: calibrate without --prior"
     ]
-    return _assembled(draft, results, fused, data, disagree), tuple(
+    return _assembled(draft, calibration.lidars, guesses, fused, data, disagree), tuple(
         warnings if comparison.moved else ()
     )
 
@@ -212,6 +208,7 @@ def with_earlier(
 def _assembled(
     draft: Calibration,
     results: Mapping[str, LidarResult],
+    guesses: Mapping[str, Guess],
     fused: Fused,
     data: DataTerm,
     disagree: bool,
@@ -221,30 +218,35 @@ def _assembled(
     Args:
         draft: a calibration with all fields that the fusion does not change.
         results: per LiDAR likewise.
+        guesses: of all LiDARs together.
         fused: the estimate.
         data: information reported as that of the data, at the estimate.
         disagree: whether the fused calibrations disagree.
     """
     poses = fused.T_vehicle_lidar
     to_right = np.ascontiguousarray(joint_right_to_vehicle_axes(poses.values()).T)
-    cov = to_right @ fused.cov @ to_right.T
+    known = fused.information + fused.trusted
+    cov = fused.cov + unguessed(known, [guesses[name] for name in poses])
+    cov = to_right @ cov @ to_right.T
     information = to_right @ data.information @ to_right.T
     uncertainty = named(
-        assess(fused.information + fused.trusted, fused.prior, poses),
+        assess(known, fused.prior, poses),
         poses,
         evidence_of(results.values()),
     )
     lidars = {}
     for i, (name, result) in enumerate(results.items()):
         block = slice(6 * i, 6 * i + 6)
-        fixed = result.guess is not None and result.guess.fixed
+        guess = guesses[name]
+        found = dict.fromkeys(AXES, False)
+        if result.has_data or guess.fixed:
+            found = dict(uncertainty.determined[name])
         lidars[name] = replace(
             result,
             T_vehicle_lidar=poses[name],
             cov=cov[block, block],
-            determined=dict(uncertainty.determined[name])
-            if result.has_data or fixed
-            else dict.fromkeys(AXES, False),
+            determined=determined_axes(found, guess, poses[name], cov[block, block]),
+            guess=guess,
         )
     complete = not uncertainty.undetermined and all(
         all(lidar.determined.values()) for lidar in lidars.values()

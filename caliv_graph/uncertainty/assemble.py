@@ -58,7 +58,7 @@ def assemble_matrices(
         name: LidarResult(
             T_vehicle_lidar=poses[name],
             cov=cov_joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6],
-            determined=_determined(
+            determined=determined_axes(
                 uncertainty.determined.get(name, nothing),
                 guesses[name],
                 poses[name],
@@ -89,7 +89,7 @@ def assemble_matrices(
     )
 
 
-def _determined(
+def determined_axes(
     found: Mapping[str, bool], guess: Guess, T_vehicle_lidar: gtsam.Pose3, cov: Array
 ) -> dict[str, bool]:
     """Whether the data determine each axis.
@@ -97,6 +97,12 @@ def _determined(
     Where nobody gave a guess, an undetermined direction may be off so far that the other axes take
     part in it: y, after half a turn about the centre of an arc. Where the tangent of that arc is
     along x the sigma of y knows nothing of it, so what a turn adds in second order counts as well.
+
+    Args:
+        found: verdict on each axis by the directions that the data determine.
+        guess: of the LiDAR.
+        T_vehicle_lidar: its extrinsic.
+        cov: (6, 6) of it, right perturbation, with what `unguessed` adds.
     """
     if not guess.found:
         return dict(found)

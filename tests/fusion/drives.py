@@ -10,11 +10,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, FOUND_SIGMA
 from caliv_graph.conventions import AXES
 from caliv_graph.fusion.terms import fuse
-from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes
-from caliv_graph.products import Array, Calibration, DataTerm, Guess, LidarResult
+from caliv_graph.geometry.se3 import retract_vehicle_axes
+from caliv_graph.products import Array, Calibration, DataTerm, Guess
+from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess
 from tests.samples import MOUNTINGS, make_covariance, pose, turn_about_centre
 
@@ -67,6 +68,7 @@ def drive(
     truth: Mapping[str, gtsam.Pose3] = TRUTH,
     guess_error: Array | None = None,
     reference: str | None = None,
+    found: bool = False,
     **changes: Any,
 ) -> Calibration:
     """What `calibrate` would write of a drive.
@@ -79,45 +81,28 @@ def drive(
         truth: extrinsics.
         guess_error: (6n,) of the initial guess, by which the rest is decided.
         reference: LiDAR; absent: the last.
+        found: nobody gave a guess.
         changes: of the calibration.
     """
     true = {name: truth[name] for name in names}
     zero = np.zeros(6 * len(names))
     centre = moved(true, zero if error is None else error)
     start = moved(true, zero if guess_error is None else guess_error)
-    guesses = {name: Guess(start[name], DEFAULT_GUESS_SIGMAS) for name in names}
+    sigmas = FOUND_SIGMA.sigmas() if found else DEFAULT_GUESS_SIGMAS
+    guesses = {name: Guess(start[name], sigmas, found=found) for name in names}
     fused = fuse([DataTerm((source,), centre, D, zero)], guesses)
-    uncertainty = assess(D, fused.prior, fused.T_vehicle_lidar)
-    to_right = np.zeros((len(D), len(D)))
-    for i, T in enumerate(fused.T_vehicle_lidar.values()):
-        to_right[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = right_to_vehicle_axes(T).T
-    cov = to_right @ fused.cov @ to_right.T
-    lidars = {
-        name: LidarResult(
-            T_vehicle_lidar=T,
-            cov=cov[6 * i : 6 * i + 6, 6 * i : 6 * i + 6],
-            determined=uncertainty.determined[name],
-            scans_used=50,
-            saw_target=bool(np.any(D[6 * i : 6 * i + 6])),
-            guess=guesses[name],
-        )
-        for i, (name, T) in enumerate(fused.T_vehicle_lidar.items())
-    }
-    calibration = Calibration(
-        status="ok"
-        if all(all(r.determined[a] for a in AXES) for r in lidars.values())
-        else "partial",
-        reference=reference or names[-1],
-        lidars=lidars,
-        cov_joint=cov,
-        information_data=to_right @ fused.information @ to_right.T,
-        undetermined=uncertainty.undetermined,
-        weak=uncertainty.weak,
-        unmet=(),
-        provenance={"mode": "auto", "drive_sha256": [source]},
-        gradient_data=to_right @ fused.gradient,
+    calibration = assemble_matrices(
+        fused.T_vehicle_lidar,
+        guesses,
+        fused.cov,
+        fused.information,
+        assess(D, fused.prior, fused.T_vehicle_lidar),
+        reference or names[-1],
+        {name: 50 for i, name in enumerate(names) if np.any(D[6 * i : 6 * i + 6])},
+        fused.gradient,
     )
-    return replace(calibration, **changes)
+    provenance = {"mode": "auto", "drive_sha256": [source]}
+    return replace(calibration, **{"provenance": provenance, **changes})
 
 
 def shift(names: Sequence[str], lidar: str, **axes: float) -> Array:

@@ -107,6 +107,65 @@ def test_the_guess_counts_once() -> None:
     assert errors(result) == pytest.approx(errors(parts[0]), abs=1e-5)
 
 
+def on_an_arc_without_guesses(source: str, *, left: bool = False) -> Calibration:
+    """Nothing on the rotation of all about the centre of a turn; nobody gave a guess."""
+    return drive(arc_information(NAMES, left=left), source=source, found=True)
+
+
+def test_fusing_drives_without_guesses_makes_up_no_knowledge() -> None:
+    """Rotation (pi, 1 sigma) and place (10 m) of two LiDARs bound the turn about the centre."""
+    first, second = (on_an_arc_without_guesses(source) for source in "ab")
+    # y of 'front' is open too: it goes sideways by a fifth of what it goes along x.
+    open_axes = {"front": ["yaw", "x", "y"], "rear": ["yaw", "x", "y"]}
+    arms = np.array([[2.0, 9.16], [-0.4, 9.16]])
+    turn = (2.0 * np.pi**-2.0 + (arms**2).sum() / 10.0**2) ** -0.5
+
+    with_prior, _ = with_earlier(second, first)
+
+    for result in (first, merged(first, second), with_prior):
+        cov = in_vehicle_axes(result, result.cov_joint)
+        sigmas = np.sqrt(np.diag(cov)).reshape(2, 6)
+        assert sigmas[:, 2] == pytest.approx(turn, rel=1e-3)
+        assert sigmas[:, 3] == pytest.approx(9.16 * turn, rel=1e-3)
+        assert sigmas[:, 4] == pytest.approx([2.0 * turn, 0.4 * turn], rel=1e-2)
+        assert {
+            name: [axis for axis, known in lidar.determined.items() if not known]
+            for name, lidar in result.lidars.items()
+        } == open_axes
+        for i, lidar in enumerate(result.lidars.values()):
+            block = slice(6 * i, 6 * i + 6)
+            assert lidar.cov == pytest.approx(result.cov_joint[block, block], abs=1e-12)
+
+
+def test_a_guess_given_for_one_drive_is_enough_for_both() -> None:
+    given = drive(arc_information(NAMES), source="a")
+    found = on_an_arc_without_guesses("b")
+
+    result = merged(found, given)
+
+    sigma, of_given = (np.sqrt(np.diag(in_vehicle_axes(c, c.cov_joint))) for c in (result, given))
+    assert sigma[[2, 3, 8, 9]] == pytest.approx(of_given[[2, 3, 8, 9]], rel=0.05)
+    assert result.lidars["front"].determined == given.lidars["front"].determined
+
+
+def test_arcs_to_both_sides_need_no_guess() -> None:
+    result = merged(on_an_arc_without_guesses("a"), on_an_arc_without_guesses("b", left=True))
+
+    assert result.status == "ok"
+    assert (np.sqrt(np.diag(in_vehicle_axes(result, result.cov_joint))) < 0.02).all()
+
+
+def test_a_lidar_without_guess_that_no_drive_shows_is_not_known() -> None:
+    D = information(NAMES)
+    D[:6], D[:, :6] = 0.0, 0.0
+    first, second = (drive(D, source=source, found=True) for source in "ab")
+
+    for result in (merged(first, second), with_earlier(second, first)[0]):
+        sigma = np.sqrt(np.diag(in_vehicle_axes(result, result.cov_joint)))
+        assert sigma[:6] == pytest.approx([np.pi] * 3 + [10.0] * 3)
+        assert (sigma[6:] < 0.02).all()
+
+
 def test_order_and_reference_do_not_matter() -> None:
     rng = np.random.default_rng(3)
     D = [information(("front", "rear"), 1), information(("left", "rear"), 2)]

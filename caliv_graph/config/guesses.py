@@ -8,7 +8,7 @@ import numpy as np
 from caliv_graph.config.lidars import FoundLidarConfig, LidarConfig, PoseSigmaConfig
 from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import PoseConfig
-from caliv_graph.products import Guess
+from caliv_graph.products import Array, Guess
 
 DEFAULT_GUESS_SIGMAS = PoseSigmaConfig().sigmas()
 """(6,) 1 sigma of a guess for which nothing is stated: the defaults of the config."""
@@ -42,6 +42,15 @@ def configured_guess(config: Config, name: str) -> Guess:
     lidar = config.lidars[name]
     sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
     return Guess(lidar.guess(), sigmas, lidar.fixed, isinstance(lidar, FoundLidarConfig))
+
+
+def prior_sigmas(guess: Guess) -> Array:
+    """(6,) sigmas of the prior that a guess is in a solve, vehicle axes, rad and m.
+
+    A trusted guess (`fixed: true`) is a measurement. Its prior has the default sigmas: with its own
+    the prior would be as good as the data, and its axes would count as undetermined.
+    """
+    return DEFAULT_GUESS_SIGMAS if guess.fixed else guess.sigmas
 
 
 def with_guess(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Config:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc, ndtr
 
-from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import prior_sigmas
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.terms import arranged, guess_of, own_term
 from caliv_graph.geometry.covariance import relative_jacobian
@@ -270,8 +270,7 @@ def _drive(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) -
     """Splits a drive's information on some LiDARs into determined and undetermined directions."""
     D, c = arranged(term, names)
     unit = scaling(len(names))
-    # The sigma of a fixed guess is so small that no direction would count as determined.
-    sigmas = [DEFAULT_GUESS_SIGMAS if guesses[n].fixed else guesses[n].sigmas for n in names]
+    sigmas = [prior_sigmas(guesses[n]) for n in names]
     prior = np.diag(np.concatenate([*sigmas, np.zeros(0)]) ** -2.0)
     if not names:
         return _Drive({}, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), ())

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.assemble import DRIVES
-from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, prior_sigmas
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
     joint_right_to_vehicle_axes,
@@ -241,11 +241,10 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
             measurement.
     """
     names = list(guesses)
-    # A fixed guess is a measurement. As a prior too, it would make its axes undetermined.
     fixed = np.repeat([guesses[name].fixed for name in names], 6)
     certainty = np.concatenate([guesses[name].sigmas for name in names]) ** -2.0
     trusted = np.diag(fixed * certainty)
-    prior = np.diag(np.where(fixed, np.tile(DEFAULT_GUESS_SIGMAS, len(names)) ** -2.0, certainty))
+    prior = np.diag(np.concatenate([prior_sigmas(guesses[name]) for name in names]) ** -2.0)
     poses = {name: _start(name, terms, guesses[name]) for name in names}
     undetermined: int | None = None
     for step_number in range(_STEPS):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.config.range_errors import UNSTATED, RangeErrors
+from caliv_graph.products import Guess
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 
 Source = Literal["sensors", "poses"]
@@ -34,6 +36,8 @@ class Assumptions:
         ground_everywhere: whether the ground is measured at every scan. `calibrate` measures it
             only at scans that see a target.
         ranges: errors of the ranges that no average removes.
+        guesses: LiDAR -> its initial guess, of which the extrinsic plays no part; those that are
+            not named have the sigmas of the scenario.
         structure: whether walls count, and the ground cell by cell with them.
         stride: for a quick prediction, only every n-th cloud is used, with n-fold weight.
     """
@@ -48,5 +52,6 @@ class Assumptions:
     extraction: ExtractionConfig = field(default_factory=ExtractionConfig)
     ground_everywhere: bool = False
     ranges: RangeErrors = UNSTATED
+    guesses: Mapping[str, Guess] = field(default_factory=dict)
     structure: bool = True
     stride: int = 1

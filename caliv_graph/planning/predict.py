@@ -12,10 +12,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import gtsam
 import numpy as np
 
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
+from caliv_graph.config.guesses import prior_sigmas
 from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import AXES
@@ -30,7 +32,7 @@ from caliv_graph.planning.structure import (
     information_with_structure,
     plan_structure,
 )
-from caliv_graph.products import Array, Direction
+from caliv_graph.products import Array, Direction, Guess
 from caliv_graph.scenario.drives import Route, make_drive
 from caliv_graph.scenario.model import UNIFORM_TO_SIGMA, Scenario
 from caliv_graph.scenario.terrain import make_terrain
@@ -209,16 +211,16 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
     )
     if not lidars:
         raise _nobody(planned, seen, assumptions.extraction)
-    n = len(lidars)
     information = np.sum([of.information(lidars) for of in drives], axis=0)
-    sigmas = _guess_sigmas(first)
-    D, offsets_s = _without_offsets(information, lidars, np.diag(np.tile(sigmas, n) ** -2.0))
+    guesses = _guesses(first, assumptions)
+    sigmas = np.concatenate([prior_sigmas(guesses[name]) for name in lidars])
+    D, offsets_s = _without_offsets(information, lidars, np.diag(sigmas**-2.0))
     covariance = predict_covariance(
         D,
         lidars,
         first.reference if first.reference in lidars else lidars[0],
-        {name: model.mounting.pose() for name, model in first.lidars.items()},
-        dict.fromkeys(first.lidars, sigmas),
+        {name: guesses[name].T_vehicle_lidar for name in lidars},
+        guesses,
         {name: sum(len(s.used) for of in seen for s in of if s.lidar == name) for name in lidars},
         offsets_s,
         by_structure,
@@ -342,6 +344,15 @@ def space(planned: Sequence[tuple[Scenario, Route]]) -> tuple[float, float]:
         sides.append(np.ptp(np.concatenate(places), axis=0))
     x, y = np.max(sides, axis=0).tolist()
     return (x, y)
+
+
+def _guesses(scenario: Scenario, assumptions: Assumptions) -> dict[str, Guess]:
+    """The initial guess of every LiDAR; its extrinsic is that of the scenario."""
+    usual = Guess(gtsam.Pose3(), _guess_sigmas(scenario))
+    return {
+        name: replace(assumptions.guesses.get(name, usual), T_vehicle_lidar=model.mounting.pose())
+        for name, model in scenario.lidars.items()
+    }
 
 
 def _guess_sigmas(scenario: Scenario) -> Array:

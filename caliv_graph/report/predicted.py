@@ -25,6 +25,7 @@ from caliv_graph.report.walls import (
 )
 from caliv_graph.results.calibration_file import calibration_document
 from caliv_graph.scenario.beams import channel_elevations_deg
+from caliv_graph.wording.guesses import in_brackets_sentence
 
 if TYPE_CHECKING:
     from caliv_graph.planning.predict import Prediction
@@ -276,10 +277,10 @@ def _sigma_parts(predicted: PredictedCovariance, word: str) -> list[RenderableTy
             cells = _sigma_cells(sigma, predicted.determined_s2s[a, b])
             pairs.add_row(Text(f"{a}\n{b}"), *cells)
         parts += titled(f"{word} 1 sigma of one LiDAR against another, vehicle axes", pairs)
-    held = any(not known for verdict in verdicts.values() for known in verdict.values())
+    held = [name for name, verdict in verdicts.items() if not all(verdict.values())]
+    found = [name for name in held if predicted.calibration.lidars[name].without_guess]
     if held:
-        note = "In brackets: not determined by the drive; the sigma of the initial guess."
-        parts.append(Text(note, style="yellow"))
+        parts.append(Text(in_brackets_sentence(held, found), style="yellow"))
     offsets = [f"LiDAR '{n}': {1e3 * s:.2f} ms" for n, s in predicted.offsets_s.items()]
     parts += sentences(f"{word} 1 sigma of the clocks:", offsets)
     return parts

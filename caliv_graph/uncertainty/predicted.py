@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from caliv_graph.config.guesses import prior_sigmas
 from caliv_graph.products import Array, Calibration, Direction, Guess, Uncertainty
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import (
@@ -28,8 +29,10 @@ class PredictedCovariance:
     Attributes:
         lidars: those that take part.
         information_data: (6n, 6n) without any prior, all other variables eliminated.
-        information_prior: (6n, 6n) of the initial guesses.
-        cov: (6n, 6n) of the result of `solve.mode: auto`.
+        information_prior: (6n, 6n) of the initial guesses, or of what stands for them in the
+            solve where there is none.
+        cov: (6n, 6n) of the solve in `solve.mode: auto`. `calibration` has that of the result, in
+            which a LiDAR without an initial guess is unknown where the data determine nothing.
         uncertainty: directions and verdicts.
         offsets_s: LiDAR -> 1 sigma of its time offset in seconds, where one was asked for.
         calibration: the same as a result whose extrinsics are the assumed ones, LiDARs that never
@@ -84,7 +87,7 @@ def predict_covariance(
     lidars: Sequence[str],
     reference: str,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
-    guess_sigmas: Mapping[str, Array],
+    guesses: Mapping[str, Guess],
     scans: Mapping[str, int],
     offsets_s: Mapping[str, float],
     structure: Collection[str] = (),
@@ -97,17 +100,16 @@ def predict_covariance(
         information_data: (6n, 6n) vehicle axes, LiDARs in the order of `lidars`.
         lidars: those that take part.
         reference: the LiDAR that pairs are taken against.
-        T_vehicle_lidar: approximate extrinsic of every LiDAR.
-        guess_sigmas: LiDAR -> (6,) of its initial guess, vehicle axes.
+        T_vehicle_lidar: approximate extrinsic of each of them.
+        guesses: of every LiDAR, in the order of the result.
         scans: LiDAR -> number of clouds of a target; absent: none.
         offsets_s: LiDAR -> 1 sigma of its time offset.
         structure: names of the LiDARs that see structure.
     """
     solved = {name: T_vehicle_lidar[name] for name in lidars}
-    prior = np.diag(np.concatenate([guess_sigmas[name] for name in lidars]) ** -2.0)
+    prior = np.diag(np.concatenate([prior_sigmas(guesses[name]) for name in lidars]) ** -2.0)
     uncertainty = assess(information_data, prior, solved)
     cov = covariance_with_prior_in_null_space(prior, spectrum(information_data, prior))
-    guesses = {name: Guess(T, guess_sigmas[name]) for name, T in T_vehicle_lidar.items()}
     return PredictedCovariance(
         lidars=tuple(lidars),
         information_data=information_data,

@@ -22,3 +22,14 @@ def before_words(lidars: Sequence[str], found: Sequence[str]) -> str:
     if set(lidars) <= set(found):
         return "the mountings that were found in the drive"
     return f"the initial guesses, and what was found in the drive for {', '.join(found)}"
+
+
+def in_brackets_sentence(undetermined: Sequence[str], found: Sequence[str]) -> str:
+    """What sigmas in brackets are: of LiDARs with undetermined axes, `found` without a guess."""
+    if not found:
+        what = "the sigma of the initial guess"
+    elif set(undetermined) <= set(found):
+        what = "no initial guess was given"
+    else:
+        what = f"the sigma of the initial guess; of {', '.join(found)} none was given"
+    return f"In brackets: not determined by the drive; {what}."

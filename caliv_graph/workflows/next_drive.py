@@ -175,6 +175,7 @@ def _assumptions(config: Config) -> Assumptions:
         time_offset=config.solve.time_offset,
         extraction=config.extraction,
         ranges=range_errors(config.noise),
+        guesses={name: configured_guess(config, name) for name in config.lidars},
         structure=config.structure.use,
     )
 

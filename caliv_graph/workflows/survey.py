@@ -178,12 +178,7 @@ def _verdict(
         problem.lidars,
         problem.reference,
         rough_extrinsics(state),
-        {
-            name: problem.guess_sigmas(name)
-            if name in problem.lidars
-            else configured_guess(config, name).sigmas
-            for name, lidar in config.lidars.items()
-        },
+        {name: configured_guess(config, name) for name in config.lidars},
         {name: sum(n for (_, of), n in scans.items() if of == name) for name in problem.lidars},
         offsets_s,
         lidars_with_structure(state.structure),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.geometry.se3 import retract_vehicle_axes
-from caliv_graph.products import Array
+from caliv_graph.products import Array, Guess
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.predicted import (
     PredictedCovariance,
@@ -24,7 +24,7 @@ def make_predicted() -> tuple[Array, PredictedCovariance]:
     rng = np.random.default_rng(5)
     root = rng.normal(size=(12, 48)) * np.tile(1.0 / np.array([1e-3] * 3 + [5e-3] * 3), 2)[:, None]
     D = root @ root.T
-    guesses = dict.fromkeys(LIDARS, SIGMAS)
+    guesses = {name: Guess(T, SIGMAS) for name, T in LIDARS.items()}
     return D, predict_covariance(
         D, ("front", "rear"), "rear", LIDARS, guesses, {"front": 9, "rear": 9}, {}
     )
@@ -52,13 +52,14 @@ def test_sigmas_of_a_pair_are_those_of_evaluates_errors() -> None:
 def test_a_lidar_without_data_keeps_its_guess() -> None:
     lidars = {**LIDARS, "left": pose(*MOUNTINGS["left"])}
     sigmas = {"front": SIGMAS, "rear": SIGMAS, "left": 2.0 * SIGMAS}
+    guesses = {name: Guess(T, sigmas[name]) for name, T in lidars.items()}
 
     predicted = predict_covariance(
         np.diag(np.tile([1e8] * 3 + [1e6] * 3, 2)),
         ("front", "rear"),
         "rear",
-        lidars,
-        sigmas,
+        LIDARS,
+        guesses,
         {"front": 20, "rear": 30},
         {},
     )
@@ -73,3 +74,22 @@ def test_a_lidar_without_data_keeps_its_guess() -> None:
     expected = math.hypot(1e-3, 1e-3)
     # x of the pair: both, and nothing of rotations for LiDARs in a row along x.
     assert predicted.sigma_s2s["front", "rear"][3] == pytest.approx(expected, rel=1e-6)
+
+
+def test_without_an_initial_guess_the_solve_is_no_knowledge() -> None:
+    """Nothing on x of all; one guess is enough for its own LiDAR, and for no other."""
+    axis = [1e-3**-2.0] * 3 + [0.0] + [1e-2**-2.0] * 2
+    lidars = {**LIDARS, "left": pose(*MOUNTINGS["left"])}
+    found = {name: Guess(T, SIGMAS, found=name != "rear") for name, T in lidars.items()}
+
+    predicted = predict_covariance(
+        np.diag(np.tile(axis, 2)), ("front", "rear"), "rear", LIDARS, found, {"front": 9}, {}
+    )
+
+    known = [1e-3] * 3
+    assert predicted.sigma_s2v["front"] == pytest.approx([*known, 10.0, 1e-2, 1e-2], rel=1e-6)
+    assert predicted.sigma_s2v["rear"] == pytest.approx([*known, 0.06, 1e-2, 1e-2], rel=1e-6)
+    assert predicted.sigma_s2v["left"] == pytest.approx([math.pi] * 3 + [10.0] * 3)
+    results = predicted.calibration.lidars
+    assert [axis for axis, told in results["front"].determined.items() if not told] == ["x"]
+    assert [name for name, result in results.items() if result.without_guess] == ["front", "left"]

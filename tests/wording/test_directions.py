@@ -13,7 +13,7 @@ import yaml
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import retract_vehicle_axes
-from caliv_graph.products import Array, VehicleParameter
+from caliv_graph.products import Array, Guess, VehicleParameter
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from caliv_graph.uncertainty.observability import UNIT, assess, limited_axes, scaling
 from caliv_graph.uncertainty.predicted import PredictedCovariance, predict_covariance
@@ -170,7 +170,7 @@ def predicted(*lost: int) -> PredictedCovariance:
             ("front", "rear"),
             "rear",
             LIDARS,
-            dict.fromkeys(LIDARS, SIGMAS),
+            {name: Guess(T, SIGMAS) for name, T in LIDARS.items()},
             {},
             {},
         )

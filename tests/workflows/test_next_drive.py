@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.guesses import configured_guess, with_found_guess
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, TopicsConfig
 from caliv_graph.errors import ConfigError, TrajectoryError
 from caliv_graph.planning.predict import Prediction, predict, predict_drives
-from caliv_graph.planning.suggest import suggest
+from caliv_graph.planning.suggest import is_met, shortfall, suggest
 from caliv_graph.products import MotionData
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.simulation.writer import config_of
@@ -82,6 +83,25 @@ def test_as_recorded_is_what_the_scenario_and_a_survey_predict() -> None:
     assert (np.abs(np.log(flat)) < np.log(1.5)).all()
     (turn,) = found.undetermined
     assert turn.text.startswith(TURN)
+
+
+def test_without_initial_guesses_a_plan_promises_what_a_calibration_gives() -> None:
+    _, config, drive = arc()
+    start = {name: config.lidars[name].guess() for name in config.lidars}
+    for name, T in start.items():
+        config = with_found_guess(config, name, T)
+    guesses = {name: configured_guess(config, name) for name in config.lidars}
+    drive = replace(drive, assumptions=replace(drive.assumptions, guesses=guesses))
+
+    found = alone(drive)
+
+    for name, sigma in found.sigma_s2v.items():
+        assert 5.0 < sigma[3] < 8.0
+        assert not found.covariance.calibration.lidars[name].determined["y"]
+    # Both LiDARs turn together: they are known against each other as before.
+    pair = ("front", "rear")
+    assert found.sigma_s2s[pair] == pytest.approx(alone(arc()[2]).sigma_s2s[pair], rel=0.15)
+    assert not is_met(shortfall(found, {"s2v_x_m": 0.5}), {"s2v_x_m": 0.5})
 
 
 def test_what_is_suggested_determines_the_rest_together_with_the_drive() -> None:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import functools
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.guesses import TRUSTED_SIGMAS
+from caliv_graph.config.guesses import TRUSTED_SIGMAS, with_found_guess
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, GroundConfig, RegistrationConfig
 from caliv_graph.pipeline import Prepared, prepare
 from caliv_graph.planning import Assumptions, predict
 from caliv_graph.planning.assumptions import Ground
+from caliv_graph.report.predicted import survey_table
 from caliv_graph.scenario.drive_models import (
     ArcDrive,
     DriveModel,
@@ -156,6 +159,34 @@ def test_a_plan_predicts_what_the_recording_tells(name: str) -> None:
     # Not the ground's part: z, roll and pitch of the pair are as good as the ground is flat.
     ratio = (found.sigma_s2s[pair] / predicted.sigma_s2s[pair])[2:5]
     assert ratio == pytest.approx(np.ones(3), abs=0.35)
+
+
+def test_without_initial_guesses_an_arc_tells_nothing_of_the_turn() -> None:
+    """As after `calibrate`: not the 0.2 m and 2 degrees that hold the solve."""
+    drive = extracted("arc")
+    config = drive.config.model_copy(
+        update={"registration": QUICK, "limits": {"s2v_x_m": 0.5, "s2v_yaw_deg": 5.0}}
+    )
+    for name, lidar in config.lidars.items():
+        config = with_found_guess(config, name, lidar.guess())
+    prepared = drive.prepared
+
+    found = survey_observations(
+        prepared.observations, prepared.trajectories, prepared.grounds, config, SilentProgress()
+    )
+
+    for name, sigma in found.covariance.sigma_s2v.items():
+        # 10 m of place along an arm of 9.16 m, for two LiDARs; any rotation allows more.
+        assert 5.0 < sigma[3] < 8.0
+        assert 0.5 < sigma[2] < 0.9
+        determined = found.covariance.calibration.lidars[name].determined
+        assert {axis for axis, told in determined.items() if not told} >= {"x", "y", "yaw"}
+    assert sum("limits s2v" in line for line in found.unmet) == 4
+    text = io.StringIO()
+    Console(width=200, file=text).print(survey_table(found))
+    assert "In brackets: not determined by the drive; no initial guess was given." in (
+        text.getvalue()
+    )
 
 
 def test_from_the_recording_on() -> None:

@@ -25,6 +25,9 @@ from caliv_graph.wording.remedies import evidence_of
 _SAME_GUESS = 1e-6
 """Largest difference of two equal guesses that were rounded, rad and m."""
 
+_OF_PRIOR = "--prior: "
+"""Begins the contradictions of an earlier calibration."""
+
 
 @dataclass(frozen=True)
 class Merger:
@@ -180,7 +183,8 @@ def with_earlier(
         p_value: probability that unchanged mounts are reported to have moved.
 
     Returns:
-        The calibration, `inconsistent` if a mount has moved since, and warnings.
+        The calibration, and warnings. It is `inconsistent` if a mount has moved since, or if one of
+        the two is; it has the contradictions of both.
     """
     own = own_term(calibration, "this drive")
     terms = prior_terms(prior)
@@ -192,17 +196,26 @@ def with_earlier(
     draft = replace(
         calibration,
         earlier=terms,
+        contradictions=(
+            *calibration.contradictions,
+            *(f"{_OF_PRIOR}{said.removeprefix(_OF_PRIOR)}" for said in prior.contradictions),
+        ),
         provenance={**calibration.provenance, "prior": dict(prior.provenance)},
     )
-    disagree = comparison.moved or calibration.status == "inconsistent"
+    disagree = comparison.moved or "inconsistent" in (calibration.status, prior.status)
     data = moved_to(own, fused.T_vehicle_lidar)
-    warnings = [
-        f"--prior and this drive disagree: {_largest(comparison)}. {comparison.conclusion} The "
-        "result mixes both: calibrate without --prior"
-    ]
-    return _assembled(draft, calibration.lidars, guesses, fused, data, disagree), tuple(
-        warnings if comparison.moved else ()
-    )
+    warnings = []
+    if comparison.moved:
+        warnings.append(
+            f"--prior and this drive disagree: {_largest(comparison)}. {comparison.conclusion} The "
+            "result mixes both: calibrate without --prior"
+        )
+    if prior.status == "inconsistent":
+        warnings.append(
+            "--prior: is inconsistent, so the result is inconsistent too: calibrate without --prior"
+        )
+    result = _assembled(draft, calibration.lidars, guesses, fused, data, disagree)
+    return result, tuple(warnings)
 
 
 def _assembled(

@@ -388,6 +388,22 @@ def test_a_mount_that_moved_since_the_prior() -> None:
     assert "LiDAR 'rear' has moved" in warning
 
 
+def test_a_prior_that_is_inconsistent_makes_the_result_so(tmp_path: Path) -> None:
+    before, alone = two_drives()
+    before = replace(before, status="inconsistent", contradictions=("stamps are late",))
+
+    result, (warning,) = with_earlier(replace(alone, contradictions=("a cloud is off",)), before)
+
+    assert merged(before, alone).status == result.status == "inconsistent"
+    assert warning.startswith("--prior: is inconsistent")
+    assert result.contradictions == ("a cloud is off", "--prior: stamps are late")
+    write_calibration(result, tmp_path / "b.yaml")
+    third = drive(information(NAMES, 5), source="c")
+    handed_on, _ = with_earlier(third, read_calibration(tmp_path / "b.yaml"))
+    assert handed_on.status == "inconsistent"
+    assert handed_on.contradictions == ("--prior: a cloud is off", "--prior: stamps are late")
+
+
 def test_a_lidar_unseen_now_follows_those_that_were() -> None:
     """The earlier drive tied it to the one that is seen again."""
     before = drive(information(NAMES, 1), source="a", error=shift(NAMES, "front", x=0.001))

@@ -91,6 +91,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         unmet=(),
         earlier=(),
         contradictions=contradictions,
+        suspects=(),
         vehicle={},
         structure=None,
     )

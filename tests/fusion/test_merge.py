@@ -12,7 +12,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.merge import Merger, merge, starting_from, with_earlier
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
-from caliv_graph.products import Array, Calibration, Guess
+from caliv_graph.products import Array, Calibration, Guess, Suspect
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from tests.fusion.drives import TRUTH, arc_information, draw, drive, information, shift
 
@@ -316,6 +316,19 @@ def test_a_merged_file_reads_back(tmp_path: Path) -> None:
     assert guess.sigmas == pytest.approx(written.sigmas, rel=1e-9)
     with pytest.raises(ConfigError, match="same drive"):
         merged(back, drive(D, source="b"))
+
+
+def test_the_suspects_of_one_drive_are_none_of_all() -> None:
+    """Each ranking explains the contradictions of its own drive."""
+    late = Suspect("lidars.front.time_offset", (0.1,), (1e-3,), (0.1,), ("s",), 0.9, 40.0, 40.0)
+    parts = [
+        drive(information(NAMES, seed), source=s, suspects=suspects)
+        for seed, s, suspects in ((1, "a", (late,)), (2, "b", ()))
+    ]
+
+    for some in (parts, parts[::-1]):
+        assert merged(*some).suspects == ()
+    assert with_earlier(parts[0], parts[1])[0].suspects == (late,)
 
 
 # ---------------------------------------------------------------- --prior

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -51,6 +53,12 @@ def prior_sigmas(guess: Guess) -> Array:
     the prior would be as good as the data, and its axes would count as undetermined.
     """
     return DEFAULT_GUESS_SIGMAS if guess.fixed else guess.sigmas
+
+
+def trust_information(guesses: Sequence[Guess]) -> Array:
+    """(6n, 6n) information that trusted guesses add to the data, vehicle axes; zero for others."""
+    trusted = [guess.fixed * guess.sigmas**-2.0 for guess in guesses]
+    return np.diag(np.concatenate([*trusted, np.zeros(0)]))
 
 
 def with_guess(config: Config, name: str, T_vehicle_lidar: gtsam.Pose3) -> Config:

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.assemble import DRIVES
-from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, prior_sigmas
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, prior_sigmas, trust_information
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import (
     joint_right_to_vehicle_axes,
@@ -241,9 +241,7 @@ def fuse(terms: Sequence[DataTerm], guesses: Mapping[str, Guess], mode: str = "a
             measurement.
     """
     names = list(guesses)
-    fixed = np.repeat([guesses[name].fixed for name in names], 6)
-    certainty = np.concatenate([guesses[name].sigmas for name in names]) ** -2.0
-    trusted = np.diag(fixed * certainty)
+    trusted = trust_information([guesses[name] for name in names])
     prior = np.diag(np.concatenate([prior_sigmas(guesses[name]) for name in names]) ** -2.0)
     poses = {name: _start(name, terms, guesses[name]) for name in names}
     undetermined: int | None = None

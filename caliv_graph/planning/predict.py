@@ -17,7 +17,7 @@ import numpy as np
 
 from caliv_graph.calibration.graph import OFFSET_SIGMA_S
 from caliv_graph.calibration.solve import OFFSET_DETERMINED_S
-from caliv_graph.config.guesses import prior_sigmas
+from caliv_graph.config.guesses import prior_sigmas, trust_information
 from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import AXES
@@ -213,6 +213,8 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
         raise _nobody(planned, seen, assumptions.extraction)
     information = np.sum([of.information(lidars) for of in drives], axis=0)
     guesses = _guesses(first, assumptions)
+    size = 6 * len(lidars)
+    information[:size, :size] += trust_information([guesses[name] for name in lidars])
     sigmas = np.concatenate([prior_sigmas(guesses[name]) for name in lidars])
     D, offsets_s = _without_offsets(information, lidars, np.diag(sigmas**-2.0))
     covariance = predict_covariance(

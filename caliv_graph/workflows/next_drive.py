@@ -13,7 +13,7 @@ import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.common.progress import Progress
-from caliv_graph.config.guesses import configured_guess
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import range_errors
 from caliv_graph.errors import ConfigError, RecordingError, TrajectoryError
@@ -291,7 +291,9 @@ def _scenario(
     objects: Mapping[str, ObjectModel],
 ) -> Scenario:
     name = re.sub(r"[^\w. -]", "_", PurePath(recording.name).stem) or "drive"
-    sigmas = np.array([configured_guess(config, n).sigmas for n in lidars])
+    guesses = [configured_guess(config, n) for n in lidars]
+    # Of a trusted one the scenario cannot say that it is.
+    sigmas = np.array([g.sigmas for g in guesses if not g.fixed] or [DEFAULT_GUESS_SIGMAS])
     rotation_rad, translation_m = np.median(sigmas[:, :3]), np.median(sigmas[:, 3:])
     return Scenario(
         name=f"{name} as recorded",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.guesses import configured_guess, with_found_guess
+from caliv_graph.config.guesses import TRUSTED_SIGMAS, configured_guess, with_found_guess
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config, TopicsConfig
 from caliv_graph.errors import ConfigError, TrajectoryError
@@ -102,6 +102,25 @@ def test_without_initial_guesses_a_plan_promises_what_a_calibration_gives() -> N
     pair = ("front", "rear")
     assert found.sigma_s2s[pair] == pytest.approx(alone(arc()[2]).sigma_s2s[pair], rel=0.15)
     assert not is_met(shortfall(found, {"s2v_x_m": 0.5}), {"s2v_x_m": 0.5})
+
+
+def test_a_trusted_mounting_determines_what_the_others_turn_with() -> None:
+    """`fixed: true` of the front LiDAR: what is left is what the target tells of the pair."""
+    recording, config, given = arc()
+    front = config.lidars["front"].model_copy(update={"fixed": True})
+    config = config.model_copy(update={"lidars": {**config.lidars, "front": front}})
+    drive = recorded_drive(recording, config, SilentProgress())
+
+    found = alone(drive)
+
+    assert found.undetermined == ()
+    assert found.sigma_s2v["front"] == pytest.approx(TRUSTED_SIGMAS, rel=0.01)
+    pair = found.sigma_s2s["front", "rear"]
+    assert (found.sigma_s2v["rear"][[2, 3, 4]] < 1.5 * pair[[2, 3, 4]]).all()
+    results = found.covariance.calibration.lidars
+    assert all(all(result.determined.values()) for result in results.values())
+    # The scenario of a suggestion has the sigmas of the LiDAR that is not trusted.
+    assert drive.scenario.initial_guess == given.scenario.initial_guess
 
 
 def test_what_is_suggested_determines_the_rest_together_with_the_drive() -> None:

@@ -37,6 +37,9 @@ from caliv_graph.wording.remedies import Evidence
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
 
+MOTION = "motion"
+"""Key of the provenance of drives without motion data: what their poses are by."""
+
 
 def assemble(
     solution: Solution,
@@ -179,7 +182,7 @@ def _motion(solution: Solution) -> dict[str, str]:
         f"odometry of lidar '{tracked[0]}'; S2V roll and pitch by the ground's normal, yaw by the "
         "direction of travel, x and y by the guess alone"
     )
-    return {"motion": text}
+    return {MOTION: text}
 
 
 def _provenance(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import caliv_graph
-from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.calibration.assemble import DRIVES, MOTION
 from caliv_graph.config.guesses import with_found_guess, with_guess
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
@@ -24,6 +24,9 @@ from caliv_graph.wording.remedies import evidence_of
 
 _SAME_GUESS = 1e-6
 """Largest difference of two equal guesses that were rounded, rad and m."""
+
+_MERGED, _PRIOR = "merged", "prior"
+"""Keys of the provenance: those of the parts of a result, and that of its `--prior`."""
 
 _OF_PRIOR = "--prior: "
 """Begins the contradictions of an earlier calibration."""
@@ -79,7 +82,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     provenance: dict[str, object] = {
         "caliv_graph": caliv_graph.__version__,
         "mode": mode,
-        "merged": [dict(c.provenance) for c in calibrations.values()],
+        _MERGED: [dict(c.provenance) for c in calibrations.values()],
         DRIVES: list(data.sources),
     }
     contradictions = tuple(
@@ -201,7 +204,7 @@ def with_earlier(
             *calibration.contradictions,
             *(f"{_OF_PRIOR}{said.removeprefix(_OF_PRIOR)}" for said in prior.contradictions),
         ),
-        provenance={**calibration.provenance, "prior": dict(prior.provenance)},
+        provenance={**calibration.provenance, _PRIOR: dict(prior.provenance)},
     )
     disagree = comparison.moved or "inconsistent" in (calibration.status, prior.status)
     data = moved_to(own, fused.T_vehicle_lidar)
@@ -246,7 +249,7 @@ def _assembled(
     uncertainty = named(
         assess(known, fused.prior, poses),
         poses,
-        evidence_of(results.values()),
+        evidence_of(results.values(), _without_motion_data(draft.provenance)),
     )
     lidars = {}
     for i, (name, result) in enumerate(results.items()):
@@ -274,6 +277,18 @@ def _assembled(
         gradient_data=to_right @ data.gradient,
         undetermined=uncertainty.undetermined,
         weak=uncertainty.weak,
+    )
+
+
+def _without_motion_data(provenance: Mapping[str, object]) -> bool:
+    """Whether the drives of a result, and those of its parts, recorded no motion at all."""
+    parts = provenance.get(_MERGED)
+    own = list(parts) if isinstance(parts, list | tuple) else []
+    if not own and MOTION not in provenance:
+        return False
+    earlier = [provenance[_PRIOR]] if _PRIOR in provenance else []
+    return all(
+        isinstance(part, Mapping) and _without_motion_data(part) for part in [*own, *earlier]
     )
 
 

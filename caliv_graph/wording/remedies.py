@@ -142,11 +142,18 @@ REMEDIES: dict[Evidence, Remedies] = {
 }
 
 
-def evidence_of(lidars: Iterable[LidarResult]) -> Evidence:
-    """What the LiDARs of a calibration saw, all of them together."""
+def evidence_of(lidars: Iterable[LidarResult], odometry: bool = False) -> Evidence:
+    """What the LiDARs of a calibration saw, all of them together.
+
+    Args:
+        lidars: their results.
+        odometry: whether no drive recorded anything else.
+    """
     results = tuple(lidars)
     target = any(lidar.saw_target for lidar in results)
     structure = any(lidar.saw_structure for lidar in results)
+    if structure and odometry:
+        return "odometry"
     if structure:
         return "both" if target else "structure"
     return "target"

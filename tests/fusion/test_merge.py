@@ -14,6 +14,7 @@ from caliv_graph.fusion.merge import Merger, merge, starting_from, with_earlier
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Calibration, Guess, Suspect
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
+from caliv_graph.wording.remedies import OF_ODOMETRY, OF_STRUCTURE
 from tests.fusion.drives import TRUTH, arc_information, draw, drive, information, shift
 
 NAMES = ("front", "rear")
@@ -329,6 +330,35 @@ def test_the_suspects_of_one_drive_are_none_of_all() -> None:
     for some in (parts, parts[::-1]):
         assert merged(*some).suspects == ()
     assert with_earlier(parts[0], parts[1])[0].suspects == (late,)
+
+
+def test_the_remedies_of_drives_without_motion_data_are_theirs(tmp_path: Path) -> None:
+    """No manoeuvre tells S2V there; as soon as one drive has motion data, a curve does."""
+
+    def past_walls(source: str, **provenance: str) -> Calibration:
+        result = drive(arc_information(NAMES), source=source)
+        lidars = {
+            name: replace(lidar, saw_target=False, scans_used=0, saw_structure=True)
+            for name, lidar in result.lidars.items()
+        }
+        return replace(result, lidars=lidars, provenance={**result.provenance, **provenance})
+
+    def remedy(result: Calibration) -> str:
+        return result.undetermined[0].remedy
+
+    a, b = (past_walls(source, motion="odometry of lidar 'rear'") for source in "ab")
+    moving = past_walls("c")
+    write_calibration(merged(a, b), tmp_path / "ab.yaml")
+    both = read_calibration(tmp_path / "ab.yaml")
+
+    for result in (
+        merged(a, b),
+        with_earlier(b, a)[0],
+        with_earlier(past_walls("d", motion=""), both)[0],
+    ):
+        assert remedy(result) == OF_ODOMETRY.turn_centre
+    for result in (merged(a, moving), with_earlier(a, moving)[0], merged(both, moving)):
+        assert remedy(result) == OF_STRUCTURE.turn_centre
 
 
 # ---------------------------------------------------------------- --prior

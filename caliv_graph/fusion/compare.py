@@ -41,8 +41,8 @@ ALPHA = 0.01
 """Probability of a false alarm if no mount has moved, over all tests of one comparison."""
 
 _MAX_PRIOR_FRACTION = 0.1
-"""Largest fraction of a direction's variance that may come from undetermined directions. Directions
-with more are not tested. Below it, the test is slightly conservative."""
+"""Largest fraction of the variance of a direction or an axis that may come from undetermined
+directions. With more it is not tested. Below it, the test is slightly conservative."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class Movement:
         movement: (6,) second calibration minus the first, vehicle axes at the (first) LiDAR,
             rotation (rad) then translation (m).
         sigma: (6,) standard deviation of the movement.
-        determined: (6,) whether both drives determine the axis. The movement and sigma of other
-            axes have no meaning.
+        determined: (6,) whether both drives determine the axis, and the guesses hardly have a part
+            in its variance. The movement and sigma of other axes have no meaning.
         chi2: chi-square of the movement along the directions that both drives determine.
         dof: number of these directions; 0: no test is possible.
         p_value: probability of a larger `chi2` if nothing has moved.
@@ -311,14 +311,17 @@ def _movement(
         movement = vehicle_axes_difference(expected, before.poses[source])
     parts = [(_selection(lidars, names, drive.poses), drive) for drive in drives]
     chi2, dof, p_value = _test(movement, parts)
-    variance = sum(
-        (
-            np.sum((J @ drive.root_data) ** 2, axis=1) + np.sum((J @ drive.root_prior) ** 2, axis=1)
-            for J, drive in parts
-        ),
-        start=np.zeros(6),
+    var_data, var_prior = (
+        sum((np.sum((J @ root) ** 2, axis=1) for J, root in roots), start=np.zeros(6))
+        for roots in (
+            [(J, drive.root_data) for J, drive in parts],
+            [(J, drive.root_prior) for J, drive in parts],
+        )
     )
+    variance = var_data + var_prior
     undetermined = np.any([_undetermined_axes(J, drive) for J, drive in parts], axis=0)
+    # Along what the drives leave open, even a small part of an axis can be off by any amount.
+    undetermined |= var_prior > _MAX_PRIOR_FRACTION * variance
     sigma = np.sqrt(variance)
     p_axes = np.where(undetermined, 1.0, 2.0 * ndtr(-np.abs(movement) / sigma))
     return Movement(

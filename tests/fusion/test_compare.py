@@ -23,7 +23,7 @@ from tests.fusion.drives import (
     moved,
     shift,
 )
-from tests.samples import unseen
+from tests.samples import turn_about_centre, unseen
 
 NAMES = ("front", "rear")
 
@@ -100,6 +100,33 @@ def test_a_shared_guess_proves_nothing() -> None:
         assert (movement.determined[3], movement.dof) == (False, 5)
     assert found.pairs[0].dof == 6
     assert all("turn centre" in texts[0] for texts in found.undetermined)
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_what_the_solves_leave_open_is_no_movement(found: bool) -> None:
+    """The same data twice; both solves ended 0.1 rad apart along what an arc leaves open.
+
+    2 m ahead of the centre, y follows a fifth of what x does: 0.2 m. The verdicts of each drive
+    call it determined, but its variance is that of the guesses.
+    """
+    D = np.diag(np.tile([1e4**2] * 3 + [1e3**2] * 3, 2))
+    vector = turn_about_centre({name: TRUTH[name] for name in NAMES}).vector
+    turn = np.concatenate([vector[name] for name in NAMES])
+    D = D - np.outer(D @ turn, D @ turn) / (turn @ D @ turn)
+    first = drive(D, source="a", guess_error=-0.05 * turn, found=found)
+    second = drive(D, source="b", guess_error=0.05 * turn, found=found)
+
+    there = compared(first, second)
+
+    front, rear = there.lidars.values()
+    assert not there.moved
+    assert front.movement[2:5] == pytest.approx([0.1, -0.916, 0.2], rel=0.05)
+    assert front.determined == rear.determined == (True, True, False, False, False, True)
+    assert front.tests == pytest.approx([1.0] * 4, abs=0.05)
+    assert merge({"a": first, "b": second}).calibration.status == "partial"
+    # What the drives do tell of is tested as before.
+    pitched = shift(NAMES, "front", pitch=1e-3)
+    assert compared(first, drive(D, source="b", error=pitched, found=found)).moved
 
 
 def test_what_the_arcs_do_tell_is_tested() -> None:

@@ -178,7 +178,11 @@ def suggest(
     best: Suggestion | None = None
     with_ramp = assumptions.ground != "height"
     quickly = replace(assumptions, stride=STRIDE)
-    beside_quickly = [SeenDrive.of(of.scenario, of.drive, quickly) for of in beside]
+    # Walls of a recording are no part of its scenario; a drive tells the same beside any other.
+    beside_quickly = [
+        of if of.structure is not None else SeenDrive.of(of.scenario, of.drive, quickly)
+        for of in beside
+    ]
     for tried in sorted(candidates(scenario, with_ramp, both_turns=bool(beside)), key=_cost):
         quick = _tried(tried, goals, quickly, beside_quickly)
         if quick is None:

@@ -19,7 +19,8 @@ from caliv_graph.planning import Assumptions, Prediction, predict
 from caliv_graph.planning.assumptions import Ground
 from caliv_graph.planning.faces import faces_of
 from caliv_graph.planning.patches import planned_patches
-from caliv_graph.planning.suggest import Planned
+from caliv_graph.planning.predict import SeenDrive
+from caliv_graph.planning.suggest import Planned, suggest
 from caliv_graph.products import Array
 from caliv_graph.report.predicted import plan_document, plan_table
 from caliv_graph.scenario.drive_models import (
@@ -203,6 +204,28 @@ def test_what_is_missing_is_named_with_its_remedy() -> None:
     (text,) = arc
     assert text.startswith("rotation of all LiDARs about the turn centre: x and yaw together, 9.16")
     assert "figure-eight" in arc[text]
+
+
+def test_a_suggestion_counts_the_walls_of_a_recorded_drive() -> None:
+    """Beside an arc to the right past walls alone, an arc to the left is enough."""
+    scenario = DRIVES["arc"]
+    drive = make_drive(scenario.drive)
+    structure = SeenDrive.of(scenario, drive, Assumptions()).structure
+    assert structure is not None
+    # As `next_drive` makes it of a recording: the world of the scenario has no walls.
+    elsewhere = scenario.model_copy(update={"world": WorldModel()})
+    recorded = SeenDrive(elsewhere, drive, Assumptions(), (), structure)
+    chair = WorldModel(objects={"chair": ChairModel(xy_m=(0.0, 0.0))}, targets=("chair",))
+    vehicle = scenario.model_copy(update={"world": chair})
+
+    alone = suggest(vehicle, {}, Assumptions())
+    beside = suggest(vehicle, {}, Assumptions(), [recorded])
+
+    assert alone is not None
+    assert beside is not None
+    assert beside.met
+    assert "arc to the left" in beside.manoeuvre
+    assert "S-curve" in alone.manoeuvre
 
 
 def test_who_shares_which_wall() -> None:

@@ -287,9 +287,19 @@ def _total(terms: Sequence[DataTerm], poses: Mapping[str, gtsam.Pose3]) -> tuple
     names = list(poses)
     D, c = np.zeros((6 * len(names), 6 * len(names))), np.zeros(6 * len(names))
     for term in terms:
-        information, gradient = arranged(moved_to(term, poses), names)
+        information, gradient = arranged(moved_to(_of(term, names), poses), names)
         D, c = D + information, c + gradient
     return D, c
+
+
+def _of(term: DataTerm, names: Sequence[str]) -> DataTerm:
+    """A term without the LiDARs that are not in `names`: they are eliminated."""
+    known = [name for name in term.T_vehicle_lidar if name in names]
+    if len(known) == len(term.T_vehicle_lidar):
+        return term
+    information, gradient = arranged(term, known)
+    poses = {name: term.T_vehicle_lidar[name] for name in known}
+    return DataTerm(term.sources, poses, information, gradient)
 
 
 def guess_of(calibration: Calibration, name: str) -> Guess:

@@ -464,6 +464,22 @@ def test_a_lidar_unseen_now_follows_those_that_were() -> None:
     )
 
 
+def test_a_prior_of_more_lidars_counts_with_what_it_tells_of_the_others() -> None:
+    more = ("front", "left", "rear")
+    D = [information(more, 1), information(NAMES, 2)]
+    error = draw(D[0], np.random.default_rng(4))
+    before, now = drive(D[0], more, source="a", error=error), drive(D[1], source="b")
+
+    result, warnings = with_earlier(now, before)
+
+    assert warnings == ()
+    assert list(result.lidars) == list(NAMES)
+    rows = [*range(6), *range(12, 18)]
+    without_left = np.linalg.inv(np.linalg.inv(D[0])[np.ix_(rows, rows)])
+    mean = np.linalg.solve(without_left + D[1], without_left @ error[rows])
+    assert errors(result) == pytest.approx(mean, abs=2e-5)
+
+
 def config(**sections: object) -> Config:
     lidars = {
         name: {"topic": name, "initial": {"xyz": [1.0, 2.0, 3.0], "rpy_deg": [1.0, 2.0, 3.0]}}

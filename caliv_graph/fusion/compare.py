@@ -17,7 +17,7 @@ from scipy.special import chdtrc, ndtr
 
 from caliv_graph.config.guesses import prior_sigmas
 from caliv_graph.errors import ConfigError
-from caliv_graph.fusion.terms import arranged, guess_of, own_term
+from caliv_graph.fusion.terms import arranged, fuse, guess_of, only, own_term, slid
 from caliv_graph.geometry.covariance import relative_jacobian
 from caliv_graph.geometry.se3 import (
     retract_vehicle_axes,
@@ -189,7 +189,8 @@ def compare_terms(
         p_value: see `compare`.
     """
     names, left_out = _comparable(terms)
-    drives = _drive(terms[0], guesses[0], names), _drive(terms[1], guesses[1], names)
+    near = _slid_together(terms, guesses, names)
+    drives = _drive(near[0], guesses[0], names), _drive(near[1], guesses[1], names)
     lidars = {name: _movement((name,), names, drives) for name in names}
     pairs = tuple(_movement(pair, names, drives) for pair in sensor_pairs(names, reference))
     tested = holm([*lidars.values(), *pairs], p_value)
@@ -264,6 +265,21 @@ def _comparable(terms: tuple[DataTerm, DataTerm]) -> tuple[list[str], dict[str, 
         else:
             names.append(name)
     return names, left_out
+
+
+def _slid_together(
+    terms: tuple[DataTerm, DataTerm],
+    guesses: tuple[Mapping[str, Guess], Mapping[str, Guess]],
+    names: Sequence[str],
+) -> tuple[DataTerm, DataTerm]:
+    """The terms over some LiDARs, each slid along what it leaves undetermined to where both meet.
+
+    What is left of their difference is small enough for a linear test. Where nobody gave a guess,
+    two solves may end half a radian apart along such a direction.
+    """
+    first, second = (only(term, names) for term in terms)
+    both = fuse((first, second), {n: guesses[0][n] for n in names}).T_vehicle_lidar
+    return slid(first, both, guesses[0]), slid(second, both, guesses[1])
 
 
 def _drive(term: DataTerm, guesses: Mapping[str, Guess], names: Sequence[str]) -> _Drive:

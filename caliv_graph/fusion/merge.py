@@ -14,7 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
-from caliv_graph.fusion.terms import Fused, fuse, guess_of, moved_to, own_term
+from caliv_graph.fusion.terms import Fused, brought_to, fuse, guess_of, own_term
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
 from caliv_graph.uncertainty.assemble import determined_axes
@@ -207,7 +207,7 @@ def with_earlier(
         provenance={**calibration.provenance, _PRIOR: dict(prior.provenance)},
     )
     disagree = comparison.moved or "inconsistent" in (calibration.status, prior.status)
-    data = moved_to(own, fused.T_vehicle_lidar)
+    data = brought_to(own, fused.T_vehicle_lidar, guesses)
     warnings = []
     if comparison.moved:
         warnings.append(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.linalg import eigh
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import skew
@@ -283,7 +284,7 @@ def rigid_twist(
     `parts` has per LiDAR (6,), vehicle axes, rad and m, at any common scale. Returns rotation about
     and shift at the vehicle's origin; None if the LiDARs move apart.
     """
-    A = _by_twist(T_vehicle_lidar[name] for name in parts)
+    A = by_twist(T_vehicle_lidar[name] for name in parts)
     y = np.concatenate([part / UNIT for part in parts.values()])
     twist = np.linalg.lstsq(A, y, rcond=None)[0]
     misfit = np.linalg.norm(A @ twist - y) / np.linalg.norm(y)
@@ -300,9 +301,29 @@ def undetermined_twists(
     if not undetermined:
         return 0, np.zeros(6)
     basis = undetermined_basis(undetermined, list(T_vehicle_lidar))
-    twists, back = np.linalg.qr(_by_twist(T_vehicle_lidar.values()))
+    twists, back = np.linalg.qr(by_twist(T_vehicle_lidar.values()))
     _, cosines, within = np.linalg.svd(basis.T @ twists)
     return int((cosines > RIGID_COSINE).sum()), np.linalg.solve(back, within[-1])
+
+
+def undetermined_motions(
+    D: Array, prior: Array, T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+) -> Array:
+    """Rigid motions of the whole sensor set that data leave to the guesses, by the hard switch.
+
+    Args:
+        D: (6n, 6n) data information, vehicle axes, LiDARs in the order of `T_vehicle_lidar`.
+        prior: (6n, 6n) of the guesses.
+        T_vehicle_lidar: the extrinsics.
+
+    Returns:
+        (6, m) twists: rotation about (rad) and shift at the vehicle's origin (m). Any scale.
+    """
+    if not T_vehicle_lidar:
+        return np.zeros((6, 0))
+    moved = scaling(len(T_vehicle_lidar))[:, None] * by_twist(T_vehicle_lidar.values())
+    information, twists = eigh(moved.T @ D @ moved, moved.T @ prior @ moved)
+    return np.asarray(twists[:, information < UNDETERMINED_RATIO**-2.0])
 
 
 def undetermined_basis(undetermined: Sequence[Direction], lidars: Sequence[str]) -> Array:
@@ -315,7 +336,7 @@ def undetermined_basis(undetermined: Sequence[Direction], lidars: Sequence[str])
     return np.asarray(basis)
 
 
-def _by_twist(poses: Iterable[gtsam.Pose3]) -> Array:
+def by_twist(poses: Iterable[gtsam.Pose3]) -> Array:
     """(6n, 6) derivative of the extrinsics, scaled, by a twist at the vehicle's origin."""
     rows = []
     for T in poses:

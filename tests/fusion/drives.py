@@ -105,6 +105,27 @@ def drive(
     return replace(calibration, **{"provenance": provenance, **changes})
 
 
+def turned_on_its_arc(
+    turn_rad: float, *, source: str, left: bool = False, error: Array | None = None
+) -> Calibration:
+    """A drive on an arc, without guesses: mountings found turned about the centre of the arc.
+
+    Args:
+        turn_rad: by which all LiDARs are off, which the drive does not tell.
+        source: digest of the drive.
+        left: arc to the left.
+        error: (12,) of what its data say, in axes that are turned with the mountings.
+    """
+    names = ("front", "rear")
+    centre = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 9.16 if left else -9.16, 0.0]))
+    turn = gtsam.Pose3(gtsam.Rot3.Yaw(turn_rad), np.zeros(3))
+    motion = centre.compose(turn).compose(centre.inverse())
+    axes = np.kron(np.eye(4), turn.rotation().matrix())
+    D = axes @ arc_information(names, 1 + left, left) @ axes.T
+    truth = {name: motion.compose(TRUTH[name]) for name in names}
+    return drive(D, names, source=source, error=error, truth=truth, found=True)
+
+
 def shift(names: Sequence[str], lidar: str, **axes: float) -> Array:
     """(6n,) perturbation of one LiDAR: `yaw=0.001` (rad), `x=0.01` (m)."""
     e = np.zeros(6 * len(names))

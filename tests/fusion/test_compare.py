@@ -22,6 +22,7 @@ from tests.fusion.drives import (
     information,
     moved,
     shift,
+    turned_on_its_arc,
 )
 from tests.samples import turn_about_centre, unseen
 
@@ -118,15 +119,34 @@ def test_what_the_solves_leave_open_is_no_movement(found: bool) -> None:
 
     there = compared(first, second)
 
-    front, rear = there.lidars.values()
+    front = there.lidars["front"]
     assert not there.moved
-    assert front.movement[2:5] == pytest.approx([0.1, -0.916, 0.2], rel=0.05)
-    assert front.determined == rear.determined == (True, True, False, False, False, True)
+    # Each drive alone may have been at the other's place: nothing is left of the turn.
+    assert front.movement == pytest.approx(np.zeros(6), abs=1e-9)
+    assert front.determined == (True, True, False, False, False, True)
     assert front.tests == pytest.approx([1.0] * 4, abs=0.05)
     assert merge({"a": first, "b": second}).calibration.status == "partial"
     # What the drives do tell of is tested as before.
     pitched = shift(NAMES, "front", pitch=1e-3)
     assert compared(first, drive(D, source="b", error=pitched, found=found)).moved
+
+
+@pytest.mark.parametrize("turn_rad", [0.05, 0.215])
+def test_arcs_without_guesses_are_compared_however_far_their_solves_ended(turn_rad: float) -> None:
+    """A search takes the place nearest to the vehicle's origin: on the left for a right arc."""
+    right = turned_on_its_arc(turn_rad, source="a")
+    left = turned_on_its_arc(-turn_rad, source="b", left=True)
+    pitched = turned_on_its_arc(
+        -turn_rad, source="b", left=True, error=shift(NAMES, "front", pitch=8e-3)
+    )
+
+    found, knocked = compared(right, left), compared(right, pitched)
+
+    assert not found.moved
+    assert found.dof == 10
+    assert found.chi2 == pytest.approx(0.0, abs=1e-3)
+    assert knocked.conclusion == "LiDAR 'front' has moved."
+    assert knocked.lidars["front"].movement[1] == pytest.approx(8e-3, rel=0.1)
 
 
 def test_what_the_arcs_do_tell_is_tested() -> None:

@@ -15,7 +15,15 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_differe
 from caliv_graph.products import Array, Calibration, Guess, Suspect
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
 from caliv_graph.wording.remedies import OF_ODOMETRY, OF_STRUCTURE
-from tests.fusion.drives import TRUTH, arc_information, draw, drive, information, shift
+from tests.fusion.drives import (
+    TRUTH,
+    arc_information,
+    draw,
+    drive,
+    information,
+    shift,
+    turned_on_its_arc,
+)
 
 NAMES = ("front", "rear")
 
@@ -154,6 +162,17 @@ def test_arcs_to_both_sides_need_no_guess() -> None:
 
     assert result.status == "ok"
     assert (np.sqrt(np.diag(in_vehicle_axes(result, result.cov_joint))) < 0.02).all()
+
+
+@pytest.mark.parametrize("turn_rad", [0.05, 0.215])
+def test_how_far_solves_without_guesses_ended_does_not_matter(turn_rad: float) -> None:
+    """A turn of 0.2 rad about a centre 9 m away leaves its tangent by 0.2 m."""
+    right = turned_on_its_arc(turn_rad, source="a")
+    left = turned_on_its_arc(-turn_rad, source="b", left=True)
+
+    for result in (merged(right, left), with_earlier(left, right)[0]):
+        assert result.status == "ok"
+        assert errors(result) == pytest.approx(np.zeros(12), abs=1e-5)
 
 
 def test_a_lidar_without_guess_that_no_drive_shows_is_not_known() -> None:

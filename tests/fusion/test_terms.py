@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from caliv_graph.config.guesses import FOUND_SIGMA
 from caliv_graph.errors import ConfigError
-from caliv_graph.fusion.terms import arranged, drive_digest, fuse, moved_to, own_term
+from caliv_graph.fusion.terms import arranged, drive_digest, fuse, moved_to, own_term, slid
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, DataTerm, GivenPoses, Guess, ImuSamples, MotionData
+from tests.drives_with_chair import RADIUS_M
 from tests.fusion.drives import TRUTH, arc_information, drive, information, moved, shift
+from tests.samples import turn_about_centre
 
 NAMES = ("front", "rear")
 LOOSE = np.array([10.0] * 3 + [100.0] * 3)
@@ -48,6 +51,37 @@ def test_a_moved_quadratic_has_the_same_slope_and_curvature(degrees: float) -> N
         assert slope == pytest.approx(-new.gradient @ axis / step, rel=1e-3, abs=30.0)
     if degrees == 0.0:
         assert new.information == pytest.approx(old.information, rel=1e-12)
+
+
+@pytest.mark.parametrize("sigma_rad", [np.inf, 1.0])
+def test_a_quadratic_slides_along_the_circle_that_its_data_leave_open(sigma_rad: float) -> None:
+    """By 0.2 rad about the centre of the arc; what little it knows of the turn it keeps."""
+    names = ("unseen", *NAMES)
+    truth = {name: TRUTH[name] for name in NAMES} | {"unseen": TRUTH["left"]}
+    turn = np.concatenate(list(turn_about_centre({n: TRUTH[n] for n in NAMES}).vector.values()))
+    lever = np.array([0.0, 0.0, 1.0] + [0.0] * 9)
+    D = arc_information(NAMES) + sigma_rad**-2.0 * np.outer(lever, lever)
+    centre = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, -RADIUS_M, 0.0]))
+    motion = centre.compose(gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.zeros(3))).compose(centre.inverse())
+    axes = np.kron(np.eye(4), motion.rotation().matrix())
+    all_D = np.zeros((18, 18))
+    all_D[6:, 6:] = axes @ D @ axes.T
+    poses = {n: motion.compose(truth[n]) if n in NAMES else truth[n] for n in names}
+    guesses = {n: Guess(poses[n], FOUND_SIGMA.sigmas(), found=True) for n in names}
+
+    found = slid(DataTerm(("a",), poses, all_D, np.zeros(18)), truth, guesses)
+
+    assert list(found.T_vehicle_lidar) == list(names)
+    for name, T in found.T_vehicle_lidar.items():
+        assert T.equals(truth[name], 1e-5)
+    assert found.information[6:, 6:] == pytest.approx(D, abs=1e-4 * D.max())
+    assert not found.information[:6].any()
+    # Its minimum is 0.2 rad back.
+    assert found.gradient[6:] @ turn == pytest.approx(0.2 * sigma_rad**-2.0, rel=1e-3, abs=1e-6)
+    # What the data determine does not slide.
+    all_D[6:, 6:] = information(NAMES)
+    rigid = DataTerm(("a",), poses, all_D, np.zeros(18))
+    assert slid(rigid, truth, guesses) is rigid
 
 
 def test_one_term_is_solved_where_its_data_are_best_met() -> None:

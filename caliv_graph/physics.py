@@ -11,7 +11,7 @@ from dataclasses import replace
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, RecordingError, TargetError, TrajectoryError
-from caliv_graph.products import Calibration, Finding, MotionData, Recording
+from caliv_graph.products import Calibration, Finding, MotionData, Recording, StructureTerm
 from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
 from caliv_graph.trajectory.heading import heading_disagreement
@@ -27,6 +27,7 @@ from caliv_graph.wording.physics import (
     motion_findings,
     tilt_finding,
 )
+from caliv_graph.wording.suspects import clock_finding
 
 
 def check_clouds(recordings: Sequence[Recording], config: Config) -> None:
@@ -86,6 +87,27 @@ def smoothed_findings(
 def _is_of_wheels(trajectory: VehicleTrajectory) -> bool:
     """Whether roll and pitch are those of level ground: there was no IMU."""
     return isinstance(trajectory, SmoothedTrajectory) and trajectory.data.wheels is not None
+
+
+def clock_findings(
+    names: Sequence[str], terms: Sequence[StructureTerm], calibration: Calibration
+) -> tuple[Finding, ...]:
+    """Clocks of LiDARs that the surfaces of a drive contradict, if the graph has no culprit.
+
+    The ranking of suspects takes structure for fixed evidence, at a clock that is right: then it
+    outvotes the target. What else is wrong beyond 5 sigma may bend walls as a late clock does.
+    `names` are of the drives.
+    """
+    suspects = calibration.suspects
+    if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
+        return ()
+    return tuple(
+        finding
+        for term in terms
+        for lidar, (late_s, sigma_s) in term.clocks.items()
+        for finding in [clock_finding(names[term.drive], lidar, late_s, sigma_s)]
+        if finding is not None
+    )
 
 
 def heading_findings(
@@ -155,13 +177,23 @@ def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibr
     if not suspects or suspects[0].sigmas > CONTRADICTION_SIGMAS:
         return calibration
     found: dict[str, float] = {}
+    clocks: dict[str, Finding] = {}
     for each in findings:
         if each.severity == "contradiction":
             name = _candidate(each.input)
             found[name] = max(found.get(name, 0.0), each.sigmas)
+            if name.endswith(".time_offset") and name.startswith("lidars."):
+                clocks[name] = each
     raised = [
         replace(s, sigmas=max(s.sigmas, found[s.input])) if s.input in found else s
         for s in suspects
+    ]
+    # What the graph says of a clock that structure outvotes is no value.
+    raised = [
+        replace(s, value=c.value, change=c.value, sigma=(c.sigma,))
+        if (c := clocks.get(s.input)) is not None
+        else s
+        for s in raised
     ]
     raised.sort(key=lambda s: -s.sigmas if s.input in found else 0.0)
     if raised[0].input in found:

@@ -470,6 +470,8 @@ class StructureTerm:
         stance: how the vehicle stands on the ground; None: no ground below it was seen.
         standing: errors of what is stated of that, which are eliminated in it; None: there are
             none, or no ground below the vehicle was seen.
+        clocks: LiDAR -> how late its stamps are and 1 sigma, seconds, by these surfaces alone, of
+            the LiDARs whose offset is held at zero.
     """
 
     drive: int
@@ -487,6 +489,7 @@ class StructureTerm:
     odometry_of: str = ""
     stance: Stance | None = None
     standing: StandingErrors | None = None
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from caliv_graph.errors import TargetError, TrajectoryError
 from caliv_graph.physics import (
+    clock_findings,
     contradicted,
     contradictions_of,
     raise_fatal,
@@ -16,7 +18,7 @@ from caliv_graph.physics import (
     warnings_of,
     with_cause,
 )
-from caliv_graph.products import Finding, Suspect
+from caliv_graph.products import Finding, StructureTerm, Suspect
 from tests.samples import make_calibration
 
 
@@ -77,3 +79,36 @@ def test_an_input_that_a_finding_contradicts_leads_where_no_score_does() -> None
     assert ranked_with(doubtful, [finding(4.0, "warning")]).suspects == (guess, height)
     culprit = replace(doubtful, suspects=(suspect("gnss.lever_arm", 20.0), height))
     assert ranked_with(culprit, [finding(6.0)]) is culprit
+
+
+def term(**clocks: tuple[float, float]) -> StructureTerm:
+    nothing = np.zeros(0)
+    return StructureTerm(
+        0, np.zeros(0, np.int64), (), {}, {}, {}, nothing, nothing, (), 0.0, clocks=clocks
+    )
+
+
+def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() -> None:
+    clock, height = suspect("lidars.front.time_offset", 1.4), suspect("ground.vehicle_height", 2.0)
+    calm = replace(make_calibration(), suspects=(height, clock))
+
+    (found,) = clock_findings(["drive"], [term(front=(0.0191, 0.0009), rear=(0.006, 0.01))], calm)
+
+    assert (found.input, found.severity) == ("lidars.front.time_offset", "contradiction")
+    # With the allowance of 2 ms: 19.1 / sqrt(0.9^2 + 2^2).
+    assert found.sigmas == pytest.approx(8.71, abs=0.01)
+    assert "drive: lidars.front.time_offset: by the surfaces around, the stamps are" in (
+        found.sentence
+    )
+    assert "0.019 +- 0.002 s late (9 sigma). Correct the clock of lidar 'front'" in found.sentence
+    first, _ = ranked_with(calm, [found]).suspects
+    assert (first.input, first.value, first.change) == (clock.input, (0.0191,), (0.0191,))
+    assert (first.sigmas, first.sigma) == (found.sigmas, (found.sigma,))
+    # 4.5 sigma are a warning, 3.9 are nothing.
+    (doubt,) = clock_findings(["drive"], [term(front=(-0.009, 0.0))], calm)
+    assert doubt.severity == "warning"
+    assert "0.002 s early" in doubt.sentence
+    assert clock_findings(["drive"], [term(front=(0.0078, 0.0))], calm) == ()
+    # Another culprit bends the walls.
+    culprit = replace(calm, suspects=(suspect("gnss.drift", 8.0), clock))
+    assert clock_findings(["drive"], [term(front=(0.02, 0.001))], culprit) == ()

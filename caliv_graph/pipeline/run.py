@@ -21,9 +21,11 @@ from caliv_graph.errors import TargetError
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.physics import (
+    clock_findings,
     contradicted,
     contradictions_of,
     ranked_with,
+    warnings_of,
 )
 from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
 from caliv_graph.products import (
@@ -97,13 +99,17 @@ def _calibrate(
             prepared.config,
             displaced=bool(prepared.contradictions),
         )
+        names = [recording.name for recording in recordings]
+        clocks = clock_findings(names, solution.structure, calibration)
+        findings = (*prepared.findings, *clocks)
         calibration = contradicted(
-            ranked_with(calibration, prepared.findings),
+            ranked_with(calibration, findings),
             prepared.contradictions,
-            contradictions_of(prepared.findings),
+            contradictions_of(findings),
         )
         calibration, conflicts = with_prior(calibration, prior, config)
 
+    doubts = (*doubts, *warnings_of(clocks))
     warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts)
     record = RunRecord(
         drives=tuple(Path(recording.name).absolute().name for recording in recordings),

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import marginal
 from caliv_graph.structure.layout import Layout
 from caliv_graph.structure.noise import LEAST_JITTER_S, MOST_JITTER_S
+from caliv_graph.structure.problem import OFFSET_SIGMA_S
 
 EVIDENCE = 3.0
 """Gain of the log-likelihood from which stamps are taken to jitter: chance gains as much in one of
@@ -22,20 +23,35 @@ SIGMAS = 200
 """Sigmas that are tried, evenly spread in the logarithm: 4 percent apart."""
 
 
-def jitter_sigma_s(H: Array, b: Array, layout: Layout) -> float:
-    """1 sigma of the jitter, s; 0 where the data say nothing of one.
-
-    Everything but the jitter is eliminated, which leaves u of covariance `A + sigma^2 A A` with the
-    information A of the jitters: exact REML, all other noise levels given.
+def told_of_jitters(H: Array, b: Array, layout: Layout) -> tuple[Array, Array]:
+    """Information A (S, S) and gradient u (S,) of the jitters, everything else eliminated.
 
     Args:
         H: (R, R) of the first `layout.plane` coordinates, no prior of the jitters in it.
         b: (R,).
         layout: with jitters.
     """
-    own = np.arange(layout.jitter, layout.plane)
-    rest = np.arange(layout.jitter)
-    A, u = marginal(H, b, own, rest)
+    return marginal(H, b, np.arange(layout.jitter, layout.plane), np.arange(layout.jitter))
+
+
+def told_clocks(A: Array, u: Array, scan_lidar: IntArray, lidars: int) -> tuple[Array, Array]:
+    """How late the stamps of each LiDAR are, (n,) s, and 1 sigma; by what jitters are told.
+
+    A late clock is the same jitter in all scans of a LiDAR. What the extrinsic could make up for is
+    eliminated: in a curve to the left and one to the right, at two speeds, it cannot. Under the
+    prior of a time offset.
+    """
+    own = (scan_lidar[:, None] == np.arange(lidars)).astype(np.float64)
+    cov = np.linalg.inv(own.T @ A @ own + np.eye(lidars) / OFFSET_SIGMA_S**2)
+    return np.asarray(cov @ (own.T @ u)), np.sqrt(np.diag(cov))
+
+
+def jitter_sigma_s(A: Array, u: Array) -> float:
+    """1 sigma of the jitter, s; 0 where the data say nothing of one.
+
+    u has the covariance `A + sigma^2 A A` with the information A of the jitters
+    (`told_of_jitters`): exact REML, all other noise levels given.
+    """
     values, vectors = np.linalg.eigh(A)
     seen = values > 1e-9 * max(float(values.max(initial=0.0)), MOST_JITTER_S**-2.0)
     told, square = values[seen], (vectors[:, seen].T @ u) ** 2

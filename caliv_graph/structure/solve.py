@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import gtsam
@@ -13,7 +13,7 @@ import numpy as np
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
-from caliv_graph.structure.jitter import jitter_sigma_s
+from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -58,6 +58,10 @@ STEPS = (2, LAST_STEPS)
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
+
+
+Clocks = dict[str, tuple[float, float]]
+"""LiDAR -> how late its stamps are, and 1 sigma, seconds."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +111,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Solved(Estimate):
-    """The outcome: an estimate, and the system there."""
+    """The outcome: an estimate, the system there, and what it tells of clocks that are held."""
 
     system: System
+    clocks: Clocks = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -161,15 +166,15 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         levels, state = Levels.of(found.nuisances), found.state
     if found is None:
         return None
-    gradient = None
+    gradient, clocks = None, Clocks()
     if own.twists is not None:
-        jittering, system = _with_jitter(found)
+        jittering, system, clocks = _with_jitter(found)
         if jittering is None:
             gradient = system.b[: found.layout.plane]
         else:
             found = _settled(jittering, LAST_STEPS, system)
         del system
-    return _on_all_poses(found, problem, poses, gradient)
+    return replace(_on_all_poses(found, problem, poses, gradient), clocks=clocks)
 
 
 def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -207,10 +212,11 @@ def _rough(
     return on_all_poses(problem.prior, poses, rough), levels
 
 
-def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
+def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
     """The same estimate with a jitter of every scan's stamp; None where the data show none.
 
-    And its system. Where there is none, the jitters are its last coordinates, without a prior.
+    And its system. Where there is none, the jitters are its last coordinates, without a prior. And
+    what they tell of clocks that are held.
     """
     problem = found.problem
     first, scans = found.layout.plane, len(problem.patches.stamps_ns)
@@ -224,14 +230,19 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System]:
     held = slice(layout.offset, layout.error)
     without = system.H[held, held].copy(), system.b[held].copy()
     add_hold(problem, state, layout, system.H, system.b)
-    sigma_s = jitter_sigma_s(system.H, system.b, layout)
+    A, u = told_of_jitters(system.H, system.b, layout)
     system.H[held, held], system.b[held] = without
+    names = problem.patches.lidars
+    values, sigmas = told_clocks(A, u, problem.patches.scan_lidar, len(names))
+    told = zip(names, values.tolist(), sigmas.tolist(), strict=True)
+    clocks = {} if layout.offsets else {name: (late, sigma) for name, late, sigma in told}
+    sigma_s = jitter_sigma_s(A, u)
     if sigma_s == 0.0:
-        return None, system
+        return None, system, clocks
     own = np.arange(layout.jitter, layout.plane)
     system.H[own, own] += sigma_s**-2.0
     nuisances = replace(found.nuisances, jitter_s=sigma_s)
-    return replace(jittering, nuisances=nuisances), system
+    return replace(jittering, nuisances=nuisances), system, clocks
 
 
 def _on_all_poses(

@@ -270,6 +270,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         ground=lidars_with_ground(found),
         stance=stance,
         standing=None if tilt is None else standing,
+        clocks=found.clocks,
     )
 
 
@@ -294,6 +295,7 @@ def term_of_odometry(
         term,
         stance=None,
         standing=None,
+        clocks={},
         stamps_ns=found.problem.prior.stamps_ns[kept],
         T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
         information=information,

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-from caliv_graph.products import Suspect
-from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS, DOUBT_SIGMAS
+from caliv_graph.products import Finding, Suspect
+from caliv_graph.uncertainty.consistency import (
+    CLOCK_BIAS_S,
+    CONTRADICTION_SIGMAS,
+    DOUBT_SIGMAS,
+)
 
 MOST_NEXT = 2
 """Suspects that are named after the first."""
@@ -60,13 +65,40 @@ def suspect_row(suspect: Suspect) -> tuple[str, str, str, str, str]:
     )
 
 
+def _lateness(late_s: float, sigma_s: float) -> str:
+    way = "late" if late_s > 0.0 else "early"
+    return f"the stamps are {abs(late_s):.3f} +- {sigma_s:.3f} s {way}"
+
+
+def clock_finding(drive: str, lidar: str, late_s: float, sigma_s: float) -> Finding | None:
+    """A clock that the walls and the ground of a drive contradict; None if they do not.
+
+    They are seen in curves to both sides and at several speeds, and lie on each other only if each
+    scan was taken where the vehicle was.
+    """
+    sigma_s = math.hypot(sigma_s, CLOCK_BIAS_S)
+    sigmas = abs(late_s) / sigma_s
+    if sigmas < DOUBT_SIGMAS:
+        return None
+    key = f"lidars.{lidar}.time_offset"
+    told = _REMEDIES_OF_LIDAR["time_offset"].format(lidar=lidar)
+    return Finding(
+        key,
+        (late_s,),
+        sigma_s,
+        sigmas,
+        "contradiction" if sigmas > CONTRADICTION_SIGMAS else "warning",
+        f"{drive}: {key}: by the surfaces around, {_lateness(late_s, sigma_s)} ({sigmas:.0f} "
+        f"sigma). {told}",
+    )
+
+
 def _by(suspect: Suspect) -> str:
     """By how much the input is off, and the value that it would take."""
     told, units = suspect.determined, suspect.units
     late = suspect.change[0]
     if suspect.input.endswith("time_offset"):
-        way = "late" if late > 0.0 else "early"
-        return f"the stamps are {abs(late):.3f} +- {suspect.sigma[0]:.3f} s {way}"
+        return _lateness(late, suspect.sigma[0])
     by = f"by {vector(suspect.change, units, told)}"
     if suspect.value != suspect.change:
         change = vector(suspect.change, units, told, "-")

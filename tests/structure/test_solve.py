@@ -41,12 +41,16 @@ def problem_of(
     noise: Noise = NOISE,
     jitter_s: float = 0.0,
     extrinsics: dict[str, gtsam.Pose3] = TRUE,
+    clock_s: float = 0.0,
 ) -> Problem:
-    """A drive; `jitter_s` is 1 sigma of the time at which a scan is taken after its stamp."""
+    """A drive; `jitter_s` is 1 sigma of the time at which a scan is taken after its stamp.
+
+    All stamps are late by `clock_s`.
+    """
     rng = np.random.default_rng(seed)
     true_poses = poses(*path)
     twists = _twists(true_poses)
-    late_s = jitter_s * np.random.default_rng([seed, 1]).standard_normal(len(twists))
+    late_s = jitter_s * np.random.default_rng([seed, 1]).standard_normal(len(twists)) - clock_s
     taken = [T.retract(d) for T, d in zip(true_poses, late_s[:, None] * twists, strict=True)]
     patches = draw_patches(walls, taken, rng, noise, extrinsics, patch_m=1.0)
     off = [rng.uniform(-0.005, 0.005, 6) for _ in extrinsics]
@@ -105,6 +109,22 @@ def motion_of(found: Solved) -> Array:
 @pytest.fixture(scope="module")
 def solved() -> Solved:
     return solve(problem_of(yard(), figure_eight(24), 1))
+
+
+def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:
+    """In curves to both sides no extrinsic makes up for it."""
+    late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
+    assert set(late.clocks) == set(solved.clocks) == {"front", "rear"}
+    for name, (value_s, sigma_s) in late.clocks.items():
+        # One linear step from the wrong extrinsics, on poses 2 m apart.
+        assert value_s == pytest.approx(0.02, rel=0.25)
+        assert value_s > 20.0 * sigma_s
+        right_s, sigma_s = solved.clocks[name]
+        assert abs(right_s) < 4.0 * sigma_s
+    # Nothing is held where the offsets are free.
+    free = replace(problem_of(yard(), figure_eight(24), 1, clock_s=0.02), offsets=(0, 1))
+    accelerations = np.zeros_like(free.twists)
+    assert solve(replace(free, accelerations=accelerations)).clocks == {}
 
 
 def test_a_yard_determines_all_but_the_height(solved: Solved) -> None:

@@ -28,14 +28,22 @@ from caliv_graph.validation.measure import (
     offset_covariance,
     rms,
 )
+from caliv_graph.validation.surfaces import LEVEL
 from caliv_graph.wording.held_out import (
     held_out_sentence,
+    level_sentence,
     nothing_shared_sentence,
     stage_sentence,
+    thick_sentence,
 )
 
 POOR = 0.01
 """Probability below which noise explains the offsets poorly."""
+
+THICK = 2.0
+"""Thickness of surfaces by a LiDAR alone over the expected one, from which no verdict is good: a
+wrong rotation moves a surface from scan to scan, and hardly the mean distance from another LiDAR's.
+"""
 
 CONTRADICTION = 5.7e-7
 """Probability beyond 5 sigma. Below it the data contradict each other, which is exit code 4."""
@@ -92,6 +100,10 @@ def judge(
         )
         sentences += (f"Thickness of {_kinds(surfaces)} by each LiDAR alone: {thick}.",)
     word = _word(better, p_value)
+    far = [name for name, value in alone[0][AFTER].items() if value > THICK * alone[1][name]]
+    if found and far:
+        sentences += (thick_sentence(_kinds(surfaces), far),)
+        word = "unclear" if word == "good" else word
     reason = sentences[1] if contradicts else ""
     return Verdict(
         word, better, measure, of_expected, chi2, dof, p_value, contradicts, sentences, reason
@@ -112,6 +124,8 @@ def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verd
     values = {stage: 1e3 * held.distance_m[stage] for stage in (BEFORE, AFTER)}
     better = values[BEFORE] / values[AFTER] if values[AFTER] > 0.0 else None
     sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER], before)]
+    if all(abs(strip.normal_map[2]) > LEVEL for strip in held.tested):
+        sentences.append(level_sentence())
     contradicting = []
     for stage in (AFTER, WITHOUT):
         test = held.tests[stage]

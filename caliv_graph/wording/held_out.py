@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 UNSEEN = (
     "Errors that all LiDARs share with the trajectory are not seen here: S2V, by a wrong "
     "imu.T_vehicle_imu, gnss.lever_arm or ground.vehicle_height"
@@ -15,6 +17,20 @@ def held_out_sentence(strips: int, before_mm: float, after_mm: float, before: st
     return (
         f"On {strips} held-out strips of structure the LiDARs are {after_mm:.1f} mm apart with the "
         f"calibration, {before_mm:.1f} mm with {before} (root mean square)."
+    )
+
+
+def level_sentence() -> str:
+    """What strips of level ground alone test."""
+    return "All of them are level: they test z, roll and pitch, but not x, y and yaw."
+
+
+def thick_sentence(kinds: str, lidars: Sequence[str]) -> str:
+    """LiDARs that see surfaces of some kinds far thicker than they should."""
+    names = " and ".join(f"'{name}'" for name in lidars)
+    return (
+        f"By {names} alone {kinds} are more than twice as thick as expected: rotation, clock or "
+        "trajectory may be off."
     )
 
 

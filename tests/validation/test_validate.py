@@ -11,9 +11,11 @@ from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Calibration, PoseNoise
 from caliv_graph.validation.covariances import given_pose_covariance
-from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation
+from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation, Verdict
+from caliv_graph.validation.measure import Errors
 from caliv_graph.validation.surfaces import Pole, Wall
 from caliv_graph.validation.validate import validate
+from caliv_graph.validation.verdict import judge
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import (
     BOX_XY,
@@ -107,6 +109,30 @@ def test_one_degree_and_50_mm_are_seen(right: Validation, wrong: Validation) -> 
     assert bad.distance_m[BEFORE] == pytest.approx(good.distance_m[BEFORE], rel=0.1)
     # The LiDAR that is right is not blamed.
     assert wrong.alone_m[AFTER]["rear"] < 0.012 < 0.05 < wrong.alone_m[AFTER]["front"]
+
+
+def test_a_lidar_whose_own_walls_are_thick_is_not_called_good(
+    right: Validation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where one wall alone is shared, a degree of yaw hardly moves its mean distance."""
+    monkeypatch.setattr(
+        "caliv_graph.validation.verdict.offset_covariance",
+        lambda tested, errors: np.eye(right.verdict.dof),
+    )
+    nothing = Errors(np.zeros((0, 0)), np.zeros((0, 0)), 0.01)
+
+    def verdict(factor: float) -> Verdict:
+        front = factor * right.expected_alone_m["front"]
+        alone = {**right.alone_m, AFTER: {**right.alone_m[AFTER], "front": front}}
+        measured = (right.surfaces, right.things, right.pairs)
+        return judge(*measured, (alone, right.expected_alone_m), nothing, right.before)
+
+    assert verdict(1.9).word == "good"
+    assert verdict(2.1).word == "unclear"
+    assert (
+        "By 'front' alone walls and poles are more than twice as thick"
+        in (verdict(2.1).sentences[-1])
+    )
 
 
 def test_an_error_that_all_lidars_share_is_seen() -> None:

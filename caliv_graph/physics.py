@@ -11,7 +11,14 @@ from dataclasses import replace
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, RecordingError, TargetError, TrajectoryError
-from caliv_graph.products import Calibration, Finding, MotionData, Recording, StructureTerm
+from caliv_graph.products import (
+    Calibration,
+    Finding,
+    MotionData,
+    Recording,
+    StructureTerm,
+    Suspect,
+)
 from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
 from caliv_graph.trajectory.heading import heading_disagreement
@@ -176,29 +183,28 @@ def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibr
     suspects = calibration.suspects
     if not suspects or suspects[0].sigmas > CONTRADICTION_SIGMAS:
         return calibration
-    found: dict[str, float] = {}
-    clocks: dict[str, Finding] = {}
-    for each in findings:
-        if each.severity == "contradiction":
-            name = _candidate(each.input)
-            found[name] = max(found.get(name, 0.0), each.sigmas)
-            if name.endswith(".time_offset") and name.startswith("lidars."):
-                clocks[name] = each
-    raised = [
-        replace(s, sigmas=max(s.sigmas, found[s.input])) if s.input in found else s
-        for s in suspects
-    ]
-    # What the graph says of a clock that structure outvotes is no value.
-    raised = [
-        replace(s, value=c.value, change=c.value, sigma=(c.sigma,))
-        if (c := clocks.get(s.input)) is not None
-        else s
-        for s in raised
-    ]
+    # The most significant one of each input.
+    contradicting = sorted(
+        (f for f in findings if f.severity == "contradiction"), key=lambda f: f.sigmas
+    )
+    found = {_candidate(f.input): f for f in contradicting}
+    raised = [_raised(s, found[s.input]) if s.input in found else s for s in suspects]
     raised.sort(key=lambda s: -s.sigmas if s.input in found else 0.0)
     if raised[0].input in found:
         raised[0] = replace(raised[0], sigmas_left=raised[0].sigmas)
     return replace(calibration, suspects=tuple(raised))
+
+
+def _raised(suspect: Suspect, finding: Finding) -> Suspect:
+    """A suspect with a finding about it; with its value, too, if it is the clock of a LiDAR.
+
+    What the graph says of a clock that structure outvotes is no value.
+    """
+    raised = replace(suspect, sigmas=max(suspect.sigmas, finding.sigmas))
+    if suspect.input.startswith("lidars.") and suspect.input.endswith(".time_offset"):
+        value, sigma = finding.value, (finding.sigma,)
+        return replace(raised, value=value, change=value, sigma=sigma)
+    return raised
 
 
 def _candidate(key: str) -> str:

@@ -114,15 +114,13 @@ def estimate_with_noise(
             return solution_without_target(solved), trajectories
     if config.solve.mode == "staged":
         grounds, structure = (), NO_STRUCTURE
-    problem = pose_problem(used, trajectories, config, kept_ns=kept_stamps(structure.patches, used))
     # The matrices are small: threads of a linear algebra library would mostly wait for each other,
     # for seconds where the machine has other work.
     with threadpool_limits(limits=1):
-        return _estimate(problem, used, trajectories, (tuple(grounds), structure), config, progress)
+        return _estimate(used, trajectories, (tuple(grounds), structure), config, progress)
 
 
 def _estimate(
-    problem: Problem,
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
     surroundings: tuple[tuple[GroundObservation, ...], StructureEvidence],
@@ -133,6 +131,7 @@ def _estimate(
     grounds, structure = surroundings
     limit = config.registration.max_iterations
     kept = kept_stamps(structure.patches, observations)
+    problem = pose_problem(observations, trajectories, config, kept_ns=kept)
     guesses = {name: problem.guesses[name] for name in problem.lidars}
     guessed = _held_grounds(grounds, guesses, problem)
     rough = rough_solve(problem, observations, guessed, config, progress, limit)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import gtsam
@@ -306,31 +306,22 @@ def evenly_over_drives(problem: Problem, sound: BoolArray, most: int | None = No
     if len(usable) <= most:
         return usable
     usable = usable[np.argsort(problem.cloud_pose[usable], kind="stable")]
-    moment = _moments(
-        problem.cloud_pose[usable].tolist(),
-        zip(
-            problem.cloud_lidar[usable].tolist(),
-            problem.cloud_placement[usable].tolist(),
-            strict=True,
-        ),
-    )
-    turn = np.mod(moment * GOLDEN_RATIO, 1.0)
+    turn = np.mod(_moments(problem, usable) * GOLDEN_RATIO, 1.0)
     return np.sort(usable[turn < most / len(usable)])
 
 
-def _moments(poses: Iterable[int], of: Iterable[tuple[int, int]]) -> IntArray:
-    """(n,) which moment each cloud is of; clouds in order of their poses, with LiDAR and target.
+def _moments(problem: Problem, clouds: IntArray) -> IntArray:
+    """(n,) which moment each cloud is of; the clouds are in the order of their poses.
 
     A moment ends before a pose with a cloud of a LiDAR and target that it has already.
     """
     out, now = [], 0
     seen: set[tuple[int, int]] = set()
-    for _, group in itertools.groupby(zip(poses, of, strict=True), key=lambda pair: pair[0]):
-        here = [key for _, key in group]
-        if seen & set(here):
-            now += 1
-            seen = set()
-        seen |= set(here)
+    for _, group in itertools.groupby(clouds.tolist(), key=lambda j: problem.cloud_pose[j]):
+        here = [(int(problem.cloud_lidar[j]), int(problem.cloud_placement[j])) for j in group]
+        if not seen.isdisjoint(here):
+            now, seen = now + 1, set()
+        seen.update(here)
         out += [now] * len(here)
     return np.array(out, dtype=np.int64)
 

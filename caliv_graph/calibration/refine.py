@@ -248,7 +248,7 @@ class _Loop:
         """`linearised`, the registration's scale by a jackknife, too."""
         shapes, reduced = self.linearised()
         begun = time.perf_counter()
-        self.state.least_scale = max(1.0, self.left_out(reduced))
+        self.state.least_scale = self.left_out(reduced)
         reduced = self.scaled(shapes, reduced)
         self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced

@@ -17,7 +17,7 @@ from caliv_graph.conventions import (
     key_parallel,
     key_vehicle,
 )
-from caliv_graph.products import Array, StructureTerm
+from caliv_graph.products import Array, StandingErrors, StructureTerm
 from caliv_graph.trajectory.factors import Gaussian, tangent_size
 
 RIDGE = 1e-9
@@ -43,7 +43,7 @@ def structure_graph(
     graph = CalibrationGraph()
     guess = (start or {}).get(problem.reference, problem.guesses[problem.reference])
     for term in terms:
-        graph.append_gaussian("structure", _gaussian(problem, term, guess, term.drive in standing))
+        graph.append_gaussian("structure", _gaussian(problem, term, guess, standing))
     return graph
 
 
@@ -84,25 +84,24 @@ def rows_of_lidars(term: StructureTerm) -> dict[str, slice]:
     }
 
 
-def rows_of_standing(term: StructureTerm) -> dict[int, slice]:
-    """Keys of the errors of the vehicle's stand, and where they follow a term's coordinates."""
-    if term.standing is None:
-        return {}
-    first, height = len(term.gradient), int(term.standing.height)
-    out = {key_height(term.drive): slice(first, first + 1)} if height else {}
-    if term.standing.tilt:
-        out[key_parallel(term.drive)] = slice(first + height, first + height + 2)
+def _rows_of_standing(drive: int, standing: StandingErrors, first: int) -> dict[int, slice]:
+    """Keys of the errors of a drive's stand, and where they are, from `first` on."""
+    out = {key_height(drive): slice(first, first + 1)} if standing.height else {}
+    if standing.tilt:
+        after = first + len(out)
+        out[key_parallel(drive)] = slice(after, after + 2)
     return out
 
 
 def _gaussian(
-    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3, standing: bool
+    problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3, standing: Collection[int]
 ) -> Gaussian:
     """A term as a Gaussian of the graph's variables, about where the term was linearised."""
     point = _linearisation_point(problem, term, T_vehicle_ref)
     own_information, own_gradient = term.information, term.gradient
-    errors = rows_of_standing(term) if standing else {}
-    if term.standing is not None and errors:
+    errors: dict[int, slice] = {}
+    if term.standing is not None and term.drive in standing:
+        errors = _rows_of_standing(term.drive, term.standing, len(term.gradient))
         own_information, own_gradient = term.standing.kept_in(own_information, own_gradient)
         first = len(term.gradient)
         point |= {

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.products import Array, Stance, StandingErrors
+from caliv_graph.structure.elimination import marginal
 from caliv_graph.structure.solve import Solved
 from caliv_graph.structure.standing import Standing, tilt_rows
 
@@ -110,9 +111,9 @@ def standing_errors(
         return None
     own, rest = n + np.flatnonzero(stated), n + np.flatnonzero(~stated)
     kept = np.concatenate([np.arange(n), own])
-    by_rest = np.linalg.solve(information[np.ix_(rest, rest)], information[rest])
-    both = information[np.ix_(kept, kept)] - information[np.ix_(kept, rest)] @ by_rest[:, kept]
-    pull = gradient[kept] - by_rest[:, kept].T @ gradient[rest]
+    both, pull = information, gradient
+    if len(rest):
+        both, pull = marginal(information, gradient, kept, rest)
     sigmas = np.array([standing.height_sigma_m, *[standing.tilt_sigma_rad or np.inf] * 2])
     prior, value = sigmas[stated] ** -2.0, now[stated]
     return StandingErrors(

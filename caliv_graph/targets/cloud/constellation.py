@@ -335,6 +335,12 @@ def _plausible_matchings(
     """
     most = 2.0 * UNMATCHED * min(len(places_a), len(places_b)) + AMBIGUOUS
     found: dict[tuple[tuple[int, int], ...], float] = {}
+    alone = np.array(
+        [
+            [_misfit(((a, b),), places_a, cov_a, places_b, cov_b) for b in range(len(places_b))]
+            for a in range(len(places_a))
+        ]
+    )
 
     def extend(pairs: tuple[tuple[int, int], ...], misfit: float) -> None:
         found[pairs] = misfit
@@ -348,12 +354,6 @@ def _plausible_matchings(
             if misfit <= most:
                 extend(more, misfit)
 
-    alone = np.array(
-        [
-            [_misfit(((a, b),), places_a, cov_a, places_b, cov_b) for b in range(len(places_b))]
-            for a in range(len(places_a))
-        ]
-    )
     extend((), 0.0)
     return found
 

@@ -112,7 +112,8 @@ def _velocity_covariances(data: SmootherInput) -> Array:
         cov, _ = wheel_covariances(twist, data.wheels, data.config)
     else:
         cov, _ = velocity_covariances(twist, data.config)
-        cov = cov * data.scales.get("velocity", 1.0) ** 2
         if is_planar(twist):
             cov = forward_alone(cov, twist)
+    # Of planar velocities `speed` is estimated in the place of `velocity`.
+    axes = data.scales.get("velocity", 1.0) * axes
     return np.asarray(cov * np.outer(axes, axes))

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, NoiseConfig
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData, TwistSamples
@@ -194,6 +194,28 @@ def test_rounding_does_not_change_the_model_of_an_axle() -> None:
     assert wheel_model(rounded, settings()) == wheel_model(motion.twist, settings())
     slipping = motion.twist.velocity + np.array([0.0, 0.01, 0.0])
     assert not wheel_model(replace(motion.twist, velocity=slipping), settings()).planar
+
+
+def test_noise_of_velocities_to_the_side_is_that_of_the_data_without_an_imu_too() -> None:
+    motion = wheels(1)
+    assert motion.twist is not None
+    noise = 0.03 * np.random.default_rng(8).standard_normal((len(motion.twist.stamps_ns), 2))
+    velocity = motion.twist.velocity.copy()
+    velocity[:, 1:] = noise
+    motion = replace(motion, twist=replace(motion.twist, velocity=velocity))
+    wanted = stamps(DRIVE.duration_s, 5.0, 0.05)
+
+    found = smooth_trajectory(motion, settings(), wanted)
+
+    # Stated as 0.1 m/s. A tenth too small: part of it passes for braking between the samples.
+    scale = found.data.scales["velocity"]
+    assert scale == pytest.approx(0.3, rel=0.2)
+    stated = settings().model_copy(update={"noise": NoiseConfig(velocity_m_s=0.1 * scale)})
+    told = smooth_trajectory(motion, stated, wanted)
+    assert found.trajectory.cov is not None
+    assert told.trajectory.cov is not None
+    sigmas, usual = (np.sqrt(np.einsum("nii->ni", t.trajectory.cov)) for t in (found, told))
+    np.testing.assert_allclose(sigmas, usual, rtol=0.02)
 
 
 def test_without_fixes_nothing_pulls_the_scale() -> None:

@@ -59,7 +59,8 @@ def validate(
     the places of the LiDARs to each other are validated then, not those on the vehicle.
 
     Exit code 3: there is no structure to validate on. Exit code 4: distances between LiDARs, on
-    walls and poles or on held-out strips, exceed the expected values by more than 5 sigma.
+    walls and poles or on held-out strips, exceed the expected values by more than 5 sigma, or
+    the calibration is as far from one by structure alone or by half the scans of the drive.
 
     Example: caliv-graph validate result/calibration.yaml config.yaml --data drive/ --out checked/
     """
@@ -76,7 +77,7 @@ def validate(
     )
     from caliv_graph.results.calibration_file import read_calibration
     from caliv_graph.validation import validate as validate_calibration
-    from caliv_graph.workflows.repeatability import split_halves
+    from caliv_graph.workflows.repeatability import split_halves, with_halves
 
     content = ("validation.json", "validation.html")
     settings = load_config(config)
@@ -91,6 +92,7 @@ def validate(
         found = validate_calibration(recording, result, settings, progress, motion)
         if repeat:
             repeated = split_halves(recording, settings, progress, p_value, motion)
+            found = with_halves(found, result, repeated)
     document = without_infinities(validation_document(found, repeated, p_value))
     if out is not None:
         page = render_validation(found, repeated, p_value)

@@ -6,9 +6,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from caliv_graph.conventions import AXES
 from caliv_graph.report.layout import UNKNOWN, millimetres
 from caliv_graph.report.surfaces import kind_of, place_text
-from caliv_graph.validation.findings import AFTER, BEFORE, WITHOUT, HeldOutStructure, HeldStrip
+from caliv_graph.validation.findings import (
+    AFTER,
+    BEFORE,
+    WITHOUT,
+    HeldOutStructure,
+    HeldStrip,
+    PairTest,
+)
 
 HELD_OUT_HEADS = (
     "",
@@ -97,7 +105,26 @@ def held_out_document(held: HeldOutStructure) -> dict[str, Any]:
             }
             for stage, test in held.tests.items()
         },
+        "s2s": [_pair_document(test) for test in held.pairs],
         "strips": [_held_document(strip) for strip in held.strips],
+    }
+
+
+def _pair_document(test: PairTest) -> dict[str, Any]:
+    """S2S of the calibration less that by structure; rad and m, null where it tells nothing."""
+    known = dict(zip(AXES, test.determined, strict=True))
+    return {
+        "from": test.lidars[0],
+        "to": test.lidars[1],
+        "chi2": test.chi2 if test.dof else None,
+        "dof": test.dof,
+        "p_value": test.p_value,
+        **{
+            what: {
+                axis: float(v) if known[axis] else None for axis, v in zip(AXES, of, strict=True)
+            }
+            for what, of in (("off", test.off), ("sigma", test.sigma))
+        },
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
@@ -13,6 +13,7 @@ from caliv_graph.products import Array
 from caliv_graph.validation.clouds import Clouds
 from caliv_graph.validation.measure import Apart, Expected, Thickness
 from caliv_graph.validation.surfaces import Pole, Thing, Wall
+from caliv_graph.wording.halves import Difference
 from caliv_graph.wording.held_out import UNSEEN
 
 BEFORE, AFTER, BEST = "before", "after", "best"
@@ -132,6 +133,49 @@ class HeldOutTest:
 
 
 @dataclass(frozen=True)
+class PairTest:
+    """S2S of the calibration against that of the solve without the held-out strips.
+
+    Attributes:
+        lidars: the two, from and to.
+        off: (6,) calibration less solve, vehicle axes at the first; rad, then m.
+        sigma: (6,) 1 sigma of it, of both.
+        determined: (6,) whether the structure tells the axis. Others have no meaning.
+        chi2: along the directions that the structure tells.
+        dof: number of these.
+        p_value: probability of a larger `chi2`; None without such directions.
+    """
+
+    lidars: Pair
+    off: Array
+    sigma: Array
+    determined: tuple[bool, ...]
+    chi2: float
+    dof: int
+    p_value: float | None
+
+    @property
+    def worst(self) -> Difference:
+        """At the determined axis that is off by most sigmas."""
+        return worst_of(self.lidars, self.off, self.sigma, self.determined)
+
+
+OFF_SIGMAS = 3.0
+"""Sigmas from which an axis by itself is called off. Less may be off along several together."""
+
+
+def worst_of(
+    lidars: Sequence[str], off: Array, sigma: Array, determined: Sequence[bool]
+) -> Difference:
+    """A difference (6,) at the determined axis that is off by most of its sigmas (6,)."""
+    sigmas = np.where(determined, np.abs(off) / sigma, 0.0)
+    axis = int(sigmas.argmax())
+    if sigmas[axis] < OFF_SIGMAS:
+        return Difference(lidars, -1, 0.0, 0.0)
+    return Difference(lidars, axis, float(off[axis]), float(sigma[axis]))
+
+
+@dataclass(frozen=True)
 class HeldOutStructure:
     """What the LiDARs differ by on the third of the structure that is held out.
 
@@ -142,6 +186,7 @@ class HeldOutStructure:
         strips: the strips in them, named.
         tests: by stage, `AFTER` and `WITHOUT`.
         distance_m: by stage, root mean square over the strips that are tested.
+        pairs: the extrinsics of the calibration against those of the solve without the strips.
     """
 
     tiles_map_m: Array
@@ -150,6 +195,7 @@ class HeldOutStructure:
     strips: tuple[HeldStrip, ...]
     tests: Mapping[str, HeldOutTest]
     distance_m: Mapping[str, float]
+    pairs: tuple[PairTest, ...] = ()
 
     @property
     def tested(self) -> tuple[HeldStrip, ...]:
@@ -204,6 +250,15 @@ class Verdict:
     contradicts: bool
     sentences: tuple[str, ...]
     reason: str = ""
+
+    def also(self, sentences: Sequence[str], contradicts: bool = False) -> Verdict:
+        """The verdict with the sentences of another test; if that contradicts, no better word."""
+        said = (*self.sentences, *sentences)
+        if not contradicts:
+            return replace(self, sentences=said)
+        word: Word = "worse" if self.word == "worse" else "contradicted"
+        reason = self.reason or sentences[0]
+        return replace(self, word=word, contradicts=True, sentences=said, reason=reason)
 
 
 @dataclass(frozen=True)

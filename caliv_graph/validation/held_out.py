@@ -8,7 +8,7 @@ in the file, and with that one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -48,6 +48,7 @@ from caliv_graph.validation.findings import (
     HeldStrip,
     Pair,
 )
+from caliv_graph.validation.solved_anew import pair_tests
 from caliv_graph.wording.held_out import no_held_out_sentence
 
 
@@ -119,17 +120,15 @@ def measure_held_out(
         # Poses by the LiDARs' own odometry hang on the extrinsics alone.
         own = odometry_of([trajectory]) is not None
         measure = at_extrinsics_on_the_poses if own else at_extrinsics
+        cov = _covariance(drive.problem, calibration, names)
         measured = {
             BEFORE: at_guesses(other),
-            AFTER: measure(
-                other,
-                extrinsics.T_vehicle_lidar,
-                extrinsics.time_offset_s,
-                _covariance(drive.problem, calibration, names),
-            ),
+            AFTER: measure(other, extrinsics.T_vehicle_lidar, extrinsics.time_offset_s, cov),
             WITHOUT: at_the_solve(other),
         }
-    found = _found(other, drive.held, measured)
+        first = len(drive.problem.offsets)
+        pairs = pair_tests(other.used, extrinsics, cov[first:, first:], calibration.reference)
+    found = replace(_found(other, drive.held, measured), pairs=pairs)
     return HeldOutOutcome(found, (), other.used if own else None)
 
 

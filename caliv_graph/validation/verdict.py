@@ -16,6 +16,7 @@ from caliv_graph.validation.findings import (
     HeldOutStructure,
     Pair,
     PairResult,
+    PairTest,
     SurfaceResult,
     ThingResult,
     Verdict,
@@ -29,6 +30,7 @@ from caliv_graph.validation.measure import (
     rms,
 )
 from caliv_graph.validation.surfaces import LEVEL
+from caliv_graph.wording.halves import solved_anew_sentence
 from caliv_graph.wording.held_out import (
     held_out_sentence,
     level_sentence,
@@ -114,13 +116,13 @@ _SEVERITY: tuple[Word, ...] = ("good", "unclear", "contradicted", "worse")
 
 
 def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verdict:
-    """The verdict with the tests on held-out strips: the worse of the two words.
+    """The verdict with the tests on held-out strips: the worse of the two words; and of S2S.
 
     Both the calibration in the file and the one without these strips are tested. Where walls and
     poles test nothing, the strips alone decide. `before` says what "before" is.
     """
     if not held.tested:
-        return replace(verdict, sentences=(*verdict.sentences, nothing_shared_sentence()))
+        return _with_pairs(verdict.also((nothing_shared_sentence(),)), held.pairs)
     values = {stage: 1e3 * held.distance_m[stage] for stage in (BEFORE, AFTER)}
     better = values[BEFORE] / values[AFTER] if values[AFTER] > 0.0 else None
     sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER], before)]
@@ -144,13 +146,28 @@ def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verd
         words_of_both.append(verdict.word)
     # Without walls, poles and objects there was nothing to say before.
     said = verdict.sentences if verdict.better is not None else ()
-    return replace(
+    found = replace(
         verdict,
         word=max(words_of_both, key=_SEVERITY.index),
         contradicts=verdict.contradicts or bool(contradicting),
         sentences=(*said, *sentences),
         reason=verdict.reason or next(iter(contradicting), ""),
     )
+    return _with_pairs(found, held.pairs)
+
+
+def _with_pairs(verdict: Verdict, pairs: Sequence[PairTest]) -> Verdict:
+    """The verdict with the tests of S2S; of the pairs that agree, the one that does so least."""
+    said: dict[bool, list[str]] = {True: [], False: []}
+    for test in sorted((t for t in pairs if t.p_value is not None), key=lambda t: t.p_value or 0.0):
+        assert test.p_value is not None
+        p_value = min(1.0, test.p_value * len(pairs))
+        tested = f"chi2 {test.chi2:.1f} of {test.dof} dof, p {p_value:.2g}"
+        alike = p_value >= CONTRADICTION
+        said[alike].append(solved_anew_sentence(test.worst, tested, alike))
+    if said[False]:
+        return verdict.also(said[False], contradicts=True)
+    return verdict.also(said[True][:1])
 
 
 def _word(better: float | None, p_value: float | None) -> Word:

@@ -27,6 +27,9 @@ from caliv_graph.products import (
     TargetCloud,
     TargetObservation,
 )
+from caliv_graph.validation.findings import Validation, worst_of
+from caliv_graph.validation.verdict import CONTRADICTION
+from caliv_graph.wording.halves import alike_sentence, elsewhere_sentence
 
 PASS_GAP_NS = 5_000_000_000
 """Gap between two clouds of the target after which a new pass begins."""
@@ -48,12 +51,14 @@ class Repeatability:
         by_passes: whether they are passes of the target. If not, they share the errors of the
             trajectory, and agree better than two drives would.
         reason: the reason why there is no comparison.
+        results: calibration of each half; empty without a comparison.
     """
 
     halves: tuple[str, str]
     comparison: Comparison | None
     by_passes: bool = False
     reason: str = ""
+    results: tuple[Calibration, ...] = ()
 
 
 Halves = tuple[tuple[TargetCloud, ...], tuple[TargetCloud, ...]]
@@ -153,7 +158,35 @@ def split_halves(
                 )
         except (TargetError, RegistrationError, SolveError) as e:
             return Repeatability(names, None, by_passes, f"{name}: {e}")
-    return Repeatability(names, compare(results[0], results[1], names, p_value), by_passes)
+    comparison = compare(results[0], results[1], names, p_value)
+    return Repeatability(names, comparison, by_passes, results=tuple(results))
+
+
+def with_halves(found: Validation, calibration: Calibration, repeated: Repeatability) -> Validation:
+    """The validation with the test of the calibration in the file against each half of the drive.
+
+    A difference beyond 5 sigma contradicts it. Halves of the calibrated drive have errors in common
+    with it: there the test is conservative. A half that contradicts itself tests nothing.
+    """
+    p_value = CONTRADICTION / max(len(repeated.results), 1)
+    alike: list[tuple[str, float]] = []
+    elsewhere = []
+    for name, result in zip(repeated.halves, repeated.results, strict=False):
+        if result.contradictions:
+            continue
+        # The file is the second: where it has the LiDARs, less where the half has them.
+        comparison = compare(result, calibration, (name, "the calibration"), p_value)
+        tested = [m for m in comparison.movements if m.dof]
+        off = [worst_of(m.lidars, m.movement, m.sigma, m.determined) for m in tested if m.moved]
+        if off:
+            elsewhere.append(elsewhere_sentence(name, max(off, key=lambda of: of.sigmas)))
+        elif tested:
+            alike.append((name, min(m.p_corrected for m in tested)))
+    if elsewhere:
+        return replace(found, verdict=found.verdict.also(elsewhere, contradicts=True))
+    if alike:
+        return replace(found, verdict=found.verdict.also((alike_sentence(alike),)))
+    return found
 
 
 def _calibrated(

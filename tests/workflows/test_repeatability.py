@@ -1,14 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
+import gtsam
 import numpy as np
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.products import TargetCloud, TargetObservation
 from caliv_graph.simulation.writer import config_of
-from caliv_graph.workflows.repeatability import alternate, split, split_halves
+from caliv_graph.validation.clouds import Clouds
+from caliv_graph.validation.findings import Validation, Verdict
+from caliv_graph.workflows.repeatability import alternate, split, split_halves, with_halves
 from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 from tests.workflows.test_survey import QUICK, scenario_of
@@ -73,3 +78,38 @@ def test_halves_of_a_drive_agree() -> None:
     assert 0.0 < pair.chi2 < 20.0
     # An arc leaves the turn about its centre open: that is no axis to compare.
     assert not found.comparison.lidars["front"].determined[2]
+
+    # A file of the same drive agrees with both; one in which a LiDAR stands elsewhere with none.
+    file = found.results[0]
+    right = with_halves(VALIDATION, file, found).verdict
+    assert (right.word, right.contradicts) == ("good", False)
+    assert "agrees with that of this drive by every other scan (p " in right.sentences[-1]
+    front = file.lidars["front"]
+    aside = front.T_vehicle_lidar.translation() + np.array([0.0, 0.1, 0.0])
+    moved = gtsam.Pose3(front.T_vehicle_lidar.rotation(), aside)
+    lidars = {**file.lidars, "front": replace(front, T_vehicle_lidar=moved)}
+    wrong = with_halves(VALIDATION, replace(file, lidars=lidars), found).verdict
+    assert (wrong.word, wrong.contradicts) == ("contradicted", True)
+    assert "S2S of 'front' to 'rear' is elsewhere, y +1" in wrong.reason
+    # A half that contradicts itself tests nothing.
+    doubted = tuple(replace(r, contradictions=("it does",)) for r in found.results)
+    assert with_halves(VALIDATION, file, replace(found, results=doubted)) is VALIDATION
+
+
+VALIDATION = Validation(
+    drive="drive",
+    lidars=("front", "rear"),
+    scans={},
+    surfaces=(),
+    things=(),
+    pairs=(),
+    thickness_m={},
+    alone_m={},
+    expected_thickness_m=0.0,
+    expected_alone_m={},
+    verdict=Verdict("good", 2.0, "distance", 1.0, 1.0, 1, 0.5, False, ("It is better.",)),
+    clouds=cast(Clouds, None),
+    best=(),
+    warnings=(),
+)
+"""Nothing of it but the verdict matters here."""

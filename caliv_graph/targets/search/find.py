@@ -49,7 +49,7 @@ MAX_SCANS = 240
 """Scans of one LiDAR that are read at most, however long the drive is."""
 
 LEVEL_SCANS = 5
-"""Scans whose ground shows a tilt of the guess: the drive has not got to a slope by then."""
+"""Scans whose ground shows a tilt of the guess: the first, under which the ground is one plane."""
 
 STANDS_M = 0.2
 STANDS_RAD = math.radians(2.0)

@@ -25,6 +25,8 @@ REACH_M = 20.0
 AGREE_RAD = math.radians(2.0)
 """Planes of several scans that differ by more than this are not the ground, or a ramp is in it."""
 
+VEHICLE_UP = np.array([0.0, 0.0, 1.0])
+
 
 def levelled(
     scans_lidar: Sequence[Array],
@@ -33,10 +35,12 @@ def levelled(
     name: str,
     config: Config,
 ) -> gtsam.Pose3:
-    """The guess `T_vehicle_lidar` with the tilt that makes the ground level.
+    """The guess `T_vehicle_lidar` with the tilt that makes the ground parallel to the vehicle.
 
-    The guess itself where the tilt is within `GUESS_SIGMAS`, or where no ground is seen. The height
-    is corrected where the config has that of the vehicle, and only together with the tilt.
+    The guess itself where no ground is seen, or where the tilt is within `GUESS_SIGMAS`: that to
+    the vehicle, which may stand on a slope, or that to the map's vertical, to which the vehicle's
+    axes may be inclined. The height is corrected where the config has that of the vehicle, and only
+    together with the tilt.
 
     Args:
         scans_lidar: (N, 3) points of some scans, metres, lidar frame.
@@ -58,13 +62,14 @@ def levelled(
             heights.append(float(plane[3]))
     if lidar.fixed or not normals:
         return guess
-    normal, up = (np.mean(of, axis=0) for of in (normals, ups))
-    normal, up = normal / np.linalg.norm(normal), up / np.linalg.norm(up)
-    tilt = math.acos(min(float(normal @ up), 1.0))
+    normal, vertical = (np.mean(of, axis=0) for of in (normals, ups))
+    normal, vertical = normal / np.linalg.norm(normal), vertical / np.linalg.norm(vertical)
+    tilt, to_vertical = (math.acos(min(float(normal @ up), 1.0)) for up in (VEHICLE_UP, vertical))
     spread = max(math.acos(min(float(normal @ each), 1.0)) for each in normals)
-    if tilt <= GUESS_SIGMAS * max(lidar.sigma.rpy_rad()[:2]) or spread > AGREE_RAD:
+    within = GUESS_SIGMAS * max(lidar.sigma.rpy_rad()[:2])
+    if min(tilt, to_vertical) <= within or spread > AGREE_RAD:
         return guess
-    axis = np.cross(normal, up)
+    axis = np.cross(normal, VEHICLE_UP)
     C = gtsam.Rot3.Expmap(tilt * axis / np.linalg.norm(axis))
     t = guess.translation()
     if config.ground.vehicle_height is not None:

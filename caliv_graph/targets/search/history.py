@@ -19,6 +19,10 @@ FOV_GAP_RAD = math.radians(5.0)
 EDGE_RAD = math.radians(0.6)
 """An object within this angle of the edge of the field of view may be cut off by it."""
 
+UPRIGHT = 0.5
+"""Cosine of the angle between the LiDAR's z and the vertical, up or down, below which the LiDAR
+lies on its side."""
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -66,7 +70,8 @@ class LidarHistory:
         self.scan_of: IntArray = np.repeat(np.arange(len(scans)), counts)
         self._base = np.array([o.base for o in self.objects]).reshape(-1, 3)
         self._fov = _field_of_view([s.azimuths for s in scans])
-        self._highest_rad = max((s.highest_rad for s in scans), default=0.0)
+        lowest_rad = min((s.elevation[0] for s in scans), default=0.0)
+        highest_rad = max((s.elevation[1] for s in scans), default=0.0)
         self.extent_m = np.array([o.extent_m for o in self.objects])
         self.points = np.array([o.points for o in self.objects], dtype=np.int64)
         self.range_m = np.array([o.range_m for o in self.objects])
@@ -75,10 +80,16 @@ class LidarHistory:
         self._azimuth = np.array([o.azimuth for o in self.objects]).reshape(-1, 2)
         low, high = self._azimuth.T
         free: BoolArray = np.array([not o.hidden for o in self.objects], dtype=bool)
-        self.whole: BoolArray = free & self._in_view(low - EDGE_RAD, high + EDGE_RAD)
-        self.top_cut: BoolArray = np.array(
-            [o.highest_rad > self._highest_rad - EDGE_RAD for o in self.objects], dtype=bool
-        )
+        beams = np.array([o.elevation for o in self.objects]).reshape(-1, 2)
+        at_low = beams[:, 0] < lowest_rad + EDGE_RAD
+        at_high = beams[:, 1] > highest_rad - EDGE_RAD
+        # The end of the elevations that is at the top of what stands: none of a LiDAR on its side,
+        # where both are at the sides.
+        up = float(self._R_guess[2, 2])
+        sideways = abs(up) < UPRIGHT
+        cut_at_side = (at_low | at_high) & sideways
+        self.whole: BoolArray = free & self._in_view(low - EDGE_RAD, high + EDGE_RAD) & ~cut_at_side
+        self.top_cut: BoolArray = (at_high if up > 0.0 else at_low) & (not sideways)
 
     def _in_view(self, begin: Array, end: Array) -> BoolArray:
         """Whether all azimuths from `begin` to `end` (n,) are inside the field of view."""

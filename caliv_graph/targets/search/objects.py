@@ -82,7 +82,7 @@ class ScanObject:
         top_m: of its highest points above the ground; NaN likewise.
         points: how many.
         azimuth: (2,) radians, from and to, lidar frame; from is in (-pi, pi].
-        highest_rad: elevation of its highest beam, lidar frame.
+        elevation: of its lowest and of its highest beam, lidar frame, radians.
         hidden: it may be larger than it appears, since an occluder is beside it or it reaches
             beyond MAX_RANGE_M.
         outline: (m, 3) some of its points, lidar frame.
@@ -96,7 +96,7 @@ class ScanObject:
     top_m: float
     points: int
     azimuth: tuple[float, float]
-    highest_rad: float
+    elevation: tuple[float, float]
     hidden: bool
     outline: Array
 
@@ -108,13 +108,14 @@ class ScanObjects:
     Attributes:
         objects: clusters above the ground.
         azimuths: (n,) bins of 0.5 degrees in which there are returns, ascending.
-        highest_rad: elevation of the highest beam that returned anything.
+        elevation: of the lowest and of the highest beam that returned anything, lidar frame,
+            radians.
         has_ground: whether ground was found.
     """
 
     objects: tuple[ScanObject, ...]
     azimuths: IntArray
-    highest_rad: float
+    elevation: tuple[float, float]
     has_ground: bool
 
 
@@ -127,13 +128,13 @@ def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
     across = np.hypot(points_lidar[:, 0], points_lidar[:, 1])
     elevation = np.arctan2(points_lidar[:, 2], across)
     bins = np.unique(np.floor(azimuth / AZIMUTH_BIN_RAD).astype(np.int64))
-    highest = float(elevation.max(initial=-math.pi / 2.0))
+    ends = float(elevation.min(initial=0.5 * math.pi)), float(elevation.max(initial=-0.5 * math.pi))
     range_m = np.hypot(across, points_lidar[:, 2])
     near = np.flatnonzero(range_m < MAX_RANGE_M + BEYOND_M)
     level = points_lidar[near] @ R_map_lidar.T
     surface = fit_surface(level)
     if surface is None:
-        return ScanObjects((), bins, highest, False)
+        return ScanObjects((), bins, ends, False)
     height = level[:, 2] - surface.height_at(level[:, :2])
     above = (height > CLEARANCE_M) & (height < CEILING_M)
     stands = _Standing(
@@ -148,7 +149,7 @@ def segment_scan(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
     spacing = _beam_spacing(azimuth, elevation)[bins_of]
     labels = _clusters(stands, spacing)
     objects = _describe(stands, labels, points_lidar, R_map_lidar, surface, spacing)
-    return ScanObjects(tuple(objects), bins, highest, True)
+    return ScanObjects(tuple(objects), bins, ends, True)
 
 
 @dataclass(frozen=True)
@@ -227,6 +228,8 @@ def _describe(
     splits = np.flatnonzero(np.diff(labels[order])) + 1
     by_azimuth = np.argsort(stands.azimuth, kind="stable")
     sorted_azimuth = stands.azimuth[by_azimuth]
+    # Of a LiDAR that hangs upside down, the beams of high elevation look at the ground.
+    upwards = 1.0 if R_map_lidar[2, 2] >= 0.0 else -1.0
     out = []
     for member in np.split(order, splits):
         if len(member) < MIN_POINTS or stands.range_m[member].min() > MAX_RANGE_M:
@@ -239,12 +242,13 @@ def _describe(
         hidden = bool(stands.range_m[member].max() > MAX_RANGE_M)
         if not hidden and extent < WIDE_M:
             beside = max(BESIDE_RAD, 2.0 * float(np.median(spacing[member])))
-            elevations = np.quantile(stands.elevation[member], [0.3, 1.0])
+            up = upwards * stands.elevation
+            elevations = np.quantile(up[member], [0.3, 1.0])
             for side in (low - beside, high):
                 other = by_azimuth[_within(sorted_azimuth, side, side + beside)]
                 in_front = stands.range_m[other] < stands.range_m[member].min() - OCCLUDED_M
-                level_with = (stands.elevation[other] > elevations[0]) & (
-                    stands.elevation[other] < elevations[1] + 2.0 * beside
+                level_with = (up[other] > elevations[0]) & (
+                    up[other] < elevations[1] + 2.0 * beside
                 )
                 hidden = hidden or bool((in_front & level_with).sum() >= 2)
         ground_z = float(surface.height_at(middle[None])[0])
@@ -262,7 +266,10 @@ def _describe(
                 top_m=float(height[1]),
                 points=len(member),
                 azimuth=(low, high),
-                highest_rad=float(stands.elevation[member].max()),
+                elevation=(
+                    float(stands.elevation[member].min()),
+                    float(stands.elevation[member].max()),
+                ),
                 hidden=hidden,
                 outline=points_lidar[stands.index[member[::step]]],
             )

@@ -27,7 +27,7 @@ def object_at(azimuth_deg: float) -> ScanObject:
         top_m=1.0,
         points=100,
         azimuth=(middle - math.radians(1.0), middle + math.radians(1.0)),
-        highest_rad=-0.1,
+        elevation=(-0.2, -0.1),
         hidden=False,
         outline=np.zeros((1, 3)),
     )
@@ -35,7 +35,7 @@ def object_at(azimuth_deg: float) -> ScanObject:
 
 def whole(azimuth_deg: float, bins: IntArray) -> bool:
     """Whether an object there is in full view of a LiDAR with returns in these half degrees."""
-    scan = ScanObjects((object_at(azimuth_deg),), bins, 0.2, True)
+    scan = ScanObjects((object_at(azimuth_deg),), bins, (-0.4, 0.2), True)
     poses = np.eye(3)[None], np.zeros((1, 3))
     history = LidarHistory("front", gtsam.Pose3(), [scan], poses, 1.0)
     return bool(history.whole[0])
@@ -67,7 +67,7 @@ def test_objects_at_one_place_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     along_m = (0.0, 0.2, 0.4501, 3.0, 0.1)
     objects = [replace(object_at(0.0), base=np.array([9.0, y, 0.0])) for y in along_m]
     objects[-1] = replace(objects[-1], extent_m=2.0 * WIDE_M)
-    scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), 0.2, True)
+    scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), (-0.4, 0.2), True)
     poses = np.eye(3)[None], np.zeros((1, 3))
     history = LidarHistory("front", gtsam.Pose3(), [scan], poses, 1.0)
     moved = Alignment(0.3, np.array([1.0, -2.0]))
@@ -75,3 +75,32 @@ def test_objects_at_one_place_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     # The same with a tree, where there are many.
     monkeypatch.setattr(align, "FEW", 0)
     assert align.concentration(history, moved) == 2 * (1 + 3)
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "low_deg", "high_deg", "top_cut", "is_whole"),
+    [
+        (0.0, -20.0, 8.0, True, True),
+        (0.0, -25.0, 0.0, False, True),
+        (10.0, -20.0, 8.0, True, True),
+        # Upside down, beams of high elevation look at the ground: the top is at the lowest.
+        (180.0, -25.0, 0.0, True, True),
+        (180.0, -20.0, 8.0, False, True),
+        # On its side, the ends of the elevations are at the left and at the right.
+        (90.0, -20.0, 8.0, False, False),
+        (-90.0, -25.0, 0.0, False, False),
+        (90.0, -10.0, 0.0, False, True),
+    ],
+)
+def test_what_the_outermost_beams_cut_off(
+    roll_deg: float, low_deg: float, high_deg: float, top_cut: bool, is_whole: bool
+) -> None:
+    """Of a LiDAR whose beams are at -25 to 8 degrees, as it is mounted."""
+    beams = math.radians(low_deg), math.radians(high_deg)
+    ends = math.radians(-25.0), math.radians(8.0)
+    scan = ScanObjects(
+        (replace(object_at(0.0), elevation=beams),), np.arange(-360, 360, 2), ends, True
+    )
+    guess = gtsam.Pose3(gtsam.Rot3.Roll(math.radians(roll_deg)), np.zeros(3))
+    history = LidarHistory("front", guess, [scan], (np.eye(3)[None], np.zeros((1, 3))), 1.0)
+    assert (bool(history.top_cut[0]), bool(history.whole[0])) == (top_cut, is_whole)

@@ -83,7 +83,7 @@ class TestOneObject:
         low, high = found.azimuth
         assert low == pytest.approx(math.atan2(0.7, 8.7), abs=math.radians(0.4))
         assert high == pytest.approx(math.atan2(1.3, 8.7), abs=math.radians(0.4))
-        assert found.highest_rad == pytest.approx(math.atan2(1.1 - 2.0, 8.7), abs=math.radians(1))
+        assert found.elevation[1] == pytest.approx(math.atan2(1.1 - 2.0, 8.7), abs=math.radians(1))
         assert not found.hidden
 
     def test_seen_with_a_mounting_that_is_off(self) -> None:

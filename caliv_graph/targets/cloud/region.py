@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray, LidarScan, TargetCloud
 from caliv_graph.targets.cloud.beams import (
     Linking,
@@ -31,7 +32,7 @@ from caliv_graph.targets.cloud.groups import (
 from caliv_graph.targets.cloud.tally import EMPTY, MOVED, NOTHING, OUTSIDE, Tally
 from caliv_graph.targets.cloud.track import CandidateSet
 from caliv_graph.targets.ground.fit import fit_ground
-from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.deskew import checked_times, deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 GUESS_SIGMAS = 2.0
@@ -201,6 +202,8 @@ class RegionExtractor:
             return []
         range_m = float(np.linalg.norm(self.centre - t))
         margin = widened_margin_m(self._config, scan.lidar, range_m)
+        if self._config.lidars[scan.lidar].fixed:
+            margin += self._swept_m(scan)
         points, near = self._near_region(scan.points_lidar, R, t, margin, tally)
         if len(near) < min(FEWEST_NEAR, extraction.min_points):
             tally.rejected[OUTSIDE] += 1
@@ -259,6 +262,20 @@ class RegionExtractor:
         R = self._R_map_region.T @ R_map_vehicle @ guess.rotation().matrix()
         t = t_map_vehicle + R_map_vehicle @ guess.translation() - self._t_map_region
         return R, t @ self._R_map_region
+
+    def _swept_m(self, scan: LidarScan) -> float:
+        """How far the target is from where it was at the stamp, at most, within a sweep; metres.
+
+        Points are chosen before their motion is compensated. The margins of guesses cover this.
+        """
+        times_s = checked_times(scan)
+        if times_s is None:
+            return 0.0
+        ends_s = (float(times_s.min()), 0.0, float(times_s.max()))
+        stamps = [scan.stamp_ns + round(at * NANOSECONDS_PER_SECOND) for at in ends_s]
+        within = np.clip(stamps, *self.trajectory.span_ns).tolist()
+        first, at_stamp, last = self.directions(scan.lidar, within)
+        return max(float(np.linalg.norm(end - at_stamp)) for end in (first, last))
 
     def directions(self, lidar: str, stamps_ns: Sequence[int]) -> Array:
         """(m, 3) metres, lidar frame: middle of the region at the stamps, at the guess."""

@@ -802,3 +802,33 @@ def test_progress_counts_every_scan() -> None:
 
     (stage,) = progress.stages
     assert (stage.total, stage.done) == (11, 11)
+
+
+def test_a_fixed_lidar_finds_the_whole_target_while_the_vehicle_drives_fast() -> None:
+    """At 10 m/s the target is 0.75 m from where it is at the stamp when the sweep gets there."""
+    rng = np.random.default_rng(5)
+    late_s, speed_m_s = 0.075, 10.0
+    box = rng.uniform([-0.3, 7.7, 0.0], [0.3, 7.75, 0.9], (300, 3))
+    ground = np.column_stack([rng.uniform([-6.0, 3.0], [6.0, 14.0], (4000, 2)), np.zeros(4000)])
+    height_m = 2.0
+    points = np.vstack([box, ground]) - [speed_m_s * late_s, 0.0, height_m]
+    times = np.append(np.full(len(points) - 1, late_s), 0.0)
+    stamps = 10**12 + 100_000_000 * np.arange(-5, 6)
+    poses = [gtsam.Pose3(gtsam.Rot3(), [speed_m_s * 1e-9 * (s - 10**12), 0, 0]) for s in stamps]
+    trajectory = GivenTrajectory(Trajectory(stamps, tuple(poses)))
+    region = TargetRegion(min=(-0.6, 7.4, -0.3), max=(0.6, 8.6, 1.2))
+    lidar = LidarConfig.model_validate(
+        {"topic": "front", "initial": {"xyz": [0, 0, height_m], "rpy_deg": [0, 0, 0]}}
+    )
+    config = Config.model_validate(
+        {
+            "data": {"format": "caliv", "path": "x"},
+            "lidars": {"front": lidar.model_copy(update={"fixed": True})},
+        }
+    )
+    scan = LidarScan("front", 10**12, points, "scan", times)
+
+    (found,) = RegionExtractor(region, config, trajectory).candidates(scan, 0)
+
+    assert np.ptp(found.cloud.points_lidar[:, 0]) > 0.5
+    assert np.median(found.cloud.points_lidar[:, 0]) == pytest.approx(0.0, abs=0.05)

@@ -237,7 +237,7 @@ def matched(tracks: Sequence[Track]) -> list[Proposal]:
     while left:
         first = left.pop(0)
         group = {first.lidar: first}
-        for lidar in {track.lidar for track in left} - {first.lidar}:
+        for lidar in sorted({track.lidar for track in left} - {first.lidar}):
             options = [
                 (c, t) for t in left if t.lidar == lidar and (c := _mismatch(first, t)) < 1.0
             ]

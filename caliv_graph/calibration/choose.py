@@ -263,8 +263,9 @@ def _why_none_stands(
         for candidate, of in zip(candidates, scatter, strict=True)
         if math.isfinite(of)
     )
+    said = f": {listed}" if listed else ""
     return (
-        f"target: none found that stands still: {listed}. Neither late stamps nor a wrong initial "
+        f"target: none found that stands still{said}. Neither late stamps nor a wrong initial "
         "guess of one LiDAR explains it: the objects move, or the poses are wrong",
         "Check the trajectory with 'caliv-graph inspect', and drive past a chair that nobody "
         "stands beside",

@@ -102,16 +102,18 @@ def place_lidars(
     drive = max(range(len(recordings)), key=lambda i: _turned_rad(trajectories[i]))
     recording, trajectory = recordings[drive], trajectories[drive]
     stamps = {n: scans_to_read(recording.scan_stamps_ns(n), trajectory) for n in config.lidars}
-    views: dict[str, _View] = {}
+    views: dict[str, View] = {}
     total = sum(map(len, stamps.values()))
     with progress.stage("finding the mountings", total) as advance:
         for name in config.lidars:
             try:
-                views[name] = _view(recording, trajectory, config, name, stamps[name], advance)
+                views[name] = view_of(recording, trajectory, config, name, stamps[name], advance)
             except ConfigError:
                 if name in missing:
                     raise
-        known = {n: _guessed(views[n], config, n) for n in views if n not in missing}
+        known = {
+            n: in_level_axes(views[n], config.lidars[n].guess()) for n in views if n not in missing
+        }
         alone = {name: sharpest(views[name].sightings) for name in missing}
         placements: dict[str, Placement] = {}
         # The clearest first: on an arc the others are placed about it.
@@ -128,7 +130,7 @@ def place_lidars(
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """What one LiDAR saw of a drive: the ground below it, and what stands around."""
 
     ground: Ground
@@ -148,15 +150,20 @@ def _clearness(found: Found) -> float:
     return float(found.sharpness[0] / found.sharpness[-1])
 
 
-def _view(
+def view_of(
     recording: Recording,
     trajectory: VehicleTrajectory,
     config: Config,
     name: str,
     stamps_ns: IntArray,
     advance: Advance,
-) -> _View:
-    """Reads the chosen scans of one LiDAR."""
+) -> View:
+    """Reads the chosen scans of one LiDAR.
+
+    Raises:
+        ConfigError: it sees no ground, or nothing that stands on it.
+        RecordingError: a cloud could not be read.
+    """
     lidar = config.lidars[name]
     scans: list[_Scan] = []
     patches: list[ScanPatches] = []
@@ -183,7 +190,7 @@ def _view(
             f"({len(sightings.level)} points in {len(scans)} scans, needs {FEWEST_POINTS}). "
             f"Enter lidars.{name}.initial, or drive past walls, cars or a chair",
         )
-    return _View(ground, sightings)
+    return View(ground, sightings)
 
 
 def _even(count: int, most: int) -> IntArray:
@@ -258,11 +265,10 @@ def _not_own(places: Array, scan_of: IntArray, scans: int) -> IntArray:
     return use[_even(len(use), MOST_POINTS)]
 
 
-def _guessed(view: _View, config: Config, name: str) -> Array:
-    """The mounting (yaw, x, y) of a guess, in the level axes of the view."""
-    T = config.lidars[name].guess()
-    R = T.rotation().matrix() @ view.ground.R_level_lidar.T
-    x, y, _ = T.translation()
+def in_level_axes(view: View, T_vehicle_lidar: gtsam.Pose3) -> Array:
+    """A mounting as (yaw, x, y) of the level axes of the view."""
+    R = T_vehicle_lidar.rotation().matrix() @ view.ground.R_level_lidar.T
+    x, y, _ = T_vehicle_lidar.translation()
     return np.array([math.atan2(R[1, 0], R[0, 0]), x, y])
 
 

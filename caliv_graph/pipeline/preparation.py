@@ -14,6 +14,7 @@ from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, TargetError, TrajectoryError
+from caliv_graph.mounting.doubts import Doubt
 from caliv_graph.mounting.place import Placement, place_lidars
 from caliv_graph.odometry.run import with_odometry
 from caliv_graph.physics import (
@@ -25,6 +26,7 @@ from caliv_graph.physics import (
     warnings_of,
     with_cause,
 )
+from caliv_graph.pipeline.mistakes import mistakes, without_remedies
 from caliv_graph.products import (
     Finding,
     GroundObservation,
@@ -33,6 +35,7 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.readers.common_stamps import with_common_stamps
+from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import read_patches
@@ -48,7 +51,11 @@ from caliv_graph.trajectory.select import (
     smooth_trajectories,
     takes_given_poses,
 )
-from caliv_graph.wording.mounting import placement_sentence, region_sentence
+from caliv_graph.wording.mounting import (
+    mistake_sentence,
+    placement_sentence,
+    region_sentence,
+)
 from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import no_target_sentence
 from caliv_graph.wording.suspects import motion_sentence
@@ -68,6 +75,7 @@ class Prepared:
         contradictions: how guesses and stamps contradict what the LiDARs see, a sentence each.
         patches: pieces of walls and other surfaces, per drive; empty: structure is not used.
         no_target: why no target was found; None: one was, or none was to be looked for.
+        mistakes: of the config, that explain why LiDARs do not see the target, a sentence each.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -79,6 +87,7 @@ class Prepared:
     contradictions: tuple[str, ...] = ()
     patches: tuple[DrivePatches, ...] = ()
     no_target: TargetError | None = None
+    mistakes: tuple[str, ...] = ()
 
 
 def motions_of(
@@ -132,12 +141,12 @@ def prepare(
         CalivError: something is wrong with the input; the message says what to do.
     """
     check_clouds(recordings, config)
-    recordings = [with_common_stamps(recording) for recording in recordings]
+    recordings = [CountedRecording(with_common_stamps(recording)) for recording in recordings]
     recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
     rough, findings, search, placements = _searched(recordings, config, motions, raw, progress)
-    config, misplaced, observations, no_target = search
+    config, misplaced, observations, no_target, wrong = search
     patches = tuple(
         without_targets(of, observations, rough[of.drive], config)
         for of in _patches(recordings, rough, config, progress)
@@ -175,6 +184,7 @@ def prepare(
         (*misplaced, *displaced(observations, trajectories, config)),
         patches,
         no_target,
+        wrong,
     )
 
 
@@ -192,9 +202,12 @@ def _with_poses(
     return out, lines
 
 
-Search = tuple[Config, tuple[str, ...], tuple[TargetObservation, ...], TargetError | None]
+Search = tuple[
+    Config, tuple[str, ...], tuple[TargetObservation, ...], TargetError | None, tuple[str, ...]
+]
 """The config with the guesses that the search had to replace; how they contradict what the LiDARs
-see, a sentence each; the targets' clouds; why there are none, if structure may replace them."""
+see, a sentence each; the targets' clouds; why there are none, if structure may replace them; and
+mistakes of the config that explain what LiDARs do not see, a sentence each."""
 
 
 def _searched(
@@ -214,6 +227,7 @@ def _searched(
     rough: Sequence[VehicleTrajectory] = ()
     findings = raw
     placements: tuple[Placement, ...] = ()
+    wrong: tuple[Doubt, ...] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
@@ -221,14 +235,32 @@ def _searched(
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         found = targets_of(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
-        caused = _with_cause(error, rough, motions, config, (findings, raw))
+        wrong = mistakes(recordings, rough, motions, config, progress, raw)
+        said = tuple(mistake_sentence(doubt, config) for doubt in wrong)
+        caused: CalivError = error
+        if wrong:
+            caused = type(error)(_what(error), " ".join(said))
+        else:
+            caused = _with_cause(error, rough, motions, config, (findings, raw))
         if caused is error and isinstance(error, TargetError) and config.target:
             elsewhere = region_sentence(placements)
             caused = TargetError(error.what, elsewhere) if elsewhere else error
         if not (isinstance(caused, TargetError) and config.target is None and _uses(config)):
             raise caused from error
-        return rough, findings, (config, (), (), caused), placements
-    return rough, findings, (*found, None), placements
+        return rough, findings, (config, (), (), caused, said), placements
+    near, misplaced, observations = found
+    if observations:
+        wrong = mistakes(recordings, rough, motions, config, progress, raw, observations)
+    if wrong:
+        # The search takes a mistake for guesses that are off.
+        misplaced, observations = (), without_remedies(observations, wrong)
+    said = tuple(mistake_sentence(doubt, config) for doubt in wrong)
+    return rough, findings, (near, misplaced, observations, None, said), placements
+
+
+def _what(error: CalivError) -> str:
+    """A message without its remedy."""
+    return error.what if isinstance(error, TargetError) else str(error)
 
 
 def _uses(config: Config) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -102,9 +103,12 @@ def _calibrate(
         names = [recording.name for recording in recordings]
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
+        if prepared.mistakes:
+            # What a solve from a mistaken guess or heading contradicts has that cause.
+            calibration = replace(calibration, contradictions=())
         calibration = contradicted(
             ranked_with(calibration, findings),
-            prepared.contradictions,
+            (*prepared.mistakes, *prepared.contradictions),
             contradictions_of(findings),
         )
         calibration, conflicts = with_prior(calibration, prior, config)

@@ -87,7 +87,7 @@ def heading_disagreement(
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
             yaw_rad=map_turn,
-            sigma_rad=_heading_sigma(smoothed),
+            sigma_rad=math.hypot(_heading_sigma(smoothed), FLOOR_RAD),
             axle_m=math.nan,
             duration_s=duration_s,
             measured=measured is not None,

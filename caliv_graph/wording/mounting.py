@@ -1,13 +1,17 @@
-"""Sentences about mountings that were found without an initial guess."""
+"""Sentences about mountings: what was found without a guess, and guesses that are mistaken."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import gtsam
 import numpy as np
 
+from caliv_graph.config.model import Config
+from caliv_graph.mounting.doubts import Doubt
 from caliv_graph.mounting.place import Placement
+from caliv_graph.mounting.sharpness import CELLS_M
 
 MOST_OTHERS = 2
 """Other mountings that are listed."""
@@ -40,6 +44,90 @@ def region_sentence(placements: Sequence[Placement]) -> str:
         "there and seem to be outside the region. Enter an initial guess (lidars.<name>.initial), "
         "or leave out 'target', so that the target is searched for"
     )
+
+
+def mistake_sentence(found: Doubt, config: Config) -> str:
+    """A mistake that explains what the LiDARs see: which, the numbers, and what to correct."""
+    what, undone, remedy = _mistake(found, config)
+    cell_m = CELLS_M[-1]
+    sharing = ", ".join(
+        f"{then:.1f} points of '{name}' share a cell of {cell_m:g} m (now {now:.1f})"
+        for name, (now, then) in found.sharing.items()
+    )
+    return (
+        f"{found.name}: most likely, {what}. {undone}, what stands still is seen at one place: "
+        f"{sharing}. {remedy}"
+    )
+
+
+def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
+    """What is wrong, how it is undone, and what to do."""
+    names = [f"'{name}'" for name in found.lidars]
+    if found.kind == "exchanged":
+        a, b = found.lidars
+        return (
+            f"the topics of lidars {names[0]} and {names[1]} are swapped",
+            "With the initial guess of the other one",
+            f"Exchange lidars.{a}.topic and lidars.{b}.topic",
+        )
+    if found.kind == "turned":
+        (name,) = found.lidars
+        roll, pitch, yaw = config.lidars[name].given.rpy_deg
+        right = math.remainder(yaw - found.turn_deg, 360.0)
+        return (
+            f"the initial guess of lidar {names[0]} is turned by {_turn(found)}",
+            "Without this turn",
+            f"Set lidars.{name}.initial.rpy_deg to about [{roll:.1f}, {pitch:.1f}, {right:.1f}]",
+        )
+    if found.kind == "heading":
+        return (
+            f"the heading of the vehicle is turned by {_turn(found)}",
+            "Without this turn",
+            _heading_remedy(found, config),
+        )
+    remedy = "Set data.pose_axes: ned"
+    if config.data.format == "caliv":
+        remedy = (
+            "Convert input/ego_poses.yaml to a vehicle with x forward, y left, z up, in a map "
+            "with z up"
+        )
+    return (
+        "the poses are of a map with z down (north, east, down): the vehicle turns right where "
+        "they turn left",
+        "In a map with z up",
+        remedy,
+    )
+
+
+def _turn(found: Doubt) -> str:
+    """An angle to the left or right."""
+    if abs(found.turn_deg) == 180:
+        return "180 degrees of yaw"
+    return (
+        f"{abs(found.turn_deg)} degrees of yaw to the {'left' if found.turn_deg > 0 else 'right'}"
+    )
+
+
+def _heading_remedy(found: Doubt, config: Config) -> str:
+    """Where the heading of the vehicle comes from, and what to check there."""
+    if found.given:
+        source = "the poses" if config.data.format == "caliv" else pose_key(config)
+        key = f"the orientation in {source}"
+    elif config.topics.heading is not None:
+        key = "heading.yaw_deg"
+    elif config.topics.imu is not None:
+        key = "imu.T_vehicle_imu and from where the IMU's yaw counts"
+    else:
+        key = "the sign of the velocities in topics.twist"
+    reversed_too = ""
+    if abs(found.turn_deg) == 180:
+        reversed_too = ": a vehicle that reverses points against its course"
+    return f"Check {key}, and that all initial guesses are in the vehicle frame{reversed_too}"
+
+
+def pose_key(config: Config) -> str:
+    """Where the config names the given poses."""
+    return "data.poses" if config.data.poses is not None else "topics.pose"
 
 
 def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:

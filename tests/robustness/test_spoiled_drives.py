@@ -123,7 +123,20 @@ def test_topics_of_two_lidars_swapped(drive: Path, tmp_path: Path) -> None:
 
     done = command("calibrate", config, "--out", tmp_path / "out")
 
-    assert done.code in (2, 3, 4)
+    assert done.code == 2
+    assert "the topics of lidars 'front' and 'rear' are swapped" in done.err
+    check_sound(done, tmp_path / "out", drive / "truth.yaml")
+
+
+def test_a_guess_with_its_yaw_half_a_turn_off(drive: Path, tmp_path: Path) -> None:
+    initial = {"xyz": [-0.4, 0.0, 2.0], "rpy_deg": [0.0, 10.0, 0.0]}
+    config = write_config(drive, tmp_path / "config.yaml", lidars__rear__initial=initial)
+
+    done = command("calibrate", config, "--out", tmp_path / "out")
+
+    assert done.code == 4, done.err
+    assert "the initial guess of lidar 'rear' is turned by 180 degrees of yaw" in done.err
+    assert "Widen" not in done.err
     check_sound(done, tmp_path / "out", drive / "truth.yaml")
 
 

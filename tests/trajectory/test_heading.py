@@ -89,3 +89,13 @@ def test_driving_backwards_is_no_disagreement() -> None:
     assert found is not None
     assert not found.warning
     assert abs(found.yaw_rad) < 4.0 * found.sigma_rad
+
+
+def test_a_heading_from_north_is_told_before_any_scan_has_a_pose() -> None:
+    """Without wanted stamps no covariance is known; its sigma is never zero."""
+    sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
+    motion = record(Course(eight_drive(31.0)), sensors, 1)
+    found = heading_disagreement(smooth_trajectory(motion, config_for(sensors), ()), motion)
+    assert found is not None
+    assert found.sigma_rad > 0.0
+    assert "against the path of the GNSS fixes" in found.warning

@@ -1,0 +1,191 @@
+"""Usual mistakes that a drive shows: topics exchanged, a guess or the heading a quarter turn off.
+
+What stands still is seen at its place again and again only with the right mountings on the right
+path. Each mistake is undone on trial; where the maps become much sharper, it was made. No target
+is needed for this, and no guess that is nearly right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from caliv_graph.common.progress import Progress
+from caliv_graph.config.lidars import FoundLidarConfig
+from caliv_graph.config.model import Config
+from caliv_graph.errors import ConfigError
+from caliv_graph.mounting.place import View, in_level_axes, view_of
+from caliv_graph.mounting.sharpness import Sightings, difference_m, sharpest_near
+from caliv_graph.products import Array, Recording
+from caliv_graph.targets.search.find import scans_to_read
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+
+Kind = Literal["exchanged", "turned", "heading", "mirrored"]
+
+SHARPER = 1.6
+"""Times as many points at one place from which a mistake is said. Measured on an arc and an S-curve
+past a chair and a few other objects: 2.3 to 15 for what was wrong, 1.3 at most for what was not."""
+
+ALIKE = 0.9
+"""Explanations that sharpen the maps nearly as much: then the one whose guesses are nearer holds.
+On an arc a mounting may turn about the centre of the arc."""
+
+QUARTERS = (180, 90, -90)
+"""Turns that are tried, degrees: axes that were taken for others."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A mistake that explains what the LiDARs see.
+
+    Attributes:
+        drive: index of the drive that shows it.
+        name: of its recording.
+        kind: `exchanged`: two LiDARs have each other's guess. `turned`: the guess of one is.
+            `heading`: that of the vehicle is, against its path. `mirrored`: the path turns right
+            where the vehicle turned left.
+        lidars: whose maps become sharper.
+        turn_deg: of `turned` and `heading`: of the guess or the heading against the right one,
+            counted to the left.
+        sharing: points that share a cell (`sharpness.sharpest_near`), now and without the mistake,
+            of each of `lidars`.
+        given: whether poses were given.
+    """
+
+    drive: int
+    name: str
+    kind: Kind
+    lidars: tuple[str, ...]
+    turn_deg: int
+    sharing: Mapping[str, tuple[float, float]]
+    given: bool
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A mistake undone: mountings of some LiDARs, and whether the way is mirrored."""
+
+    kind: Kind
+    turn_deg: int
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3]
+    mirrored: bool = False
+
+
+def doubts(
+    recordings: Sequence[Recording],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+) -> tuple[Doubt, ...]:
+    """The mistake that each drive shows, if it shows one; the same one of a guess only once.
+
+    Clouds are read again: it is asked where something is wrong already.
+
+    Raises:
+        RecordingError: a cloud could not be read.
+    """
+    found: dict[tuple[object, ...], Doubt] = {}
+    names = [n for n, lidar in config.lidars.items() if _is_guessed(lidar)]
+    for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
+        given = isinstance(trajectory, GivenTrajectory)
+        if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
+            continue  # its path is that of a guess
+        views = _views(recording, trajectory, config, names, progress)
+        doubt = _of_drive(drive, recording.name, views, config, given)
+        if doubt is not None:
+            of = () if doubt.kind in ("exchanged", "turned") else (drive,)
+            found.setdefault((doubt.kind, doubt.lidars, *of), doubt)
+    return tuple(found.values())
+
+
+def _is_guessed(lidar: object) -> bool:
+    """Whether somebody gave the guess of a LiDAR."""
+    return getattr(lidar, "initial", None) is not None and not isinstance(lidar, FoundLidarConfig)
+
+
+def _views(
+    recording: Recording,
+    trajectory: VehicleTrajectory,
+    config: Config,
+    names: Sequence[str],
+    progress: Progress,
+) -> dict[str, View]:
+    """What each LiDAR sees, of those that see the ground and what stands on it."""
+    stamps = {n: scans_to_read(recording.scan_stamps_ns(n), trajectory) for n in names}
+    views = {}
+    with progress.stage("looking for mistakes", sum(map(len, stamps.values()))) as advance:
+        for name in names:
+            try:
+                views[name] = view_of(recording, trajectory, config, name, stamps[name], advance)
+            except ConfigError:
+                continue
+    return views
+
+
+def _of_drive(
+    drive: int, name: str, views: Mapping[str, View], config: Config, given: bool
+) -> Doubt | None:
+    """The mistake whose undoing sharpens the maps most; None if none does by much."""
+    guesses = {n: config.lidars[n].guess() for n in views}
+    now = {n: _sharpness(views[n].sightings, views[n], T)[0] for n, T in guesses.items()}
+    best: tuple[float, float, _Trial, dict[str, float]] | None = None
+    for trial in _trials(guesses, given):
+        then, moved_m = {}, 0.0
+        for n, T in trial.T_vehicle_lidar.items():
+            seen = views[n].sightings.mirrored if trial.mirrored else views[n].sightings
+            then[n], off_m = _sharpness(seen, views[n], T)
+            moved_m += off_m
+        gains = np.array([then[n] / now[n] for n in then])
+        if not _explains(gains, trial.kind):
+            continue
+        gain = float(np.log(gains).sum())
+        alike = -math.log(ALIKE) * max(len(gains), 1)
+        if best is None or gain > best[0] + alike or (gain > best[0] - alike and moved_m < best[1]):
+            best = gain, moved_m, trial, then
+    if best is None:
+        return None
+    _, _, trial, then = best
+    sharing = {n: (now[n], then[n]) for n in then}
+    return Doubt(drive, name, trial.kind, tuple(then), trial.turn_deg, sharing, given)
+
+
+def _explains(gains: Array, kind: Kind) -> bool:
+    """Whether the maps are so much sharper; of what concerns all, those of most."""
+    if kind in ("heading", "mirrored"):
+        return bool(np.sort(gains)[(len(gains) - 1) // 2] >= SHARPER and gains.min() >= ALIKE)
+    return bool(gains.min() >= SHARPER)
+
+
+def _sharpness(
+    sightings: Sightings, view: View, T_vehicle_lidar: gtsam.Pose3
+) -> tuple[float, float]:
+    """The sharpness near a mounting, and how far from it, metres at 15 m."""
+    start = in_level_axes(view, T_vehicle_lidar)
+    found, sharing = sharpest_near(sightings, start)
+    return sharing, difference_m(found, start)
+
+
+def _trials(guesses: Mapping[str, gtsam.Pose3], given: bool) -> Iterator[_Trial]:
+    """All that is tried, for LiDARs with these guesses."""
+    names = list(guesses)
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            yield _Trial("exchanged", 0, {a: guesses[b], b: guesses[a]})
+    for turn in QUARTERS:
+        back = gtsam.Rot3.Yaw(-math.radians(turn))
+        for name, T in guesses.items():
+            alone = gtsam.Pose3(back.compose(T.rotation()), T.translation())
+            yield _Trial("turned", turn, {name: alone})
+    if not guesses:
+        return
+    for turn in QUARTERS:
+        # A heading that is turned turns all that is seen about the vehicle.
+        turned = gtsam.Pose3(gtsam.Rot3.Yaw(-math.radians(turn)), np.zeros(3))
+        yield _Trial("heading", turn, {name: turned.compose(T) for name, T in guesses.items()})
+    if given:
+        yield _Trial("mirrored", 0, guesses, mirrored=True)

@@ -1,0 +1,111 @@
+"""Mistakes of guesses and poses that a drive past posts shows, without a target."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config
+from caliv_graph.mounting.doubts import Doubt, doubts
+from caliv_graph.mounting.place import place_lidars
+from caliv_graph.products import Trajectory
+from caliv_graph.trajectory.select import GivenTrajectory
+from caliv_graph.wording.mounting import mistake_sentence
+from tests.mounting.posts import Drive, config_of
+
+FRONT = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.17, 0.0), np.array([2.0, 0.0, 2.0]))
+REAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.17, math.pi), np.array([-0.4, 0.0, 2.0]))
+ERROR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.04), np.array([0.06, -0.07, 0.04]))
+"""As far off as a guess may be."""
+DRIVE = Drive({"front": FRONT, "rear": REAR})
+GUESSES = config_of(front=FRONT.compose(ERROR), rear=REAR.compose(ERROR))
+DOWN = gtsam.Pose3(gtsam.Rot3(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+
+
+def turned(degrees: float, T: gtsam.Pose3) -> gtsam.Pose3:
+    """A mounting of which the rotation is turned about the vertical."""
+    R = gtsam.Rot3.Yaw(math.radians(degrees)).compose(T.rotation())
+    return gtsam.Pose3(R, T.translation())
+
+
+def along(*poses: gtsam.Pose3) -> GivenTrajectory:
+    return GivenTrajectory(Trajectory(DRIVE.way.trajectory.stamps_ns, poses))
+
+
+def found(config: Config, way: GivenTrajectory = DRIVE.way) -> tuple[Doubt, ...]:
+    return doubts([DRIVE], [way], config, SilentProgress())
+
+
+def test_sound_guesses_have_no_mistake() -> None:
+    assert found(GUESSES) == ()
+
+
+def test_topics_that_are_swapped() -> None:
+    config = config_of(front=REAR.compose(ERROR), rear=FRONT.compose(ERROR))
+    (doubt,) = found(config)
+    assert (doubt.kind, doubt.lidars) == ("exchanged", ("front", "rear"))
+    text = mistake_sentence(doubt, config)
+    assert "the topics of lidars 'front' and 'rear' are swapped" in text
+    assert "Exchange lidars.front.topic and lidars.rear.topic" in text
+
+
+@pytest.mark.parametrize("degrees", [180.0, 90.0, -90.0])
+def test_a_guess_whose_yaw_is_a_quarter_turn_off(degrees: float) -> None:
+    config = config_of(front=FRONT.compose(ERROR), rear=turned(degrees, REAR.compose(ERROR)))
+    (doubt,) = found(config)
+    assert (doubt.kind, doubt.lidars, doubt.turn_deg) == ("turned", ("rear",), degrees)
+    now, then = doubt.sharing["rear"]
+    assert then > 1.6 * now
+    text = mistake_sentence(doubt, config)
+    assert f"'rear' is turned by {abs(degrees):.0f} degrees of yaw" in text
+    right = math.degrees(REAR.compose(ERROR).rotation().yaw())
+    assert f"{math.remainder(right, 360.0):.1f}]" in text
+
+
+def test_a_heading_that_points_backwards() -> None:
+    back = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi), np.zeros(3))
+    way = along(*(T.compose(back) for T in DRIVE.way.trajectory.T_map_vehicle))
+    (doubt,) = found(GUESSES, way)
+    assert (doubt.kind, doubt.turn_deg, doubt.given) == ("heading", 180, True)
+    text = mistake_sentence(doubt, GUESSES)
+    assert "the heading of the vehicle is turned by 180 degrees" in text
+    assert "a vehicle that reverses points against its course" in text
+
+
+def test_poses_of_north_east_down() -> None:
+    way = along(*(DOWN.compose(T).compose(DOWN) for T in DRIVE.way.trajectory.T_map_vehicle))
+    (doubt,) = found(GUESSES, way)
+    assert (doubt.kind, doubt.lidars) == ("mirrored", ("front", "rear"))
+    text = mistake_sentence(doubt, GUESSES)
+    assert "a map with z down" in text
+    assert "Set data.pose_axes: ned" in text
+
+
+def test_a_mistake_of_the_config_is_said_once_of_several_drives() -> None:
+    config = config_of(front=REAR, rear=FRONT)
+    (doubt,) = doubts([DRIVE, DRIVE], [DRIVE.way, DRIVE.way], config, SilentProgress())
+    assert doubt.drive == 0
+
+
+def test_a_heading_is_of_one_drive() -> None:
+    back = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi), np.zeros(3))
+    wrong = along(*(T.compose(back) for T in DRIVE.way.trajectory.T_map_vehicle))
+    second = replace(DRIVE, name="second")
+    (doubt,) = doubts([DRIVE, second], [DRIVE.way, wrong], GUESSES, SilentProgress())
+    assert (doubt.drive, doubt.name, doubt.kind) == (1, "second", "heading")
+
+
+def test_a_drive_without_anything_upright_tells_nothing() -> None:
+    bare = replace(DRIVE, posts=False)
+    assert doubts([bare], [bare.way], config_of(front=REAR, rear=FRONT), SilentProgress()) == ()
+
+
+def test_a_mounting_that_was_found_is_no_guess_to_doubt() -> None:
+    config, _ = place_lidars([DRIVE], [DRIVE.way], config_of("front", rear=REAR), SilentProgress())
+    assert found(config) == ()
+    assert found(config_of(front=FRONT)) == ()

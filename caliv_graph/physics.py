@@ -21,6 +21,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
+from caliv_graph.trajectory.given_physics import poses_physics
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
@@ -32,6 +33,7 @@ from caliv_graph.wording.physics import (
     guess_findings,
     heading_finding,
     motion_findings,
+    poses_finding,
     tilt_finding,
 )
 from caliv_graph.wording.suspects import clock_finding
@@ -49,6 +51,9 @@ def raw_findings(motions: Mapping[int, MotionData], config: Config) -> tuple[Fin
     out: list[Finding] = []
     for motion in motions.values():
         if takes_given_poses(motion, config):
+            poses = poses_physics(motion)
+            if poses is not None:
+                out.append(poses_finding(poses, config))
             continue
         try:
             found = motion_physics(motion, config)

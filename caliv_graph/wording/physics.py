@@ -16,6 +16,12 @@ from caliv_graph.targets.cloud.copies import Copy
 from caliv_graph.targets.ground.guesses import Misfit
 from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.axes import Axes
+from caliv_graph.trajectory.given_physics import (
+    MAX_OFF_RAD,
+    MAX_TILT_RAD,
+    MIN_SPREAD_RAD,
+    PosesPhysics,
+)
 from caliv_graph.trajectory.heading import HeadingDisagreement
 from caliv_graph.trajectory.physics import (
     Gravity,
@@ -26,6 +32,7 @@ from caliv_graph.trajectory.physics import (
 )
 from caliv_graph.trajectory.tilt import VehicleTilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
+from caliv_graph.wording.mounting import pose_key
 
 WARNING_SIGMAS = 3.0
 """From here a disagreement is said."""
@@ -267,6 +274,79 @@ def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:
                 f"{name}: the stamps of the GNSS are {abs(delay_s):.2f} +- {sigma_s:.2f} s {way} "
                 "against those of the IMU, by the accelerations of both: correct its clock",
             )
+
+
+_READINGS = {
+    "wxyz": (
+        "with the quaternions in the order w x y z",
+        "Write them in the order x y z w",
+    ),
+    "frd": (
+        "with the z axis of the vehicle down",
+        "Set data.pose_axes: frd",
+    ),
+    "ned": (
+        "with the z axis of the map down",
+        "Turn the map, so that its z is up, or set data.pose_axes: ned if the vehicle's z is down "
+        "too",
+    ),
+    "inverse": (
+        "as the map in the vehicle frame",
+        "Invert them: they must be the vehicle in the map",
+    ),
+    "compass": (
+        "with rotations for a map of north, east, down",
+        "Give rotations and positions for one map, with z up",
+    ),
+    "y": ("with y the other way", "Change the sign of y, so that the map is right-handed"),
+    "x": ("with x the other way", "Change the sign of x, so that the map is right-handed"),
+    "xy": ("with x and y exchanged", "Exchange them: east is x, and north is y"),
+}
+"""How given poses are read (`trajectory.given_physics.READINGS`), and what to do."""
+
+
+def poses_finding(found: PosesPhysics, config: Config) -> Finding:
+    """Given poses of a vehicle that does not stand upright or not go where it points.
+
+    Axes with z down are a choice that guesses may share: then they are no contradiction.
+    """
+    now, then = found.now, found.then
+    limits = [(now.tilt_rad, MAX_TILT_RAD)]
+    parts, mended = [], []
+    if not now.upright:
+        parts.append(
+            f"z of the vehicle is {math.degrees(now.tilt_rad):.0f} degrees from z of the map"
+        )
+        mended.append(f"{math.degrees(then.tilt_rad):.1f} degrees")
+    if now.strays:
+        limits.append((now.spread_rad, MIN_SPREAD_RAD))
+        parts.append(
+            "the direction of travel strays from where the vehicle points by "
+            f"{math.degrees(now.spread_rad):.0f} degrees"
+        )
+        mended.append(f"{math.degrees(then.spread_rad):.1f} degrees")
+    elif now.aside_rad > MAX_OFF_RAD:
+        limits.append((now.aside_rad, MAX_OFF_RAD))
+        parts.append(
+            f"the direction of travel is {math.degrees(now.aside_rad):.0f} degrees off where the "
+            "vehicle points"
+        )
+        mended.append(f"{math.degrees(then.aside_rad):.1f} degrees")
+    ways, remedies = zip(*(_READINGS[reading] for reading in found.readings), strict=True)
+    where = "input/ego_poses.yaml" if config.data.format == "caliv" else pose_key(config)
+    if config.data.format == "caliv" and "frd" in found.readings:
+        remedies = ("Convert them to a vehicle with x forward, y left, z up, in a map with z up",)
+    off, limit = max(limits, key=lambda of: of[0] / of[1])
+    sigma = limit / CONTRADICTION_SIGMAS
+    return Finding(
+        "topics.pose",
+        (),
+        math.degrees(sigma),
+        off / sigma,
+        "warning" if "frd" in found.readings else "fatal",
+        f"{found.name}: by the poses in {where}, {' and '.join(parts)} (median). Read "
+        f"{' or '.join(ways)}, they have {' and '.join(mended)}. {'; or '.join(remedies)}",
+    )
 
 
 def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:

@@ -17,6 +17,7 @@ from caliv_graph.config.mounting import GnssConfig, ImuConfig
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.config.sections import (
     FilePath,
+    Fine,
     Finite,
     Name,
     NonNegative,
@@ -85,11 +86,26 @@ class TargetRegion(Section):
         return self
 
 
+_MOST_HEIGHT_M = 30.0
+"""Of a vehicle frame above or below the ground: that of a container crane on wheels."""
+
+
+def _above_ground(height_m: float) -> float:
+    if abs(height_m) > _MOST_HEIGHT_M:
+        raise ValueError(
+            f"must be within {_MOST_HEIGHT_M:g} m of the ground: in metres, not millimetres"
+        )
+    return height_m
+
+
+Height = Annotated[Finite, AfterValidator(_above_ground)]
+
+
 class GroundConfig(Section):
     """The ground as a source of roll, pitch and height."""
 
     use: bool = True
-    vehicle_height: Finite | None = Field(
+    vehicle_height: Height | None = Field(
         None, description="metres, height of the vehicle frame above ground; absent: unknown"
     )
     sigma: Positive = Field(0.005, description="metres, sigma of vehicle_height over the drive")
@@ -131,7 +147,7 @@ class RobustConfig(Section):
 class ExtractionConfig(Section):
     """How target points are cut out of the clouds."""
 
-    ground_distance: Positive = Field(
+    ground_distance: Fine = Field(
         0.05, description="metres; points nearer to the ground plane are ground"
     )
     voxel: NonNegative = Field(

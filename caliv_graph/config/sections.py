@@ -66,6 +66,12 @@ def _on_a_vehicle(xyz: tuple[float, float, float]) -> tuple[float, float, float]
     return xyz
 
 
+def _within_a_metre(value: float) -> float:
+    if value > 1.0:
+        raise ValueError("must be at most 1 m: in metres, not millimetres")
+    return value
+
+
 def as_written(value: Any) -> Any:
     """A number as the text that it was: a folder may be called 2024, and a LiDAR 1."""
     # YAML reads a whole number only where its digits are all there is (`yaml_text`).
@@ -77,6 +83,8 @@ FilePath = Annotated[Path, BeforeValidator(as_written)]
 Finite = Annotated[float, AfterValidator(_finite)]
 Positive = Annotated[float, Field(gt=0.0), AfterValidator(_finite), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0.0), AfterValidator(_finite)]
+Fine = Annotated[Positive, AfterValidator(_within_a_metre)]
+"""A length of the detail that a LiDAR sees."""
 Triple = tuple[Finite, Finite, Finite]
 Place = Annotated[Triple, AfterValidator(_on_a_vehicle)]
 PositiveTriple = tuple[Positive, Positive, Positive]

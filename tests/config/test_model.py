@@ -138,10 +138,23 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
         ({"lidars": {"float": lidar(min_range=-1)["front"]}}, "'lidars.float.min_range': "),
         ({"lidars": {"up[1]": lidar(sigma={"xyz": 0})["front"]}}, "'lidars.up[1].sigma.xyz': "),
         ({"solve": 3}, "'solve': must be keys with values (got '3')"),
+        ({"ground": {"vehicle_height": 350}}, "'ground.vehicle_height': must be within 30 m of "
+         "the ground: in metres, not millimetres (got '350')"),
+        ({"ground": {"vehicle_height": -35.0}}, "'ground.vehicle_height': must be within 30 m"),
+        ({"noise": {"lidar_range_m": 10}}, "'noise.lidar_range_m': must be at most 1 m: in metres, "
+         "not millimetres (got '10')"),
+        ({"extraction": {"ground_distance": 50}}, "'extraction.ground_distance': must be at most "),
     ],
 )  # fmt: skip
 def test_what_is_not_valid_is_named_with_its_place(sections: dict[str, Any], part: str) -> None:
     assert part in error_of(**sections)
+
+
+@pytest.mark.parametrize("height_m", [0.0, -0.4, 7.5, 25.0])
+def test_heights_that_vehicles_have(height_m: float) -> None:
+    """Of a frame in the road, of a mining truck, of a container crane."""
+    sections = {"lidars": lidar(), "ground": {"vehicle_height": height_m}}
+    assert Config.model_validate(sections).ground.vehicle_height == height_m
 
 
 @pytest.mark.parametrize("name", ["", " front", "a\nb", "\x1b[31mred", "\u2028", "x" * 101, "\t"])

@@ -88,7 +88,7 @@ class Bag:
         """
         self._path = path
         self._files = _find_files(path)
-        self._is_ros1 = self._files[0].suffix == ".bag"
+        self._is_ros1 = _is_ros1(self._files[0])
         self._stores: dict[str, Typestore] = {}
         # Readers between two passes: opening one may unpack or scan the whole bag.
         self._idle: list[list[_Reader]] = []
@@ -265,7 +265,7 @@ class Bag:
         try:
             for file in self._files:
                 with self._errors_named(file):
-                    reader = Reader1(file) if file.suffix == ".bag" else Reader2(file)
+                    reader = Reader1(file) if _is_ros1(file) else Reader2(file)
                     reader.open()
                     readers.append(reader)
                     _check_index(reader)
@@ -332,6 +332,11 @@ def _has_all_fields(store: Typestore, standard: Typestore) -> bool:
         for name, (_, fields) in store.fielddefs.items()
         if name in standard.fielddefs
     )
+
+
+def _is_ros1(path: Path) -> bool:
+    """Whether one of `_find_files` is a ROS 1 bag; a folder is a ROS 2 bag, by any name."""
+    return path.suffix == ".bag" and path.is_file()
 
 
 def _find_files(path: Path) -> list[Path]:

@@ -323,3 +323,11 @@ def test_two_topics_of_one_number(tmp_path: Path) -> None:
         except RecordingError as e:
             said += str(e)
     assert "has the number of another topic" in said
+
+
+@pytest.mark.parametrize("kind", ["mcap", "mcap-file", "mcap-message", "sqlite3"])
+def test_the_folder_of_a_ros_2_bag_may_be_called_as_a_ros_1_bag(kind: str, tmp_path: Path) -> None:
+    named = write_bag(tmp_path / "drive", messages(), kind).rename(tmp_path / "drive.bag")
+    bag = Bag(named)
+    assert not bag.is_ros1
+    assert len(list(bag.messages(bag.topics))) == len(list(messages()))

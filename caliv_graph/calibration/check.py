@@ -40,6 +40,9 @@ from caliv_graph.uncertainty.consistency import (
 from caliv_graph.wording.contradictions import contradiction_sentence
 from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
 
+_MOTION_INPUTS = ("gnss.", "poses.", "imu.", "twist.", "wheels.", "heading.")
+"""How the names of suspects begin that turn the trajectory, or its heading, themselves."""
+
 
 def _headings(
     trajectories: Sequence[VehicleTrajectory], motions: Mapping[int, MotionData]
@@ -111,7 +114,13 @@ def check(
     sentences += [contradiction_sentence(each, leads) for each in found]
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
-    disagreements = (heading.warning for heading in headings.values() if heading.warning)
+    said = {each.drive for each in found if isinstance(each, consistency.Heading)}
+    turned = leads and suspects[0].input.startswith(_MOTION_INPUTS)
+    disagreements = (
+        heading.warning
+        for index, heading in headings.items()
+        if heading.warning and not turned and drives[index] not in said
+    )
     doubts = filter(None, [doubt_sentence(suspects)])
     return calibration, (*doubts, *disagreements, *untested)
 
@@ -131,7 +140,8 @@ def unexplained(
 ) -> tuple[Contradiction, ...]:
     """The findings that remain once the first suspect is freed, without what its sentence says.
 
-    A guess that is far off has many causes, which its own sentence names. Findings about many
+    A guess that is far off has many causes, which its own sentence names. Heading and course are of
+    one trajectory, which a wrong input of the motion turns. Findings about many
     parameters at once (outliers, coarse registrations) have no suspect of their own, and remain.
     """
     left = {s.input: s.sigmas_left for s in suspects}
@@ -148,6 +158,8 @@ def unexplained(
                 name = f"lidars.{each.lidar}.mount.{each.kind}"
             case Assumed(kind="height"):
                 name = "ground.vehicle_height"
+            case consistency.Heading():
+                return not suspects[0].input.startswith(_MOTION_INPUTS)
             case _:
                 return True
         return left.get(name, math.inf) > consistency.CONTRADICTION_SIGMAS

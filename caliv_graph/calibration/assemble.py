@@ -37,6 +37,12 @@ from caliv_graph.wording.remedies import Evidence
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
 
+MARKS = "drive_marks"
+"""Key of the provenance: marks of the messages of each drive, in the order of the digests."""
+
+SLOW_ERRORS = "slow_errors"
+"""Key of the provenance: correlated errors of the motion data."""
+
 MOTION = "motion"
 """Key of the provenance of drives without motion data: what their poses are by."""
 
@@ -47,11 +53,12 @@ def assemble(
     recordings: Sequence[Recording],
     digests: Sequence[str] = (),
     trajectories: Sequence[VehicleTrajectory] = (),
+    marks: Sequence[Sequence[str]] = (),
 ) -> Calibration:
     """The reported result: every LiDAR of the config, in its order, in right perturbations.
 
-    `recordings` and their `digests` (`drive_digest`) go to the provenance. `trajectories` are those
-    of the drives.
+    `recordings`, their `digests` (`drive_digest`) and `marks` (`drive_marks`) go to the provenance.
+    `trajectories` are those of the drives.
     """
     uncertainty = named(
         assess(
@@ -81,6 +88,8 @@ def assemble(
         lidars_with_structure(solution.structure),
     )
     provenance = _provenance(config, recordings, solution, digests)
+    if any(marks):
+        provenance[MARKS] = [list(of) for of in marks]
     result = replace(
         draft,
         provenance=provenance,
@@ -185,6 +194,24 @@ def _motion(solution: Solution) -> dict[str, str]:
     return {MOTION: text}
 
 
+def _slow_errors(solution: Solution) -> dict[str, object]:
+    """The correlated errors of the motion data that the sigmas allow for, with their source."""
+    levels = [level for level in solution.sensor_noise if level.time_s is not None]
+    if not levels:
+        return {}
+    return {
+        SLOW_ERRORS: [
+            {
+                "name": level.name,
+                "sigma": float(f"{level.sigma:.6g}"),
+                "unit": level.unit,
+                "from": level.source,
+            }
+            for level in levels
+        ]
+    }
+
+
 def _provenance(
     config: Config, recordings: Sequence[Recording], solution: Solution, digests: Sequence[str]
 ) -> dict[str, object]:
@@ -199,6 +226,7 @@ def _provenance(
         "recordings": [Path(r.name).absolute().name for r in recordings],
         **({DRIVES: list(digests)} if digests else {}),
         **_motion(solution),
+        **_slow_errors(solution),
         **({} if solution.pose_noise is None else {"pose_noise": asdict(solution.pose_noise)}),
         "registration_scale": solution.registration_scale,
         "iterations": solution.iterations,

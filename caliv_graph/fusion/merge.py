@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.compare import ALPHA, Comparison, compare_terms
+from caliv_graph.fusion.marks import are_one, marked_drives
 from caliv_graph.fusion.terms import Fused, brought_to, fuse, guess_of, own_term
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Calibration, DataTerm, Guess, LidarResult
@@ -65,6 +67,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
     first = next(iter(calibrations.values()))
     own = {label: own_term(c, label) for label, c in calibrations.items()}
     terms = _every_drive_once(own, calibrations)
+    _check_copies(calibrations)
     guesses = _first_guesses(calibrations)
     agreement = _agreement(own, terms, guesses, first.reference, p_value)
     modes = {c.provenance.get("mode") for c in calibrations.values()}
@@ -129,7 +132,12 @@ def _together_per_lidar(
     return out
 
 
-def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) -> Config:
+def starting_from(
+    config: Config,
+    prior: Calibration,
+    digests: Sequence[str],
+    marks: Sequence[Sequence[str]] = (),
+) -> Config:
     """The config with the extrinsics of an earlier calibration as initial guesses.
 
     Their sigmas stay those of the config, because a mount may have moved since.
@@ -138,6 +146,7 @@ def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) ->
         config: the config.
         prior: the earlier calibration.
         digests: digests of the drives to calibrate.
+        marks: of each of these drives (`marks.drive_marks`).
 
     Raises:
         ConfigError: the earlier calibration is of the same drive or has none of the LiDARs, or the
@@ -149,7 +158,9 @@ def starting_from(config: Config, prior: Calibration, digests: Sequence[str]) ->
             "Set solve.mode to auto or joint"
         )
     known = {source for term in prior_terms(prior) for source in term.sources}
-    if known & set(digests):
+    earlier = marked_drives(prior.provenance).values()
+    again = any(are_one(frozenset(of), other) for of in marks for other in earlier)
+    if again or known & set(digests):
         raise ConfigError(
             "--prior: is a result of the drive that is to be calibrated, which would count twice. "
             "Give a calibration of another drive"
@@ -192,7 +203,9 @@ def with_earlier(
     """
     own = own_term(calibration, "this drive")
     terms = prior_terms(prior)
-    guesses = {name: guess_of(calibration, name) for name in calibration.lidars}
+    # What the new drive found is no guess: then that of the earlier file is the one.
+    stated = _first_guesses({"this drive": calibration, "--prior": prior})
+    guesses = {name: stated[name] for name in calibration.lidars}
     before = _together(terms, {name: guess_of(prior, name) for name in prior.lidars} | guesses)
     comparison = compare_terms((before, own), (guesses, guesses), calibration.reference, p_value)
     mode = "joint" if calibration.provenance.get("mode") == "joint" else "auto"
@@ -325,6 +338,23 @@ def _every_drive_once(
             from_label |= dict.fromkeys(term.sources, f"{label} (--prior)")
             terms.append(term)
     return terms
+
+
+def _check_copies(calibrations: Mapping[str, Calibration]) -> None:
+    """Raises `ConfigError` if drives of two calibrations are copies or parts of one recording.
+
+    A drive that both name by the same digest counts once already.
+    """
+    marked = {label: marked_drives(c.provenance) for label, c in calibrations.items()}
+    for (one, of_one), (other, of_other) in itertools.combinations(marked.items(), 2):
+        for digest, marks in of_one.items():
+            for again, same in of_other.items():
+                if digest != again and are_one(marks, same):
+                    raise ConfigError(
+                        f"{other}: stems from the same drive as {one}, as another copy or part of "
+                        f"it: {len(marks & same)} of {min(len(marks), len(same))} messages that "
+                        "were compared are the same. It would count twice. Leave one of them out"
+                    )
 
 
 def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:

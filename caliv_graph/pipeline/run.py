@@ -19,6 +19,7 @@ from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_of
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
+from caliv_graph.fusion.marks import drive_marks
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.physics import (
@@ -73,7 +74,8 @@ def _calibrate(
     recordings = sampled = [SampledRecording(recording) for recording in recordings]
     motions, used, notes = motions_of(recordings, config, progress)
     digests = [drive_digest(motion) for motion in motions.values()]
-    guessed = used if prior is None else starting_from(used, prior, digests)
+    marks = [drive_marks(motion) for motion in motions.values()]
+    guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
     prepared = prepare(recordings, guessed, motions, progress)
     try:
@@ -89,7 +91,12 @@ def _calibrate(
         raise without_anything(prepared, error) from error
     with progress.stage("checking the result", None):
         calibration = assemble(
-            solution, with_found_of(config, prepared.config), recordings, digests, trajectories
+            solution,
+            with_found_of(config, prepared.config),
+            recordings,
+            digests,
+            trajectories,
+            marks,
         )
         calibration, doubts = check(
             calibration,

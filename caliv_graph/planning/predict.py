@@ -235,7 +235,7 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(
-            *_warnings(planned, seen, lidars, assumptions.time_offset),
+            *_warnings(planned, seen, lidars, guesses, assumptions.time_offset),
             *undetermined_offset_sentences(offsets_s, OFFSET_DETERMINED_S),
         ),
     )
@@ -280,14 +280,15 @@ def _warnings(
     planned: Sequence[tuple[Scenario, Route]],
     seen: Sequence[Sequence[Sighting]],
     lidars: Sequence[str],
+    guesses: Mapping[str, Guess],
     time_offset: bool,
 ) -> Iterable[str]:
     for name in planned[0][0].lidars:
         if name not in lidars:
-            yield (
-                f"lidar '{name}' never sees a target or a wall often enough: it keeps its initial "
-                "guess"
-            )
+            then = "it keeps its initial guess"
+            if guesses[name].found:
+                then = "its extrinsics stay unknown, because it has no initial guess"
+            yield f"lidar '{name}' never sees a target or a wall often enough: {then}"
     for scenario, _ in planned:
         for placement in placements(scenario):
             if placement.is_round:

@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup
 
 import caliv_graph
+from caliv_graph.calibration.assemble import MARKS
 from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.config.load import dump_config
 from caliv_graph.config.model import Config
@@ -301,6 +302,7 @@ def _inputs(calibration: Calibration) -> list[tuple[str, str]]:
     return [
         (key, str(item))
         for key, value in calibration.provenance.items()
+        if key != MARKS
         for item in (value if isinstance(value, list) else [value])
     ]
 

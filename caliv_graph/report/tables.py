@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from caliv_graph.calibration.assemble import SLOW_ERRORS
 from caliv_graph.common.progress import StageRecord, count_text
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Calibration, Direction
@@ -53,6 +54,9 @@ def calibration_table(
     parts += titled(
         "Sensor to vehicle: T_vehicle_lidar and 1 sigma in vehicle axes", _extrinsics(calibration)
     )
+    slow = slow_errors_text(calibration.provenance)
+    if slow:
+        parts.append(Text(slow))
     if len(calibration.lidars) > 1:
         parts += titled(
             "Sensor to sensor: T_to_from and 1 sigma in the axes of 'to'",
@@ -90,6 +94,25 @@ def calibration_table(
     if seconds is not None:
         parts += titled("Time", _times(stages, seconds))
     return Group(*parts)
+
+
+def slow_errors_text(provenance: Mapping[str, Any]) -> str:
+    """Which slow errors of the motion data the sigmas allow for, and whence they are; or nothing.
+
+    With few fixes they are assumed, and may be smaller than what more fixes would show.
+    """
+    said = []
+    for level in provenance.get(SLOW_ERRORS, ()):
+        what = (
+            str(level["name"]).replace("_correlated", "").replace("_", " ").replace("gnss", "GNSS")
+        )
+        unit = "mm" if level["unit"] == "m" else "mrad"
+        source = str(level["from"])
+        from_ = "estimated from the drive" if source.startswith("residuals") else source
+        said.append(f"{what} {1e3 * float(level['sigma']):.2g} {unit} ({from_})")
+    if not said:
+        return ""
+    return f"The S2V sigmas allow for slow errors of the motion data: {', '.join(said)}."
 
 
 def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) -> RenderableType:

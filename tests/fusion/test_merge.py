@@ -150,11 +150,11 @@ def test_a_guess_given_for_one_drive_is_enough_for_both() -> None:
     given = drive(arc_information(NAMES), source="a")
     found = on_an_arc_without_guesses("b")
 
-    result = merged(found, given)
-
-    sigma, of_given = (np.sqrt(np.diag(in_vehicle_axes(c, c.cov_joint))) for c in (result, given))
-    assert sigma[[2, 3, 8, 9]] == pytest.approx(of_given[[2, 3, 8, 9]], rel=0.05)
-    assert result.lidars["front"].determined == given.lidars["front"].determined
+    for result in (merged(found, given), with_earlier(found, given)[0]):
+        both = [np.sqrt(np.diag(in_vehicle_axes(c, c.cov_joint))) for c in (result, given)]
+        sigma, of_given = both
+        assert sigma[[2, 3, 8, 9]] == pytest.approx(of_given[[2, 3, 8, 9]], rel=0.05)
+        assert result.lidars["front"].determined == given.lidars["front"].determined
 
 
 def test_arcs_to_both_sides_need_no_guess() -> None:
@@ -252,6 +252,26 @@ def test_drives_count_once() -> None:
         merged(first, drive(D, source="a"))
     with pytest.raises(ConfigError, match=r"c\.yaml: stems from the same drive as a\.yaml"):
         merged(first, drive(D, source="b"), merged(drive(D, source="c"), first))
+
+
+def test_a_copy_of_a_recording_does_not_count_twice() -> None:
+    """A copy without a topic or cut in time has another digest, and the same messages."""
+    whole, part, others = ([f"m{n:012x}" for n in of] for of in (range(16), range(10), (99, 0)))
+
+    def of_drive(source: str, marks: list[str]) -> Calibration:
+        made = drive(information(NAMES), source=source)
+        return replace(made, provenance={**made.provenance, "drive_marks": [marks]})
+
+    first, copy, another = of_drive("a", whole), of_drive("b", part), of_drive("c", others)
+    said = r"b\.yaml: stems from the same drive as a\.yaml.*: 10 of 10 messages"
+    with pytest.raises(ConfigError, match=said):
+        merged(first, copy)
+    with pytest.raises(ConfigError, match="stems from the same drive"):
+        merged(merged(first, another), copy)
+    with pytest.raises(ConfigError, match="is a result of the drive that is to be calibrated"):
+        starting_from(config(), first, ["b"], [part])
+    assert merged(first, another).status == "ok"
+    assert starting_from(config(), first, ["c"], [others]).lidars
 
 
 def test_files_that_name_no_drive_are_told_apart_by_what_they_say(tmp_path: Path) -> None:

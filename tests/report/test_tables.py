@@ -21,7 +21,7 @@ from caliv_graph.report.inspection import (
     TargetSummary,
 )
 from caliv_graph.report.inspection_table import inspection_table
-from caliv_graph.report.tables import calibration_table, evaluation_table
+from caliv_graph.report.tables import calibration_table, evaluation_table, slow_errors_text
 from caliv_graph.uncertainty.evaluation import evaluate
 from tests.samples import make_calibration, unseen
 
@@ -266,3 +266,13 @@ def test_what_a_recording_holds() -> None:
     seen = "target 1 near (15.0, -9.0, 0.5) m in the map"
     assert " ".join(cells(lines, "front", after=seen)) == "3 4.0 to 9.5 10 / 20 / 30 3 to 5, 11"
     assert cells(lines, "rear", after=seen) == ["0", "-", "-", "never"]
+
+
+def test_slow_errors_are_said_with_their_source() -> None:
+    level = {"name": "gnss_correlated_horizontal", "sigma": 0.0525, "unit": "m"}
+    known = {"slow_errors": [{**level, "from": "residuals of the LiDARs"}]}
+    text = slow_errors_text(known)
+    assert text.endswith("of the motion data: GNSS horizontal 52 mm (estimated from the drive).")
+    open_ = {"slow_errors": [{**level, "sigma": 0.0124, "from": "expected: LiDARs leave it open"}]}
+    assert "GNSS horizontal 12 mm (expected: LiDARs leave it open)" in slow_errors_text(open_)
+    assert slow_errors_text({}) == ""

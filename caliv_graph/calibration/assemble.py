@@ -32,7 +32,7 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.uncertainty.assemble import assemble_matrices
 from caliv_graph.uncertainty.observability import assess, limited_axes
 from caliv_graph.wording.directions import named, same_as_parameters
-from caliv_graph.wording.remedies import Evidence
+from caliv_graph.wording.remedies import Evidence, with_height_set
 
 DRIVES = "drive_sha256"
 """Key of the provenance: digests of the drives a calibration was made from."""
@@ -70,6 +70,12 @@ def assemble(
         solution.T_vehicle_lidar,
         evidence_of_terms(solution.structure, bool(solution.registrations)),
     )
+    if config.ground.use and config.ground.vehicle_height is not None:
+        undetermined, weak = (
+            tuple(with_height_set(direction, config.ground.sigma) for direction in directions)
+            for directions in (uncertainty.undetermined, uncertainty.weak)
+        )
+        uncertainty = replace(uncertainty, undetermined=undetermined, weak=weak)
     uncertainty = same_as_parameters(
         uncertainty, solution.information_data, solution.information_knowing
     )

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from caliv_graph.products import LidarResult
+from caliv_graph.products import Direction, LidarResult
 
 Evidence = Literal["target", "structure", "both", "odometry"]
 """What the LiDARs see: a target, walls and other structure, or both; or structure of a drive that
@@ -140,6 +140,21 @@ REMEDIES: dict[Evidence, Remedies] = {
     "both": OF_BOTH,
     "odometry": OF_ODOMETRY,
 }
+
+
+_HEIGHT = "measure the height of the vehicle frame above the ground and set ground.vehicle_height "
+
+
+def with_height_set(direction: Direction, sigma_m: float) -> Direction:
+    """A direction whose remedy does not ask for the height of the vehicle, which the config has."""
+    if not direction.remedy.startswith(_HEIGHT):
+        return direction
+    _, _, manoeuvre = direction.remedy.partition(", or ")
+    remedy = (
+        f"measure ground.vehicle_height better than its ground.sigma of {1e3 * sigma_m:.3g} mm, "
+        "and set both"
+    )
+    return replace(direction, remedy=f"{remedy}, or {manoeuvre}" if manoeuvre else remedy)
 
 
 def evidence_of(lidars: Iterable[LidarResult], odometry: bool = False) -> Evidence:

@@ -119,10 +119,11 @@ def solution_residuals(solution: Solution) -> tuple[Residuals, ...]:
 def trajectory_residuals(trajectory: SmoothedTrajectory) -> tuple[Residuals, ...]:
     """Residuals of a smoothed trajectory, by sensor, without dropped GNSS fixes."""
     found: dict[str, list[gtsam.NonlinearFactor]] = defaultdict(list)
-    for index, kind in enumerate(trajectory.factor_kinds):
-        found[kind].append(trajectory.graph.at(index))
+    estimate = trajectory.estimate()
+    for index, kind in enumerate(estimate.graph.kinds):
+        found[kind].append(estimate.graph.factors.at(index))
     return tuple(
-        _of_factors(*_TRAJECTORY_KINDS[kind], found[kind], trajectory.values)
+        _of_factors(*_TRAJECTORY_KINDS[kind], found[kind], estimate.values)
         for kind in _TRAJECTORY_KINDS
         if kind in found
     )
@@ -142,11 +143,12 @@ def all_residuals(solution: Solution, record: RunRecord) -> tuple[Residuals, ...
 def gnss_residuals(trajectory: SmoothedTrajectory) -> tuple[IntArray, Array]:
     """Stamps (k,) of the nodes with GNSS fixes, and residuals (k, 3) in metres, map axes."""
     nodes, residuals = [], []
-    for index, kind in enumerate(trajectory.factor_kinds):
+    estimate = trajectory.estimate(frozenset({"gnss"}))
+    for index, kind in enumerate(estimate.graph.kinds):
         if kind == "gnss":
-            factor = trajectory.graph.at(index)
+            factor = estimate.graph.factors.at(index)
             nodes.append(gtsam.symbolIndex(factor.keys()[0]))
-            residuals.append(_errors(factor, trajectory.values)[1])
+            residuals.append(_errors(factor, estimate.values)[1])
     stamps = trajectory.nodes_ns[np.array(nodes, dtype=np.int64)]
     return stamps, np.array(residuals).reshape(-1, 3)
 

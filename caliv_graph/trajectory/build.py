@@ -29,7 +29,7 @@ from caliv_graph.trajectory.imu import preintegrate
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
-from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.states import States, without_bias
 from caliv_graph.trajectory.wheels import level_sigmas, normal_of
 
 GAUGE_M = 1e-4
@@ -98,6 +98,23 @@ def build_graph(
     if data.positions is None:
         _add_gauge_prior(graph, data, states)
     return graph if kinds == KINDS else graph.only(kinds)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A solved graph, and the estimate.
+
+    Attributes:
+        states: the estimate.
+        graph: the factors.
+        values: the estimate, as values of the graph.
+        built_with: whose biases integrated and carried the measurements of the graph.
+    """
+
+    states: States
+    graph: TrajectoryGraph
+    values: gtsam.Values
+    built_with: States
 
 
 def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, states: States) -> None:

@@ -12,13 +12,14 @@ import gtsam
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values
+from caliv_graph.trajectory.build import Estimate, TrajectoryGraph, build_graph, from_values
 from caliv_graph.trajectory.factors import position_residuals, velocity_residuals
 from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, without_bias
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.states import States, without_bias
 
 
 def parameter_columns(
@@ -69,14 +70,16 @@ def parameter_columns(
     return out
 
 
-def columns_of(smoothed: SmoothedTrajectory, parameters: Sequence[InputParameter]) -> Array:
-    """`parameter_columns` of a smoothed trajectory, at its estimate."""
+def columns_of(
+    smoothed: SmoothedTrajectory, estimate: Estimate, parameters: Sequence[InputParameter]
+) -> Array:
+    """`parameter_columns` of a smoothed trajectory, at its `estimate()`."""
     return parameter_columns(
         smoothed.data,
         smoothed.nodes_ns,
         smoothed.states,
-        TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds)),
-        smoothed.values,
+        estimate.graph,
+        estimate.values,
         smoothed.gnss_dropped,
         parameters,
     )

@@ -15,12 +15,12 @@ import scipy.sparse
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import build_graph, from_values
+from caliv_graph.trajectory.build import Estimate, build_graph, from_values
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import solved
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised
-from caliv_graph.trajectory.solve import Estimate, step_of, without_right_side
+from caliv_graph.trajectory.solve import step_of, without_right_side
 from caliv_graph.trajectory.uncertain import Settled, moved
 
 
@@ -81,7 +81,11 @@ def step_with_errors(
         of = [p.parameter for p in parameters]
         columns = parameter_columns(data, nodes, states, graph, values, dropped, of)
     after = Settled(
-        data, Estimate(states, graph, values), parameters, columns, found.cov_corner[first:, first:]
+        data,
+        Estimate(states, graph, values, states),
+        parameters,
+        columns,
+        found.cov_corner[first:, first:],
     )
     linear = graph.factors.linearize(values)
     estimated = by_node[:, STATE:]

@@ -56,9 +56,10 @@ def error_effects(
     i = trajectory.node_indices(stamps_ns)
     n, width = len(trajectory.nodes_ns), STATE + AXES * len(kinds)
     common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]
-    linear = trajectory.graph.linearize(trajectory.values)
-    R = trajectory.states.R_map_imu
-    J, _ = linearised(linear, trajectory.factor_kinds, kinds, R, common)
+    estimate, R = trajectory.estimate(), trajectory.states.R_map_imu
+    linear = estimate.graph.factors.linearize(estimate.values)
+    J, _ = linearised(linear, estimate.graph.kinds, kinds, R, common)
+    del estimate, linear
     both = Chain.zero(n, width, len(common))
     both.add(J)
     wanted = (STATE * i[:, None] + np.arange(POSE)).ravel()
@@ -100,14 +101,16 @@ def poses_and_gain(
     i, of = smoothed.node_indices(stamps_ns), [p.parameter for p in parameters]
     n, width = len(smoothed.nodes_ns), STATE + AXES * len(kinds)
     common = [] if smoothed.yaw_bias is None else [key_yaw_bias()]
-    linear = smoothed.graph.linearize(smoothed.values)
-    R = smoothed.states.R_map_imu
-    J, r = linearised(linear, smoothed.factor_kinds, kinds, R, common)
-    columns = columns_of(smoothed, of)
+    estimate, R = smoothed.estimate(), smoothed.states.R_map_imu
+    linear = estimate.graph.factors.linearize(estimate.values)
+    J, r = linearised(linear, estimate.graph.kinds, kinds, R, common)
+    columns = columns_of(smoothed, estimate, of)
+    del estimate, linear
     with_right = Chain.zero(n, width, len(common) + columns.shape[1] + 1)
     with_right.add(beside(beside(J, columns), -r[:, None]))
     chain = with_right.leading(STATE)
-    joint = replace(smoothed, chain=chain, parameters=parameters).joint(stamps_ns)
+    with_suspects = replace(smoothed, chain=chain, chain_nodes=None, parameters=parameters)
+    joint = with_suspects.joint(stamps_ns)
     own = np.arange(len(common) + columns.shape[1])
     both = replace(
         with_right,

@@ -24,7 +24,8 @@ from caliv_graph.trajectory.effects import STEP_NS, ErrorsByStep, error_steps
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import rotated, rotations_of, usable_orientations
 from caliv_graph.trajectory.noise import orientation_covariances
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory, first_nodes
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.states import first_nodes
 from caliv_graph.trajectory.suspects import suspect_parameters
 from caliv_graph.trajectory.variances import NODES
 

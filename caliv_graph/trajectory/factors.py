@@ -18,7 +18,7 @@ import scipy.sparse
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.smoothed import States
+from caliv_graph.trajectory.states import States
 
 NoiseModel = gtsam.noiseModel.Base
 

@@ -18,7 +18,7 @@ from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpo
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
-from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.states import States, without_bias
 
 STANDSTILL_S = 1.0
 """Length of the windows that are tested for standstill."""

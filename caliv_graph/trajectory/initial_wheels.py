@@ -13,7 +13,7 @@ from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.kinematics import Windows, antenna_windows
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.nodes import carry_to_nodes
-from caliv_graph.trajectory.smoothed import States
+from caliv_graph.trajectory.states import States
 
 MIN_SPEED_M_S = 0.5
 """Slower, the course of an antenna is noise."""

@@ -18,7 +18,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.imu import interpolate
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.smoothed import States, without_bias
+from caliv_graph.trajectory.states import States, without_bias
 
 MIN_SPEED_M_S = 0.5
 """Slower, the direction of the velocity is noise."""

@@ -10,10 +10,11 @@ from scipy.special import chdtri
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, IntArray
+from caliv_graph.trajectory.build import Estimate
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import positions_at_nodes
-from caliv_graph.trajectory.smoothed import States, without_bias
-from caliv_graph.trajectory.solve import ERROR_TOLERANCE, ROUGH_TOLERANCE, Estimate, solve
+from caliv_graph.trajectory.solve import ERROR_TOLERANCE, ROUGH_TOLERANCE, solve
+from caliv_graph.trajectory.states import States, without_bias
 
 OUTLIER_P_VALUE = 1e-6
 """Probability of a larger squared residual under white noise, at which a fix is an outlier: less

@@ -27,7 +27,7 @@ from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.outliers import dropped_warnings, solve_without_outliers
 from caliv_graph.trajectory.parameters import UncertainParameter
-from caliv_graph.trajectory.smoothed import SmoothedTrajectory, States, poses_of_vehicle
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
     ROUGH_TOLERANCE,
     chain_of,
@@ -35,6 +35,7 @@ from caliv_graph.trajectory.solve import (
     solve,
     solve_from_the_start,
 )
+from caliv_graph.trajectory.states import States, poses_of_vehicle
 from caliv_graph.trajectory.uncertain import (
     Settled,
     are_wide,
@@ -93,6 +94,9 @@ def smooth_trajectory(
     cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
     last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)
     data, estimate = last.settled.data, last.settled.estimate
+    # Only those at wanted stamps are asked for: the memory of the others grows with the drive.
+    kept = np.unique(nearest_node(nodes, wanted)) if len(wanted) else None
+    chain = last.chain if kept is None else last.chain.only(kept)
     warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, last.cov),
@@ -106,9 +110,8 @@ def smooth_trajectory(
         yaw_bias=None if yaw_sigma is None else (estimate.states.yaw_bias_rad, yaw_sigma),
         gnss_rejected=robust.dropped if positions is None else positions.stamps_ns[robust.dropped],
         origin_deg_m=None if positions is None else positions.origin_deg_m,
-        graph=estimate.graph.factors,
-        values=estimate.values,
-        chain=last.chain,
+        built_with=estimate.built_with,
+        chain=chain,
         inertial=data.inertial,
         data=data,
         gnss_dropped=robust.dropped,
@@ -117,6 +120,7 @@ def smooth_trajectory(
         parameter_cov=last.settled.cov,
         correlated=tuple(errors),
         errors=last.errors,
+        chain_nodes=kept,
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -15,66 +15,14 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import cross, stack
 from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.readers.common_stamps import MERGE_NS
+from caliv_graph.trajectory.build import KINDS, Estimate, build_graph, to_values
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
-from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, interpolate, log_so3
+from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
-
-
-@dataclass(frozen=True)
-class States:
-    """An estimate of all nodes.
-
-    Attributes:
-        R_map_imu: (n, 3, 3).
-        p_map_imu: (n, 3) metres.
-        velocity_map: (n, 3) m/s of the IMU's origin.
-        force_bias: (n, 3) m/s^2, imu frame.
-        gyro_bias: (n, 3) rad/s, imu frame.
-        yaw_bias_rad: of the orientation source; 0 if not estimated.
-    """
-
-    R_map_imu: Array
-    p_map_imu: Array
-    velocity_map: Array
-    force_bias: Array
-    gyro_bias: Array
-    yaw_bias_rad: float = 0.0
-
-
-def first_nodes(states: States, n: int) -> States:
-    """The estimate of the first n nodes."""
-    return replace(
-        states,
-        R_map_imu=states.R_map_imu[:n],
-        p_map_imu=states.p_map_imu[:n],
-        velocity_map=states.velocity_map[:n],
-        force_bias=states.force_bias[:n],
-        gyro_bias=states.gyro_bias[:n],
-    )
-
-
-def poses_of_vehicle(
-    states: States, nodes: IntArray, T_vehicle_imu: gtsam.Pose3
-) -> tuple[gtsam.Pose3, ...]:
-    """T_map_vehicle of some nodes, by their indices."""
-    T_imu_vehicle = T_vehicle_imu.inverse()
-    return tuple(
-        gtsam.Pose3(gtsam.Rot3(R), p).compose(T_imu_vehicle)
-        for R, p in zip(states.R_map_imu[nodes], states.p_map_imu[nodes], strict=True)
-    )
-
-
-def without_bias(inertial: Inertial, nodes_ns: IntArray, states: States) -> DeadReckoning:
-    """Dead reckoning with the biases of an estimate, linear between nodes."""
-    at = inertial.stamps_ns
-    return DeadReckoning(
-        at,
-        inertial.gyro - interpolate(at, nodes_ns, states.gyro_bias),
-        inertial.force - interpolate(at, nodes_ns, states.force_bias),
-    )
+from caliv_graph.trajectory.states import States, poses_of_vehicle, without_bias
 
 
 def within_span(
@@ -133,8 +81,7 @@ class SmoothedTrajectory:
         yaw_bias: (value, sigma) in radians of the orientation source, if estimated.
         gnss_rejected: (k,) stamps of fixes that were dropped as outliers.
         origin_deg_m: latitude, longitude and altitude of the map's origin, None without GNSS.
-        graph: the factors, over T_map_imu (i), velocity (v), bias (b), yaw bias (y).
-        values: the estimate, as values of the graph.
+        built_with: whose biases integrated and carried the measurements of the graph.
         chain: the graph's information at the estimate.
         inertial: the IMU samples used.
         data: the input as it was used, its parameters and the noise of the fixes as estimated.
@@ -145,6 +92,8 @@ class SmoothedTrajectory:
         correlated: errors of sensors that are correlated over time. States and chain contain them,
             the chain as the last coordinates of every state; the graph does not.
         errors: (n, 3 e) their estimates at the nodes, metres or radians, map axes.
+        chain_nodes: (m,) indices of the nodes whose states the chain has, ascending, all others
+            being eliminated; None: it has all.
     """
 
     trajectory: Trajectory
@@ -158,8 +107,7 @@ class SmoothedTrajectory:
     yaw_bias: tuple[float, float] | None
     gnss_rejected: IntArray
     origin_deg_m: tuple[float, float, float] | None
-    graph: gtsam.NonlinearFactorGraph = field(repr=False)
-    values: gtsam.Values = field(repr=False)
+    built_with: States = field(repr=False)
     chain: Chain = field(repr=False)
     inertial: Inertial = field(repr=False)
     data: SmootherInput = field(repr=False)
@@ -169,6 +117,7 @@ class SmoothedTrajectory:
     parameter_cov: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     correlated: tuple[CorrelatedError, ...] = ()
     errors: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    chain_nodes: IntArray | None = field(default=None, repr=False)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -179,6 +128,22 @@ class SmoothedTrajectory:
     def open_kinds(self) -> list[str]:
         """Sensors whose errors may be correlated over time; none where such errors are in use."""
         return [] if self.correlated else [kind for kind in MOVES if kind in self.factor_kinds]
+
+    def estimate(self, kinds: Set[str] = KINDS) -> Estimate:
+        """The factors of some kinds, and the estimate as values; made anew at every call.
+
+        Over T_map_imu (i), velocity (v), bias (b), yaw bias (y). A graph takes 4 MB per minute of
+        drive: who needs it shall not keep it.
+        """
+        graph = build_graph(
+            self.data,
+            self.nodes_ns,
+            self.built_with,
+            self.gnss_dropped,
+            self.data.config.robust.kernel,
+            kinds,
+        )
+        return Estimate(self.states, graph, to_values(self.states, self.data), self.built_with)
 
     @cached_property
     def _dead(self) -> DeadReckoning:
@@ -253,7 +218,8 @@ class SmoothedTrajectory:
     def bias_sigmas(self) -> tuple[Array, Array]:
         """1 sigma of the biases at the nodes: (n, 3) m/s^2 and (n, 3) rad/s, imu frame."""
         n = len(self.nodes_ns)
-        linear = self.graph.linearize(self.values)
+        estimate = self.estimate()
+        linear = estimate.graph.factors.linearize(estimate.values)
         marginals = Marginals(linear, node_ordering(n, self.yaw_bias is not None))
         cov = marginals.covariances([key_bias(i) for i in range(n)])
         sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -336,6 +302,12 @@ class SmoothedTrajectory:
             start += p.parameter.size
         kept = [k for name in names for k in at[name]]
         held = [k for name in at if name not in names for k in at[name]]
+        if self.chain_nodes is not None:
+            places = np.searchsorted(self.chain_nodes, nodes)
+            there = self.chain_nodes[np.minimum(places, len(self.chain_nodes) - 1)] == nodes
+            if not there.all():
+                raise KeyError(int(self.nodes_ns[nodes[np.argmin(there)]]))
+            nodes = np.asarray(places, np.int64)
         return self.chain.pose_information(nodes, [*kept, start], held)
 
     def _substitution(self, m: int, parameters: Sequence[InputParameter]) -> scipy.sparse.csr_array:

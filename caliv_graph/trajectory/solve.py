@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -12,14 +11,14 @@ import numpy as np
 from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import TrajectoryGraph, build_graph, from_values, to_values
+from caliv_graph.trajectory.build import Estimate, build_graph, from_values, to_values
 from caliv_graph.trajectory.chain import STATE, Chain
 from caliv_graph.trajectory.chain_solution import solved_columns
 from caliv_graph.trajectory.initial import extended_states
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.measurements import rotated
-from caliv_graph.trajectory.smoothed import States
+from caliv_graph.trajectory.states import States
 
 MAX_PASSES = 4
 """Preintegration and carrying are repeated with the new biases at most this often. Two passes do
@@ -58,15 +57,6 @@ MAX_YAW_SIGMA_RAD = 0.2
 MAX_POSITION_SIGMA_M = 10.0
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A solved graph, built with the biases of the estimate before, and the estimate."""
-
-    states: States
-    graph: TrajectoryGraph
-    values: gtsam.Values
-
-
 def solve_from_the_start(data: SmootherInput, nodes: IntArray, states: States) -> States:
     """Extends an estimate of the first nodes to all nodes, doubling its length after every solve.
 
@@ -101,10 +91,10 @@ def solve(
         found = from_values(values, len(nodes), data)
         gyro_change = np.abs(found.gyro_bias - states.gyro_bias).max()
         force_change = np.abs(found.force_bias - states.force_bias).max()
-        states = found
+        built_with, states = states, found
         if gyro_change < GYRO_BIAS_CHANGE_RAD_S and force_change < FORCE_BIAS_CHANGE_M_S2:
             break
-    return Estimate(states, graph, values)
+    return Estimate(states, graph, values, built_with)
 
 
 def optimise(

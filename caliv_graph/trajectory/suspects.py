@@ -122,10 +122,11 @@ def misfit(smoothed: SmoothedTrajectory) -> float:
     outliers do not matter, and a single wrong input is small in most of them.
     """
     squares: dict[str, list[float]] = {kind: [] for kind in ("gnss", "velocity", "orientation")}
-    for number, kind in enumerate(smoothed.factor_kinds):
+    estimate = smoothed.estimate()
+    for number, kind in enumerate(estimate.graph.kinds):
         if kind in squares:
-            factor: Any = smoothed.graph.at(number)
-            residual = factor.unwhitenedError(smoothed.values)
+            factor: Any = estimate.graph.factors.at(number)
+            residual = factor.unwhitenedError(estimate.values)
             white = factor.noiseModel().unweightedWhiten(residual)
             squares[kind].append(float(white @ white))
     usual = float(chdtri(3, 0.5))

@@ -16,7 +16,7 @@ import numpy as np
 from caliv_graph.conventions import key_imu, key_parameters
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
-from caliv_graph.trajectory.build import from_values
+from caliv_graph.trajectory.build import Estimate, from_values
 from caliv_graph.trajectory.chain import UNDETERMINED, inverse_of
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
@@ -33,7 +33,7 @@ from caliv_graph.trajectory.parameters import (
     mount_rotation,
     speed_scale,
 )
-from caliv_graph.trajectory.solve import ERROR_TOLERANCE, Estimate, solve
+from caliv_graph.trajectory.solve import ERROR_TOLERANCE, solve
 
 MAX_STEPS = 15
 """Of the parameters. Sound figures take one or two; a lever arm that is unknown about five, under

@@ -39,7 +39,7 @@ from caliv_graph.trajectory.parameters import (
     mount_rotation,
     speed_scale,
 )
-from caliv_graph.trajectory.smoothed import States, first_nodes
+from caliv_graph.trajectory.states import States, first_nodes
 from caliv_graph.trajectory.wheels import is_planar
 
 COMPONENTS: Mapping[str, tuple[str, tuple[int, ...]]] = {

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from caliv_graph.trajectory.build import TrajectoryGraph
 from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.correlated_step import chain_with_errors
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.solve import Estimate, chain_of
+from caliv_graph.trajectory.solve import chain_of
 from caliv_graph.trajectory.uncertain import Settled
 
 
@@ -27,15 +26,14 @@ def with_parameters(
     if not more:
         return smoothed
     every = (*smoothed.parameters, *more)
-    columns = columns_of(smoothed, [p.parameter for p in every])
-    linear = smoothed.graph.linearize(smoothed.values)
+    estimate = smoothed.estimate()
+    columns = columns_of(smoothed, estimate, [p.parameter for p in every])
+    linear = estimate.graph.factors.linearize(estimate.values)
     if smoothed.correlated:
-        graph = TrajectoryGraph(smoothed.graph, list(smoothed.factor_kinds))
-        estimate = Estimate(smoothed.states, graph, smoothed.values)
         settled = Settled(smoothed.data, estimate, every, columns)
         chain = chain_with_errors(
             settled, linear, smoothed.nodes_ns, smoothed.correlated, smoothed.errors
         )
     else:
         chain = chain_of(linear, len(smoothed.nodes_ns), smoothed.data.yaw_bias, columns)
-    return replace(smoothed, chain=chain, parameters=every)
+    return replace(smoothed, chain=chain, chain_nodes=None, parameters=every)

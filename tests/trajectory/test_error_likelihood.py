@@ -41,7 +41,8 @@ def test_it_is_the_likelihood_of_the_longer_chain(monkeypatch: pytest.MonkeyPatc
     part = type(graph)()
     for i in inside:
         part.push_back(graph.at(i))
-    linear, kinds = part.linearize(trajectory.values), [trajectory.factor_kinds[i] for i in inside]
+    values, kinds = trajectory.estimate().values, [trajectory.factor_kinds[i] for i in inside]
+    linear = part.linearize(values)
     nodes, R = trajectory.nodes_ns[:NODES], trajectory.states.R_map_imu[:NODES]
     columns = np.random.default_rng(0).standard_normal((sum(_rows(linear)), 1))
     found = eliminated(

@@ -21,7 +21,7 @@ from caliv_graph.trajectory.factors import (
     velocity_factor,
     velocity_residuals,
 )
-from caliv_graph.trajectory.smoothed import States
+from caliv_graph.trajectory.states import States
 
 POSE, VELOCITY, BIAS = 0, 1, 2
 UNIT = gtsam.noiseModel.Unit.Create(3)

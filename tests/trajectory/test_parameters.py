@@ -47,11 +47,13 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
     huber = smooth_trajectory(
         MOTION, config_of({"robust": {"kernel": "huber", "huber_k": 0.7}}), WANTED
     )
-    linear = huber.graph.linearize(huber.values)
+    estimate = huber.estimate()
+    graph, values = estimate.graph.factors, estimate.values
+    linear = graph.linearize(values)
     weights = []
-    for number in range(huber.graph.size()):
-        factor: Any = huber.graph.at(number)
-        white = whitening(factor, huber.values) @ factor.unwhitenedError(huber.values)
+    for number in range(graph.size()):
+        factor: Any = graph.at(number)
+        white = whitening(factor, values) @ factor.unwhitenedError(values)
         right: Any = linear.at(number)
         np.testing.assert_allclose(white, -right.getb(), atol=1e-9)
         weights.append(factor.noiseModel().weight(white))
@@ -87,5 +89,6 @@ def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     # The sum of squares: minus its half is the log-likelihood whose gradient is stated.
     reduced = joint.information[size:, size:] - cross.T @ np.linalg.solve(poses, cross)
     slope = joint.gradient[size:] - cross.T @ np.linalg.solve(poses, joint.gradient[:size])
-    gained = moved.graph.error(moved.values) - smoothed.graph.error(smoothed.values)
+    after, before = (t.estimate() for t in (moved, smoothed))
+    gained = after.graph.factors.error(after.values) - before.graph.factors.error(before.values)
     assert gained == pytest.approx(0.5 * d @ reduced @ d - slope @ d, rel=0.05, abs=0.05)

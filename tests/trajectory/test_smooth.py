@@ -175,7 +175,9 @@ def test_joint_information_is_that_of_gtsam() -> None:
     keys = [
         gtsam.symbol("i", int(np.flatnonzero(smoothed.nodes_ns == s)[0])) for s in some.tolist()
     ]
-    joint = gtsam.Marginals(smoothed.graph, smoothed.values).jointMarginalCovariance(keys)
+    estimate = smoothed.estimate()
+    marginals = gtsam.Marginals(estimate.graph.factors, estimate.values)
+    joint = marginals.jointMarginalCovariance(keys)
     cov_imu = np.block([[joint.at(a, b) for b in keys] for a in keys])
     Ad = np.kron(np.eye(4), sensors.T_vehicle_imu.AdjointMap())
     cov = Ad @ cov_imu @ Ad.T
@@ -209,9 +211,8 @@ def test_another_measurement_weighs_the_same_on_the_marginal_as_on_the_whole() -
         start.insert(key, pose)
     by_marginal = gtsam.GaussNewtonOptimizer(small, start).optimize()
 
-    whole = gtsam.NonlinearFactorGraph()
-    for j in range(smoothed.graph.size()):
-        whole.add(smoothed.graph.at(j))
+    estimate = smoothed.estimate()
+    whole = gtsam.NonlinearFactorGraph(estimate.graph.factors)
     node = gtsam.symbol("i", int(np.flatnonzero(smoothed.nodes_ns == some[1])[0]))
     Ad = sensors.T_vehicle_imu.inverse().AdjointMap()
     cov_imu = Ad @ np.diag(noise.sigmas() ** 2) @ Ad.T
@@ -222,7 +223,7 @@ def test_another_measurement_weighs_the_same_on_the_marginal_as_on_the_whole() -
             gtsam.noiseModel.Gaussian.Covariance(cov_imu),
         )
     )
-    by_whole = gtsam.GaussNewtonOptimizer(whole, smoothed.values).optimize()
+    by_whole = gtsam.GaussNewtonOptimizer(whole, estimate.values).optimize()
 
     for key, stamp, before in zip(keys, some.tolist(), poses, strict=True):
         i = gtsam.symbol("i", int(np.flatnonzero(smoothed.nodes_ns == stamp)[0]))

@@ -179,7 +179,7 @@ def test_the_slope_of_the_likelihood_is_right() -> None:
     for i in inside:
         part.push_back(graph.at(i))
     likelihood = NoiseLikelihood(
-        part.linearize(trajectory.values),
+        part.linearize(trajectory.estimate().values),
         [kinds[i] for i in inside],
         [],
         nodes,

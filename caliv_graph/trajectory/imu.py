@@ -77,6 +77,12 @@ class Inertial:
     force: Array
     gaps_ns: IntArray
 
+    def part(self, samples: slice) -> Inertial:
+        """Some of the samples."""
+        return Inertial(
+            self.stamps_ns[samples], self.gyro[samples], self.force[samples], self.gaps_ns
+        )
+
     @property
     def begin_ns(self) -> int:
         """First stamp."""

@@ -24,6 +24,22 @@ from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
 from caliv_graph.trajectory.states import States, poses_of_vehicle, without_bias
 
+PART_NS, PAUSE_NS = 60_000_000_000, 5_000_000_000
+"""The IMU is dead reckoned over a minute at a time: over a whole drive its samples take three times
+the memory that they have as they were read. After a longer pause of the stamps it begins anew."""
+
+RATE_WINDOW_NS = 50_000_000
+"""Half the time over which the gyroscope is averaged for the vehicle's velocity."""
+
+
+def parts_of(stamps_ns: IntArray) -> list[IntArray]:
+    """Indices of the stamps (m,), in any order, of each part of the drive."""
+    order = np.argsort(stamps_ns, kind="stable")
+    ordered = stamps_ns[order]
+    minute = (ordered - ordered[:1]) // PART_NS
+    cuts = np.flatnonzero((np.diff(ordered) > PAUSE_NS) | (np.diff(minute) > 0)) + 1
+    return [part for part in np.split(order, cuts) if len(part)]
+
 
 def within_span(
     stamps_ns: Sequence[int] | IntArray, span_ns: tuple[int, int], whose: str
@@ -145,9 +161,13 @@ class SmoothedTrajectory:
         )
         return Estimate(self.states, graph, to_values(self.states, self.data), self.built_with)
 
-    @cached_property
-    def _dead(self) -> DeadReckoning:
-        return without_bias(self.inertial, self.nodes_ns, self.states)
+    def _dead(self, begin_ns: int, end_ns: int) -> DeadReckoning:
+        """The IMU alone, from the last sample before a time to the first one after another."""
+        stamps = self.inertial.stamps_ns
+        first = int(np.searchsorted(stamps, begin_ns, "right")) - 1
+        last = int(np.searchsorted(stamps, end_ns, "right")) + 1
+        some = slice(max(min(first, len(stamps) - 2), 0), max(last, 2))
+        return without_bias(self.inertial.part(some), self.nodes_ns, self.states)
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
         """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3), metres, at any times within the span.
@@ -161,6 +181,16 @@ class SmoothedTrajectory:
 
     def _imu_states(self, stamps: IntArray) -> tuple[Array, Array, Array]:
         """R_map_imu, its origin and its velocity in the map."""
+        R, p, v = (
+            np.empty((len(stamps), 3, 3)),
+            np.empty((len(stamps), 3)),
+            np.empty((len(stamps), 3)),
+        )
+        for part in parts_of(stamps):
+            R[part], p[part], v[part] = self._imu_states_of(stamps[part])
+        return R, p, v
+
+    def _imu_states_of(self, stamps: IntArray) -> tuple[Array, Array, Array]:
         i = np.clip(np.searchsorted(self.nodes_ns, stamps, "right") - 1, 0, len(self.nodes_ns) - 2)
         R, p, v = self._carried(i, stamps)
         miss_R, miss_p, miss_v = self._misses
@@ -175,7 +205,9 @@ class SmoothedTrajectory:
         return R, p, v
 
     def _carried(self, i: IntArray, stamps: IntArray) -> tuple[Array, Array, Array]:
-        dR, dv, dp = self._dead.between(self.nodes_ns[i], stamps)
+        at_node = self.nodes_ns[i]
+        dead = self._dead(int(at_node.min()), int(stamps.max()))
+        dR, dv, dp = dead.between(at_node, stamps)
         dt = (stamps - self.nodes_ns[i])[:, None] * 1e-9
         g = np.array([0.0, 0.0, -self.gravity_m_s2])
         R, v = self.states.R_map_imu[i], self.states.velocity_map[i]
@@ -185,13 +217,14 @@ class SmoothedTrajectory:
 
     @cached_property
     def _misses(self) -> tuple[Array, Array, Array]:
-        i = np.arange(len(self.nodes_ns) - 1)
-        R, p, v = self._carried(i, self.nodes_ns[1:])
-        return (
-            log_so3(np.swapaxes(R, 1, 2) @ self.states.R_map_imu[1:]),
-            self.states.p_map_imu[1:] - p,
-            self.states.velocity_map[1:] - v,
-        )
+        after = self.nodes_ns[1:]
+        out = np.empty((3, len(after), 3))
+        for part in parts_of(after):
+            R, p, v = self._carried(part, after[part])
+            out[0, part] = log_so3(np.swapaxes(R, 1, 2) @ self.states.R_map_imu[part + 1])
+            out[1, part] = self.states.p_map_imu[part + 1] - p
+            out[2, part] = self.states.velocity_map[part + 1] - v
+        return out[0], out[1], out[2]
 
     def velocities_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
         """Velocity (m, 3) m/s of the vehicle's origin and angular velocity (m, 3) rad/s.
@@ -200,7 +233,11 @@ class SmoothedTrajectory:
         """
         stamps = within_span(stamps_ns, self.span_ns, "its span")
         R, _, v = self._imu_states(stamps)
-        rates = self._dead.rates(stamps, 50_000_000)
+        rates = np.empty((len(stamps), 3))
+        for part in parts_of(stamps):
+            own = stamps[part]
+            dead = self._dead(int(own.min()) - RATE_WINDOW_NS, int(own.max()) + RATE_WINDOW_NS)
+            rates[part] = dead.rates(own, RATE_WINDOW_NS)
         R_vi = self.T_vehicle_imu.rotation().matrix()
         arm = self.T_vehicle_imu.inverse().translation()
         at_origin = np.einsum("nji,nj->ni", R, v) + cross(rates, arm)

@@ -45,7 +45,7 @@ class BagIndex:
         clocks: the stamps of each topic, summarised.
         frame_ids: the frame in the first header of each topic.
         scans: record time by stamp of each LiDAR's clouds, in the order of the stamps.
-        collectors: motion data by kind and topic.
+        collectors: motion data by kind and topic, until they are taken.
         marks: what the stamps of each LiDAR mark.
         warnings: what is missing or damaged, a line each.
     """
@@ -53,7 +53,7 @@ class BagIndex:
     clocks: Mapping[str, Clock]
     frame_ids: Mapping[str, str]
     scans: Mapping[str, Mapping[int, int]]
-    collectors: Mapping[tuple[str, str], Collector]
+    collectors: dict[tuple[str, str], Collector]
     marks: Mapping[str, StampMark]
     warnings: tuple[str, ...]
 

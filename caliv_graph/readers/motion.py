@@ -103,7 +103,9 @@ class GnssCollector(RowCollector):
             return None
         cov = covariances(rows[:, 5:14])
         cov[rows[:, 4] == 0] = np.nan  # COVARIANCE_TYPE_UNKNOWN
-        return GnssFixes(stamps, rows[:, 0], rows[:, 1], rows[:, 2], or_none(cov))
+        # Copies: a view would keep the whole rows alive.
+        latitude, longitude, altitude = (column.copy() for column in rows[:, :3].T)
+        return GnssFixes(stamps, latitude, longitude, altitude, or_none(cov))
 
     @property
     def fixes(self) -> int:
@@ -153,7 +155,8 @@ class TwistCollector(RowCollector):
         if not len(stamps):
             return None
         cov = or_none(covariances(rows[:, 3:12]))
-        return TwistSamples(stamps, rows[:, :3], cov, *_yaw_rates(rows[:, 12], rows[:, 13]))
+        velocity = rows[:, :3].copy()  # a view would keep the whole rows alive
+        return TwistSamples(stamps, velocity, cov, *_yaw_rates(rows[:, 12], rows[:, 13]))
 
 
 def _yaw_rates(rate: Array, variance: Array) -> tuple[Array | None, Array | None]:

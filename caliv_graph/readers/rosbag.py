@@ -98,6 +98,7 @@ class RosbagRecording:
                     self._motion_topics.setdefault((kind, name))
         self._poses, self._pose_axes = poses, pose_axes
         self._motion: MotionData | None = None
+        self._fixes: dict[str, int] = {}
         self._times: dict[str, TimesSeen] = {name: TimesSeen() for name in self._lidars}
         self._damaged_clouds: dict[str, set[int]] = {name: set() for name in self._lidars}
         self._damage = ""
@@ -146,15 +147,19 @@ class RosbagRecording:
     def imu_checks(self) -> Mapping[str, ImuCheck]:
         """The units of each IMU that has samples, by topic."""
         found = {}
-        for (_, topic), collector in self._index.collectors.items():
-            samples = collector.finish() if isinstance(collector, ImuCollector) else None
+        for kind, topic in self._motion_topics:
+            collector = self._index.collectors.get((kind, topic))
+            if collector is None and kind == "imu" and self._motion is not None:
+                samples = self._motion.imu
+            else:
+                samples = collector.finish() if isinstance(collector, ImuCollector) else None
             if samples is not None:
                 found[topic] = check_imu(samples)
         return found
 
     def gnss_fixes(self) -> Mapping[str, int]:
         """Messages with a fix of each GNSS receiver, by topic."""
-        return {
+        return self._fixes | {
             topic: collector.fixes
             for (_, topic), collector in self._index.collectors.items()
             if isinstance(collector, GnssCollector)
@@ -282,6 +287,11 @@ class RosbagRecording:
                 )
             if check.rate_problem:
                 self._warnings.append(f"{where}: {check.rate_problem}")
+        for kind, topic in self._used.items():
+            # The collector has all that it took once more.
+            taken = index.collectors.pop((kind, topic))
+            if isinstance(taken, GnssCollector):
+                self._fixes[topic] = 0 if motion.gnss is None else len(motion.gnss.stamps_ns)
         return motion
 
     def _decoded(self, found: tuple[str, int, bytes]) -> tuple[int, DecodedCloud | str]:

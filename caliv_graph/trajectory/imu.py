@@ -163,7 +163,11 @@ def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array,
                 "accelerometer. Choose another topics.imu"
             )
     finite &= finite_force
-    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[finite]
+    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)
+    # The samples themselves where all are usable: a copy per smoothing is a third of a MB per
+    # minute.
+    if not finite.all():
+        stamps = stamps[finite]
     warnings = []
     if not finite.all():
         warnings.append(
@@ -181,7 +185,9 @@ def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array,
             f"{name}: IMU stamps do not increase: {stamps[at]} ns, then {stamps[at + 1]} ns. "
             "Sort the messages by stamp, or choose another topics.imu"
         )
-    gyro, force = imu.angular_velocity[finite], imu.specific_force[finite]
+    gyro, force = imu.angular_velocity, imu.specific_force
+    if not finite.all():
+        gyro, force = gyro[finite], force[finite]
     median = float(np.median(np.linalg.norm(force, axis=1)))
     if not MIN_FORCE_M_S2 < median < MAX_FORCE_M_S2:
         raise TrajectoryError(

@@ -130,6 +130,32 @@ class Chain:
             self.corner,
         )
 
+    def part(self, states: slice) -> Chain:
+        """The chain of some states in a row, without what the others say of them."""
+        diagonal = self.diagonal[states]
+        coupling = self.coupling[states][: max(len(diagonal) - 1, 0)]
+        return Chain(diagonal, coupling, self.border[states], self.corner)
+
+    def head(self, n: int) -> Chain:
+        """The chain of the first n states, all others eliminated."""
+        diagonal, border = self.diagonal[-1].copy(), self.border[-1].copy()
+        corner = self.corner.copy()
+        if n == len(self.diagonal):
+            return self
+        for i in range(len(self.diagonal) - 1, n - 1, -1):
+            inverse, link = inverse_of(diagonal), self.coupling[i - 1]
+            to_border = inverse @ border
+            corner -= border.T @ to_border
+            diagonal = self.diagonal[i - 1] - link @ inverse @ link.T
+            border = self.border[i - 1] - link @ to_border
+        out = self.part(slice(0, n))
+        return Chain(
+            np.concatenate([out.diagonal[:-1], diagonal[None]]),
+            out.coupling,
+            np.concatenate([out.border[:-1], border[None]]),
+            corner,
+        )
+
     def only(self, wanted: IntArray) -> Chain:
         """The chain of the states of ascending indices `wanted` (m,), all others eliminated."""
         keep = set(wanted.tolist())

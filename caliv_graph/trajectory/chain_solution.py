@@ -18,7 +18,10 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.chain import UNDETERMINED, Chain, banded_of
 
 COLUMNS_TOGETHER = 128
-"""Columns that `solved_in_blocks` solves for at a time: 20 MB for two minutes of nodes."""
+"""Columns that `solved_in_blocks` solves for at a time, at most: 20 MB for two minutes of nodes."""
+
+BYTES_TOGETHER = 20_000_000
+"""Of these columns; on longer drives they are fewer."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,8 @@ def solved(chain: Chain, gradient: Array) -> ChainSolution:
     )
 
 
-def inverse_columns(chain: Chain, coordinates: IntArray) -> Array:
-    """(n w + k, m) columns of the inverse of a chain's information.
+def inverse_in_blocks(chain: Chain, coordinates: IntArray) -> Iterator[tuple[slice, Array]]:
+    """(n w + k, m) columns of the inverse of a chain's information, some at a time.
 
     `coordinates` (m,) are of states, each i w + j.
 
@@ -83,9 +86,14 @@ def inverse_columns(chain: Chain, coordinates: IntArray) -> Array:
         TrajectoryError: the chain is singular.
     """
     n, w = chain.diagonal.shape[:2]
-    right = np.zeros((n * w + len(chain.corner), len(coordinates)))
-    right[coordinates, np.arange(len(coordinates))] = 1.0
-    return solved_columns(chain, right)
+
+    def unit(block: slice) -> Array:
+        some = coordinates[block]
+        right = np.zeros((n * w + len(chain.corner), len(some)))
+        right[some, np.arange(len(some))] = 1.0
+        return right
+
+    return solved_in_blocks(chain, unit, len(coordinates))
 
 
 def solved_columns(chain: Chain, right: Array) -> Array:
@@ -111,7 +119,8 @@ def solved_in_blocks(
         TrajectoryError: the chain is singular.
     """
     factor = _Factor(chain)
-    for block in parts(count, -(-count // COLUMNS_TOGETHER)):
+    most = min(COLUMNS_TOGETHER, max(BYTES_TOGETHER // (8 * chain.diagonal[:, 0].size), 1))
+    for block in parts(count, -(-count // most)):
         yield block, factor.solved(right(block))
 
 

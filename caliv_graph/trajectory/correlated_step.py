@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-import scipy.sparse
 
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
@@ -19,7 +18,7 @@ from caliv_graph.trajectory.build import Estimate, build_graph, from_values
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
 from caliv_graph.trajectory.chain_solution import solved
 from caliv_graph.trajectory.columns import parameter_columns
-from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised
+from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised_in_parts
 from caliv_graph.trajectory.solve import step_of, without_right_side
 from caliv_graph.trajectory.uncertain import Settled, moved
 
@@ -136,15 +135,16 @@ def chain_with_errors(
     common = [key_yaw_bias()] if settled.data.yaw_bias else []
     names = [error.kind for error in errors]
     R = estimate.states.R_map_imu
-    J, residuals = linearised(linear, estimate.graph.kinds, names, R, common)
     width = STATE + AXES * len(errors)
     of_errors = np.zeros((n, width))
     of_errors[:, STATE:] = estimated
-    residuals = residuals + J[:, : n * width] @ of_errors.ravel()
-    columns = np.zeros((len(residuals), 0)) if settled.columns is None else settled.columns
-    J = beside(J, np.column_stack([columns, -residuals]))
-    chain = Chain.zero(n, width, J.shape[1] - n * width)
-    chain.add(scipy.sparse.csr_array(J))
+    columns = settled.columns
+    extra = 0 if columns is None else columns.shape[1]
+    chain = Chain.zero(n, width, len(common) + extra + 1)
+    for rows, J, r in linearised_in_parts(linear, estimate.graph.kinds, names, R, common):
+        residuals = r + J[:, : n * width] @ of_errors.ravel()
+        own = np.zeros((len(r), 0)) if columns is None else columns[rows]
+        chain.add(beside(J, np.column_stack([own, -residuals])))
     prior = Chain.zero(n, width, 0)
     add_prior(prior, nodes, errors)
     pull = np.einsum("nij,nj->ni", prior.diagonal, of_errors)

@@ -15,9 +15,9 @@ import numpy as np
 from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
-from caliv_graph.trajectory.chain_solution import inverse_columns, solved_in_blocks
+from caliv_graph.trajectory.chain_solution import inverse_in_blocks, solved_in_blocks
 from caliv_graph.trajectory.columns import columns_of
-from caliv_graph.trajectory.correlated import AXES, linearised
+from caliv_graph.trajectory.correlated import AXES, linearised_in_parts
 from caliv_graph.trajectory.parameters import UncertainParameter
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.trajectory.suspects import suspect_parameters
@@ -58,25 +58,28 @@ def error_effects(
     common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]
     estimate, R = trajectory.estimate(), trajectory.states.R_map_imu
     linear = estimate.graph.factors.linearize(estimate.values)
-    J, _ = linearised(linear, estimate.graph.kinds, kinds, R, common)
-    del estimate, linear
+    of_factors = estimate.graph.kinds
+    del estimate
     both = Chain.zero(n, width, len(common))
-    both.add(J)
+    for _, J, _ in linearised_in_parts(linear, of_factors, kinds, R, common):
+        both.add(J)
+    del linear
     wanted = (STATE * i[:, None] + np.arange(POSE)).ravel()
-    inverse = inverse_columns(both.leading(STATE), wanted)
-    by_state = inverse[: n * STATE].reshape(n, STATE, len(wanted))
+    first, middle = error_steps(trajectory.nodes_ns)
+    gains = np.empty((len(kinds), len(wanted), AXES, len(first)))
+    # Some poses at a time: for all nodes of a long drive the columns would take gigabytes.
+    for block, inverse in inverse_in_blocks(both.leading(STATE), wanted):
+        by_state = inverse[: n * STATE].reshape(n, STATE, -1)
+        for number in range(len(kinds)):
+            of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
+            # An error of a sensor acts at its own node: the coupling of neighbours has none.
+            gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, :STATE, of_error])
+            gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
+            gains[number, block] = np.add.reduceat(gain, first, 2)
     Ad = np.asarray(trajectory.T_vehicle_imu.AdjointMap())
-    out = []
-    for number, kind in enumerate(kinds):
-        of_error = slice(STATE + AXES * number, STATE + AXES * (number + 1))
-        # An error of a sensor acts at its own node: the coupling of neighbours has none.
-        gain = np.einsum("nwp,nwa->pan", by_state, both.diagonal[:, :STATE, of_error])
-        gain += np.einsum("kp,nak->pan", inverse[n * STATE :], both.border[:, of_error])
-        shape = gain.shape
-        turned = Ad @ gain.reshape(len(i), POSE, -1)
-        first, middle = error_steps(trajectory.nodes_ns)
-        out.append(ErrorEffects(kind, middle, np.add.reduceat(turned.reshape(shape), first, 2)))
-    return tuple(out)
+    turned = Ad @ gains.reshape(len(kinds), len(i), POSE, -1)
+    pairs = zip(kinds, turned.reshape(gains.shape), strict=True)
+    return tuple(ErrorEffects(kind, middle, gain) for kind, gain in pairs)
 
 
 def poses_and_gain(
@@ -103,11 +106,12 @@ def poses_and_gain(
     common = [] if smoothed.yaw_bias is None else [key_yaw_bias()]
     estimate, R = smoothed.estimate(), smoothed.states.R_map_imu
     linear = estimate.graph.factors.linearize(estimate.values)
-    J, r = linearised(linear, estimate.graph.kinds, kinds, R, common)
-    columns = columns_of(smoothed, estimate, of)
-    del estimate, linear
+    columns, of_factors = columns_of(smoothed, estimate, of), estimate.graph.kinds
+    del estimate
     with_right = Chain.zero(n, width, len(common) + columns.shape[1] + 1)
-    with_right.add(beside(beside(J, columns), -r[:, None]))
+    for rows, J, r in linearised_in_parts(linear, of_factors, kinds, R, common):
+        with_right.add(beside(J, np.column_stack([columns[rows], -r])))
+    del linear
     chain = with_right.leading(STATE)
     with_suspects = replace(smoothed, chain=chain, chain_nodes=None, parameters=parameters)
     joint = with_suspects.joint(stamps_ns)
@@ -122,13 +126,16 @@ def poses_and_gain(
         [np.zeros(0), *(np.square(1.0 / np.asarray(p.sigmas)) for p in parameters)]
     )
     first, _ = error_steps(smoothed.nodes_ns)
-    within = smoothed.nodes_ns[first] <= (until_ns or smoothed.nodes_ns[-1])
-    errors = ErrorsByStep(both, first, int(np.count_nonzero(within)))
+    steps = int(np.count_nonzero(smoothed.nodes_ns[first] <= (until_ns or smoothed.nodes_ns[-1])))
+    # Nodes after all that is asked for are eliminated once, not solved for in every column.
+    n = max(int(first[steps]) if steps < len(first) else n, int(i[-1]) + 1)
+    states, first = both.leading(STATE).head(n), first[first < n]
+    errors = ErrorsByStep(both.part(slice(0, n)), first, steps)
     # A parameter that moves T_vehicle_imu moves the vehicle, the IMU being where it is.
     moves = np.hstack([np.zeros((POSE, 0)), *(p.imu_moves(smoothed.data) for p in of)])
     Ad = np.asarray(smoothed.T_vehicle_imu.AdjointMap())
     gain = np.empty((len(i), POSE, errors.count))
-    for block, solution in solved_in_blocks(both.leading(STATE), errors.columns, errors.count):
+    for block, solution in solved_in_blocks(states, errors.columns, errors.count):
         of_imu = solution[: n * STATE].reshape(n, STATE, -1)[i, :POSE]
         gain[:, :, block] = Ad @ (of_imu - moves @ solution[n * STATE + len(common) :])
     return joint, gain.reshape(POSE * len(i), -1)

@@ -47,6 +47,32 @@ def marginal(H: Array, keep: list[int]) -> Array:
     return np.asarray(np.linalg.inv(np.linalg.inv(H)[np.ix_(keep, keep)]))
 
 
+@pytest.mark.parametrize("common", [0, 2])
+@pytest.mark.parametrize("n", [1, 4, 7])
+def test_the_head_of_a_chain_is_the_marginal(n: int, common: int) -> None:
+    chain, H = random_chain(7, common, seed=5)
+
+    head = chain.head(n)
+
+    size = STATE * n
+    expected = marginal(H, [*range(size), *range(STATE * 7, len(H))])
+    scale = np.sqrt(np.diag(expected))
+    found = np.zeros_like(expected)
+    for i in range(n):
+        own = slice(STATE * i, STATE * (i + 1))
+        found[own, own] = head.diagonal[i]
+        found[own, size:] = head.border[i]
+        found[size:, own] = head.border[i].T
+        if i + 1 < n:
+            after = slice(own.stop, own.stop + STATE)
+            found[own, after] = head.coupling[i]
+            found[after, own] = head.coupling[i].T
+    found[size:, size:] = head.corner
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
+    )
+
+
 @pytest.mark.parametrize("common", [0, 1])
 @pytest.mark.parametrize(
     "wanted", [[0], [3], [6], [0, 6], [1, 2, 5], [0, 1, 2, 3, 4, 5, 6]], ids=str

@@ -192,6 +192,25 @@ def test_joint_information_is_that_of_gtsam() -> None:
     np.testing.assert_allclose(cov[6:12, 6:12], marginal[4], rtol=1e-5, atol=1e-12)
 
 
+def test_poses_do_not_depend_on_what_else_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The IMU is dead reckoned around the times that are asked for, in parts of the drive."""
+    sensors = replace(mounted_askew(), noise=1.0)
+    motion = record(Course(arc_drive(8.0)), sensors, 2)
+    smoothed = smooth_trajectory(motion, config_for(sensors), stamps(7.0, 5.0, 0.01))
+    begin, end = smoothed.span_ns
+    at = np.random.default_rng(0).permutation(np.linspace(begin, end, 500).astype(np.int64))
+    whole = (*smoothed.poses_at(at), *smoothed.velocities_at(at))
+
+    monkeypatch.setattr("caliv_graph.trajectory.smoothed.PART_NS", 700_000_000)
+    apart = replace(smoothed)
+    parts = (*apart.poses_at(at), *apart.velocities_at(at))
+    singly = [apart.poses_at([stamp]) for stamp in at.tolist()]
+
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-10)
+    np.testing.assert_allclose(np.concatenate([t for _, t in singly]), whole[1], atol=1e-10)
+
+
 def test_another_measurement_weighs_the_same_on_the_marginal_as_on_the_whole() -> None:
     sensors = mounted_askew()
     motion = record(Course(arc_drive(5.0)), sensors, 3)

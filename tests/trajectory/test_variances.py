@@ -12,7 +12,7 @@ from caliv_graph.conventions import key_bias, key_imu, key_velocity
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.build import build_graph
 from caliv_graph.trajectory.chain import STATE
-from caliv_graph.trajectory.chain_solution import inverse_columns, solved
+from caliv_graph.trajectory.chain_solution import inverse_in_blocks, solved
 from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
 from caliv_graph.trajectory.effects import (
     STEP_NS,
@@ -32,7 +32,9 @@ WANTED = stamps(7.0, 2.0)[2:]
 
 
 @pytest.mark.parametrize("common", [0, 2])
-def test_a_chain_is_solved_and_inverted_like_a_dense_matrix(common: int) -> None:
+def test_a_chain_is_solved_and_inverted_like_a_dense_matrix(
+    common: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     chain, H = random_chain(5, common, seed=4)
     gradient = np.random.default_rng(1).standard_normal(len(H)) * np.sqrt(np.diag(H))
     inverse = np.linalg.inv(H)
@@ -50,7 +52,10 @@ def test_a_chain_is_solved_and_inverted_like_a_dense_matrix(common: int) -> None
     border = inverse[:n, n:].reshape(5, STATE, common)
     assert found.cov_border == pytest.approx(border, rel=1e-5)
     wanted = np.array([3, STATE + 1, 4 * STATE])
-    assert inverse_columns(chain, wanted) == pytest.approx(inverse[:, wanted], rel=1e-5)
+    monkeypatch.setattr("caliv_graph.trajectory.chain_solution.COLUMNS_TOGETHER", 2)
+    blocks = [columns for _, columns in inverse_in_blocks(chain, wanted)]
+    assert len(blocks) > 1
+    assert np.hstack(blocks) == pytest.approx(inverse[:, wanted], rel=1e-5)
 
 
 def test_the_information_of_a_gauss_markov_error_is_the_inverse_of_its_covariance() -> None:
@@ -246,6 +251,19 @@ def test_poses_and_inputs_follow_an_error_by_the_gain(monkeypatch: pytest.Monkey
     assert change == pytest.approx(of_gnss @ by_step, abs=1e-5)
     assert np.abs(change - held.gain[:, 1] @ by_step).max() > 3e-5
     assert np.abs(change).max() > 1e-3
+
+
+def test_the_gain_of_some_steps_is_a_part_of_that_of_all() -> None:
+    """Nodes after the steps that are asked for are eliminated first; they still count."""
+    some = WANTED[:5]
+    _, whole = poses_and_gain(base(), some, ["orientation", "gnss"])
+    joint, part = poses_and_gain(base(), some, ["orientation", "gnss"], int(some[-1]))
+
+    steps = part.shape[1] // 6
+    assert steps < whole.shape[1] // 6
+    expected = whole.reshape(len(whole), 6, -1)[:, :, :steps].reshape(part.shape)
+    assert part == pytest.approx(expected, abs=1e-6 * np.abs(whole).max())
+    assert len(joint.information) == 6 * len(some)
 
 
 def test_an_input_that_may_be_wrong_explains_what_it_could() -> None:

@@ -12,6 +12,7 @@ from caliv_graph.calibration.pose_priors import plain_prior, pose_priors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
 from caliv_graph.calibration.solve import SolveState, offset_sigmas, solve_registered
 from caliv_graph.calibration.structure import nearest_extrinsics
+from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.model import Config
 from caliv_graph.products import (
     Array,
@@ -185,6 +186,8 @@ class StructureEvidence:
         patches = [of for of in self.patches if len(of.scan) and len(kept_ns.get(of.drive, ()))]
         if not patches:
             return ()
+        # The largest stage: what smaller ones left behind in pieces would come on top.
+        give_back_freed_memory()
         kept = {of.drive: np.asarray(kept_ns[of.drive], np.int64) for of in patches}
         stamps = {
             of.drive: np.unique(np.concatenate([kept[of.drive], of.stamps_ns])) for of in patches

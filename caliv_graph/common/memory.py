@@ -16,6 +16,17 @@ MOST_KEPT = 512 * 2**20
 """Free bytes at the end of the heap that are kept: the working set of the largest calibrations."""
 
 
+def give_back_freed_memory() -> None:
+    """Gives memory that is freed back to the system, in front of a stage that takes much.
+
+    What many small objects leave behind is in pieces that no large array fits into.
+    """
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (AttributeError, OSError, TypeError):
+        return  # not glibc
+
+
 def keep_freed_memory() -> bool:
     """Keeps memory that is freed for the next array; whether the system's library can do so.
 

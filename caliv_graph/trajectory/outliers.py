@@ -69,9 +69,11 @@ def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States)
         rough = limit > final
         solved_with = "roughly" if rough else kernel
         tolerance = ROUGH_TOLERANCE if rough else ERROR_TOLERANCE
+        del estimate  # its graph: 4 MB per minute of drive
         estimate = solve(data, nodes, states, dropped, kernel, tolerance)
         states = estimate.states
     if solved_with != kernel:
+        del estimate
         estimate = solve(data, nodes, states, dropped, kernel)
     return Robust(data, estimate, dropped, tuple(warnings))
 

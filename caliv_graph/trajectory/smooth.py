@@ -8,6 +8,7 @@ origin, and without an orientation source its heading is the x axis.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -83,13 +84,16 @@ def smooth_trajectory(
         else {}
     )
     if wrong:
-        robust = solve_without_outliers(scaled(robust.data, wrong), nodes, found)
+        data = scaled(robust.data, wrong)
+        del robust  # its graph
+        robust = solve_without_outliers(data, nodes, found)
         warnings += robust.warnings
-    data, estimate, positions = robust.data, robust.estimate, robust.data.positions
-    settled = Settled(data, estimate)
+    data, positions = robust.data, robust.data.positions
+    settled = Settled(data, robust.estimate)
     if parameters:
         kernel = data.config.robust.kernel
-        settled = settle(data, nodes, estimate, robust.dropped, kernel, parameters)
+        settled = settle(data, nodes, robust.estimate, robust.dropped, kernel, parameters)
+        robust = replace(robust, estimate=settled.estimate)  # one graph is enough
     linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
     last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)

@@ -132,6 +132,7 @@ REPLACED = {
     "caliv_graph.simulation.write_drive": quiet,
     "caliv_graph.validation.validate": quiet,
     "caliv_graph.workflows.repeatability.split_halves": lambda *_: None,
+    "caliv_graph.workflows.repeatability.with_halves": lambda found, *_: found,
     "caliv_graph.report.validation.validation_document": lambda *_: {},
     "caliv_graph.report.validation.validation_table": lambda *_: "",
     "caliv_graph.report.validation.render_validation": lambda *_: "",

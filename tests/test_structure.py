@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.assemble import DRIVES
+from caliv_graph.calibration.assemble import DRIVES, MARKS
 from caliv_graph.calibration.structure_evidence import KEPT_POSES
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import (
@@ -135,7 +135,7 @@ def check_files(run: CalibrationRun, drive: ChairDrive, folder: Path) -> None:
 def test_its_result_is_compared_merged_and_a_prior(walls: Structure) -> None:
     alone = run_on(arc().asked(target=False)).calibration
     # As of another drive of the vehicle.
-    alone = replace(alone, provenance={**alone.provenance, DRIVES: ["another"]})
+    alone = replace(alone, provenance={**alone.provenance, DRIVES: ["another"], MARKS: [[]]})
     other = by_target()
 
     assert not compare(alone, other, ("walls", "chair")).moved

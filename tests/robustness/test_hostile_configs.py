@@ -51,7 +51,10 @@ def configs(draw: st.DrawFn) -> dict[str, Any]:
         "reference": draw(st.sampled_from([*chosen, ""])),
         "target": draw(st.sampled_from([None, {"min": low_corner, "max": high_corner}])),
         "ground": {"vehicle_height": draw(st.none() | metres), "sigma": draw(positive)},
-        "noise": {"lidar_range_m": draw(positive), "velocity_m_s": draw(st.none() | positive)},
+        "noise": {
+            "lidar_range_m": min(draw(positive), 1.0),
+            "velocity_m_s": draw(st.none() | positive),
+        },
         "require": draw(st.lists(st.sampled_from(["s2s", "s2v", "s2v_rotation"]), unique=True)),
         "limits": draw(st.dictionaries(st.sampled_from(["s2v_yaw_deg", "s2s_x_m"]), positive)),
         "data": {"format": draw(st.sampled_from(["rosbag", "caliv"])), "path": "drive"},

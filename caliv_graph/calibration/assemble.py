@@ -80,18 +80,19 @@ def assemble(
         uncertainty, solution.information_data, solution.information_knowing
     )
     guesses = {name: configured_guess(config, name) for name in config.lidar_order()}
-    information, gradient = _without_trust(solution, guesses)
+    information_data, gradient = _without_trust(solution, guesses)
     draft = assemble_matrices(
         {name: solution.T_vehicle_lidar[name] for name in solution.lidars},
         guesses,
         solution.cov,
-        information,
+        solution.information_data,
         uncertainty,
         solution.reference,
         _scans_used(solution),
         gradient,
         solution.time_offsets,
         lidars_with_structure(solution.structure),
+        information_data,
     )
     provenance = _provenance(config, recordings, solution, digests)
     if any(marks):

@@ -26,6 +26,7 @@ def assemble_matrices(
     gradient: Array | None = None,
     time_offsets: Mapping[str, tuple[float, float]] = _NO_OFFSETS,
     structure: Collection[str] = (),
+    information_data: Array | None = None,
 ) -> Calibration:
     """A calibration of every LiDAR, without requirements and provenance.
 
@@ -33,13 +34,15 @@ def assemble_matrices(
         solved: extrinsics of the n LiDARs in the graph, in the order of the matrices.
         guesses: of every LiDAR, in the order of the result; one that is not in the graph keeps it.
         cov: (6n, 6n) vehicle axes.
-        information: (6n, 6n) of the data alone, vehicle axes.
+        information: (6n, 6n) of the data and of trusted guesses (`fixed: true`), vehicle axes: what
+            is determined without the other guesses.
         uncertainty: verdicts on the solved LiDARs.
         reference: name of the reference LiDAR.
         scans: LiDAR -> clouds of a target that carry weight; absent: none.
         gradient: (6n,) of the data's log-likelihood, vehicle axes.
         time_offsets: LiDAR -> value and sigma in seconds, where estimated.
         structure: names of the LiDARs that saw structure.
+        information_data: (6n, 6n) of the data alone, which is reported; None: `information`.
     """
     names = list(guesses)
     poses = {name: solved.get(name, guesses[name].T_vehicle_lidar) for name in names}
@@ -52,7 +55,8 @@ def assemble_matrices(
             cov_joint[block, block] = axes.T @ np.diag(known_sigmas(guesses[name]) ** 2) @ axes
     own = [guesses[name] for name in solved]
     cov_joint += to_right @ (cov + unguessed(information, own)) @ to_right.T
-    information_joint = to_right @ information @ to_right.T
+    reported = information if information_data is None else information_data
+    information_joint = to_right @ reported @ to_right.T
     nothing = dict.fromkeys(AXES, False)
     lidars = {
         name: LidarResult(

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import eigh
 
+from caliv_graph.config.guesses import prior_sigmas
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, BoolArray, Direction, Guess, Uncertainty
@@ -150,18 +151,18 @@ def unguessed(D: Array, guesses: Sequence[Guess]) -> Array:
     knowledge: along these directions the variance becomes that of what is known before the drive.
 
     Args:
-        D: (6n, 6n) information of the data, vehicle axes.
+        D: (6n, 6n) information of the data and of trusted guesses (`fixed: true`), vehicle axes.
         guesses: of the n LiDARs.
     """
     if not any(guess.found for guess in guesses):
         return np.zeros_like(D)
-    held, known = (
-        np.diag(np.concatenate(sigmas) ** -2.0)
-        for sigmas in (
-            [guess.sigmas for guess in guesses],
-            [known_sigmas(guess) for guess in guesses],
-        )
-    )
+    # As in the solve: trust is in D, and the prior of a trusted guess has the usual sigmas.
+    priors = [prior_sigmas(guess) for guess in guesses]
+    of_nothing = [
+        UNKNOWN_SIGMAS if guess.found else prior
+        for guess, prior in zip(guesses, priors, strict=True)
+    ]
+    held, known = (np.diag(np.concatenate(s) ** -2.0) for s in (priors, of_nothing))
     split = spectrum(D, held)
     U = split.vectors[:, split.undetermined] * scaling(len(guesses))[:, None]
     if not U.shape[1]:

@@ -15,9 +15,11 @@ from caliv_graph.geometry.covariance import (
 )
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration
+from caliv_graph.uncertainty.assemble import second_order
 from caliv_graph.uncertainty.observability import (
     AXIS_SHARE,
     LIDAR_SHARE,
+    UNDETERMINED_RATIO,
     UNIT,
     scaling,
     undetermined_basis,
@@ -64,8 +66,9 @@ def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str,
     results = [calibration.lidars[name] for name in (source, to)]
     if not all(result.has_data for result in results):
         return dict.fromkeys(AXES, False)
+    known = _known_of_found(calibration, source, to)
     if not calibration.undetermined:
-        return dict.fromkeys(AXES, True)
+        return known
     names = list(calibration.lidars)
     basis = undetermined_basis(calibration.undetermined, names)
     T_from, T_to = (result.T_vehicle_lidar for result in results)
@@ -78,9 +81,30 @@ def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str,
     shares = np.sum(seen**2, axis=1)
     total = float(shares.sum())
     return {
-        axis: bool(total <= LIDAR_SHARE or share <= AXIS_SHARE * total)
+        axis: known[axis] and bool(total <= LIDAR_SHARE or share <= AXIS_SHARE * total)
         for axis, share in zip(AXES, shares, strict=True)
     }
+
+
+def _known_of_found(calibration: Calibration, source: str, to: str) -> dict[str, bool]:
+    """Per axis of `T_to_from`, whether its sigma is below what counts as determined.
+
+    Asked only where one of the two has no guess, as `assemble.determined_axes` asks of one LiDAR:
+    along undetermined directions the covariance is then that of nothing known, and other axes take
+    part in it.
+    """
+    guesses = [calibration.lidars[name].guess for name in (source, to)]
+    found = [guess.sigmas for guess in guesses if guess is not None and guess.found]
+    if not found:
+        return dict.fromkeys(AXES, True)
+    T_vehicle_from, T_vehicle_to = (calibration.lidars[n].T_vehicle_lidar for n in (source, to))
+    cov = parent_axes_covariance(
+        T_vehicle_to.between(T_vehicle_from), pair_covariance(calibration, source, to)
+    )
+    sigmas = np.sqrt(np.diag(cov) + second_order(cov))
+    # Two found guesses are off independently. Each is as sure in all directions.
+    limits = UNDETERMINED_RATIO * np.sqrt(np.sum(np.square(found), axis=0))
+    return {axis: bool(yes) for axis, yes in zip(AXES, sigmas <= limits, strict=True)}
 
 
 def _rows(calibration: Calibration, *lidars: str) -> list[int]:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from caliv_graph.config.guesses import FOUND_SIGMA
 from caliv_graph.conventions import AXES
-from caliv_graph.products import Direction
+from caliv_graph.products import Direction, Guess
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
 from tests.samples import make_calibration, unseen
 
@@ -70,6 +72,21 @@ def test_a_lidar_without_a_target_determines_no_pair() -> None:
     calibration = unseen(make_calibration(undetermined=()), "front")
 
     assert not any(pair_determined(calibration, "front", "rear").values())
+
+
+def test_a_pair_without_guesses_is_not_determined_where_its_sigma_is_that_of_nothing() -> None:
+    calibration = make_calibration(undetermined=())
+    cov = calibration.cov_joint.copy()
+    cov[9, 9] += 1.0  # x of the rear LiDAR's own axes, which are those of the pair: 1 m
+    wide = replace(calibration, cov_joint=cov)
+    sigmas = FOUND_SIGMA.sigmas()
+    for found, lost in ((False, []), (True, ["x"])):
+        lidars = {
+            name: replace(lidar, guess=Guess(lidar.T_vehicle_lidar, sigmas, found=found))
+            for name, lidar in wide.lidars.items()
+        }
+        determined = pair_determined(replace(wide, lidars=lidars), "front", "rear")
+        assert [axis for axis in AXES if not determined[axis]] == lost
 
 
 def test_without_undetermined_directions_all_is_determined() -> None:

@@ -837,6 +837,11 @@ class LidarResult:
         return self.saw_target or self.saw_structure
 
     @property
+    def placed(self) -> bool:
+        """Whether data or a trusted guess (`fixed: true`) say where it is."""
+        return self.has_data or (self.guess is not None and self.guess.fixed)
+
+    @property
     def without_guess(self) -> bool:
         """Whether nobody gave a guess: what the drive does not determine is unknown then."""
         return self.guess is not None and self.guess.found

@@ -11,12 +11,14 @@ import gtsam
 import numpy as np
 import scipy.sparse
 
+from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import (
     Array,
     Calibration,
     Direction,
+    Guess,
     LidarResult,
     LinearisedGraph,
     Mixture,
@@ -105,6 +107,14 @@ def unseen(calibration: Calibration, name: str) -> Calibration:
         saw_target=False,
     )
     return replace(calibration, lidars={**calibration.lidars, name: never})
+
+
+def trusted(calibration: Calibration, name: str) -> Calibration:
+    """The same, but the config fixes one LiDAR (`fixed: true`), which saw nothing."""
+    unseen_one = unseen(calibration, name).lidars[name]
+    guess = Guess(unseen_one.T_vehicle_lidar, TRUSTED_SIGMAS, fixed=True)
+    known = replace(unseen_one, determined=dict.fromkeys(AXES, True), guess=guess)
+    return replace(calibration, lidars={**calibration.lidars, name: known})
 
 
 def make_solution(placements: int = 1) -> Solution:

@@ -26,8 +26,8 @@ def unmet_requirements(calibration: Calibration, config: Config) -> Calibration:
     return replace(calibration, unmet=tuple(dict.fromkeys(unmet)))
 
 
-def _seen(calibration: Calibration) -> list[str]:
-    return [name for name, lidar in calibration.lidars.items() if lidar.has_data]
+def _placed(calibration: Calibration) -> list[str]:
+    return [name for name, lidar in calibration.lidars.items() if lidar.placed]
 
 
 def _unmet(calibration: Calibration, requirement: str) -> list[str]:
@@ -35,12 +35,13 @@ def _unmet(calibration: Calibration, requirement: str) -> list[str]:
     if requirement == "s2s":
         verdicts = {
             f"'{a}' to '{b}'": (AXES, pair_determined(calibration, a, b))
-            for a, b in sensor_pairs(_seen(calibration), calibration.reference)
+            for a, b in sensor_pairs(_placed(calibration), calibration.reference)
         }
     else:
         axes = AXES[:3] if requirement == "s2v_rotation" else AXES
         verdicts = {
-            f"'{name}'": (axes, calibration.lidars[name].determined) for name in _seen(calibration)
+            f"'{name}'": (axes, calibration.lidars[name].determined)
+            for name in _placed(calibration)
         }
     out = []
     for what, (needed, determined) in verdicts.items():
@@ -57,13 +58,13 @@ def _over_limit(calibration: Calibration, key: str, limit: float) -> list[str]:
     kind, angle, length = match.groups()
     axis = AXES.index(angle or length)
     unit, name_of_unit = (math.degrees(1.0), "degrees") if angle else (1.0, "m")
-    seen = _seen(calibration)
+    placed = _placed(calibration)
     if kind == "s2v":
-        sigmas = {f"'{name}'": sigmas_s2v(calibration, name) for name in seen}
+        sigmas = {f"'{name}'": sigmas_s2v(calibration, name) for name in placed}
     else:
         sigmas = {
             f"'{a}' to '{b}'": sigmas_s2s(calibration, a, b)
-            for a, b in sensor_pairs(seen, calibration.reference)
+            for a, b in sensor_pairs(placed, calibration.reference)
         }
     return [
         f"limits {key}: sigma of {what} is {sigma[axis] * unit:.3g} {name_of_unit}, limit {limit:g}"

@@ -121,7 +121,7 @@ def verdicts(calibration: Calibration) -> list[tuple[str, str, str]]:
         else:
             out.append((f"{name} to the vehicle", *_axes_texts(lidar.determined)))
     for source, to in sensor_pairs(calibration.lidars, calibration.reference):
-        if all(calibration.lidars[n].has_data for n in (source, to)):
+        if all(calibration.lidars[n].placed for n in (source, to)):
             axes = _axes_texts(pair_determined(calibration, source, to))
             out.append((f"{source} to {to}", *axes))
     return out

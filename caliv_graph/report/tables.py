@@ -128,9 +128,9 @@ def evaluation_table(evaluation: Mapping[str, Any], calibration: Calibration) ->
     for errors in evaluation["pairs"]:
         # A pair's axes are marked as determined in the axes of `to`; these errors are in vehicle
         # axes.
-        seen = all(calibration.lidars[errors[end]].has_data for end in ("from", "to"))
+        placed = all(calibration.lidars[errors[end]].placed for end in ("from", "to"))
         name = f"S2S {errors['from']} to {errors['to']}"
-        table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, seen)))
+        table.add_row(Text(name), *_error_cells(errors, dict.fromkeys(AXES, placed)))
     parts = titled("Errors in vehicle axes (estimate minus truth)", table)
     if guessed or unguessed:
         of = "the error of the initial guess" if guessed else "no initial guess was given"

@@ -64,7 +64,7 @@ def pair_determined(calibration: Calibration, source: str, to: str) -> dict[str,
     shift along the axes of `to`.
     """
     results = [calibration.lidars[name] for name in (source, to)]
-    if not all(result.has_data for result in results):
+    if not all(result.placed for result in results):
         return dict.fromkeys(AXES, False)
     known = _known_of_found(calibration, source, to)
     if not calibration.undetermined:

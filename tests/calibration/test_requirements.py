@@ -13,7 +13,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Array, Calibration, Direction
 from caliv_graph.uncertainty.pairs import sigmas_s2s, sigmas_s2v
-from tests.samples import make_calibration, pose, unseen
+from tests.samples import make_calibration, pose, trusted, unseen
 
 DEGREE = math.radians(1.0)
 
@@ -166,6 +166,15 @@ def test_what_was_required_is_asked_of_those_that_saw_it() -> None:
 
 def test_a_trusted_lidar_need_not_see_anything() -> None:
     assert unmet(unseen(make_calibration(), "front"), "front") == ()
+
+
+def test_what_is_required_of_pairs_is_asked_of_a_trusted_lidar_that_saw_nothing() -> None:
+    calibration = trusted(make_calibration(undetermined=(alone("rear", "front", "z"),)), "front")
+
+    sentences = unmet(calibration, "front", require=["s2s"], limits={"s2s_x_m": 1e-9})
+
+    assert [sentence.split(":")[0] for sentence in sentences] == ["require s2s", "limits s2s_x_m"]
+    assert all("'front' to 'rear'" in sentence for sentence in sentences)
 
 
 # ------------------------------------------------------------------ limits

@@ -23,7 +23,7 @@ from caliv_graph.report.inspection import (
 from caliv_graph.report.inspection_table import inspection_table
 from caliv_graph.report.tables import calibration_table, evaluation_table, slow_errors_text
 from caliv_graph.uncertainty.evaluation import evaluate
-from tests.samples import make_calibration, unseen
+from tests.samples import make_calibration, trusted, unseen
 
 
 def rendered(table: RenderableType, width: int = 80) -> list[str]:
@@ -201,6 +201,15 @@ def test_names_are_no_markup() -> None:
 
     assert "reference [red]rear" in text
     assert "[bold]s2v" in text
+
+
+def test_a_pair_with_a_trusted_lidar_that_saw_nothing_has_a_verdict() -> None:
+    calibration = trusted(make_calibration(undetermined=()), "front")
+    truth = {name: result.T_vehicle_lidar for name, result in calibration.lidars.items()}
+
+    assert ("front to rear", "all six axes", "") in verdicts(calibration)
+    lines = rendered(evaluation_table(evaluate(calibration, truth), calibration))
+    assert cells(lines, "S2S front to rear")[:6] == ["0.00"] * 6
 
 
 @pytest.mark.parametrize("width", [80, 120])

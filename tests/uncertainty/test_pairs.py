@@ -10,7 +10,7 @@ from caliv_graph.config.guesses import FOUND_SIGMA
 from caliv_graph.conventions import AXES
 from caliv_graph.products import Direction, Guess
 from caliv_graph.uncertainty.pairs import pair_covariance, pair_determined, sensor_pairs
-from tests.samples import make_calibration, unseen
+from tests.samples import make_calibration, trusted, unseen
 
 
 def direction(**vectors: list[float]) -> Direction:
@@ -72,6 +72,15 @@ def test_a_lidar_without_a_target_determines_no_pair() -> None:
     calibration = unseen(make_calibration(undetermined=()), "front")
 
     assert not any(pair_determined(calibration, "front", "rear").values())
+
+
+def test_a_trusted_lidar_that_saw_nothing_determines_its_pairs() -> None:
+    up = direction(front=[0] * 6, left=[0, 0, 0, 0, 0, 1])
+    calibration = trusted(make_calibration("front", "left", undetermined=(up,)), "front")
+
+    determined = pair_determined(calibration, "front", "left")
+
+    assert [axis for axis in AXES if not determined[axis]] == ["z"]
 
 
 def test_a_pair_without_guesses_is_not_determined_where_its_sigma_is_that_of_nothing() -> None:

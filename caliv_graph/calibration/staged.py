@@ -69,7 +69,8 @@ def staged_solution(state: SolveState, registrations: Sequence[Registration]) ->
         measured_poses(registrations, state.turns)[1] / state.scale**2,
         information_data,
         cov,
-        held=("x", "y", "z"),
+        # A trusted translation is as good as estimated.
+        held=() if problem.reference in problem.fixed else ("x", "y", "z"),
         iterations=1,
         converged=converged and turned,
         time_offsets=offsets,

@@ -326,6 +326,13 @@ class Config(Section):
             )
         if not self.reference:
             object.__setattr__(self, "reference", next(iter(self.lidars)))
+        fixed = [name for name, lidar in self.lidars.items() if lidar.fixed]
+        if fixed and self.solve.mode == "staged" and self.reference not in fixed:
+            raise ValueError(
+                f"'solve.mode: staged' places all LiDARs by the initial guess of the reference "
+                f"'{self.reference}', which would move lidars.{fixed[0]}, whose guess is fixed: "
+                f"set reference to {fixed[0]}, or mode to auto"
+            )
         topics = [lidar.topic for lidar in self.lidars.values()]
         for topic in topics:
             if topics.count(topic) > 1:

@@ -14,6 +14,7 @@ from caliv_graph.calibration.robust import MIN_WEIGHT
 from caliv_graph.calibration.snooping import snoop_clouds
 from caliv_graph.calibration.solve import solve_registered
 from caliv_graph.calibration.staged import staged_solution
+from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config, RobustConfig, SolveConfig
 from caliv_graph.config.mounting import PoseConfig
@@ -85,6 +86,29 @@ def solved(
     registrations = [registered(case, tuple(measured))]
     state = solve_registered(problem, registrations, (), config_of(kernel, trim_percent))
     return case, staged_solution(state, registrations)
+
+
+def test_a_fixed_reference_is_determined_and_stays() -> None:
+    case = make_case(*LIDARS, count=20, seed=1)
+    problem = guessed(case.problem, np.random.default_rng(1))
+    true = case.problem.guesses["rear"]
+    problem = replace(
+        problem,
+        guesses={**problem.guesses, "rear": true},
+        prior_sigmas={**problem.prior_sigmas, "rear": TRUSTED_SIGMAS},
+        fixed=frozenset(["rear"]),
+    )
+    registrations = [registered(case, noisy(case, 1))]
+    state = solve_registered(problem, registrations, (), config_of("huber"))
+
+    solution = staged_solution(state, registrations)
+
+    assert solution.held == ()
+    assert solution.T_vehicle_lidar["rear"].equals(true, 1e-4)
+    rear = slice(6 * solution.lidars.index("rear"), None)
+    sigmas = np.sqrt(np.diag(solution.cov))[rear][:6]
+    assert (sigmas < 1.01 * TRUSTED_SIGMAS).all()
+    assert s2s_nees(case, solution) < 18.5
 
 
 def s2s_nees(case: Case, solution: Solution) -> float:

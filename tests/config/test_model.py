@@ -71,6 +71,11 @@ def test_the_example_of_the_specification() -> None:
     assert config.ground.vehicle_height == 0.0
 
 
+def test_staged_may_fix_the_reference() -> None:
+    lidars = {**lidar(fixed=True), "rear": {**lidar()["front"], "topic": "b"}}
+    assert parse(lidars=lidars, reference="front", solve={"mode": "staged"}).lidars["front"].fixed
+
+
 def test_defaults() -> None:
     config = parse()
 
@@ -117,6 +122,10 @@ def test_an_unknown_key_names_the_nearest(sections: dict[str, Any], message: str
             ({"lidars": {"front": {"topic": "a", "fixed": True}}}, "and initial is not given"),
             ({"lidars": {"front": {"topic": "a"}}, "solve": {"mode": "staged"}},
              "lidars.front.initial is not given"),
+        ({"lidars": {**lidar(fixed=True), "rear": {**lidar()["front"], "topic": "b"}},
+          "reference": "rear", "solve": {"mode": "staged"}},
+         "of the reference 'rear', which would move lidars.front, whose guess is fixed: set "
+         "reference to front, or mode to auto"),
         ({"lidars": lidar(initial={"xyz": [0, math.nan, 0]})}, "'lidars.front.initial.xyz.1': "
          "must be a finite number (got 'nan')"),
         ({"lidars": lidar(initial={"xyz": [0, 0]})}, "'lidars.front.initial.xyz.2' is missing"),

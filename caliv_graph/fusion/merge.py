@@ -381,7 +381,8 @@ def _check_copies(calibrations: Mapping[str, Calibration]) -> None:
 def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:
     """Per LiDAR the guess of the first calibration that states one, in order of appearance.
 
-    A guess that was found in a drive stands back behind one that somebody gave.
+    A guess that was found in a drive stands back behind one that somebody gave, and that behind one
+    that is trusted (`fixed: true`): it is a measurement.
     """
     out: dict[str, Guess] = {}
     for calibration in calibrations.values():
@@ -392,8 +393,10 @@ def _first_guesses(calibrations: Mapping[str, Calibration]) -> dict[str, Guess]:
                 if name in c.lidars and (guess := c.lidars[name].guess) is not None
             ]
             if name not in out:
+                fixed = [guess for guess in stated if guess.fixed]
                 given = [guess for guess in stated if not guess.found]
-                out[name] = next(iter([*given, *stated]), None) or guess_of(calibration, name)
+                first = next(iter([*fixed, *given, *stated]), None)
+                out[name] = first or guess_of(calibration, name)
     return out
 
 
@@ -460,20 +463,28 @@ def _mean_offset(results: Sequence[LidarResult]) -> tuple[float, float] | None:
 
 
 def _differing_guesses(calibrations: Mapping[str, Calibration], merged: Calibration) -> list[str]:
-    """A warning per LiDAR whose guess decides undetermined axes and differs between files."""
-    if not merged.undetermined:
-        return []
+    """A warning per file and LiDAR whose guess decides, where those of files differ.
+
+    A guess decides undetermined axes, and a trusted one all.
+    """
     out = []
     for name, lidar in merged.lidars.items():
         used = lidar.guess
         for label, calibration in calibrations.items():
             other = calibration.lidars[name].guess if name in calibration.lidars else None
-            if used is None or other is None or all(lidar.determined.values()):
-                continue
-            if other.found:
+            if used is None or other is None or other.found:
                 continue  # nobody gave it
             apart = vehicle_axes_difference(other.T_vehicle_lidar, used.T_vehicle_lidar)
-            if np.abs(apart).max() > _SAME_GUESS:
+            if np.abs(apart).max() <= _SAME_GUESS:
+                continue
+            if used.fixed and other.fixed:
+                out.append(
+                    f"{label}: its fixed extrinsic of '{name}' is not used: it differs from that "
+                    f"of an earlier file by {1e3 * np.linalg.norm(apart[3:]):.1f} mm and "
+                    f"{np.degrees(np.linalg.norm(apart[:3])):.3f} degrees. Fix it at one place, or "
+                    "remove 'fixed'"
+                )
+            elif merged.undetermined and not used.fixed and not all(lidar.determined.values()):
                 out.append(
                     f"{label}: its initial guess of '{name}' is not used: it differs from that of "
                     "an earlier file, which decides the undetermined axes"

@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.merge import Merger, merge, starting_from, with_earlier
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.geometry.se3 import (
+    retract_vehicle_axes,
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
 from caliv_graph.products import Array, Calibration, Guess, Suspect
 from caliv_graph.results.calibration_file import read_calibration, write_calibration
+from caliv_graph.uncertainty.pairs import sigmas_s2v
 from caliv_graph.wording.remedies import OF_ODOMETRY, OF_STRUCTURE
 from tests.fusion.drives import (
     TRUTH,
@@ -339,6 +345,33 @@ def test_a_trusted_mounting_stays() -> None:
 
     assert result.lidars["rear"].T_vehicle_lidar.equals(TRUTH["rear"], 1e-4)
     assert all(result.lidars["rear"].determined.values())
+
+
+def test_a_trusted_mounting_counts_whichever_file_has_it() -> None:
+    D = information(NAMES)
+    free = drive(D, source="a")
+    fixed, other = (
+        with_trusted(drive(D, source=source), shift(NAMES, "rear", x=x))
+        for source, x in (("b", 0.001), ("c", 0.003))
+    )
+    for files in ((free, fixed), (fixed, free)):
+        result = merger(*files)
+        assert result.warnings == ()
+        rear = result.calibration.lidars["rear"]
+        assert rear.guess is not None
+        assert rear.guess.fixed
+        assert sigmas_s2v(result.calibration, "rear")[3] < 1.01e-4
+    (warning,) = merger(fixed, free, other).warnings
+    assert warning.startswith("c.yaml: its fixed extrinsic of 'rear' is not used: it differs")
+    assert "by 2.0 mm and 0.000 degrees" in warning
+
+
+def with_trusted(calibration: Calibration, error: Array) -> Calibration:
+    """The same, its rear LiDAR fixed where it is off by some rows of `error`."""
+    at = retract_vehicle_axes(TRUTH["rear"], error[6:])
+    trusted = Guess(at, TRUSTED_SIGMAS, fixed=True)
+    rear = replace(calibration.lidars["rear"], guess=trusted)
+    return replace(calibration, lidars={**calibration.lidars, "rear": rear})
 
 
 def test_a_merged_file_reads_back(tmp_path: Path) -> None:

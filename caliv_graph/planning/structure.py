@@ -227,8 +227,13 @@ def information_with_structure(
         add_ground(H, structure.motion, scenario, drive, stamps, columns, assumptions, with_planes)
     H = H[nodes]
     # Coordinates: those of `columns`, then poses, then errors of LiDARs and of the vehicle's stand.
-    errors = layout.plane - layout.error
-    total = np.zeros((k + POSE * m + errors,) * 2)
+    errors = k + POSE * m + np.arange(layout.plane - layout.error)
+    if columns.ground == "height":
+        # One error of the vehicle's height, above planes and strips. The system has its prior.
+        stand = layout.standing - layout.error
+        errors[stand] = columns.height
+        errors[stand + 1 :] -= 1
+    total = np.zeros((max(k + POSE * m, errors.max(initial=0) + 1),) * 2)
     total[:k, :k] = H[:, POSE:, POSE:].sum(axis=0)
     each = k + POSE * np.arange(m)[:, None] + np.arange(POSE)
     total[each[:, :, None], each[:, None]] += H[:, :POSE, :POSE]
@@ -237,14 +242,12 @@ def information_with_structure(
     rest = np.arange(columns.kept, k)
     total[rest, rest] += RIDGE
     total[columns.all_biases, columns.all_biases] += bias_information(columns, assumptions)
-    if columns.ground == "height":
-        total[columns.height, columns.height] += height_sigma_of(scenario, assumptions) ** -2.0
     own = np.concatenate(
         [
             k + np.arange(POSE * m),
             6 * len(names) + np.arange(len(layout.offsets)),
             np.arange(6 * len(names)),
-            k + POSE * m + np.arange(errors),
+            errors,
         ]
     )
     total[np.ix_(own, own)] += _in_vehicle_axes(structure.found)

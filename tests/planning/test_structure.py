@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import ConfigError
 from caliv_graph.planning import Assumptions, Prediction, predict
@@ -33,6 +34,7 @@ from caliv_graph.scenario.drive_models import (
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel
+from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.scenario.world_models import (
     BoxModel,
     CarModel,
@@ -41,6 +43,7 @@ from caliv_graph.scenario.world_models import (
     WallModel,
     WorldModel,
 )
+from caliv_graph.structure.term import lidars_with_ground
 from caliv_graph.uncertainty.observability import UNIT
 from tests.drives_with_chair import RADIUS_M, paper_lidar
 from tests.samples import turn_about, twist_of_all
@@ -340,6 +343,30 @@ def test_walls_make_a_target_unnecessary_and_help_beside_one() -> None:
     assert (pair[2:5] < 0.5 * by_chair[2:5]).all()
     assert not alone.covariance.calibration.lidars["front"].saw_target
     assert alone.covariance.calibration.lidars["front"].saw_structure
+
+
+def test_the_height_above_strips_and_planes_of_ground_counts_once() -> None:
+    """z of a LiDAR is no better known than the height that is stated, here to 5 cm."""
+    objects = numbered(wall(22, -5, 80), wall(5, 8, 10)) | {"chair": ChairModel(xy_m=(9.0, -19.0))}
+    scenario = drive_past(S_CURVE, objects, rate_hz=1.0).model_copy(
+        update={"world": WorldModel(objects=objects, targets=("chair",))}
+    )
+    drive = make_drive(scenario.drive, make_terrain(scenario.world.ground))
+    assumptions = Assumptions(
+        source="poses", ground_height_sigma_m=0.05, extraction=ExtractionConfig(min_scans=4)
+    )
+    seen = SeenDrive.of(scenario, drive, assumptions)
+    assert seen.structure is not None
+    assert len(seen.structure.found.stands().pose)
+    assert not lidars_with_ground(seen.structure.found)  # too few scans: their planes count
+
+    H = seen.information(tuple(scenario.lidars))
+
+    z = 5
+    rest = np.delete(np.arange(12), z)
+    cross = H[z, rest]
+    information = H[z, z] - cross @ np.linalg.solve(H[np.ix_(rest, rest)], cross)
+    assert 0.05 < information**-0.5 < 0.051
 
 
 def test_a_clock_beside_walls() -> None:

@@ -15,7 +15,6 @@ import numpy as np
 
 from caliv_graph.calibration.ground import GROUND_BIASES, TOGETHER_NS, bias_sigmas
 from caliv_graph.calibration.ground_weights import TILT_RAD
-from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.planning.assumptions import Assumptions, Ground, Source
@@ -39,10 +38,13 @@ from caliv_graph.targets.ground.measure import MAX_APART_NS
 from caliv_graph.trajectory.chain import POSE, STATE, Chain
 
 PLANE = 3
-"""Number of coordinates of the ground plane: slopes along map x and y, and height."""
+"""Number of coordinates of the ground plane: slopes along its x and y, and height."""
 
 RAMP_HEIGHT_M = 0.02
 """Height of the ground above level from which on the vehicle does not stand on the plane."""
+
+LEAST_HEAVE_M = 1e-4
+"""Of the vehicle on its wheels, 1 sigma: `calibrate` estimates none below."""
 
 RIDGE = 1e-6
 """Information added to targets and planes. It makes unobservable coordinates (the yaw of a round
@@ -284,9 +286,12 @@ def add_ground(
         assumptions: sigmas of the ground, and its use.
         only: LiDARs that measure planes; None: all that see the ground.
     """
-    level = _level(motion, scenario, drive)
+    R_plane_map = _plane_axes(motion, drive)
+    level = _level(motion, scenario, drive, R_plane_map)
     nodes = motion.nodes_of(stamps_ns)
-    origin = motion.position_map[nodes].mean(axis=0)
+    # Of the vehicle in axes of the plane.
+    R = R_plane_map @ motion.R_map_vehicle
+    place = (motion.position_map - motion.position_map[nodes].mean(axis=0)) @ R_plane_map.T
     tilt_sigma, distance_sigma = (
         assumptions.ground_tilt_sigma_rad,
         assumptions.ground_distance_sigma_m,
@@ -310,31 +315,30 @@ def add_ground(
         info *= view_weights(motion.position_map[at])[:, None]
         stood[at] = True
         J = np.zeros((len(at), 3, H.shape[1]))
-        _seen_plane(J, motion, at, origin, model, name, columns)
+        _seen_plane(J, R[at], place[at], model, name, columns)
         np.add.at(H, at, np.swapaxes(J, 1, 2) @ (info[:, :, None] * J))
     if assumptions.ground == "height":
-        _add_contact(H, motion, np.flatnonzero(stood), origin, columns)
+        _add_contact(H, np.flatnonzero(stood), R, place, columns, assumptions)
 
 
 def _seen_plane(
     J: Array,
-    motion: PlannedMotion,
-    at: IntArray,
-    origin: Array,
+    R: Array,
+    place: Array,
     model: LidarModel,
     name: str,
     columns: Columns,
 ) -> None:
-    """Fills the derivatives (m, 3, 6 + k) of the plane that a LiDAR sees from the nodes `at` (m,).
+    """Fills the derivatives (m, 3, 6 + k) of the plane that a LiDAR sees from m nodes.
 
-    Two of its normal in map axes, one of its distance; heights are about `origin`.
+    Two of its normal, one of its distance, in axes of the plane, as is the vehicle: rotation `R`
+    (m, 3, 3), `place` (m, 3) metres.
     """
     t = model.mounting.pose().translation()
-    R, place = motion.R_map_vehicle[at], motion.position_map[at]
-    arm = place + R @ t - origin
+    arm = place + R @ t
     lidar = _behind(columns.lidar(name)).start
     plane = POSE + columns.plane
-    # Residual of the normal in map axes: LiDAR tilt minus slopes of the plane.
+    # Residual of the normal: LiDAR tilt minus slopes of the plane.
     tilt = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) @ R
     J[:, :2, :3] = J[:, :2, lidar : lidar + 3] = tilt
     J[:, 0, plane] = J[:, 1, plane + 1] = -1.0
@@ -350,22 +354,42 @@ def _seen_plane(
 
 
 def _add_contact(
-    H: Array, motion: PlannedMotion, at: IntArray, origin: Array, columns: Columns
+    H: Array, at: IntArray, R: Array, place: Array, columns: Columns, assumptions: Assumptions
 ) -> None:
-    """Adds that the vehicle stands on the plane, at the nodes `at`; heights are about `origin`."""
-    R, place = motion.R_map_vehicle[at], motion.position_map[at] - origin
+    """Adds that the vehicle stands on the plane, at the nodes `at`; see `_seen_plane`."""
+    R, place = R[at], place[at]
+    sigma_m = max(assumptions.heave_sigma_m, LEAST_HEAVE_M)
     J = np.zeros((len(at), 1, H.shape[1]))
     J[:, 0, 3:6] = R[:, 2]
     J[:, 0, POSE + columns.plane : POSE + columns.plane + 2] = -place[:, :2]
     J[:, 0, POSE + columns.plane + 2] = J[:, 0, POSE + columns.height] = -1.0
-    H[at] += np.swapaxes(J, 1, 2) @ J / HEAVE_SIGMA_M**2
+    H[at] += np.swapaxes(J, 1, 2) @ J / sigma_m**2
 
 
-def _level(motion: PlannedMotion, scenario: Scenario, drive: Route) -> Array:
+def _plane_axes(motion: PlannedMotion, drive: Route) -> Array:
+    """R_plane_map (3, 3): axes of the ground plane, z along its normal, x as near to map x.
+
+    Where no terrain is stated (a recorded drive), the plane is that of most poses. It may have a
+    slope, as in `calibration.ground_weights`.
+    """
+    if drive.terrain is not None:
+        return np.eye(3)
+    normal = np.median(motion.R_map_vehicle[:, :, 2], axis=0)
+    normal /= np.linalg.norm(normal)
+    along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    along /= np.linalg.norm(along)
+    return np.array([along, np.cross(normal, along), normal])
+
+
+def _level(motion: PlannedMotion, scenario: Scenario, drive: Route, R_plane_map: Array) -> Array:
     """(n,) whether the vehicle stands on the plane, not on a ramp."""
-    upright = motion.R_map_vehicle[:, 2, 2] > math.cos(TILT_RAD[0])
+    # x and y of the normal in the vehicle frame.
+    tilt = np.einsum("i,nij->nj", R_plane_map[2], motion.R_map_vehicle)[:, :2]
+    if drive.terrain is None:
+        off = np.linalg.norm(tilt - np.median(tilt, axis=0), axis=1)
+        return np.asarray(off < math.sin(TILT_RAD[0]))
     low = motion.position_map[:, 2] - scenario.world.ground.height_m < RAMP_HEIGHT_M
-    return np.asarray(upright & low) if drive.terrain is not None else np.asarray(upright)
+    return np.asarray((np.linalg.norm(tilt, axis=1) < math.sin(TILT_RAD[0])) & low)
 
 
 def eliminate_heave(H: Array, sigma_m: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -10,15 +11,19 @@ import pytest
 
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
+from caliv_graph.planning.assumptions import Assumptions
+from caliv_graph.planning.predict import Prediction, predict_drives
 from caliv_graph.planning.recorded_motion import lifted, pose_noise_model
 from caliv_graph.planning.recorded_route import RecordedRoute
 from caliv_graph.planning.recorded_target import CANDIDATES, Silhouettes, nearest_object
 from caliv_graph.products import Array, Trajectory
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.scenario.drives import make_drive
+from caliv_graph.scenario.model import load_scenario
 from caliv_graph.scenario.shapes import object_mesh
 from caliv_graph.trajectory.select import GivenTrajectory
 
+SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 DRIVE = make_drive(ArcDrive(duration_s=17.0, radius_m=6.0, speed_m_s=1.5))
 FIRST_NS = 1_750_000_000_000_000_000
 UP_M = 0.4
@@ -64,6 +69,35 @@ def test_outside_its_span_a_route_stands_still_at_its_end() -> None:
     late = route.states(np.array([17_000_000_000, 30_000_000_000], np.int64))
 
     assert late.position_map[0] == pytest.approx(late.position_map[1], abs=1e-6)
+
+
+def on_slope(slope_deg: float, ramp: bool = False) -> Prediction:
+    """The arc past a chair as a recorded drive on a slope; `ramp`: 3 degrees more at the end."""
+    scenario = load_scenario(SCENARIOS / "demo_arc.yaml")
+    drive = make_drive(scenario.drive, None)
+    stamps_ns = np.arange(0, round(1e9 * drive.duration_s), 50_000_000, dtype=np.int64)
+    states = drive.states(stamps_ns)
+    slope, more = (
+        gtsam.Pose3(gtsam.Rot3.Pitch(-math.radians(deg)), np.zeros(3)) for deg in (slope_deg, 3.0)
+    )
+    poses = [slope.compose(T) for T in unstack(states.R_map_vehicle, states.position_map)]
+    if ramp:
+        begin = 4 * len(poses) // 5
+        poses[begin:] = [T.compose(more) for T in poses[begin:]]
+    route = RecordedRoute(
+        GivenTrajectory(Trajectory(stamps_ns, tuple(poses))), 0, int(stamps_ns[-1]), 0.0
+    )
+    return predict_drives([(scenario, route)], Assumptions(structure=False))
+
+
+def test_ground_with_a_slope_counts_and_a_ramp_does_not() -> None:
+    """What the arc past a chair leaves open does not depend on the slope of the yard."""
+    level, sloped, ramp = on_slope(0.0), on_slope(3.0), on_slope(3.0, ramp=True)
+    assert len(sloped.undetermined) == len(level.undetermined)
+    for name, sigma in level.sigma_s2v.items():
+        np.testing.assert_allclose(sloped.sigma_s2v[name], sigma, rtol=0.1)
+        # Fewer planes tell roll and pitch.
+        assert (ramp.sigma_s2v[name][:2] > 1.03 * sigma[:2]).all()
 
 
 def test_the_white_error_of_given_poses_is_seen_in_them() -> None:

@@ -39,7 +39,8 @@ class Assumptions:
         guesses: LiDAR -> its initial guess, of which the extrinsic plays no part; those that are
             not named have the sigmas of the scenario.
         structure: whether walls count, and the ground cell by cell with them.
-        stride: for a quick prediction, only every n-th cloud is used, with n-fold weight.
+        stride: for a quick prediction, only every n-th cloud is used, with n-fold weight; of each
+            LiDAR two stay.
     """
 
     ground: Ground = "height"

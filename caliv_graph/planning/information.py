@@ -131,9 +131,10 @@ def drive_information(
     Returns:
         (6n, 6n) vehicle axes, or (7n, 7n) with a time offset per LiDAR after all extrinsics.
     """
-    stride = assumptions.stride
-    used = [replace(s, used=s.used[stride // 2 :: stride]) for s in sightings]
-    used = [s for s in used if len(s.used)]
+    used = [s for s in sightings if len(s.used)]
+    # Two clouds of each LiDAR stay: one alone tells nothing where the place of a target is free.
+    stride = min([assumptions.stride, *(max(len(s.used) // 2, 1) for s in used)])
+    used = [replace(s, used=s.used[stride // 2 :: stride]) for s in used]
     at_targets = np.unique(np.concatenate([s.stamps_ns[s.used] for s in used]))
     everywhere = assumptions.ground_everywhere and assumptions.ground != "none"
     stamps = at_targets
@@ -142,7 +143,7 @@ def drive_information(
             np.concatenate([scan_stamps(scenario, n, drive.duration_s) for n in scenario.lidars])
         )
     motion = plan_motion(
-        drive, scenario, stamps, source_of(scenario, assumptions), NODE_NS * assumptions.stride
+        drive, scenario, stamps, source_of(scenario, assumptions), NODE_NS * stride
     )
     columns = Columns(
         lidars,

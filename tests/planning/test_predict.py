@@ -289,6 +289,16 @@ def test_height_is_as_good_as_that_of_the_vehicle() -> None:
         assert prediction.sigma_s2v["front"][5] == pytest.approx(sigma_m, rel=0.05)
 
 
+def test_a_vehicle_that_heaves_knows_its_height_no_better() -> None:
+    z = [
+        planned("arc", "height", ground_height_sigma_m=1e-4, heave_sigma_m=heave_m).sigma_s2v[
+            "front"
+        ][5]
+        for heave_m in (0.005, 0.05)
+    ]
+    assert z[1] > 3.0 * z[0]
+
+
 def test_range_biases_lift_the_ground_of_each_lidar() -> None:
     """By the ground alone S2S z is no better than they let it be; the target knows it to 4 mm."""
     sigmas = bias_sigmas(UNSTATED)
@@ -371,6 +381,21 @@ def test_a_quick_look_is_nearly_as_good() -> None:
         full, quick = planned(name, "height"), planned(name, "height", stride=4)
         for lidar in full.sigma_s2v:
             assert quick.sigma_s2v[lidar] == pytest.approx(full.sigma_s2v[lidar], rel=0.1)
+
+
+def test_a_quick_look_at_two_clouds_uses_both() -> None:
+    first, *_ = DRIVES["arc"]
+    slow = {n: m.model_copy(update={"rate_hz": 0.2}) for n, m in first.lidars.items()}
+    scenario = first.model_copy(update={"lidars": slow})
+    assumptions = Assumptions(ranges=EXACT, extraction=ExtractionConfig(min_scans=2))
+    full = predict(scenario, assumptions=assumptions)
+    assert [len(s.used) for s in full.sightings[0] if len(s.used)] == [2]
+
+    quick = predict(scenario, assumptions=replace(assumptions, stride=4))
+
+    np.testing.assert_allclose(
+        quick.covariance.information_data, full.covariance.information_data, rtol=1e-9
+    )
 
 
 def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:

@@ -16,6 +16,7 @@ from caliv_graph.config.guesses import (
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.products import Array
 from caliv_graph.uncertainty.observability import UNIT
 from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2v
 from tests.samples import MOUNTINGS, make_solution, pose
@@ -35,6 +36,7 @@ def test_a_lidar_without_a_guess_is_as_well_known_as_its_pair_with_a_fixed_one()
     between = np.kron([[1.0, -1.0], [-1.0, 1.0]], np.diag(UNIT**-2.0))
     trust = np.kron(np.diag([1.0, 0.0]), np.diag(TRUSTED_SIGMAS**-2.0))
     priors = [prior_sigmas(configured_guess(config, name)) for name in poses]
+    known: Array = np.asarray(between + trust, dtype=np.float64)
     solution = make_solution()
     registration = solution.registrations[0]
     front = registration.observation.clouds[0]
@@ -45,9 +47,9 @@ def test_a_lidar_without_a_guess_is_as_well_known_as_its_pair_with_a_fixed_one()
         registrations=(replace(registration, observation=observation),),
         cloud_weights=(np.ones(2),),
         T_vehicle_lidar=poses,
-        information_data=between + trust,
+        information_data=known,
         information_prior=np.diag(np.concatenate(priors) ** -2.0),
-        cov=np.linalg.inv(between + trust),
+        cov=np.asarray(np.linalg.inv(known), dtype=np.float64),
     )
 
     result = assemble(solution, config, ())

@@ -22,6 +22,7 @@ QUIET = settings(
 )
 
 metres = st.floats(-100.0, 100.0)
+heights = st.floats(-30.0, 30.0)
 positive = st.floats(1e-6, 1e6)
 triples = st.tuples(metres, metres, metres)
 names = st.text(min_size=1, max_size=20).filter(lambda name: not name_problem(name))
@@ -50,7 +51,7 @@ def configs(draw: st.DrawFn) -> dict[str, Any]:
         "lidars": lidars,
         "reference": draw(st.sampled_from([*chosen, ""])),
         "target": draw(st.sampled_from([None, {"min": low_corner, "max": high_corner}])),
-        "ground": {"vehicle_height": draw(st.none() | metres), "sigma": draw(positive)},
+        "ground": {"vehicle_height": draw(st.none() | heights), "sigma": draw(positive)},
         "noise": {
             "lidar_range_m": min(draw(positive), 1.0),
             "velocity_m_s": draw(st.none() | positive),

@@ -205,7 +205,10 @@ def with_earlier(
     terms = prior_terms(prior)
     # What the new drive found is no guess: then that of the earlier file is the one.
     stated = _first_guesses({"this drive": calibration, "--prior": prior})
-    guesses = {name: stated[name] for name in calibration.lidars}
+    guesses = {
+        name: stated[name] if lidar.guess is None or lidar.guess.found else lidar.guess
+        for name, lidar in calibration.lidars.items()
+    }
     before = _together(terms, {name: guess_of(prior, name) for name in prior.lidars} | guesses)
     comparison = compare_terms((before, own), (guesses, guesses), calibration.reference, p_value)
     mode = "joint" if calibration.provenance.get("mode") == "joint" else "auto"

@@ -366,6 +366,15 @@ def test_a_trusted_mounting_counts_whichever_file_has_it() -> None:
     assert "by 2.0 mm and 0.000 degrees" in warning
 
 
+def test_whether_a_mounting_is_fixed_beside_a_prior_is_what_the_config_says() -> None:
+    D = information(NAMES)
+    fixed = with_trusted(drive(D, source="a"), np.zeros(12))
+    result, _ = with_earlier(drive(D, source="b"), fixed)
+    assert result.lidars["rear"].guess is not None
+    assert not result.lidars["rear"].guess.fixed
+    assert sigmas_s2v(result, "rear")[3] > 1e-3
+
+
 def with_trusted(calibration: Calibration, error: Array) -> Calibration:
     """The same, its rear LiDAR fixed where it is off by some rows of `error`."""
     at = retract_vehicle_axes(TRUTH["rear"], error[6:])

@@ -234,29 +234,8 @@ def with_earlier(
         warnings.append(
             "--prior: is inconsistent, so the result is inconsistent too: calibrate without --prior"
         )
-    results = _seen_in_either(calibration, prior)
-    warnings += [
-        f"--prior: LiDAR '{name}' saw neither target nor structure in this drive. Its extrinsic "
-        "rests on the earlier calibration, and no test tells whether its mount has moved since: "
-        "check its topic, or drive where it sees something"
-        for name, result in results.items()
-        if result.has_data and not calibration.lidars[name].placed
-    ]
-    result = _assembled(draft, results, guesses, fused, data, disagree)
+    result = _assembled(draft, calibration.lidars, guesses, fused, data, disagree)
     return result, tuple(warnings)
-
-
-def _seen_in_either(calibration: Calibration, prior: Calibration) -> dict[str, LidarResult]:
-    """The results of a calibration; a LiDAR has seen what it saw in the earlier one, too."""
-    out = dict(calibration.lidars)
-    for name in out.keys() & prior.lidars.keys():
-        before = prior.lidars[name]
-        out[name] = replace(
-            out[name],
-            saw_target=out[name].saw_target or before.saw_target,
-            saw_structure=out[name].saw_structure or before.saw_structure,
-        )
-    return out
 
 
 def _assembled(
